@@ -1,0 +1,1 @@
+"""The autopilot over MAVLink: its state, its parameters, its IMUs."""

@@ -1,0 +1,105 @@
+"""The record of one calibration: what was found, how well, and what was done with it.
+
+The keys are a surface that others rely on. What is unknown or does not apply is None (null in JSON), never absent
+and never zero. All axes are the vehicle's FRD.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+FORMAT_VERSION = 1
+
+Axes = tuple[float, float, float]
+Outcome = Literal["verified", "stored", "failed", "rolled_back"]
+
+
+class PoseSigma(msgspec.Struct, frozen=True, kw_only=True):
+    """One-sigma uncertainty of the pose."""
+
+    theta: float | None
+    gamma: float | None
+    psi: float | None
+
+
+class Pose(msgspec.Struct, frozen=True, kw_only=True):
+    """How the aircraft stood: nose up, right side down, clockwise from true north."""
+
+    theta_deg: float | None
+    gamma_deg: float | None
+    psi_deg: float | None
+    sigma_deg: PoseSigma
+
+
+class Site(msgspec.Struct, frozen=True, kw_only=True):
+    """Where it stood, and who said so."""
+
+    latitude_deg: float | None
+    height_m: float | None
+    gravity_m_s2: float | None
+    declination_deg: float | None
+    source: str | None
+
+
+class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):
+    """One autopilot parameter: before, what was set, what came back.
+
+    "verified": read back and seen in the telemetry. "stored": read back, but its effect cannot be seen.
+    "failed": not set, or not put back. "rolled_back": the old value is in force again.
+    """
+
+    before: float | None
+    after: float
+    read_back: float | None
+    outcome: Outcome
+
+
+class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU: whole biases (measured without any offset, minus truth), sigmas, and what was written."""
+
+    name: str
+    samples: int
+    temperature_degc: float | None
+    gyro_bias_rad_s: Axes | None
+    gyro_sigma_stat_rad_s: Axes | None
+    gyro_sigma_use_rad_s: Axes | None
+    accel_bias_m_s2: Axes | None
+    accel_sigma_stat_m_s2: Axes | None
+    accel_sigma_use_m_s2: Axes | None
+    covariance: tuple[tuple[float | None, ...], ...] | None
+    """6x6: gyro x y z in rad/s, accelerometer x y z in m/s^2; None where that half was not determined."""
+    residual_gyro_rad_s: Axes | None
+    residual_accel_m_s2: Axes | None
+    warnings: tuple[str, ...] = ()
+    written: dict[str, WrittenParameter] = {}
+
+
+class Record(msgspec.Struct, frozen=True, kw_only=True):
+    """One calibration, finished in whatever way."""
+
+    format_version: int = FORMAT_VERSION
+    state: Literal["done", "failed", "cancelled"]
+    reason: str
+    warnings: tuple[str, ...]
+    started_at: str
+    """UTC, ISO 8601; the host's clock, which on a field computer may be wrong."""
+    duration_s: float
+    pose: Pose | None
+    site: Site | None
+    imus: tuple[ImuRecord, ...]
+
+
+def to_json(record: Record) -> bytes:
+    """The record as JSON, every key present."""
+    return msgspec.json.encode(record)
+
+
+def from_json(data: bytes) -> Record:
+    """Read a record back.
+
+    Raises:
+        msgspec.MsgspecError: not a record of this format.
+    """
+    return msgspec.json.decode(data, type=Record)

@@ -1,0 +1,23 @@
+"""What can be asked for."""
+
+from __future__ import annotations
+
+import enum
+
+
+class What(enum.Enum):
+    """Which biases to calibrate; the numbers are param1 of MAV_CMD_USER_1."""
+
+    BOTH = 0
+    GYROS = 1
+    ACCELEROMETERS = 2
+
+    @property
+    def gyros(self) -> bool:
+        """Whether gyro biases are asked for."""
+        return self is not What.ACCELEROMETERS
+
+    @property
+    def accelerometers(self) -> bool:
+        """Whether accelerometer biases are asked for."""
+        return self is not What.GYROS

@@ -1,0 +1,1 @@
+"""The service: wiring, and the conduct of a calibration."""

@@ -1,0 +1,51 @@
+"""Everything that can go wrong, named by its cause.
+
+One root, so that a face (command line, ground station, MQTT) catches one type and shows one line. The text of
+an error is what a tired pilot reads: where, what was found, what is allowed.
+"""
+
+from __future__ import annotations
+
+
+class CompanionError(Exception):
+    """Root of all errors that the companion raises on purpose."""
+
+
+class ConfigError(CompanionError):
+    """The configuration cannot be used; one line that names file, key, what was found and what is allowed."""
+
+
+class LinkError(CompanionError):
+    """A port, socket or stream could not be opened or was lost."""
+
+
+class DaemonUnreachableError(CompanionError):
+    """No daemon answers on the control socket."""
+
+
+class StorageError(CompanionError):
+    """A record could not be written or read."""
+
+
+class CalibrationRefusedError(CompanionError):
+    """The measurement fails its own checks; nothing may be written."""
+
+
+class AutopilotError(CompanionError):
+    """The autopilot did not do what was asked."""
+
+
+class NotDisarmedError(AutopilotError):
+    """The autopilot is armed, or whether it is armed is unknown: nothing may be written."""
+
+
+class ParameterTimeoutError(AutopilotError):
+    """The autopilot did not answer a parameter request within all retries."""
+
+
+class ParameterRefusedError(AutopilotError):
+    """The autopilot refused a parameter (PARAM_ERROR) or answered with another value than was set."""
+
+
+class AutopilotRebootedError(AutopilotError):
+    """The autopilot restarted in the middle of an exchange."""

@@ -1,0 +1,108 @@
+"""MAVLink on one link: packing, parsing, sequence numbers, and who wants to hear which message.
+
+pymavlink's generated dialect class is the codec; `mavutil` is not used (it blocks, prints, and weighs 41 MiB).
+No socket is opened here: a transport (links.mavlink_transport, or a test's) hands received bytes to `receive` and
+gives `attach` a function that sends.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable
+from typing import TypeVar
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+logger = logging.getLogger(__name__)
+
+Message = mavlink.MAVLink_message
+M = TypeVar("M", bound=mavlink.MAVLink_message)
+Handler = Callable[[M, float], None]
+Unsubscribe = Callable[[], None]
+
+
+class MavlinkLink:
+    """One MAVLink connection as one component sees it.
+
+    `system_id` may be changed while running: it is latched from the autopilot's heartbeat. All calls are made on
+    the event loop's thread; handlers must not block.
+    """
+
+    def __init__(self, *, system_id: int = 1, component_id: int = 191) -> None:
+        self.component_id = component_id
+        self.received: Counter[str] = Counter()
+        """Messages by type, plus "bad" (failed checks) and "handler error"."""
+        self.sent = 0
+        self.dropped = 0
+        """Messages that could not be sent because no transport was attached."""
+        self.last_received_s: float | None = None
+        self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+        self._codec.robust_parsing = True
+        self._transmit: Callable[[bytes], None] | None = None
+        self._handlers: dict[str, list[Handler[mavlink.MAVLink_message]]] = {}
+
+    @property
+    def system_id(self) -> int:
+        """The system id under which we send."""
+        return self._codec.srcSystem
+
+    @system_id.setter
+    def system_id(self, value: int) -> None:
+        self._codec.srcSystem = value
+
+    @property
+    def connected(self) -> bool:
+        """Whether a transport is attached; says nothing of a peer behind it."""
+        return self._transmit is not None
+
+    def attach(self, transmit: Callable[[bytes], None] | None) -> None:
+        """Give the function that sends bytes, or None while there is none. What was half received is forgotten."""
+        self._transmit = transmit
+        self._codec.buf = bytearray()
+        self._codec.buf_index = 0
+
+    def send(self, message: mavlink.MAVLink_message) -> bool:
+        """Send a message now; False (and counted) when no transport is attached."""
+        if self._transmit is None:
+            self.dropped += 1
+            return False
+        data = message.pack(self._codec)
+        self._codec.seq = (self._codec.seq + 1) % 256
+        self._transmit(data)
+        self.sent += 1
+        return True
+
+    def subscribe(self, kind: type[M], handler: Handler[M]) -> Unsubscribe:
+        """Call `handler(message, t_s)` for every message of a kind, whoever sent it; returns how to stop that."""
+        handlers = self._handlers.setdefault(kind.msgname, [])
+        handlers.append(handler)
+
+        def unsubscribe() -> None:
+            if handler in handlers:
+                handlers.remove(handler)
+
+        return unsubscribe
+
+    def receive(self, data: bytes, t_s: float) -> None:
+        """Take bytes that arrived at `t_s` (monotonic); never raises, whatever they are."""
+        try:
+            messages = self._codec.parse_buffer(data) or ()
+        except Exception:  # noqa: BLE001 - the generated parser's own faults must not reach the loop
+            self.received["bad"] += 1
+            self._codec.buf = bytearray()
+            self._codec.buf_index = 0
+            return
+        for message in messages:
+            name = message.get_type()
+            if name == "BAD_DATA":
+                self.received["bad"] += 1
+                continue
+            self.received[name] += 1
+            self.last_received_s = t_s
+            for handler in tuple(self._handlers.get(name, ())):
+                try:
+                    handler(message, t_s)
+                except Exception:
+                    self.received["handler error"] += 1
+                    logger.exception("handling %s failed", name)

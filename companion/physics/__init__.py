@@ -1,0 +1,1 @@
+"""Frames, the Earth, gradienter laws, quantisation: pure functions."""

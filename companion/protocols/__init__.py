@@ -1,0 +1,1 @@
+"""Bytes to samples, samples to commands; no I/O, no clock."""

@@ -1,0 +1,66 @@
+"""The words for what sensors say: one frozen structure a kind, units in the field names.
+
+`t_s` is the host's monotonic clock (the event loop's `time()`), in seconds, at which the quantity was sampled as
+well as the protocol can tell: the time of the read minus the line time of the bytes that came after the frame.
+Vectors are in the sensor's own axes until a `mounting` has turned them into the vehicle's FRD.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+Vector = tuple[float, float, float]
+
+
+class ImuSample(msgspec.Struct, frozen=True, gc=False):
+    """Angular rate and specific force of one IMU at one instant.
+
+    Specific force is what an accelerometer measures: (0, 0, -9.8) m/s^2 in FRD when level at rest.
+    """
+
+    t_s: float
+    gyro_rad_s: Vector
+    accel_m_s2: Vector
+    temperature_degc: float | None = None
+    sequence: int | None = None
+    """The device's own counter as it came, not unwrapped; None where the protocol has none."""
+    t_device_s: float | None = None
+    """The device's own clock as it came, not unwrapped; None where the protocol has none."""
+
+
+class TiltSample(msgspec.Struct, frozen=True, gc=False):
+    """The two readings of a gradienter, in its own axes and by its own law (physics.gradienter)."""
+
+    t_s: float
+    x_deg: float
+    y_deg: float
+    temperature_degc: float | None = None
+
+
+class CompassSample(msgspec.Struct, frozen=True, gc=False):
+    """A heading, clockwise from north, in [0, 360); whether magnetic or true north is the configuration's."""
+
+    t_s: float
+    heading_deg: float
+    pitch_deg: float | None = None
+    roll_deg: float | None = None
+
+
+class MagSample(msgspec.Struct, frozen=True, gc=False):
+    """A magnetic field vector in the device's axes; `counts` where the device gives no unit."""
+
+    t_s: float
+    field_gauss: Vector | None = None
+    counts: tuple[int, int, int] | None = None
+
+
+class AttitudeSample(msgspec.Struct, frozen=True, gc=False):
+    """What a device itself believes its attitude to be."""
+
+    t_s: float
+    yaw_deg: float
+    pitch_deg: float
+    roll_deg: float
+
+
+Sample = ImuSample | TiltSample | CompassSample | MagSample | AttitudeSample

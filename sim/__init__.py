@@ -1,0 +1,1 @@
+"""A virtual aircraft and the devices, autopilots and faults around it."""
