@@ -375,9 +375,7 @@ def _check_imu(imu: Imu, here: str, name: str) -> None:
 def _check_port(port: str, here: str, name: str) -> None:
     if port.startswith("/") or re.fullmatch(r"tcp://\S+:\d{1,5}", port):
         return
-    raise ConfigError(
-        f"{name}: {here!r}: found {port!r}; allowed: a device path (/dev/...) or tcp://HOST:PORT"
-    )
+    raise ConfigError(f"{name}: {here!r}: found {port!r}; allowed: a device path (/dev/...) or tcp://HOST:PORT")
 
 
 def _check_ports_differ(config: Config, name: str) -> None:

@@ -76,7 +76,7 @@ class MavlinkLink:
     def subscribe(self, kind: type[M], handler: Handler[M]) -> Unsubscribe:
         """Call `handler(message, t_s)` for every message of a kind, whoever sent it; returns how to stop that."""
         handlers = self._handlers.setdefault(kind.msgname, [])
-        handlers.append(handler)
+        handlers.append(handler)  # type: ignore[arg-type]
 
         def unsubscribe() -> None:
             if handler in handlers:
