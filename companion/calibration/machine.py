@@ -46,7 +46,7 @@ class Event(enum.Enum):
     CANCEL = "cancel"
 
 
-RESTING: Final = frozenset({State.IDLE, State.DONE, State.FAILED, State.CANCELLED})
+RESTING: Final = (State.IDLE, State.DONE, State.FAILED, State.CANCELLED)
 
 TRANSITIONS: Final[dict[tuple[State, Event], State]] = {
     **{(state, Event.REQUEST): State.WAITING for state in RESTING},
