@@ -115,7 +115,7 @@ def _preflight_calibration(parameters: tuple[float, ...]) -> Calibrate | Refused
 def _request_message(message_id: float) -> SendVersion | Refused:
     if message_id == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
         return SendVersion()
-    if message_id in range(1 << 24):
+    if 0 <= message_id < 1 << 24 and message_id.is_integer():
         return Refused(mavlink.MAV_RESULT_UNSUPPORTED, f"Message {message_id:.0f} cannot be requested here")
     return _denied(f"Message request refused: param1 {message_id:g}")
 

@@ -11,9 +11,8 @@ import asyncio
 import errno
 import logging
 import re
-import socket
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol, cast
 
 from companion.errors import LinkError
 from companion.links.backoff import Backoff
@@ -112,6 +111,14 @@ async def _run_udp(
         await asyncio.sleep(backoff.next_s())
 
 
+class _DatagramOut(Protocol):
+    """What every event loop's datagram transport can, though asyncio's own type does not say so."""
+
+    def sendto(self, data: bytes, addr: tuple[Any, ...] | None = None) -> None: ...
+
+    def get_write_buffer_size(self) -> int: ...
+
+
 class _Udp(asyncio.DatagramProtocol):
     """What both kinds of UDP share: receiving, a bounded way out, and an end."""
 
@@ -121,14 +128,14 @@ class _Udp(asyncio.DatagramProtocol):
         self.now_s = loop.time
         self.closed: asyncio.Future[None] = loop.create_future()
         self._failed: asyncio.Future[str] = loop.create_future()
-        self._transport: asyncio.DatagramTransport | None = None
+        self._transport: _DatagramOut | None = None
 
     async def run(self) -> str:
         """Serve until the socket fails; returns why."""
         return await self._failed
 
     def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
-        self._transport = transport
+        self._transport = cast("_DatagramOut", transport)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = None
@@ -192,7 +199,8 @@ class _Listener(_Udp):
         return
 
     def _send_to_all(self, data: bytes) -> bool:
-        return any([self.send_to(data, peer) for peer in self._heard_s])
+        sent = [self.send_to(data, peer) for peer in self._heard_s]
+        return any(sent)
 
     def _prune(self) -> None:
         now_s = self.now_s()
