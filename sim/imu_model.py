@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.aircraft import VirtualAircraft
+from sim.aircraft import Truth, VirtualAircraft
 from sim.earth import STANDARD_GRAVITY_M_S2, Array, mounting_matrix
 
 DEG_H = math.radians(1.0) / 3600.0
@@ -233,6 +233,8 @@ class ImuModel:
         )
         self._random = np.random.default_rng([seed, 2])
         self._noise = np.empty((0, 6))
+        self._seen: Truth | None = None
+        self._ideal = np.zeros(6)
         self._gyro_matrix = _response(gyro_scale, gyro_misalignment_rad) @ self.mounting.T
         self._accel_matrix = _response(accel_scale, accel_misalignment_rad) @ self.mounting.T
 
@@ -271,8 +273,11 @@ class ImuModel:
 
     def expected(self, t_s: float) -> Array:
         """The reading without noise, rounding and limit: three rates, three specific forces."""
-        rate, force = self.aircraft.truth_at(t_s)
-        return np.concatenate((self._gyro_matrix @ rate, self._accel_matrix @ force)) + self._bias_at(t_s)
+        truth = self.aircraft.truth_at(t_s)
+        if truth is not self._seen:  # a standing aircraft gives the same object again and again
+            ideal = np.concatenate((self._gyro_matrix @ truth.rate_rad_s, self._accel_matrix @ truth.force_m_s2))
+            self._seen, self._ideal = truth, ideal
+        return self._ideal + self._bias_at(t_s)
 
     def expected_block(self, t_s: Array) -> Array:
         """The same at times (n), ascending: (n, 6)."""
