@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import re
 
 from companion.config.sections import Config, Imu, Mounting
@@ -10,6 +11,7 @@ from companion.config.words import allowed
 from companion.errors import ConfigError
 from companion.rotations import ROTATIONS_DEG
 
+UPRIGHT_COSINE = 0.5
 PORT_WORDS = "a device path (/dev/...) or tcp://HOST:PORT"
 
 
@@ -43,6 +45,7 @@ def check_together(config: Config, name: str) -> None:
         device = getattr(config, section)
         if device is not None:
             _check_mounting(device.mounting, f"{section}.mounting", name)
+            _check_upright(device.mounting, f"{section}.mounting", name)
             _check_port(device.port, f"{section}.port", name)
     _check_ports_differ(config, name)
     _check_mavlink_url(config.mavlink.url, name)
@@ -115,3 +118,12 @@ def _check_mounting(mounting: Mounting, here: str, name: str) -> None:
         f"{name}: {here!r}: found {mounting!r}{hint}; allowed: a MAVLink rotation name such as"
         ' "ROTATION_YAW_90", or [roll, pitch, yaw] in degrees'
     )
+
+
+def _check_upright(mounting: Mounting, here: str, name: str) -> None:
+    """Neither liquid nor pendulum nor tilt-compensated compass works on its side or head, nor can it tell."""
+    roll_deg, pitch_deg, _ = ROTATIONS_DEG[mounting] if isinstance(mounting, str) else mounting
+    if math.cos(math.radians(roll_deg)) * math.cos(math.radians(pitch_deg)) < UPRIGHT_COSINE:
+        raise ConfigError(
+            f"{name}: {here!r}: found {mounting!r}, on its side or upside down; allowed: within 60 degrees of upright"
+        )

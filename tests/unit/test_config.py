@@ -109,6 +109,10 @@ bind = "127.0.0.1:8080"
             ["gradienter.port", "found 3", "a text"],
         ),
         ("[compass]\nport = 'COM3'\nprotocol = 'hmr3300'", ["compass.port", "'COM3'", "tcp://HOST:PORT"]),
+        (
+            "[gradienter]\nport = '/dev/x'\nprotocol = 'inclinometer_xy'\nlaw = 'axis'\nmounting = 'ROTATION_ROLL_180'",
+            ["gradienter.mounting", "ROTATION_ROLL_180", "upside down", "upright"],
+        ),
         ("[mqtt]\nhost = ''", ["mqtt.host", "found ''", "not empty"]),
         ("[vehicle]\nlatitude_deg = 3 4", ["not valid TOML", "line 8"]),
     ],
