@@ -60,6 +60,8 @@ class Hmr3300Decoder(LineDecoder):
         if cut:
             raise RejectedError(TOO_LONG)
         if not line.strip(b"\r"):
+            # A bare line feed in mid-stream may have been a line's first digit; after a gap it is the end of the CR LF.
+            self._follows_line_end = bool(line) or not follows_line_end
             return None
         if _DAMAGED.search(line):
             raise RejectedError(PARITY)

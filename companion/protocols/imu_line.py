@@ -98,4 +98,4 @@ def _decode(sentence: bytes, t_s: float) -> ImuSample:
         gx, gy, gz, ax, ay, az = numbers(fields[2:8])
     gyro_rad_s, accel_m_s2 = (gx, gy, gz), (ax, ay, az)
     check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
-    return ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, sequence, t_us * 1e-6)
+    return ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, sequence, t_us / 1e6)

@@ -109,7 +109,7 @@ class Layout:
             accel_m_s2: Vector = values[accel : accel + 3]
             temperature_degc = None if self.temperature is None else values[self.temperature]
             check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
-            t_device_s = None if self.time_startup is None else values[self.time_startup] * 1e-9
+            t_device_s = None if self.time_startup is None else values[self.time_startup] / 1e9
             samples.append(ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, None, t_device_s))
         if self.attitude is not None:
             yaw_deg, pitch_deg, roll_deg = values[self.attitude : self.attitude + 3]
