@@ -139,7 +139,8 @@ class CommandServer:
             return
         final = self._finals.get(command.key)
         if command.confirmation > 0 and final is not None and now_s - final.sent_s <= REMEMBER_FINAL_S:
-            self._acknowledge(command.key, final.result)
+            # Remembered anew: this copy of the ACK may be lost as well.
+            self._finally(command.key, final.result, now_s)
             return
         self._obey(command.key, request, now_s)
 
