@@ -103,7 +103,8 @@ class ArduPilotDouble:
         self._down = False
         self._generation = 0
         self._last_later_s = 0.0
-        self._wake: asyncio.Event | None = None
+        self._failed: asyncio.Future[None] | None = None
+        self._timer: asyncio.TimerHandle | None = None
         self._boot_gyros(0.0)
 
     # The outside: two ends, and the loop.
@@ -119,20 +120,15 @@ class ArduPilotDouble:
     async def run(self) -> None:
         """Send heartbeats and streams until cancelled."""
         loop = asyncio.get_running_loop()
-        self._wake = asyncio.Event()
+        self._failed = loop.create_future()
         self._begin(loop.time())
+        self._tick()
         try:
-            while True:
-                now_s = loop.time()
-                self._send_due(now_s)
-                due = [at for channel in self.channels if (at := channel.next_due_s()) is not None]
-                handle = loop.call_at(max(min(due), now_s), self._wake.set) if due and not self._down else None
-                await self._wake.wait()
-                self._wake.clear()
-                if handle is not None:
-                    handle.cancel()
+            await self._failed
         finally:
-            self._wake = None
+            self._failed = None
+            if self._timer is not None:
+                self._timer.cancel()
 
     # What tests and people do to it.
 
@@ -289,8 +285,8 @@ class ArduPilotDouble:
 
     def wake(self) -> None:
         """Tell `run` that something is due earlier than it thought."""
-        if self._wake is not None:
-            self._wake.set()
+        if self._failed is not None:
+            asyncio.get_running_loop().call_soon(self._tick)
 
     def erase_parameters(self) -> None:
         """PREFLIGHT_STORAGE 2 or 4: everything is gone, at the next boot the defaults are there."""
@@ -345,6 +341,23 @@ class ArduPilotDouble:
         for channel in self.channels:
             channel.set_stream(HEARTBEAT, 1.0, loop_s)
             channel.streams[HEARTBEAT].next_s = loop_s
+
+    def _tick(self) -> None:
+        """Send what is due and come back for what is next: plain callbacks, cheaper than a task."""
+        if self._failed is None or self._failed.done():
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        loop = asyncio.get_running_loop()
+        try:
+            self._send_due(loop.time())
+        except Exception as error:  # noqa: BLE001 - handed to whoever awaits run()
+            self._failed.set_exception(error)
+            return
+        due = [at for channel in self.channels if (at := channel.next_due_s()) is not None]
+        if due and not self._down:
+            self._timer = loop.call_at(min(due), self._tick)
 
     def _send_due(self, loop_s: float) -> None:
         if self._down:

@@ -55,7 +55,9 @@ class InertialPath:
         self.model, self.instance = model, instance
         self._store = store
         self._random = np.random.default_rng([seed, 3, instance])
-        self._normal = np.empty((0, 2, 6))
+        self._noise: list[Array] = []
+        self._noise_key = (0.0, 0.0)
+        self._transition = np.eye(2)
         steps = np.repeat([model.spec.gyro.step, model.spec.accel.step], 3)
         self._density = np.sqrt(model.white**2 + steps**2 / 12.0 / RAW_RATE_HZ)
         self._state = np.zeros((2, 6))
@@ -103,7 +105,7 @@ class InertialPath:
     def _start(self, t_s: float) -> None:
         cutoff = 2.0 * math.pi * self._cutoff_hz()
         sigma = np.outer([1.0, cutoff], self._density) * math.sqrt(cutoff / (4.0 * _DAMPING))
-        self._state = sigma * self._draw()
+        self._state = sigma * self._random.standard_normal((2, 6))
         self._state[0] += self._correct(self.model.expected(t_s), t_s, armed=False)
         self._time_s = t_s
 
@@ -129,15 +131,21 @@ class InertialPath:
         return self._board
 
     def _advance(self, target: Array, span_s: float) -> None:
-        transition, root = self._kernel(span_s)
-        deviation = self._state
-        deviation[0] -= target
-        self._state = transition @ deviation + (root @ self._draw()) * self._density
-        self._state[0] += target
-
-    def _kernel(self, span_s: float) -> tuple[Array, Array]:
-        """Transition matrix, and square root of the covariance that unit white noise adds, over a span."""
         key = (round(span_s, 6), self._cutoff_hz())
+        if key != self._noise_key or not self._noise:
+            transition, root = self._kernel(key)
+            count = 128 if key == self._noise_key else 1  # a block once the same span has come twice
+            kicks = (root @ self._random.standard_normal((count, 2, 6))) * self._density
+            self._noise_key, self._transition, self._noise = key, transition, list(kicks)
+        state = self._state
+        state[0] -= target
+        state = self._transition @ state
+        state += self._noise.pop()
+        state[0] += target
+        self._state = state
+
+    def _kernel(self, key: tuple[float, float]) -> tuple[Array, Array]:
+        """Transition matrix, and square root of the covariance that unit white noise adds, over a span."""
         found = self._kernels.get(key)
         if found is None:
             omega = 2.0 * math.pi * key[1]
@@ -153,10 +161,3 @@ class InertialPath:
                 self._kernels.clear()
             self._kernels[key] = found
         return found
-
-    def _draw(self) -> Array:
-        if len(self._normal) == 0:
-            self._normal = self._random.standard_normal((512, 2, 6))
-        drawn: Array = self._normal[0]
-        self._normal = self._normal[1:]
-        return drawn
