@@ -51,9 +51,5 @@ class ParameterMismatchError(ParameterRefusedError):
     """The autopilot answered a write with another value than was set."""
 
 
-class WriteFailedError(AutopilotError):
-    """A set of parameters could not be written as a whole; `companion.autopilot.writer` says what is in force now."""
-
-
 class AutopilotRebootedError(AutopilotError):
     """The autopilot restarted in the middle of an exchange."""
