@@ -13,12 +13,16 @@ import msgspec
 
 from companion.config.rules import check_together
 from companion.config.sections import (
+    AtArm,
     Calibration,
     Compass,
+    CompassProtocol,
     Config,
     Control,
     Gradienter,
+    GradienterProtocol,
     Imu,
+    ImuProtocol,
     Mavlink,
     Mounting,
     Parity,
@@ -31,12 +35,16 @@ from companion.errors import ConfigError
 
 __all__ = [
     "DEFAULT_PATH",
+    "AtArm",
     "Calibration",
     "Compass",
+    "CompassProtocol",
     "Config",
     "Control",
     "Gradienter",
+    "GradienterProtocol",
     "Imu",
+    "ImuProtocol",
     "Mavlink",
     "Mounting",
     "Parity",
