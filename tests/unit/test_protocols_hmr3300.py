@@ -53,6 +53,8 @@ def test_magnetometer_counts_keep_their_order_and_sign() -> None:
         (b"123.4, 18.6, -0.5\n", "line end"),
         (b"123.4, 1\xb86, -0.5\r\n", "parity"),
         (b"123.4, 1\x006, -0.5\r\n", "parity"),
+        (b"1" * 39 + b"\r\n", "not a measurement"),
+        (b"1" * 40 + b"\r\n", "too long"),
         (b"1" * 100 + b"\r\n", "too long"),
     ],
 )
