@@ -8,13 +8,14 @@ of repeat must be told apart too:
 - the sender's own repeat while the job runs: IN_PROGRESS and no second job, since ground stations take any other
   result for the end.
 - a retransmission (confirmation > 0) of a request that was answered within the last seconds: the final ACK was
-  lost or crossed it on the way. It gets the same result again; anything else would calibrate twice for one press
-  of a button. A request with confirmation 0 is a new press and starts anew.
+  lost or crossed it on the way. It gets the same result again, and may do so until none has come for 3 s; anything
+  else would calibrate twice for one press of a button. A request with confirmation 0 is a new press and starts anew.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import NamedTuple
@@ -37,6 +38,7 @@ ACK_PERIOD_S = 0.4
 REMEMBER_FINAL_S = 3.0
 SAME_PACKET_S = 0.5
 _REMEMBERED = 32
+_RETRY_S = 0.1
 
 _RESULTS = {
     "done": (mavlink.MAV_RESULT_ACCEPTED, Severity.NOTICE),
@@ -69,7 +71,8 @@ class _Running(NamedTuple):
 
 class _Final(NamedTuple):
     result: int
-    sent_s: float
+    at_s: float
+    sent: bool
 
 
 class CommandServer:
@@ -97,17 +100,18 @@ class CommandServer:
         )
 
     def step(self, now_s: float) -> float:
-        """Report on the running job; returns when to report next (infinity: nothing runs)."""
+        """Report on the running job; returns when to report next (infinity: nothing to report)."""
+        retry_s = self._send_unsent(now_s)
         running = self._running
         if running is None:
-            return float("inf")
+            return retry_s
         if running.job.finished.done():
             self._finish(running, _result_of(running.job), now_s)
-            return float("inf")
+            return min(retry_s, now_s + _RETRY_S)
         if now_s >= self._next_ack_s:
             self._acknowledge_progress(running)
             self._next_ack_s = now_s + ACK_PERIOD_S
-        return self._next_ack_s
+        return min(retry_s, self._next_ack_s)
 
     def close(self, now_s: float) -> None:
         """Take no more commands; who still waits is told, so that no requester waits for ever."""
@@ -138,7 +142,7 @@ class CommandServer:
         if copy:
             return
         final = self._finals.get(command.key)
-        if command.confirmation > 0 and final is not None and now_s - final.sent_s <= REMEMBER_FINAL_S:
+        if command.confirmation > 0 and final is not None and now_s - final.at_s <= REMEMBER_FINAL_S:
             # Remembered anew: this copy of the ACK may be lost as well.
             self._finally(command.key, final.result, now_s)
             return
@@ -189,6 +193,7 @@ class CommandServer:
         if isinstance(job, Refusal):
             self._refuse(key, _REFUSALS[job.kind], f"{name} refused: {job.reason}", now_s)
             return
+        self._finals.pop(key, None)
         self._running = _Running(key, request, job)
         self._acknowledge_progress(self._running)
         self._next_ack_s = now_s + ACK_PERIOD_S
@@ -220,18 +225,30 @@ class CommandServer:
         self._finally(key, result, now_s)
 
     def _finally(self, key: requests.Key, result: int, now_s: float) -> None:
-        self._finals[key] = _Final(result, now_s)
+        sent = self._acknowledge(key, result)
+        self._finals[key] = _Final(result, now_s, sent)
         self._finals.move_to_end(key)
         if len(self._finals) > _REMEMBERED:
             self._finals.popitem(last=False)
-        self._acknowledge(key, result)
+        if not sent:
+            self._wake()
+
+    def _send_unsent(self, now_s: float) -> float:
+        """Try again what a transport that was gone or full did not take, for as long as somebody may still wait."""
+        retry_s = math.inf
+        for key, final in self._finals.items():
+            if not final.sent and now_s - final.at_s <= REMEMBER_FINAL_S:
+                sent = self._link.connected and self._acknowledge(key, final.result)
+                self._finals[key] = final._replace(sent=sent)
+                retry_s = retry_s if sent else now_s + _RETRY_S
+        return retry_s
 
     def _acknowledge_progress(self, running: _Running) -> None:
-        progress = min(max(running.job.progress_percent, 0), 100)
+        progress = min(max(int(running.job.progress_percent), 0), 100)
         self._acknowledge(running.key, mavlink.MAV_RESULT_IN_PROGRESS, progress)
 
-    def _acknowledge(self, key: requests.Key, result: int, progress: int = 0) -> None:
-        self._link.send(
+    def _acknowledge(self, key: requests.Key, result: int, progress: int = 0) -> bool:
+        return self._link.send(
             mavlink.MAVLink_command_ack_message(key.command, result, progress, 0, key.system_id, key.component_id)
         )
 

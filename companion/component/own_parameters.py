@@ -144,8 +144,8 @@ class OwnParameters:
             return math.inf
         if now_s >= self._next_s:
             index = next(iter(self._pending))
-            del self._pending[index]
-            self._send(self._all[index])
+            if self._send(self._all[index]):
+                del self._pending[index]
             self._next_s = now_s + 1.0 / VALUES_PER_S
         return self._next_s if self._pending else math.inf
 
@@ -158,8 +158,8 @@ class OwnParameters:
         self._pending.setdefault(parameter.index)
         self._wake()
 
-    def _send(self, parameter: _Parameter) -> None:
-        self._link.send(
+    def _send(self, parameter: _Parameter) -> bool:
+        return self._link.send(
             mavlink.MAVLink_param_value_message(
                 parameter.name.encode("ascii"), parameter.value, _REAL32, len(self._all), parameter.index
             )
@@ -197,8 +197,10 @@ class OwnParameters:
         refusal = self._apply(parameter, message)
         if refusal:
             self._say(Severity.WARNING, f"{parameter.name} not set: {refusal}", Weight.REFUSAL)
-        self._pending.pop(parameter.index, None)
-        self._send(parameter)
+        if self._send(parameter):
+            self._pending.pop(parameter.index, None)
+        else:
+            self._request(parameter)
 
     def _apply(self, parameter: _Parameter, message: mavlink.MAVLink_param_set_message) -> str:
         """Take over the new value; returns why not, or nothing."""

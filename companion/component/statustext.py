@@ -32,6 +32,7 @@ REPEAT_S = 3.0
 STALE_S = 20.0
 """What could not be said for so long (no link) is no news any more; results are kept."""
 _REMEMBERED_TEXTS = 32
+_FULL_RETRY_S = 0.1
 
 _ASCII = str.maketrans(
     {"°": " deg", "σ": "sigma", "µ": "u", "μ": "u", "²": "^2", "±": "+-", "×": "x", "≤": "<=", "≥": ">=", "≠": "!=",
@@ -133,7 +134,9 @@ class StatusText:
                 self._take_next(now_s)
             if not self._sending:
                 return math.inf
-            self._link.send(self._sending.popleft())
+            if not self._link.send(self._sending[0]):
+                return now_s + _FULL_RETRY_S
+            self._sending.popleft()
             self._tokens -= 1.0
         if not self._sending and not any(self._waiting.values()):
             return math.inf

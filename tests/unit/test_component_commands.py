@@ -559,3 +559,61 @@ def test_a_scripted_job_is_a_job() -> None:
         assert (await job.finished).outcome == "done"
 
     run_virtual(main())
+
+
+class TestBrokenTransport:
+    def test_the_end_is_told_when_the_transport_is_back_in_time(self) -> None:
+        async def main() -> None:
+            async with bench() as b:
+                transmit = b.link._transmit
+                b.ground.command(CALIBRATE, 0)
+                await asyncio.sleep(1)
+                for gone in (None, lambda data: False):
+                    b.ground.command(CALIBRATE, 0)
+                    await asyncio.sleep(1)
+                    b.link.attach(gone)
+                    b.service.jobs[-1].finish("failed")
+                    await asyncio.sleep(2)
+                    before = len(b.ground.finals())
+                    b.link.attach(transmit)
+                    await asyncio.sleep(0.2)
+                    assert b.ground.finals()[before:] == [FAILED]
+                    await asyncio.sleep(5)
+                    assert len(b.ground.finals()) == before + 1
+
+        run_virtual(main())
+
+    def test_long_after_it_is_told_to_nobody(self) -> None:
+        async def main() -> None:
+            async with bench() as b:
+                transmit = b.link._transmit
+                b.ground.command(CALIBRATE, 0)
+                await asyncio.sleep(1)
+                b.link.attach(None)
+                b.service.jobs[0].finish("done")
+                await asyncio.sleep(3.2)
+                b.link.attach(transmit)
+                await asyncio.sleep(5)
+                assert b.ground.finals() == []
+
+        run_virtual(main())
+
+    def test_a_new_press_forgets_an_end_that_was_never_told(self) -> None:
+        async def main() -> None:
+            async with bench() as b:
+                transmit = b.link._transmit
+                b.ground.command(CALIBRATE, 0)
+                await asyncio.sleep(1)
+                b.link.attach(None)
+                b.service.jobs[0].finish("failed")
+                await asyncio.sleep(0.5)
+                again = b.ground.pack(command_message(CALIBRATE, 0))
+                b.link.receive(again, asyncio.get_running_loop().time())
+                b.link.attach(transmit)
+                await asyncio.sleep(1)
+                assert b.ground.finals() == []
+                b.service.jobs[1].finish("done")
+                await asyncio.sleep(1)
+                assert b.ground.finals() == [ACCEPTED]
+
+        run_virtual(main())

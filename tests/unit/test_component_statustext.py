@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.component.component import Component
 from companion.component.statustext import Severity, StatusText, Weight, split_chunks, to_ascii
 from companion.links.mavlink import MavlinkLink
 from tests.support.component import Ground, bench
@@ -196,5 +197,28 @@ def test_nothing_to_say_is_not_said() -> None:
             assert not b.component.say(Severity.INFO, " \n ")
             await asyncio.sleep(1)
             assert b.ground.texts() == []
+
+    run_virtual(main())
+
+
+def test_a_full_transport_delays_texts_and_values_but_loses_none() -> None:
+    def define(component: Component) -> None:
+        for name in ("CMP_A", "CMP_B", "CMP_C"):
+            component.parameters.define(name, 0, 0, 9)
+
+    async def main() -> None:
+        async with bench(prepare=define) as b:
+            await asyncio.sleep(0.1)
+            transmit = b.link._transmit
+            b.link.attach(lambda data: False)
+            b.component.say(Severity.NOTICE, "x" * 120, Weight.RESULT)
+            for name in ("CMP_A", "CMP_B", "CMP_C"):
+                b.component.parameters.set(name, 5)
+            await asyncio.sleep(5)
+            assert b.ground.texts() == []
+            b.link.attach(transmit)
+            await asyncio.sleep(1)
+            assert put_together(statustexts(b.ground)) == ["x" * 120]
+            assert len(b.ground.times("PARAM_VALUE")) == 3
 
     run_virtual(main())
