@@ -26,7 +26,7 @@ from companion.calibration.windows import (
     TiltWindow,
     Window,
     heading_window,
-    imu_estimate,
+    imu_estimates,
     tilt_window,
 )
 from companion.errors import CalibrationRefusedError
@@ -343,16 +343,13 @@ class RollingCollector:
 
     def _estimate(self, slots: list[int]) -> list[ImuEstimate]:
         rejected = slots[-1] - slots[0] + 1 - len(slots)
-        return [
-            imu_estimate(
-                self._inputs[name],
-                [source.batches.batches[slot] for slot in slots],
-                end_s=slots[-1] + 1.0,
-                horizon_s=self._settings.horizon_s,
-                rejected=rejected,
-            )
-            for name, source in self._imus.items()
-        ]
+        return imu_estimates(
+            [self._inputs[name] for name in self._imus],
+            [[source.batches.batches[slot] for slot in slots] for source in self._imus.values()],
+            end_s=slots[-1] + 1.0,
+            horizon_s=self._settings.horizon_s,
+            rejected=rejected,
+        )
 
     def _pose_batches(self, source: Source, slots: list[int]) -> list[Batch]:
         found = [source.batches.batches[slot] for slot in slots if slot in source.batches.batches]

@@ -36,14 +36,26 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
 def is_enough(settings: Settings, estimates: Sequence[ImuEstimate]) -> bool:
     """Whether every axis meets its target, or its white part is below 30 % of what averaging cannot remove."""
     return all(
-        bool(_done(triad.white_variance, triad.use_variance, target).all())
+        bool(_done(triad.white_variance, triad.use_variance, np.asarray(target)).all())
         for triad, target in _triads(settings, estimates)
     )
 
 
 def expected_s(settings: Settings, estimates: Sequence[ImuEstimate]) -> int:
     """Good seconds after which it is expected to be enough, the noise staying as seen so far."""
-    return max((_expected(settings, *item) for item in _triads(settings, estimates)), default=settings.min_slots)
+    triads = _triads(settings, estimates)
+    if not triads:
+        return settings.min_slots
+    seconds = np.arange(settings.min_slots, settings.max_slots + 1, dtype=np.float64)[:, None]
+    white = np.square(np.concatenate([triad.white for triad, _ in triads])) / seconds
+    floor = floor_variance(
+        np.concatenate([triad.flicker for triad, _ in triads]),
+        np.concatenate([triad.walk for triad, _ in triads]),
+        seconds,
+        settings.horizon_s,
+    )
+    done = _done(white, white + floor, np.repeat([target for _, target in triads], 3)).all(axis=1)
+    return settings.min_slots + int(done.argmax()) if done.any() else settings.max_slots
 
 
 def _triads(settings: Settings, estimates: Sequence[ImuEstimate]) -> list[tuple[Estimate, float]]:
@@ -51,13 +63,5 @@ def _triads(settings: Settings, estimates: Sequence[ImuEstimate]) -> list[tuple[
     return gyros + [(item.accel, settings.target_accel_sigma_m_s2) for item in estimates]
 
 
-def _expected(settings: Settings, triad: Estimate, target: float) -> int:
-    seconds = np.arange(settings.min_slots, settings.max_slots + 1, dtype=np.float64)[:, None]
-    white = np.square(triad.white) / seconds
-    floor = floor_variance(triad.flicker, triad.walk, seconds, settings.horizon_s)
-    done = _done(white, white + floor, target).all(axis=1)
-    return settings.min_slots + int(done.argmax()) if done.any() else settings.max_slots
-
-
-def _done(white: NDArray[np.float64], use: NDArray[np.float64], target: float) -> NDArray[np.bool_]:
-    return np.asarray((use <= target**2) | (white < WHITE_SHARE * (use - white)))
+def _done(white: NDArray[np.float64], use: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return np.asarray((use <= np.square(target)) | (white < WHITE_SHARE * (use - white)))

@@ -144,25 +144,29 @@ def white_noise(slots: NDArray[np.int64], values: Floats) -> Floats:
     return np.asarray(np.sqrt(variance) * student_ratio(freedom))
 
 
-def estimates(imu: ImuInput, batches: Sequence[Batch], *, end_s: float, horizon_s: float) -> tuple[Estimate, Estimate]:
-    """Gyro and accelerometer over good batches, in the sensor's axes.
+def estimates(
+    imus: Sequence[ImuInput], batches: Sequence[Sequence[Batch]], *, end_s: float, horizon_s: float
+) -> list[tuple[Estimate, Estimate]]:
+    """Gyro and accelerometer of every IMU over the same good seconds, each in its sensor's axes.
+
+    All columns of all IMUs go through each step at once: numpy's cost is by the call, not by the column.
 
     Args:
-        imu: its noise and its steps.
-        batches: good ones, ascending, at least 2.
+        imus: their noise and their steps.
+        batches: for every IMU its good batches, ascending, of the same at least 2 slots.
         end_s: end of the window; a ramp is evaluated here and never later.
         horizon_s: H of V(T, H).
     """
-    gyro, accel = imu.profile.gyro, imu.profile.accel
-    slots = np.array([batch.slot for batch in batches], dtype=np.int64)
-    values = np.array([batch.mean for batch in batches])
-    times = np.array([0.5 * (batch.first_s + batch.last_s) for batch in batches])
-    seconds = float(len(batches))
+    gyros, accels = [imu.profile.gyro for imu in imus], [imu.profile.accel for imu in imus]
+    slots = np.array([batch.slot for batch in batches[0]], dtype=np.int64)
+    values = _columns([[batch.mean for batch in item] for item in batches])
+    seconds = float(len(slots))
     mean = huber_mean(values)
     leverage = np.full(values.shape[1], 1.0 / seconds)
     slope = np.zeros(values.shape[1])
     level: Floats = values
     if len(values) >= RAMP_BATCHES:
+        times = slots.astype(np.float64) + 0.5
         line = huber_line(times, values, end_s)
         ramps = np.abs(line.t_statistic) > RAMP_T
         mean = np.where(ramps, line.end, mean)
@@ -170,11 +174,13 @@ def estimates(imu: ImuInput, batches: Sequence[Batch], *, end_s: float, horizon_
         slope = np.where(ramps, line.slope, 0.0)
         level = values - slope * (times - times.mean())[:, None]
     measured = white_noise(slots, level)
-    white = np.maximum(measured, np.repeat([gyro.white, accel.white], 3))
-    flicker = _flicker(slots, level, measured, np.repeat([gyro.flicker, accel.flicker], 3))
-    walk = np.repeat([gyro.walk, accel.walk], 3)
+    white = np.maximum(measured, _per_axis([m.white for m in gyros], [m.white for m in accels]))
+    flicker = _flicker(slots, level, measured, _per_axis([m.flicker for m in gyros], [m.flicker for m in accels]))
+    walk = _per_axis([m.walk for m in gyros], [m.walk for m in accels])
     quantum, half_step = _quantisation(
-        batches, np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3), truncates=imu.truncates
+        batches,
+        _per_axis([imu.gyro_step_rad_s for imu in imus], [imu.accel_step_m_s2 for imu in imus]),
+        np.repeat([imu.truncates for imu in imus], 6),
     )
     # Where a ramp is seen, the next H seconds lie between "it ends now" and "it goes on": the mean over them is off
     # by anything from nothing to slope * H / 2.
@@ -196,7 +202,18 @@ def estimates(imu: ImuInput, batches: Sequence[Batch], *, end_s: float, horizon_
             half_step=half_step[part],
         )
 
-    return triad(slice(0, 3)), triad(slice(3, 6))
+    return [(triad(slice(at, at + 3)), triad(slice(at + 3, at + 6))) for at in range(0, 6 * len(imus), 6)]
+
+
+def _columns(values: list[list[Floats]]) -> Floats:
+    """(imus, seconds, 6) as (seconds, 6 * imus)."""
+    stacked = np.array(values)
+    return np.asarray(stacked.transpose(1, 0, 2).reshape(stacked.shape[1], -1))
+
+
+def _per_axis(gyro: Sequence[float], accel: Sequence[float]) -> Floats:
+    """One figure a triad and IMU as one a column."""
+    return np.repeat(np.array([gyro, accel], dtype=np.float64).T.ravel(), 3)
 
 
 def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: Floats) -> Floats:
@@ -210,37 +227,49 @@ def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: F
     return np.maximum(np.sqrt(more) / FLOOR_OF_FLICKER, profile)
 
 
-def _quantisation(batches: Sequence[Batch], steps: Floats, *, truncates: bool) -> tuple[Floats, NDArray[np.bool_]]:
-    """What the reading's steps may hide, as one sigma a channel, and where there are fewer than 3 distinct values.
+def _quantisation(
+    batches: Sequence[Sequence[Batch]], steps: Floats, truncates: NDArray[np.bool_]
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """What the reading's steps may hide, as one sigma a column, and where there are fewer than 3 distinct values.
 
     Half a step for truncation and for fewer than 3 distinct values; else, for rounding, the bound that noise of
     sigma leaves, (q / pi) exp(-2 pi^2 sigma^2 / q^2) (method sections 2.2 and 2.5).
     """
-    low = np.min([batch.low for batch in batches], axis=0)
-    high = np.max([batch.high for batch in batches], axis=0)
-    distinct = np.max([batch.distinct for batch in batches], axis=0)
+    low = _columns([[batch.low for batch in item] for item in batches]).min(axis=0)
+    high = _columns([[batch.high for batch in item] for item in batches]).max(axis=0)
+    distinct = np.array([[batch.distinct for batch in item] for item in batches]).max(axis=1).ravel()
     known = steps > 0.0
     few = np.where(known, high - low < 1.5 * steps, distinct < 3)
     # A stream of floats may carry coarse steps all the same: then the step is what lies between its two values.
     half = np.where(known, steps, high - low) / 2.0
-    if truncates:
-        return np.where(known | few, half, 0.0), few
-    variance = np.mean([batch.variance for batch in batches], axis=0)
+    variance = _columns([[batch.variance for batch in item] for item in batches]).mean(axis=0)
     divisor = np.where(known, steps, 1.0)
-    bound = np.where(known, steps / math.pi * np.exp(-2.0 * math.pi**2 * variance / divisor**2), 0.0)
-    return np.where(few, half, bound), few
+    bound = steps / math.pi * np.exp(-2.0 * math.pi**2 * variance / np.square(divisor))
+    return np.where(few | (truncates & known), half, bound), few
 
 
-def imu_estimate(
-    imu: ImuInput, batches: Sequence[Batch], *, end_s: float, horizon_s: float, rejected: int
-) -> ImuEstimate:
-    """The window of one IMU from its good batches.
+def imu_estimates(
+    imus: Sequence[ImuInput], batches: Sequence[Sequence[Batch]], *, end_s: float, horizon_s: float, rejected: int
+) -> list[ImuEstimate]:
+    """The windows of all IMUs from their good batches, which are of the same seconds.
 
     Raises:
         CalibrationRefusedError: an axis never changes, or most samples were lost.
     """
-    _refuse_broken(imu, batches)
-    gyro, accel = estimates(imu, batches, end_s=end_s, horizon_s=horizon_s)
+    if not imus:
+        return []
+    for imu, own in zip(imus, batches, strict=True):
+        _refuse_broken(imu, own)
+    triads = estimates(imus, batches, end_s=end_s, horizon_s=horizon_s)
+    return [
+        _imu_estimate(imu, own, gyro, accel, rejected)
+        for imu, own, (gyro, accel) in zip(imus, batches, triads, strict=True)
+    ]
+
+
+def _imu_estimate(
+    imu: ImuInput, batches: Sequence[Batch], gyro: Estimate, accel: Estimate, rejected: int
+) -> ImuEstimate:
     temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
     rotation = np.asarray(imu.rotation, dtype=np.float64)
     window = ImuWindow(
