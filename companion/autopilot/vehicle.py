@@ -127,6 +127,7 @@ class Vehicle:
         self._unix_minus_loop_s: float | None = None
         self._watchers: list[Callable[[VehicleEvent], None]] = []
         self._found = asyncio.Event()
+        self._boot_time_heard = asyncio.Event()
         self._wanted: list[_Wanted] = []
         self._version_asked_s, self._version_pause_s = -math.inf, 2.0
         self._lost_timer: asyncio.TimerHandle | None = None
@@ -200,6 +201,21 @@ class Vehicle:
                 self._watchers.remove(callback)
 
         return unsubscribe
+
+    async def hear_boot_time(self, timeout_s: float = 1.0) -> bool:
+        """Ask for the time since boot and wait for it; afterwards `boots` counts every restart until now.
+
+        Without this a quick restart shows only once its time messages come again. False: none came in time.
+        """
+        heard = self._boot_time_heard
+        heard.clear()
+        self.commands.request_message(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
+        try:
+            async with asyncio.timeout(timeout_s):
+                await heard.wait()
+        except TimeoutError:
+            return False
+        return True
 
     async def wait_found(self) -> None:
         """Wait, without limit, until the autopilot is being heard."""
@@ -332,7 +348,9 @@ class Vehicle:
     # --- what the other messages tell
 
     def _boot_time(self, boot_s: float, t_s: float) -> None:
-        if not self._boot_clock.rebooted(boot_s, t_s):
+        restarted = self._boot_clock.rebooted(boot_s, t_s)
+        self._boot_time_heard.set()
+        if not restarted:
             return
         self.boots += 1
         self._armed = None  # the last heartbeat was of the time before

@@ -40,7 +40,7 @@ _PUT_BACK_S: Final = 60.0
 """How long putting back may take in all, of an autopilot whose heartbeat comes but who answers badly."""
 
 _TELL_REBOOT_S: Final = 2.0
-"""After heartbeats have come back: the time since boot is asked for, and comes at 1 Hz."""
+"""After heartbeats have come back: how long the time since boot is awaited."""
 
 _ROUNDS: Final = 2
 """How often putting back is tried; a late echo may have passed for a confirmation the first time."""
@@ -154,7 +154,7 @@ class ParameterWriter:
                 for item in items:
                     await self._write(item)
                 await self._read_back(items)
-                self._check_end()
+                await self._check_end()
             except _Failure as failure:
                 await self._fail(items, failure)
             except asyncio.CancelledError:
@@ -265,7 +265,8 @@ class ParameterWriter:
                     "answered another value", f"{name} was set to {_words(wanted)} and reads {_words(item.read_back)}"
                 )
 
-    def _check_end(self) -> None:
+    async def _check_end(self) -> None:
+        await self._vehicle.hear_boot_time()
         self._check_boot("before all was read back")
         state = self._vehicle.arm_state
         if state is ArmState.ARMED:
@@ -308,7 +309,7 @@ class ParameterWriter:
             # It fell silent: if it comes back, learn first whether it restarted.
             self._give_up_s = asyncio.get_running_loop().time() + _RECOVERY_S
             if await self._wait_disarmed():
-                await asyncio.sleep(_TELL_REBOOT_S)
+                await self._vehicle.hear_boot_time(_TELL_REBOOT_S)
         if self._vehicle.boots != self._boots and kind != "rebooted in the middle":
             kind, reason = "rebooted in the middle", f"{self._vehicle.name} restarted ({reason})"
         await self._put_back(items, leave_foreign=kind == "rebooted in the middle")

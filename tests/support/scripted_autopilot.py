@@ -198,6 +198,8 @@ class ScriptedAutopilot:
                     2, int.from_bytes(version, "big"), 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, 0
                 )
             )
+        if message.command == mavlink.MAV_CMD_REQUEST_MESSAGE and int(message.param1) == 2:
+            self._stream(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
         if self.acks:
             who = (message.get_srcSystem(), message.get_srcComponent())
             self.send(mavlink.MAVLink_command_ack_message(message.command, result, 0, 0, *who))
