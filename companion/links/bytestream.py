@@ -22,8 +22,8 @@ from companion.links.serial_port import SerialOpener
 
 logger = logging.getLogger(__name__)
 
-READ_BYTES = 65536
-"""More than a tty buffers (4 KiB), so that one wake-up empties the port and its time stamp holds for all of it."""
+READ_BYTES = 4096
+"""As much as a tty buffers: one wake-up empties the port, so one time stamp holds for all that it brought."""
 OUT_BUFFER_BYTES = 16384
 """Over a second at 115200 baud; what waits longer than that is better dropped than sent."""
 CONNECT_DEADLINE_S = 5.0

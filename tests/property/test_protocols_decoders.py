@@ -106,7 +106,7 @@ def limit_of(decoder: Decoder) -> int:
 
 
 @pytest.mark.parametrize("kind", DECODERS)
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=80)
 @given(data=st.data())
 def test_how_a_stream_is_cut_changes_nothing(kind: type[Decoder], data: st.DataObject) -> None:
     stream = data.draw(streams(kind))
@@ -121,7 +121,7 @@ def test_how_a_stream_is_cut_changes_nothing(kind: type[Decoder], data: st.DataO
 
 
 @pytest.mark.parametrize("kind", DECODERS)
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=80)
 @given(data=st.data())
 def test_nothing_raises_and_what_waits_is_bounded(kind: type[Decoder], data: st.DataObject) -> None:
     decoder = kind()
@@ -156,7 +156,7 @@ GOOD: dict[type[Decoder], bytes] = {
 
 
 @pytest.mark.parametrize("kind", DECODERS)
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=80)
 @given(data=st.data())
 def test_a_good_frame_after_anything_is_found(kind: type[Decoder], data: st.DataObject) -> None:
     before = data.draw(st.one_of(st.binary(max_size=400), damaged(FRAMES[kind]), FRAMES[kind].map(lambda f: f[:-3])))
@@ -168,13 +168,13 @@ def test_a_good_frame_after_anything_is_found(kind: type[Decoder], data: st.Data
     assert samples[-1:] == alone
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=80)
 @given(st.binary(max_size=400))
 def test_the_folded_checksum_is_the_bytewise_one(body: bytes) -> None:
     assert xor_checksum(body) == xor(body)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=80)
 @given(st.integers(0, 65535), st.integers(0, 2**32 - 1), triples, triples)
 def test_an_imu_line_is_read_as_it_was_written(
     sequence: int, t_us: int, gyro: tuple[float, float, float], accel: tuple[float, float, float]
@@ -186,7 +186,7 @@ def test_an_imu_line_is_read_as_it_was_written(
     assert (sample.sequence, sample.t_device_s) == (sequence, t_us / 1e6)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(deadline=None, max_examples=80)
 @given(st.integers(0, 2**64 - 1), triples, triples, finite)
 def test_a_binary_frame_is_read_as_it_was_written(
     time_ns: int, gyro: tuple[float, float, float], accel: tuple[float, float, float], temperature: float
@@ -196,7 +196,7 @@ def test_a_binary_frame_is_read_as_it_was_written(
     assert struct.pack("<3f", *gyro) == floats(*sample.gyro_rad_s)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(deadline=None, max_examples=80)
 @given(st.lists(st.tuples(st.sampled_from("XYxG"), thousandths), max_size=30))
 def test_only_an_x_and_the_y_right_after_it_make_a_reading(lines: list[tuple[str, float]]) -> None:
     """Against a plain reading of the rule with a regular expression over the axes."""

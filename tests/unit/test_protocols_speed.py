@@ -17,12 +17,12 @@ BUDGET_US = 40.0
 def test_a_frame_costs_far_less_than_its_budget(name: str, frame: bytes) -> None:
     best_us = float("inf")
     halves = (frame[:33], frame[33:])  # a port seldom gives a frame in one piece
-    for _ in range(20):  # the best of many: this machine may be doing something else
+    for _ in range(20):  # the best of many, in processor time: this machine may be doing something else
         decoder = make_decoder("imu", name, 1e-5)
-        start_s = time.perf_counter()
+        start_s = time.process_time()
         for _ in range(100):
             for half in halves:
                 decoder.feed(half, 1.0)
-        best_us = min(best_us, (time.perf_counter() - start_s) * 1e4)
+        best_us = min(best_us, (time.process_time() - start_s) * 1e4)
         assert decoder.accepted == 100
     assert best_us < BUDGET_US
