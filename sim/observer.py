@@ -6,7 +6,7 @@ It believes nothing but what the autopilot sends on its second link.
 from __future__ import annotations
 
 import asyncio
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -72,8 +72,7 @@ class Observer(asyncio.DatagramProtocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Keep the socket."""
-        assert isinstance(transport, asyncio.DatagramTransport)
-        self._transport = transport
+        self._transport = cast("asyncio.DatagramTransport", transport)
 
     def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
         """Take what the autopilot says."""

@@ -148,6 +148,14 @@ class RollingCollector:
             known.gate = gate
             self.reset("another stream", imu.name)
 
+    def retarget(self, settings: Settings) -> None:
+        """Other targets from the next look on; the lengths (`min_still_s`, `max_s`) stay as they were."""
+        self._settings = msgspec.structs.replace(
+            self._settings,
+            target_gyro_sigma_rad_s=settings.target_gyro_sigma_rad_s,
+            target_accel_sigma_m_s2=settings.target_accel_sigma_m_s2,
+        )
+
     def expect(self, *, gradienter: bool, compass: bool) -> None:
         """Change which pose sensors are waited for, for example when one is found dead; the IMUs' history stays."""
         added = (gradienter and self._tilt is None) or (compass and self._heading is None)

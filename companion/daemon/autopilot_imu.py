@@ -56,6 +56,8 @@ class AutopilotImu:
         """What the autopilot subtracts, as read; None while that is not known."""
         self.problem = "not read yet"
         """Why the offsets are not known, in one line."""
+        self.failures = 0
+        """How often reading the offsets has failed in a row."""
         self._vehicle, self._parameters = vehicle, parameters
         self._take, self._void = take, void
         self._ours = 0
@@ -103,7 +105,7 @@ class AutopilotImu:
             AutopilotError: they cannot be read, or this IMU cannot be calibrated.
         """
         assumed, fresh = self.calibration, await read_calibration(self._parameters, self.instance)
-        self.calibration, self.problem = fresh, ""
+        self.calibration, self.problem, self.failures = fresh, "", 0
         if assumed is None or not _same(assumed, fresh):
             self._void("the autopilot's offsets were read anew")
             return False
@@ -142,6 +144,7 @@ class AutopilotImu:
                 await self.refresh()
             except AutopilotError as error:
                 self.problem = str(error)
+                self.failures += 1
                 logger.warning("%s: %s", self.name, error)
                 self._stale.set()
                 await asyncio.sleep(RETRY_S)

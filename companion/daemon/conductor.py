@@ -34,7 +34,7 @@ from companion.daemon.ledger import Offload
 from companion.daemon.mend import Mender
 from companion.daemon.push import Pusher
 from companion.daemon.report import Draft
-from companion.errors import CalibrationRefusedError, CompanionError, StorageError
+from companion.errors import AutopilotError, CalibrationRefusedError, CompanionError, StorageError
 from companion.physics.units import DEG_H, MG
 from companion.storage.records import RecordStore
 
@@ -44,6 +44,8 @@ Say = Callable[[Severity, str, Weight], object]
 
 POLL_S: Final = 0.2
 SAY_WAITING_EVERY_S: Final = 10.0
+READ_ATTEMPTS: Final = 2
+"""So often, within one calibration, the autopilot's offsets may fail to be read."""
 # Shares of the progress bar: measuring, then writing, then verifying.
 MEASURED_PERCENT: Final = 70.0
 WRITTEN_PERCENT: Final = 80.0
@@ -286,10 +288,16 @@ class Conductor:
         loop = asyncio.get_running_loop()
         said_s = -math.inf
         said = ""
+        failures = {name: imu.failures for name, imu in self._imus.items()}
         while True:
             now_s = loop.time()
             if self._vehicle.arm_state is ArmState.ARMED:
                 raise CalibrationRefusedError("armed during the measurement; nothing was written")
+            for name, imu in self._imus.items():
+                failures[name] = min(failures[name], imu.failures)
+                if imu.failures - failures[name] >= READ_ATTEMPTS:
+                    # Patience is for what can change by itself; an autopilot that does not answer is a fault.
+                    raise AutopilotError(f"imu {name}: {imu.problem}")
             status = self._collector.status(now_s)
             waiting_for = self._not_ready() or status.waiting_for
             if waiting_for is not None:

@@ -32,7 +32,7 @@ class SerialSensor:
         settings = PortSettings(port, baud or info.baud, parity or info.parity)
         self.name, self.kind, self.protocol = name, kind, protocol
         self.decoder = make_decoder(kind, protocol, settings.seconds_per_byte)
-        self.link = ByteLink(settings, self._on_bytes, name=name, on_state=self._on_state)
+        self.link = ByteLink(settings, self.receive, name=name, on_state=self._on_state)
         self._take = take
         self._last_sample_s: float | None = None
         self._counted = (0.0, 0)
@@ -47,7 +47,8 @@ class SerialSensor:
         if connected:
             self.decoder.interrupted()
 
-    def _on_bytes(self, data: bytes, t_s: float) -> None:
+    def receive(self, data: bytes, t_s: float) -> None:
+        """Take bytes that were read at `t_s`."""
         samples = self.decoder.feed(data, t_s)
         if not samples:
             return

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import signal
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Iterator
 from typing import Any, Final
 
 import msgspec
@@ -149,32 +149,37 @@ class Service:
         elif isinstance(sample, CompassSample):
             self.collector.add_compass(sample)
 
-    def _sources(self) -> list[tuple[str, Callable[[], Coroutine[Any, Any, None]]]]:
-        """Everything that brings samples: name and what runs it."""
-        return [
-            *((imu.name, imu.run) for imu in self.imus.values()),
-            *((sensor.name, sensor.run) for sensor in self.sensors),
-        ]
-
-    async def run(self, *, transport: bool = True) -> None:
-        """Run until cancelled, then leave the autopilot in order.
+    async def run(self) -> None:
+        """Run until cancelled, reachable on the control socket.
 
         Raises:
             CompanionError: it cannot start (another daemon runs, the storage cannot be read).
+        """
+        async with ControlServer(self.config.control.path, self.answer):
+            logger.info("ready: %s", self.config.control.path)
+            await self.serve()
+
+    async def serve(self, *, mavlink: bool = True, ports: bool = True) -> None:
+        """Do the work until cancelled, then leave the autopilot in order.
+
+        Args:
+            mavlink: open the configured MAVLink connection (else the link has been put on a wire already).
+            ports: open the serial ports (else somebody hands their bytes to `sensors`).
         """
         self.ledger.load()
         history = self.store.history(limit=1)
         self.conductor.last = history[0] if history else None
         try:
-            async with ControlServer(self.config.control.path, self.answer), asyncio.TaskGroup() as group:
+            async with asyncio.TaskGroup() as group:
                 try:
                     group.create_task(self.component.run(), name="component")
-                    if transport:
+                    if mavlink:
                         group.create_task(run_transport(self.link, self.config.mavlink.url), name="mavlink")
                     group.create_task(self.mender.run(), name="mender")
-                    for name, source in self._sources():
-                        group.create_task(source(), name=name)
-                    logger.info("ready: %s", self.config.control.path)
+                    for imu in self.imus.values():
+                        group.create_task(imu.run(), name=imu.name)
+                    for sensor in self.sensors if ports else ():
+                        group.create_task(sensor.run(), name=sensor.name)
                     await asyncio.get_running_loop().create_future()
                 finally:
                     # Before the links go: a write under way needs them to come to its end.
@@ -185,7 +190,8 @@ class Service:
     async def listen(self, seconds: float) -> Object:
         """Open everything, listen, and tell what `status` would; for `companion check`, writes nothing."""
         running = [self.component.run(), run_transport(self.link, self.config.mavlink.url)]
-        running += [source() for _, source in self._sources()]
+        running += [imu.run() for imu in self.imus.values()]
+        running += [sensor.run() for sensor in self.sensors]
         tasks = [asyncio.get_running_loop().create_task(one) for one in running]
         try:
             await asyncio.sleep(seconds)
