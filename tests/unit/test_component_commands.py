@@ -478,6 +478,20 @@ def test_the_networks_copy_of_a_packet_is_no_second_request(command: int) -> Non
     run_virtual(main())
 
 
+def test_a_sender_that_never_counts_its_packets_may_press_again() -> None:
+    async def main() -> None:
+        async with bench() as b:
+            b.service.takes_s = 0
+            packet = b.ground.pack(command_message(CALIBRATE, 0))
+            for _ in range(3):
+                b.ground.send_raw(packet)
+                await asyncio.sleep(0.6)
+            assert b.ground.finals() == [ACCEPTED] * 3
+            assert len(b.service.started) == 3
+
+    run_virtual(main())
+
+
 @pytest.mark.parametrize("int_", [False, True], ids=["LONG", "INT"])
 @pytest.mark.parametrize("command", [400, 31013, 31014, 2500, 65535])
 def test_unknown_commands_are_unsupported(command: int, int_: bool) -> None:
