@@ -47,5 +47,9 @@ class ParameterRefusedError(AutopilotError):
     """The autopilot refused a parameter (PARAM_ERROR) or answered with another value than was set."""
 
 
+class ParameterMismatchError(ParameterRefusedError):
+    """The autopilot answered a write with another value than was set."""
+
+
 class AutopilotRebootedError(AutopilotError):
     """The autopilot restarted in the middle of an exchange."""

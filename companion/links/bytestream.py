@@ -196,10 +196,10 @@ class ByteLink:
         """What a failed read or write means; None for a read that brought no bytes."""
         url = self.settings.url
         if self.settings.is_tcp:
-            return f"{url}: the other side closed the connection" if error is None else f"{url}: {error.strerror}"
+            return f"{url}: {'the other side closed the connection' if error is None else _words(error)}"
         if error is None or error.errno in (errno.EIO, errno.ENXIO, errno.ENODEV):
             return f"{url}: the device is gone; unplugged?"
-        return f"{url}: {error.strerror}"
+        return f"{url}: {_words(error)}"
 
     def _lose(self, reason: str) -> None:
         # At once, not when `run` gets to it: while a dead descriptor is open, the device comes back under another name.
@@ -229,6 +229,11 @@ class ByteLink:
             self._on_state(connected, reason)
 
 
+def _words(error: OSError) -> str:
+    """The system's own words: asyncio puts "Connect call failed" and an address in their place."""
+    return os.strerror(error.errno) if error.errno else str(error)
+
+
 async def _connect_tcp(settings: PortSettings) -> int:
     """Connect to the first address that answers; return the socket's descriptor.
 
@@ -244,7 +249,7 @@ async def _connect_tcp(settings: PortSettings) -> int:
                 try:
                     return await _connect(loop, socket.socket(family, kind, protocol), address)
                 except OSError as error:
-                    reason = f"{settings.url}: {error.strerror or error}"
+                    reason = f"{settings.url}: {_words(error)}"
     except TimeoutError:
         reason = f"{settings.url}: no answer within {CONNECT_DEADLINE_S:g} s"
     except (OSError, UnicodeError) as error:

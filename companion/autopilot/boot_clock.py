@@ -1,0 +1,56 @@
+"""Did the autopilot restart? Told from its time since boot."""
+
+from __future__ import annotations
+
+from typing import Final
+
+_BACK_S: Final = 0.5
+"""Late and repeated packets step back by milliseconds; a restart by all the time it was up."""
+
+_GAP_S: Final = 2.0
+_CONFIRM_S: Final = 0.5
+_WRAP_S: Final = 2**32 * 1e-3
+"""time_boot_ms is a 32 bit number: it starts again after 49.7 days."""
+
+
+class BootClock:
+    """Watches the time since boot that many messages carry; all of them count from the same boot.
+
+    A restart shows in one of two ways. The time goes back. Or, after a silence, it has advanced by less than half
+    of what the host's clock has: a restart while the link was lost, of which the time since boot has meanwhile
+    overtaken the old one. (Half, since a simulator may run slower than real time. And the first messages after a
+    silence of our own making are old ones from a buffer, so this second way must hold for another half second.)
+    """
+
+    def __init__(self) -> None:
+        self._last: tuple[float, float] | None = None
+        self._before_gap: tuple[float, float] | None = None
+        self._suspected_s = 0.0
+
+    def rebooted(self, boot_s: float, t_s: float) -> bool:
+        """Take one message's time since boot, received at `t_s`; True when a restart lies between it and the last."""
+        if self._last is None:
+            self._last = (boot_s, t_s)
+            return False
+        last_boot_s, last_t_s = self._last
+        advance_s = boot_s - last_boot_s
+        if advance_s < -_BACK_S and not (last_boot_s > _WRAP_S - 60.0 and boot_s < 60.0 + (t_s - last_t_s)):
+            self._last, self._before_gap = (boot_s, t_s), None
+            return True
+        if self._before_gap is None and _too_slow(boot_s, t_s, self._last):
+            self._before_gap, self._suspected_s = self._last, t_s
+        elif self._before_gap is not None:
+            if not _too_slow(boot_s, t_s, self._before_gap):
+                self._before_gap = None
+            elif t_s - self._suspected_s >= _CONFIRM_S:
+                self._last, self._before_gap = (boot_s, t_s), None
+                return True
+        if advance_s < -_BACK_S or advance_s >= 0.0:
+            self._last = (boot_s, t_s)
+        return False
+
+
+def _too_slow(boot_s: float, t_s: float, since: tuple[float, float]) -> bool:
+    silence_s = t_s - since[1]
+    advance_s = (boot_s - since[0]) % _WRAP_S
+    return silence_s > _GAP_S and advance_s < 0.5 * silence_s - 0.5

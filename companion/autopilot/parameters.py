@@ -1,0 +1,311 @@
+"""Single parameters over MAVLink: read by name, write one REAL32, watch what anybody writes.
+
+Every write is guarded: immediately before each PARAM_SET that leaves, the first as well as every repetition, the
+aircraft must be disarmed. Neither autopilot refuses a PARAM_SET while armed (autopilots 1.3, 4.4), so nobody else
+will. MAVLink has no transaction: between a PARAM_SET and its answer the aircraft may arm; `writer` looks again at
+the end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.float32 import float32, same_float32
+from companion.autopilot.vehicle import ArmState, Vehicle, VehicleEvent
+from companion.errors import (
+    AutopilotRebootedError,
+    NotDisarmedError,
+    ParameterMismatchError,
+    ParameterRefusedError,
+    ParameterTimeoutError,
+)
+from companion.links.mavlink import MavlinkLink, Unsubscribe
+
+logger = logging.getLogger(__name__)
+
+_NO_ERROR: Final = 0
+_DOES_NOT_EXIST: Final = 1
+_ERROR_WORDS: Final = {
+    1: "it does not exist",
+    2: "the value is out of range",
+    3: "no permission",
+    4: "no such component",
+    5: "it is read-only",
+    6: "its type is not supported",
+    7: "its type does not match",
+    8: "it could not be read",
+}
+"""MAV_PARAM_ERROR in words; the generated dialect knows only the first five."""
+
+_INBOX: Final = 64
+
+
+class _Inbox:
+    """What arrives about one name during one exchange; when full the oldest answer is dropped."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._arrived: deque[float | _Refusal | _Reboot] = deque(maxlen=_INBOX)
+        self._bell = asyncio.Event()
+
+    def put(self, item: float | _Refusal | _Reboot) -> None:
+        self._arrived.append(item)
+        self._bell.set()
+
+    def clear(self) -> None:
+        self._arrived.clear()
+        self._bell.clear()
+
+    async def get(self, deadline_s: float) -> float | _Refusal | _Reboot | None:
+        """The next item, or None at the deadline (loop's clock)."""
+        while not self._arrived:
+            self._bell.clear()
+            try:
+                async with asyncio.timeout_at(deadline_s):
+                    await self._bell.wait()
+            except TimeoutError:
+                return None
+        return self._arrived.popleft()
+
+
+class _Refusal:
+    """A PARAM_ERROR."""
+
+    def __init__(self, code: int) -> None:
+        self.code = code
+
+    @property
+    def words(self) -> str:
+        return _ERROR_WORDS.get(self.code, f"error {self.code}")
+
+
+class _Reboot:
+    """The autopilot restarted."""
+
+
+class ParameterClient:
+    """The parameters of one autopilot.
+
+    Args:
+        link: the connection.
+        vehicle: whose parameters they are, and whether it is armed.
+        timeout_s: how long one message's answer is awaited.
+        retries: how often the message is repeated after that.
+    """
+
+    def __init__(self, link: MavlinkLink, vehicle: Vehicle, *, timeout_s: float = 1.0, retries: int = 3) -> None:
+        self.vehicle = vehicle
+        self.writes = 0
+        """How many PARAM_SET have left, repetitions included."""
+        self._link = link
+        self._timeout_s = timeout_s
+        self._tries = 1 + retries
+        self._inboxes: list[_Inbox] = []
+        self._watchers: list[Callable[[str, float], None]] = []
+        self._answering: str | None = None
+        self._unsubscribe = [
+            link.subscribe(mavlink.MAVLink_param_value_message, self._on_value),
+            link.subscribe(mavlink.MAVLink_param_error_message, self._on_error),
+            vehicle.watch(self._on_event),
+        ]
+
+    async def read(self, name: str) -> float:
+        """Ask for a parameter by name and return what comes.
+
+        Raises:
+            ParameterTimeoutError: no answer within all retries.
+            ParameterRefusedError: PARAM_ERROR, such as that it does not exist.
+            AutopilotRebootedError: the autopilot restarted meanwhile.
+        """
+        with self._exchange(name) as inbox:
+            for _ in range(self._tries):
+                answer = await self._ask(inbox, name, -1)
+                if isinstance(answer, float):
+                    return answer
+                if isinstance(answer, _Refusal):
+                    raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.words}")
+        raise ParameterTimeoutError(
+            f"{self.vehicle.name} does not answer for {name} ({self._tries} requests, {self._timeout_s:g} s each)"
+        )
+
+    async def read_optional(self, name: str) -> float | None:
+        """Like `read`, but None when the autopilot has no such parameter.
+
+        Firmware from ArduPilot 4.7 and PX4 1.17 on says so (PARAM_ERROR); older ones are silent. Silence means that
+        it does not exist only while heartbeats come and the autopilot answers for another parameter right after;
+        otherwise requests do not reach it.
+
+        Raises:
+            ParameterTimeoutError: no answer to anything.
+            ParameterRefusedError: PARAM_ERROR other than that it does not exist.
+            AutopilotRebootedError: the autopilot restarted meanwhile.
+        """
+        with self._exchange(name) as inbox:
+            for _ in range(self._tries):
+                answer = await self._ask(inbox, name, -1)
+                if isinstance(answer, float):
+                    return answer
+                if isinstance(answer, _Refusal):
+                    if answer.code == _DOES_NOT_EXIST:
+                        return None
+                    raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.words}")
+        if not self.vehicle.alive or not await self._answers_at_all():
+            raise ParameterTimeoutError(f"{self.vehicle.name} answers neither for {name} nor for anything else")
+        return None
+
+    async def write(self, name: str, value: float) -> float:
+        """Set a parameter (REAL32, rounded to float32) and wait for the autopilot to confirm that very value.
+
+        Another value in between may be an answer to somebody else's write, so the wait goes on; if nothing else
+        comes it is what the autopilot made of ours.
+
+        Returns:
+            The confirmed value, within 1 ulp of what was asked.
+
+        Raises:
+            NotDisarmedError: armed, or unknown whether armed, when a PARAM_SET was about to leave. If it was a
+                repetition, the first one may have had its effect.
+            ParameterTimeoutError: no answer within all retries; it may have had its effect.
+            ParameterMismatchError: answered with another value.
+            ParameterRefusedError: PARAM_ERROR, or the value is not a finite number.
+            AutopilotRebootedError: the autopilot restarted meanwhile; it may have had its effect.
+        """
+        wanted = float32(value)
+        if not math.isfinite(wanted):
+            raise ParameterRefusedError(f"{name}: {value} is not a number that may be written")
+        other: float | None = None
+        with self._exchange(name) as inbox:
+            for _ in range(self._tries):
+                self._require_disarmed(name)
+                deadline_s = self._send(self._set_message(name, wanted), inbox)
+                while (answer := await self._next(inbox, deadline_s)) is not None:
+                    if isinstance(answer, _Refusal):
+                        raise ParameterRefusedError(
+                            f"{self.vehicle.name} refuses {name} = {wanted:.9g}: {answer.words}"
+                        )
+                    if same_float32(answer, wanted):
+                        return answer
+                    other = answer
+        if other is not None:
+            raise ParameterMismatchError(f"{name} was set to {wanted:.9g}, {self.vehicle.name} answers {other:.9g}")
+        raise ParameterTimeoutError(
+            f"{self.vehicle.name} does not answer to setting {name} ({self._tries} times, {self._timeout_s:g} s each)"
+        )
+
+    def watch(self, callback: Callable[[str, float], None]) -> Unsubscribe:
+        """Be told of every PARAM_VALUE of the autopilot, whoever caused it; returns how to stop that."""
+        self._watchers.append(callback)
+
+        def unsubscribe() -> None:
+            if callback in self._watchers:
+                self._watchers.remove(callback)
+
+        return unsubscribe
+
+    def close(self) -> None:
+        """Stop listening."""
+        for unsubscribe in self._unsubscribe:
+            unsubscribe()
+
+    def _require_disarmed(self, name: str) -> None:
+        state = self.vehicle.arm_state
+        if state is not ArmState.DISARMED:
+            why = "the aircraft is armed" if state is ArmState.ARMED else "it is unknown whether the aircraft is armed"
+            raise NotDisarmedError(f"{name} is not written: {why}")
+
+    @contextlib.contextmanager
+    def _exchange(self, name: str) -> Iterator[_Inbox]:
+        inbox = _Inbox(name)
+        self._inboxes.append(inbox)
+        try:
+            yield inbox
+        finally:
+            self._inboxes.remove(inbox)
+
+    def _send(
+        self, message: mavlink.MAVLink_param_set_message | mavlink.MAVLink_param_request_read_message, inbox: _Inbox
+    ) -> float:
+        """Send; the deadline of the answer. Nothing may be awaited between the guard and this."""
+        if self._link.send(message) and isinstance(message, mavlink.MAVLink_param_set_message):
+            self.writes += 1
+        return asyncio.get_running_loop().time() + self._timeout_s
+
+    async def _next(self, inbox: _Inbox, deadline_s: float) -> float | _Refusal | None:
+        answer = await inbox.get(deadline_s)
+        if isinstance(answer, _Reboot):
+            raise AutopilotRebootedError(f"{self.vehicle.name} restarted while {inbox.name} was exchanged")
+        return answer
+
+    async def _ask(self, inbox: _Inbox, name: str, index: int) -> float | _Refusal | None:
+        """One PARAM_REQUEST_READ and the first answer to it."""
+        deadline_s = self._send(self._read_message(name, index), inbox)
+        answer = await self._next(inbox, deadline_s)
+        if isinstance(answer, float):
+            self._answering = inbox.name if index < 0 else self._answering
+        return answer
+
+    async def _answers_at_all(self) -> bool:
+        """Whether a parameter that must exist is answered for: the last one that was, else the first of the list."""
+        name, index = (self._answering, -1) if self._answering is not None else ("", 0)
+        with self._exchange(name) as inbox:
+            for _ in range(self._tries):
+                if await self._ask(inbox, name, index) is not None:
+                    return True
+        return False
+
+    def _target(self) -> tuple[int, int]:
+        if self.vehicle.system_id is None:
+            raise ParameterTimeoutError("no autopilot has been heard yet")
+        return self.vehicle.system_id, self.vehicle.component_id
+
+    def _read_message(self, name: str, index: int) -> mavlink.MAVLink_param_request_read_message:
+        return mavlink.MAVLink_param_request_read_message(*self._target(), _wire_name(name), index)
+
+    def _set_message(self, name: str, value: float) -> mavlink.MAVLink_param_set_message:
+        kind: int = mavlink.MAV_PARAM_TYPE_REAL32
+        return mavlink.MAVLink_param_set_message(*self._target(), _wire_name(name), value, kind)
+
+    def _on_value(self, message: mavlink.MAVLink_param_value_message, _t_s: float) -> None:
+        if not self.vehicle.sent(message):
+            return
+        name, value = message.param_id, float(message.param_value)
+        for inbox in self._inboxes:
+            if inbox.name == name or (inbox.name == "" and message.param_index == 0):
+                inbox.put(value)
+        for callback in tuple(self._watchers):
+            try:
+                callback(name, value)
+            except Exception:
+                logger.exception("a watcher failed on %s", name)
+
+    def _on_error(self, message: mavlink.MAVLink_param_error_message, _t_s: float) -> None:
+        addressed = message.target_system in (0, self._link.system_id) and message.target_component in (
+            0,
+            self._link.component_id,
+        )
+        if not self.vehicle.sent(message) or not addressed or message.error == _NO_ERROR:
+            return
+        for inbox in self._inboxes:
+            if inbox.name == message.param_id:
+                inbox.put(_Refusal(message.error))
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        if event == "rebooted":
+            self._answering = None
+            for inbox in self._inboxes:
+                inbox.put(_Reboot())
+
+
+def _wire_name(name: str) -> bytes:
+    data = name.encode("ascii")
+    if len(data) > 16:  # the codec would cut it, and the rest may be another parameter's name
+        raise ValueError(f"{name!r} is longer than the 16 characters of a MAVLink parameter name")
+    return data

@@ -1,0 +1,420 @@
+"""The autopilot as seen from outside: which one it is, whether it is armed, whether it restarted, where it stands.
+
+Whoever writes to it asks `arm_state` immediately before every message that leaves. A heartbeat tells the past: the
+state is UNKNOWN as soon as the last one is 2 s old, and after a restart until the next one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import enum
+import logging
+import math
+from collections.abc import Callable
+from typing import Final, Literal
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.boot_clock import BootClock
+from companion.autopilot.commands import Commands
+from companion.links.mavlink import MavlinkLink, Message, Unsubscribe
+
+logger = logging.getLogger(__name__)
+
+HEARTBEAT_TIMEOUT_S: Final = 2.0
+"""Without a heartbeat for this long nobody knows whether the aircraft is armed (autopilots section 8)."""
+
+HEARTBEAT_RATE_HZ: Final = 5.0
+"""Asked of ArduPilot on our own link: a second is a long time not to know of an arming (autopilots 5.1)."""
+
+_TICK_S: Final = 0.5
+_STALL_S: Final = 1.0
+_ADOPT_OTHER_COMPONENT_S: Final = 2.0
+_EARLIEST_UNIX_TIME_S: Final = 1577836800.0  # 2020: a clock before that has not been set
+
+_NOT_AIRCRAFT: Final = frozenset(
+    {
+        mavlink.MAV_TYPE_ANTENNA_TRACKER,
+        mavlink.MAV_TYPE_GCS,
+        mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
+        mavlink.MAV_TYPE_GIMBAL,
+        mavlink.MAV_TYPE_ADSB,
+        mavlink.MAV_TYPE_CAMERA,
+        mavlink.MAV_TYPE_CHARGING_STATION,
+        mavlink.MAV_TYPE_FLARM,
+        mavlink.MAV_TYPE_SERVO,
+        mavlink.MAV_TYPE_ODID,
+        mavlink.MAV_TYPE_BATTERY,
+        mavlink.MAV_TYPE_PARACHUTE,
+        mavlink.MAV_TYPE_LOG,
+        mavlink.MAV_TYPE_OSD,
+        mavlink.MAV_TYPE_IMU,
+        mavlink.MAV_TYPE_GPS,
+        mavlink.MAV_TYPE_WINCH,
+        mavlink.MAV_TYPE_ILLUMINATOR,
+        mavlink.MAV_TYPE_GRIPPER,
+    }
+)
+
+Firmware = Literal["ardupilot", "px4", "other"]
+VehicleEvent = Literal["armed", "disarmed", "lost", "found", "rebooted"]
+"""What `Vehicle.watch` tells. "found": latched, or heard again after "lost". "armed" and "disarmed": the heartbeat
+says so and the one before, if any, said otherwise; so the first heartbeat of all brings "found" and one of them."""
+
+
+class ArmState(enum.Enum):
+    """Whether the motors may turn. Only DISARMED permits a write."""
+
+    DISARMED = "disarmed"
+    ARMED = "armed"
+    UNKNOWN = "unknown"
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Position:
+    """Where the autopilot believes to be; the height is above mean sea level."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    source: str
+
+
+@dataclasses.dataclass(slots=True)
+class _Wanted:
+    """A message that is asked for again whenever it stays away."""
+
+    message: type[Message]
+    rate_hz: float
+    heard_s: float = -math.inf
+    asked_s: float = -math.inf
+    pause_s: float = 3.0
+
+
+class Vehicle:
+    """The one autopilot that is calibrated.
+
+    Args:
+        link: the connection; its system id follows the vehicle's when that is latched.
+        system_id: the vehicle's, or None to latch the first real autopilot that is heard. Once latched it stays.
+
+    A real autopilot is a heartbeat with a known autopilot type and the type of a vehicle: ground stations,
+    gimbals, ADS-B receivers and the like are ignored, whatever they claim. Component 1 is taken at once; another
+    component only if it is ArduPilot or PX4 and component 1 stays silent for 2 s.
+    """
+
+    def __init__(self, link: MavlinkLink, *, system_id: int | None = None) -> None:
+        self.system_id: int | None = None
+        self.component_id: int = mavlink.MAV_COMP_ID_AUTOPILOT1
+        self.firmware: Firmware | None = None
+        self.version: str | None = None
+        """Such as "4.6.1" or "4.8.0-dev"; None until AUTOPILOT_VERSION has come."""
+        self.system_status: int | None = None
+        """MAV_STATE of the last heartbeat."""
+        self.boots = 0
+        """How many restarts were seen."""
+        self.position: Position | None = None
+        self.commands = Commands(link, self._target)
+        self._link = link
+        self._configured_system_id = system_id
+        self._heartbeat_s: float | None = None
+        self._armed: bool | None = None
+        self._lost = True
+        self._trusted_from_s = -math.inf
+        self._candidates: dict[tuple[int, int], float] = {}
+        self._boot_clock = BootClock()
+        self._unix_minus_loop_s: float | None = None
+        self._watchers: list[Callable[[VehicleEvent], None]] = []
+        self._found = asyncio.Event()
+        self._boot_time_heard = asyncio.Event()
+        self._wanted: list[_Wanted] = []
+        self._version_asked_s, self._version_pause_s = -math.inf, 2.0
+        self._lost_timer: asyncio.TimerHandle | None = None
+        self._tick_timer: asyncio.TimerHandle | None = None
+        self._tick_due_s = math.inf
+        self._closed = False
+        self._unsubscribe = [
+            link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat),
+            link.subscribe(mavlink.MAVLink_system_time_message, self._on_system_time),
+            link.subscribe(mavlink.MAVLink_autopilot_version_message, self._on_version),
+            link.subscribe(mavlink.MAVLink_global_position_int_message, self._on_global_position),
+            link.subscribe(mavlink.MAVLink_gps_raw_int_message, self._on_gps),
+            link.subscribe(mavlink.MAVLink_attitude_message, self._on_boot_ms),
+            link.subscribe(mavlink.MAVLink_scaled_imu_message, self._on_boot_ms),
+            link.subscribe(mavlink.MAVLink_scaled_imu2_message, self._on_boot_ms),
+            link.subscribe(mavlink.MAVLink_scaled_imu3_message, self._on_boot_ms),
+            link.subscribe(mavlink.MAVLink_raw_imu_message, self._on_boot_us),
+            link.subscribe(mavlink.MAVLink_highres_imu_message, self._on_boot_us),
+        ]
+
+    @property
+    def arm_state(self) -> ArmState:
+        """ARMED or DISARMED by a heartbeat of the latched autopilot younger than 2 s, else UNKNOWN."""
+        if self._lost or self._armed is None or self._heartbeat_s is None:
+            return ArmState.UNKNOWN
+        now_s = asyncio.get_running_loop().time()
+        # After a stall of our own loop the next heartbeats read are old ones that waited in a buffer.
+        stalled = now_s - self._tick_due_s > _STALL_S or self._heartbeat_s < self._trusted_from_s
+        if stalled or now_s - self._heartbeat_s >= HEARTBEAT_TIMEOUT_S:
+            return ArmState.UNKNOWN
+        return ArmState.ARMED if self._armed else ArmState.DISARMED
+
+    @property
+    def alive(self) -> bool:
+        """Whether the latched autopilot's heartbeat came within the last 2 s."""
+        age_s = self.heartbeat_age_s
+        return not self._lost and age_s is not None and age_s < HEARTBEAT_TIMEOUT_S
+
+    @property
+    def heartbeat_age_s(self) -> float | None:
+        """Seconds since the latched autopilot's last heartbeat; None before the first."""
+        if self._heartbeat_s is None:
+            return None
+        return asyncio.get_running_loop().time() - self._heartbeat_s
+
+    @property
+    def unix_time_s(self) -> float | None:
+        """UTC as the autopilot has it (from its GNSS), carried on by the loop's clock; None when it has none."""
+        if self._unix_minus_loop_s is None:
+            return None
+        return self._unix_minus_loop_s + asyncio.get_running_loop().time()
+
+    @property
+    def name(self) -> str:
+        """For people: "ArduPilot 4.6.1, system 1"."""
+        if self.system_id is None:
+            return "no autopilot"
+        words = {"ardupilot": "ArduPilot", "px4": "PX4"}.get(self.firmware or "", "autopilot")
+        return f"{words}{' ' + self.version if self.version else ''}, system {self.system_id}"
+
+    def sent(self, message: Message) -> bool:
+        """Whether a message came from the latched autopilot."""
+        return self._target() == (message.get_srcSystem(), message.get_srcComponent())
+
+    def watch(self, callback: Callable[[VehicleEvent], None]) -> Unsubscribe:
+        """Be told of events, in the order in which they are seen; returns how to stop that."""
+        self._watchers.append(callback)
+
+        def unsubscribe() -> None:
+            if callback in self._watchers:
+                self._watchers.remove(callback)
+
+        return unsubscribe
+
+    async def hear_boot_time(self, timeout_s: float = 1.0) -> bool:
+        """Ask for the time since boot and wait for it; afterwards `boots` counts every restart until now.
+
+        Without this a quick restart shows only once its time messages come again. False: none came in time.
+        """
+        heard = self._boot_time_heard
+        heard.clear()
+        self.commands.request_message(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
+        try:
+            async with asyncio.timeout(timeout_s):
+                await heard.wait()
+        except TimeoutError:
+            return False
+        return True
+
+    async def wait_found(self) -> None:
+        """Wait, without limit, until the autopilot is being heard."""
+        await self._found.wait()
+
+    def close(self) -> None:
+        """Stop listening; the arm state is UNKNOWN from here on."""
+        self._closed = True
+        self._lost = True
+        self._found.clear()
+        for unsubscribe in self._unsubscribe:
+            unsubscribe()
+        for timer in (self._lost_timer, self._tick_timer):
+            if timer is not None:
+                timer.cancel()
+        self.commands.close()
+
+    def _target(self) -> tuple[int, int] | None:
+        return None if self.system_id is None else (self.system_id, self.component_id)
+
+    def _tell(self, event: VehicleEvent) -> None:
+        logger.log(logging.WARNING if event in ("lost", "rebooted") else logging.INFO, "%s: %s", self.name, event)
+        for callback in tuple(self._watchers):
+            try:
+                callback(event)
+            except Exception:
+                logger.exception("a watcher failed on %r", event)
+
+    # --- heartbeats
+
+    def _on_heartbeat(self, message: mavlink.MAVLink_heartbeat_message, t_s: float) -> None:
+        if message.type in _NOT_AIRCRAFT or message.autopilot == mavlink.MAV_AUTOPILOT_INVALID:
+            return
+        if self.system_id is None and self._may_latch(message, t_s):
+            self._latch(message)
+        if not self.sent(message):
+            return
+        was_lost, was_armed = self._lost, self._armed
+        self._heartbeat_s = asyncio.get_running_loop().time()
+        self._armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        self.system_status = message.system_status
+        self._lost = False
+        self._found.set()
+        self._watch_for_loss()
+        if was_lost:
+            self._ask_soon()
+            self._tell("found")
+        if self._armed != was_armed:
+            self._tell("armed" if self._armed else "disarmed")
+
+    def _may_latch(self, message: mavlink.MAVLink_heartbeat_message, t_s: float) -> bool:
+        system, component = message.get_srcSystem(), message.get_srcComponent()
+        if self._configured_system_id not in (None, system) or system == 0:
+            return False
+        if component == mavlink.MAV_COMP_ID_AUTOPILOT1:
+            return True
+        if message.autopilot not in (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4):
+            return False
+        first_s = self._candidates.setdefault((system, component), t_s)
+        return t_s - first_s >= _ADOPT_OTHER_COMPONENT_S
+
+    def _latch(self, message: mavlink.MAVLink_heartbeat_message) -> None:
+        self.system_id = self._link.system_id = message.get_srcSystem()
+        self.component_id = message.get_srcComponent()
+        firmwares: dict[int, Firmware] = {
+            mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot",
+            mavlink.MAV_AUTOPILOT_PX4: "px4",
+        }
+        self.firmware = firmwares.get(message.autopilot, "other")
+        self._candidates.clear()
+        self._wanted = [
+            _Wanted(mavlink.MAVLink_system_time_message, 1.0),
+            _Wanted(mavlink.MAVLink_global_position_int_message, 1.0),
+        ]
+        self._tick()
+
+    def _watch_for_loss(self) -> None:
+        loop = asyncio.get_running_loop()
+        if self._lost_timer is not None:
+            self._lost_timer.cancel()
+        self._lost_timer = loop.call_later(HEARTBEAT_TIMEOUT_S, self._lose)
+
+    def _lose(self) -> None:
+        self._lost = True
+        self._found.clear()
+        self._tell("lost")
+
+    # --- what is asked for
+
+    def _tick(self) -> None:
+        loop = asyncio.get_running_loop()
+        now_s = loop.time()
+        if now_s - self._tick_due_s > _STALL_S:
+            self._trusted_from_s = now_s + 0.1
+            logger.warning("the event loop stood still for %.1f s", now_s - self._tick_due_s)
+        if self._closed:
+            return
+        self._tick_due_s = now_s + _TICK_S
+        self._tick_timer = loop.call_at(self._tick_due_s, self._tick)
+        if not self._lost:
+            self._ask_for_missing(now_s)
+
+    def _ask_soon(self) -> None:
+        # What was streamed before a loss is gone if the autopilot restarted meanwhile.
+        for wanted in self._wanted:
+            wanted.asked_s, wanted.pause_s = -math.inf, 3.0
+        if self.firmware == "ardupilot":
+            heartbeat_id: int = mavlink.MAVLINK_MSG_ID_HEARTBEAT
+            self.commands.request_message_interval(heartbeat_id, HEARTBEAT_RATE_HZ)
+        self._ask_for_missing(asyncio.get_running_loop().time())
+
+    def _ask_for_missing(self, now_s: float) -> None:
+        for wanted in self._wanted:
+            silent = now_s - wanted.heard_s > 2.5 / wanted.rate_hz
+            if silent and now_s - wanted.asked_s > wanted.pause_s:
+                if wanted.asked_s > -math.inf:
+                    wanted.pause_s = min(2 * wanted.pause_s, 30.0)
+                wanted.asked_s = now_s
+                self.commands.request_message_interval(wanted.message.id, wanted.rate_hz)
+        if self.version is None and now_s - self._version_asked_s > self._version_pause_s:
+            self._version_asked_s = now_s
+            self._version_pause_s = min(2 * self._version_pause_s, 60.0)
+            self.commands.request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+
+    def _heard(self, message: Message, t_s: float) -> None:
+        for wanted in self._wanted:
+            if wanted.message.msgname == message.get_type():
+                wanted.heard_s, wanted.pause_s = t_s, 3.0
+
+    # --- what the other messages tell
+
+    def _boot_time(self, boot_s: float, t_s: float) -> None:
+        restarted = self._boot_clock.rebooted(boot_s, t_s)
+        self._boot_time_heard.set()
+        if not restarted:
+            return
+        self.boots += 1
+        self._armed = None  # the last heartbeat was of the time before
+        self.position = None
+        self._unix_minus_loop_s = None
+        self.version = None
+        self._version_asked_s, self._version_pause_s = -math.inf, 2.0
+        self._ask_soon()
+        self._tell("rebooted")
+
+    def _on_boot_ms(
+        self,
+        message: mavlink.MAVLink_attitude_message
+        | mavlink.MAVLink_scaled_imu_message
+        | mavlink.MAVLink_scaled_imu2_message
+        | mavlink.MAVLink_scaled_imu3_message,
+        t_s: float,
+    ) -> None:
+        if self.sent(message):
+            self._boot_time(message.time_boot_ms * 1e-3, t_s)
+
+    def _on_boot_us(
+        self, message: mavlink.MAVLink_raw_imu_message | mavlink.MAVLink_highres_imu_message, t_s: float
+    ) -> None:
+        # The field may carry UTC instead; no autopilot has been up since the nineteen-seventies.
+        if self.sent(message) and message.time_usec * 1e-6 < _EARLIEST_UNIX_TIME_S:
+            self._boot_time(message.time_usec * 1e-6, t_s)
+
+    def _on_system_time(self, message: mavlink.MAVLink_system_time_message, t_s: float) -> None:
+        if not self.sent(message):
+            return
+        self._heard(message, t_s)
+        self._boot_time(message.time_boot_ms * 1e-3, t_s)
+        unix_s = message.time_unix_usec * 1e-6
+        self._unix_minus_loop_s = unix_s - t_s if unix_s > _EARLIEST_UNIX_TIME_S else None
+
+    def _on_version(self, message: mavlink.MAVLink_autopilot_version_message, _t_s: float) -> None:
+        if self.sent(message):
+            self.version = _version_text(message.flight_sw_version)
+
+    def _on_global_position(self, message: mavlink.MAVLink_global_position_int_message, t_s: float) -> None:
+        if not self.sent(message):
+            return
+        self._heard(message, t_s)
+        self._boot_time(message.time_boot_ms * 1e-3, t_s)
+        position = _position(message.lat, message.lon, message.alt, "autopilot GLOBAL_POSITION_INT")
+        if position is not None:
+            self.position = position
+
+    def _on_gps(self, message: mavlink.MAVLink_gps_raw_int_message, _t_s: float) -> None:
+        estimated = self.position is not None and "GLOBAL_POSITION" in self.position.source
+        if self.sent(message) and message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX and not estimated:
+            self.position = _position(message.lat, message.lon, message.alt, "autopilot GPS_RAW_INT") or self.position
+
+
+def _position(latitude_1e7: int, longitude_1e7: int, height_mm: int, source: str) -> Position | None:
+    # (0, 0) is what ArduPilot sends while it knows no position.
+    if (latitude_1e7, longitude_1e7) == (0, 0) or abs(latitude_1e7) > 900000000 or abs(longitude_1e7) > 1800000000:
+        return None
+    return Position(latitude_1e7 * 1e-7, longitude_1e7 * 1e-7, height_mm * 1e-3, source)
+
+
+def _version_text(packed: int) -> str:
+    """Major, minor, patch and kind of release from AUTOPILOT_VERSION.flight_sw_version, one byte each."""
+    major, minor, patch, kind = packed.to_bytes(4, "big")
+    suffix = "-dev" if kind < 64 else "-alpha" if kind < 128 else "-beta" if kind < 192 else "-rc" if kind < 255 else ""
+    return f"{major}.{minor}.{patch}{suffix}"

@@ -1,0 +1,197 @@
+"""Did the written offsets have their effect? Judged from the telemetry before and after.
+
+A parameter that reads back right proves nothing about the value in use: PX4 stores a small change and goes on with
+the old one, and a wrong orientation or sign moves the wrong axis (autopilots 4.2, 8.6). So the step that the output
+made is compared with the step that it had to make. Everything is judged in the axes of the parameters (the board's),
+so that a verdict names a parameter; the residual that remains is judged in the vehicle's.
+
+Two hypotheses stand against each other, "the whole step" and "no step". With the step's standard deviation s, an
+axis can tell them apart when the expected step is at least 8 s, since each then keeps 4 s for itself; a true axis is
+called wrong once in 16000. Over the three axes together a matched filter estimates the fraction of the step that was
+made, which can see what no axis can see alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Final, Literal
+
+import numpy as np
+
+from companion.physics.frames import Array, Matrix
+from companion.samples import Vector
+
+SIGMAS: Final = 4.0
+"""How far from its hypothesis a figure may lie, in standard deviations."""
+
+VISIBLE_SIGMAS: Final = 2 * SIGMAS
+
+SCALE_TOLERANCE: Final = 0.05
+"""Besides noise: a sensor's scale error and cross-axis sensitivity change the step by a few percent at most."""
+
+AxisWord = Literal["seen", "too small to see", "not seen", "wrong"]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Observation:
+    """One vector, the rate or the specific force of one IMU, before and after a write.
+
+    Means and sigmas are (3,) in the vehicle's FRD, in the unit of the vector; a sigma is that of the mean and covers
+    what the sensor drifts between the two windows.
+    """
+
+    parameters: tuple[str, str, str]
+    unit: str
+    before: Vector
+    before_sigma: Vector
+    after: Vector
+    after_sigma: Vector
+    expected_step: Vector
+    """What the output had to move by (`ardupilot.output_step`)."""
+    truth: Vector
+    """What the sensor had to read."""
+    tolerance: float
+    """What may remain of the residual besides noise."""
+    orientation: Matrix | None = None
+    """3x3, the parameters' axes to the vehicle's; None: they are the same."""
+    resolution: float = 0.0
+    """For integer messages one last digit, by which truncation may misstate a mean; 0 for floats."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class AxisVerdict:
+    """One parameter: the step in its axis, expected and made, and how well the latter is known."""
+
+    parameter: str
+    word: AxisWord
+    expected: float
+    made: float
+    sigma: float
+    words: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Verdict:
+    """One vector.
+
+    Attributes:
+        axes: a verdict for each parameter.
+        fraction: of the expected step that was made, over all axes; None when nothing was to be moved.
+        fraction_sigma: its standard deviation.
+        residual: mean after the write minus truth, vehicle FRD.
+        within: per vehicle axis, whether the residual is within the tolerance and 4 sigma.
+        problems: a line for each thing that is not right.
+        warnings: a line for each thing that could not be judged.
+    """
+
+    axes: tuple[AxisVerdict, AxisVerdict, AxisVerdict]
+    fraction: float | None
+    fraction_sigma: float | None
+    residual: Vector
+    within: tuple[bool, bool, bool]
+    problems: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Nothing contradicts the write; what is too small to see does not."""
+        return not self.problems
+
+    def outcome(self, parameter: str) -> Literal["verified", "stored", "failed"]:
+        """What the record says of a parameter that read back right."""
+        word = next(axis.word for axis in self.axes if axis.parameter == parameter)
+        if word in ("not seen", "wrong"):
+            return "failed"
+        return "verified" if word == "seen" else "stored"
+
+
+def judge(seen: Observation) -> Verdict:
+    """Judge one vector."""
+    rotation = np.eye(3) if seen.orientation is None else seen.orientation
+    made = rotation.T @ (np.asarray(seen.after) - np.asarray(seen.before))
+    expected = rotation.T @ np.asarray(seen.expected_step)
+    variance = np.asarray(seen.before_sigma) ** 2 + np.asarray(seen.after_sigma) ** 2
+    sigma = np.sqrt((rotation.T**2) @ variance)
+    # Both means may be misstated, each by up to a digit.
+    slack = 2.0 * seen.resolution
+    fraction, fraction_sigma = _matched_filter(made, expected, sigma, seen.resolution)
+    together = _together(fraction, fraction_sigma)
+    x, y, z = (
+        _judge_axis(name, float(e), float(m), float(s), slack, seen.unit)
+        for name, e, m, s in zip(seen.parameters, expected, made, sigma, strict=True)
+    )
+    residual = np.asarray(seen.after) - np.asarray(seen.truth)
+    allowed = seen.tolerance + SIGMAS * np.asarray(seen.after_sigma) + seen.resolution
+    within = [bool(inside) for inside in np.abs(residual) <= allowed]
+    axes = (x, y, z)
+    problems = [axis.words for axis in axes if axis.word in ("not seen", "wrong")]
+    if not problems and together in ("not seen", "wrong"):
+        problems.append(_together_words(seen.parameters, together, fraction or 0.0))
+    for axis_name, inside, value, limit in zip("xyz", within, residual, allowed, strict=True):
+        if not inside:
+            problems.append(
+                f"after the write {axis_name} is still off by {value:.3g} {seen.unit}, allowed are {limit:.2g}"
+                f" ({_family(seen.parameters)})"
+            )
+    hidden = [axis.words for axis in axes if axis.word == "too small to see" and axis.expected != 0.0]
+    return Verdict(
+        axes=axes,
+        fraction=fraction,
+        fraction_sigma=fraction_sigma,
+        residual=(float(residual[0]), float(residual[1]), float(residual[2])),
+        within=(within[0], within[1], within[2]),
+        problems=tuple(problems),
+        warnings=tuple(hidden) if together != "seen" else (),
+    )
+
+
+def _judge_axis(parameter: str, expected: float, made: float, sigma: float, slack: float, unit: str) -> AxisVerdict:
+    noise = SIGMAS * sigma + slack
+    figures = f"{parameter}: the output moved by {made:.3g} {unit}, expected {expected:.3g}, noise {sigma:.2g}"
+    agrees = abs(made - expected) <= noise + SCALE_TOLERANCE * abs(expected)
+    word: AxisWord
+    if not all(map(math.isfinite, (expected, made, sigma))):
+        word, words = "wrong", f"{figures}: not a number"
+    elif abs(expected) < 2 * noise:
+        word, words = (
+            ("too small to see", f"{figures}: too small to see")
+            if agrees
+            else ("wrong", f"{figures}: it moved although it should not")
+        )
+    elif agrees:
+        word, words = "seen", f"{figures}: seen"
+    elif abs(made) <= noise:
+        word, words = "not seen", f"{figures}: the autopilot stored the value but does not use it"
+    else:
+        word, words = "wrong", f"{figures}: not the step that was written (sign, orientation, scale, or it moved)"
+    return AxisVerdict(parameter, word, expected, made, sigma, words)
+
+
+def _matched_filter(made: Array, expected: Array, sigma: Array, resolution: float) -> tuple[float | None, float | None]:
+    """The weighted least-squares fraction of `expected` in `made`, and its sigma."""
+    floor = np.maximum(sigma, max(resolution, 1e-12))
+    weight = float(np.sum((expected / floor) ** 2))
+    if not math.isfinite(weight) or weight == 0.0:
+        return None, None
+    return float(np.sum(made * expected / floor**2)) / weight, 1.0 / math.sqrt(weight)
+
+
+def _together(fraction: float | None, sigma: float | None) -> AxisWord:
+    if fraction is None or sigma is None or VISIBLE_SIGMAS * sigma > 1.0:
+        return "too small to see"
+    if abs(fraction - 1.0) <= SIGMAS * sigma + SCALE_TOLERANCE:
+        return "seen"
+    return "not seen" if abs(fraction) <= SIGMAS * sigma else "wrong"
+
+
+def _together_words(parameters: Sequence[str], word: AxisWord, fraction: float) -> str:
+    family = _family(parameters)
+    if word == "not seen":
+        return f"{family}: no axis moved as written; the autopilot stored the values but does not use them"
+    return f"{family}: the output made {fraction:.0%} of the step that was written"
+
+
+def _family(parameters: Sequence[str]) -> str:
+    return f"{parameters[0]}, {', '.join('_' + name[-1] for name in parameters[1:])}"

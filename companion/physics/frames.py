@@ -1,0 +1,73 @@
+"""Frames and rotations.
+
+Body: FRD (x forward, y right, z down), as on the MAVLink wire. Navigation: NED. The paper writes RFU (x right,
+y forward, z up) and ENU instead; `FRD_FROM_RFU` is the bridge, its own inverse, and the same matrix takes ENU to NED.
+Angles: theta is pitch (nose up +), gamma is roll (right side down +), psi is heading, clockwise from true north;
+they are the aerospace 3-2-1 angles (method section 1.1).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.physics.units import DEG
+from companion.rotations import ROTATIONS_DEG
+
+Matrix = NDArray[np.float64]
+Array = NDArray[np.float64]
+
+FRD_FROM_RFU: Matrix = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Matrix:
+    """The direction cosine matrix C_n^b, 3x3: a vector's NED components to its FRD components.
+
+    Equation (5) of the paper, in FRD/NED, with its first row mended: the printed T11 and T12 have the wrong sign on
+    their second terms, which leaves the matrix without orthogonality, and row 2 must carry cos(theta), not the
+    cosine of the latitude (method section 1.3).
+    """
+    sr, cr = math.sin(roll_rad), math.cos(roll_rad)
+    st, ct = math.sin(pitch_rad), math.cos(pitch_rad)
+    sp, cp = math.sin(yaw_rad), math.cos(yaw_rad)
+    return np.array(
+        [
+            [ct * cp, ct * sp, -st],
+            [sr * st * cp - cr * sp, sr * st * sp + cr * cp, sr * ct],
+            [cr * st * cp + sr * sp, cr * st * sp - sr * cp, cr * ct],
+        ]
+    )
+
+
+def rotation_matrix(mounting: str | tuple[float, float, float]) -> Matrix:
+    """How a sensor is mounted: the 3x3 matrix from the sensor's axes to the vehicle's FRD axes.
+
+    Args:
+        mounting: a MAVLink rotation name, or (roll, pitch, yaw) in degrees.
+
+    Raises:
+        KeyError: no rotation of that name (the configuration checks names before they come here).
+    """
+    angles_deg = ROTATIONS_DEG[mounting] if isinstance(mounting, str) else mounting
+    matrix = body_from_ned(*(angle * DEG for angle in angles_deg)).T
+    if all(angle % 90.0 == 0.0 for angle in angles_deg):
+        return np.rint(matrix) + 0.0  # exact where it can be, and no negative zeros
+    return matrix
+
+
+def skew(vector: Array) -> Matrix:
+    """The cross-product matrix [v x], 3x3."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def wrap_deg(angle_deg: float) -> float:
+    """An angle brought into [-180, 180)."""
+    return (angle_deg + 180.0) % 360.0 - 180.0
+
+
+def roll_pitch_from_up(up: Array) -> tuple[float, float]:
+    """Roll gamma and pitch theta in radians of the body in whose FRD axes `up` (shape (3,)) points up."""
+    return math.atan2(-up[1], -up[2]), math.atan2(up[0], math.hypot(up[1], up[2]))

@@ -1,0 +1,87 @@
+"""What a gradienter's two readings mean.
+
+Equation (1) of the paper, gamma = arcsin(sin qx / cos theta) with theta = qy, holds only for a sensor of which each
+output is the elevation of its own axis. A liquid cell reads the slope of the liquid's surface instead, and many
+modern devices give Euler angles; the wrong law costs 0.15 degrees (2.6 mg) at 10/10 degrees (method section 1.2).
+So the law is a property of the sensor:
+
+| law     | outputs for (theta, gamma)                       | recovered by                                     |
+|---------|--------------------------------------------------|--------------------------------------------------|
+| "axis"  | qy = theta, qx = asin(sin gamma cos theta)       | theta = qy, gamma = asin(sin qx / cos theta)     |
+| "slope" | qy = atan(tan theta / cos gamma), qx = gamma     | gamma = qx, theta = atan(tan qy cos qx)          |
+| "euler" | qy = theta, qx = gamma                           | as they are                                      |
+
+qx: right side down +; qy: nose up +; both in the sensor's own frame.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+
+from companion.physics.frames import Array, Matrix
+from companion.physics.units import DEG
+
+Law = Literal["axis", "slope", "euler"]
+
+
+def attitude_from_readings(law: Law, x_deg: float, y_deg: float) -> tuple[float, float]:
+    """Pitch theta and roll gamma in radians from the two readings in degrees.
+
+    Raises:
+        ValueError: the readings cannot belong together ("axis" needs |qx| + |qy| <= 90 degrees).
+    """
+    qx, qy = x_deg * DEG, y_deg * DEG
+    if law == "axis":
+        sine = math.sin(qx) / math.cos(qy) if abs(y_deg) < 90.0 else math.inf
+        if abs(sine) > 1.0:
+            raise ValueError(
+                f"gradienter readings x {x_deg:.3f} deg and y {y_deg:.3f} deg cannot belong together: with"
+                ' law = "axis" |x| + |y| is at most 90 deg'
+            )
+        return qy, math.asin(sine)
+    if law == "slope":
+        return math.atan(math.tan(qy) * math.cos(qx)), qx
+    return qy, qx
+
+
+def up_in_sensor(law: Law, x_deg: float, y_deg: float) -> Array:
+    """The direction of specific force at rest (up) in the sensor's own FRD axes, shape (3,), unit length.
+
+    This is f^b / g of method section 1.2: (sin theta, -sin gamma cos theta, -cos gamma cos theta). Turning it by
+    the mounting gives the same direction in the vehicle's axes, whatever the mounting.
+
+    Raises:
+        ValueError: as `attitude_from_readings`.
+    """
+    theta, gamma = attitude_from_readings(law, x_deg, y_deg)
+    return np.array([math.sin(theta), -math.sin(gamma) * math.cos(theta), -math.cos(gamma) * math.cos(theta)])
+
+
+def up_jacobian(law: Law, x_deg: float, y_deg: float) -> Matrix:
+    """The Jacobian d up / d (qx, qy), shape (3, 2), per radian of reading; analytic for each law.
+
+    For "axis" this is method section 2.1's d b_a / d q divided by -g, in FRD: up = (sin qy, -sin qx, -c) with
+    c = sqrt(1 - sin^2 qx - sin^2 qy).
+
+    Raises:
+        ValueError: as `attitude_from_readings`.
+    """
+    theta, gamma = attitude_from_readings(law, x_deg, y_deg)
+    st, ct, sg, cg = math.sin(theta), math.cos(theta), math.sin(gamma), math.cos(gamma)
+    if law == "axis":
+        cx, cy = math.cos(x_deg * DEG), math.cos(y_deg * DEG)
+        sx, sy = math.sin(x_deg * DEG), math.sin(y_deg * DEG)
+        c = ct * cg
+        return np.array([[0.0, cy], [-cx, 0.0], [sx * cx / c, sy * cy / c]])
+    by_theta = np.array([ct, sg * st, cg * st])
+    by_gamma = np.array([0.0, -cg * ct, sg * ct])
+    if law == "euler":
+        return np.column_stack([by_gamma, by_theta])
+    # slope: gamma = qx, tan theta = tan qy cos qx; d theta / d qx and d theta / d qy by the chain rule.
+    qx, qy = x_deg * DEG, y_deg * DEG
+    theta_by_x = -math.tan(qy) * math.sin(qx) * ct**2
+    theta_by_y = math.cos(qx) / math.cos(qy) ** 2 * ct**2
+    return np.column_stack([by_gamma + by_theta * theta_by_x, by_theta * theta_by_y])

@@ -1,0 +1,261 @@
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.ardupilot import (
+    ImuCalibration,
+    ImuParameters,
+    accel_offset_after,
+    changes_for,
+    offsets_after,
+    output_step,
+    read_calibration,
+    whole_bias,
+)
+from companion.autopilot.parameters import ParameterClient
+from companion.autopilot.vehicle import Vehicle
+from companion.errors import AutopilotError, AutopilotRebootedError, CalibrationRefusedError
+from companion.links.mavlink import MavlinkLink
+from tests.support.scripted_autopilot import ScriptedAutopilot, f32, flying_on
+from tests.support.virtual_time import run_virtual
+
+IMU1 = {
+    "INS_GYROFFS_X": 0.001,
+    "INS_GYROFFS_Y": 0.002,
+    "INS_GYROFFS_Z": 0.003,
+    "INS_ACCOFFS_X": 0.1,
+    "INS_ACCOFFS_Y": 0.2,
+    "INS_ACCOFFS_Z": 0.3,
+    "INS_ACCSCAL_X": 1.01,
+    "INS_ACCSCAL_Y": 0.99,
+    "INS_ACCSCAL_Z": 1.0,
+    "INS_GYR_ID": 2752772,
+    "INS_ACC_ID": 2753028,
+    "INS_TCAL1_ENABLE": 0,
+    "INS_USE": 1,
+    "INS_GYR_CAL": 0,
+    "AHRS_ORIENTATION": 0,
+}
+
+
+def read(parameters: dict[str, float], instance: int = 1, autopilot: ScriptedAutopilot | None = None) -> ImuCalibration:
+    async def main() -> ImuCalibration:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        client = ParameterClient(link, vehicle)
+        autopilot_ = autopilot or ScriptedAutopilot()
+        autopilot_.parameters = {name: f32(value) for name, value in parameters.items()}
+        async with flying_on(link, autopilot_):
+            await vehicle.wait_found()
+            await asyncio.sleep(2.0)
+            try:
+                return await read_calibration(client, instance)
+            finally:
+                vehicle.close()
+
+    return run_virtual(main())
+
+
+def test_names_of_the_three_instances() -> None:
+    one, two, three = ImuParameters(1), ImuParameters(2), ImuParameters(3)
+    assert one.gyro_offset == ("INS_GYROFFS_X", "INS_GYROFFS_Y", "INS_GYROFFS_Z")
+    assert one.accel_offset[1] == "INS_ACCOFFS_Y"
+    assert one.accel_scale[2] == "INS_ACCSCAL_Z"
+    assert (one.gyro_id, one.accel_id, one.use) == ("INS_GYR_ID", "INS_ACC_ID", "INS_USE")
+    assert (one.gyro_caltemp, one.accel_caltemp) == ("INS_GYR1_CALTEMP", "INS_ACC1_CALTEMP")
+    assert two.gyro_offset[0] == "INS_GYR2OFFS_X"
+    assert two.accel_offset[0] == "INS_ACC2OFFS_X"
+    assert two.accel_scale[0] == "INS_ACC2SCAL_X"
+    assert (two.gyro_id, two.accel_id, two.use) == ("INS_GYR2_ID", "INS_ACC2_ID", "INS_USE2")
+    assert (two.gyro_caltemp, two.tcal_enable) == ("INS_GYR2_CALTEMP", "INS_TCAL2_ENABLE")
+    assert three.accel_offset[2] == "INS_ACC3OFFS_Z"
+    assert one.tcal_enable == "INS_TCAL1_ENABLE"
+    for names in (one, two, three):
+        for name in (*names.gyro_offset, *names.accel_scale, names.accel_caltemp, names.tcal_enable):
+            assert len(name) <= 16
+    with pytest.raises(AutopilotError, match="IMU 4"):
+        ImuParameters(4)
+
+
+def test_reads_what_is_there() -> None:
+    calibration = read(IMU1)
+    assert calibration.gyro_offset_rad_s == (f32(0.001), f32(0.002), f32(0.003))
+    assert calibration.accel_offset_m_s2 == (f32(0.1), f32(0.2), f32(0.3))
+    assert calibration.accel_scale == (f32(1.01), f32(0.99), 1.0)
+    assert (calibration.gyro_id, calibration.accel_id) == (2752772, 2753028)
+    assert (calibration.tcal_enable, calibration.gyr_cal) == (0, 0)
+    assert np.array_equal(calibration.orientation, np.eye(3))
+    assert calibration.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("orientation", "extra", "of_board_x"),
+    [
+        (2, {}, (0, 1, 0)),
+        (6, {}, (0, -1, 0)),
+        (24, {}, (0, 0, -1)),
+        (12, {}, (-1, 0, 0)),
+        (42, {}, (1, 0, 0)),
+        (41, {}, (math.cos(math.radians(7)), 0, -math.sin(math.radians(7)))),
+        (
+            101,
+            {"CUST_ROT_ENABLE": 1, "CUST_ROT1_ROLL": 0, "CUST_ROT1_PITCH": 0, "CUST_ROT1_YAW": 30},
+            (math.cos(math.radians(30)), math.sin(math.radians(30)), 0),
+        ),
+        (
+            102,
+            {"CUST_ROT_ENABLE": 1, "CUST_ROT2_ROLL": 20, "CUST_ROT2_PITCH": 90, "CUST_ROT2_YAW": 0},
+            (0, 0, -1),
+        ),
+        (100, {"AHRS_CUSTOM_ROLL": 0, "AHRS_CUSTOM_PIT": 0, "AHRS_CUSTOM_YAW": 180}, (-1, 0, 0)),
+    ],
+)
+def test_where_the_boards_x_points_for_an_orientation(
+    orientation: int, extra: dict[str, float], of_board_x: tuple[float, float, float]
+) -> None:
+    calibration = read(IMU1 | {"AHRS_ORIENTATION": orientation} | extra)
+    assert calibration.orientation @ np.array([1.0, 0.0, 0.0]) == pytest.approx(of_board_x, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"INS_TCAL1_ENABLE": 2}, "INS_TCAL1_ENABLE = 2.*learning"),
+        ({"INS_ACC_ID": 0}, "no IMU 1: INS_ACC_ID = 0"),
+        ({"INS_GYR_ID": 0}, "no IMU 1: INS_GYR_ID = 0"),
+        ({"INS_ACCSCAL_Y": 0.0}, "INS_ACCSCAL_Y is 0"),
+        ({"INS_GYROFFS_Z": math.nan}, "INS_GYROFFS_Z is nan"),
+        ({"AHRS_ORIENTATION": 77}, "AHRS_ORIENTATION = 77 is not known"),
+        ({"AHRS_ORIENTATION": 101, "CUST_ROT_ENABLE": 0}, "needs CUST_ROT_ENABLE = 1"),
+    ],
+)
+def test_what_cannot_be_worked_with_is_refused_with_a_reason(changed: dict[str, float], words: str) -> None:
+    with pytest.raises(AutopilotError, match=words):
+        read(IMU1 | changed)
+
+
+def test_an_instance_that_does_not_exist() -> None:
+    with pytest.raises(AutopilotError, match="no IMU 3: INS_GYR3OFFS_X does not exist"):
+        read(IMU1, 3)
+
+
+def test_old_firmware_without_temperature_calibration() -> None:
+    missing = {name: value for name, value in IMU1.items() if name != "INS_TCAL1_ENABLE"}
+    assert read(missing, autopilot=ScriptedAutopilot(param_errors=False)).tcal_enable is None
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"INS_GYR_CAL": 1}, "INS_GYR_CAL = 1: the next boot"),
+        ({"INS_ACCOFFS_X": 0, "INS_ACCOFFS_Y": 0, "INS_ACCOFFS_Z": 0}, "3D Accel calibration needed"),
+        ({"INS_ACCSCAL_X": 1.3}, "outside 0.8 to 1.2"),
+        ({"INS_USE": 0}, "INS_USE = 0"),
+    ],
+)
+def test_what_is_odd_is_a_warning(changed: dict[str, float], words: str) -> None:
+    (warning,) = read(IMU1 | changed).warnings
+    assert words in warning
+
+
+def test_px4_is_not_supported_yet() -> None:
+    with pytest.raises(AutopilotError, match="PX4 is not supported yet by this version"):
+        read(IMU1, autopilot=ScriptedAutopilot(autopilot=mavlink.MAV_AUTOPILOT_PX4))
+
+
+def test_a_restart_while_reading_is_no_calibration() -> None:
+    autopilot = ScriptedAutopilot()
+    tasks: list[asyncio.Task[None]] = []
+
+    def restart(message: object) -> bool:
+        if getattr(message, "param_id", "") == "INS_ACCOFFS_Y" and not tasks:
+            tasks.append(asyncio.ensure_future(autopilot.reboot(0.5)))
+        return True
+
+    autopilot.on_message = restart
+    with pytest.raises(AutopilotRebootedError):
+        read(IMU1, autopilot=autopilot)
+
+
+def plain(**changes: object) -> ImuCalibration:
+    calibration = ImuCalibration(
+        instance=1,
+        gyro_offset_rad_s=(0.001, 0.002, 0.003),
+        accel_offset_m_s2=(0.1, 0.2, 0.3),
+        accel_scale=(1.0, 1.0, 1.0),
+        gyro_id=1,
+        accel_id=1,
+        tcal_enable=0,
+        orientation=np.eye(3),
+        gyr_cal=0,
+    )
+    return dataclasses.replace(calibration, **changes)  # type: ignore[arg-type]
+
+
+def test_the_documented_run() -> None:
+    # A real run: bias 0.3 read as +0.29928 with offset 0.001; offset 0.301 then reads -0.00092 (autopilots 9.1).
+    calibration = plain(accel_offset_m_s2=(0.001, 0.0, 0.0))
+    (x, _, _) = accel_offset_after(calibration, (0.30020, 0.0, 0.0))
+    assert x == pytest.approx(0.301, abs=3e-4)
+
+
+def test_residuals_turn_into_the_boards_axes_and_scale_is_divided_out() -> None:
+    yaw_90 = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    calibration = plain(orientation=yaw_90, accel_scale=(1.1, 0.9, 1.0))
+    gyro, accel = offsets_after(calibration, (0.01, 0.02, 0.03), (0.11, 0.22, 0.33))
+    # Vehicle x is minus the board's y, vehicle y is the board's x.
+    assert gyro == pytest.approx((0.001 + 0.02, 0.002 - 0.01, 0.003 + 0.03), rel=1e-6)
+    assert accel == pytest.approx((0.1 + 0.22 / 1.1, 0.2 - 0.11 / 0.9, 0.3 + 0.33), rel=1e-6)
+    assert all(value == f32(value) for value in (*gyro, *accel))
+    gyro_bias, accel_bias = whole_bias(calibration, (0.01, 0.02, 0.03), (0.11, 0.22, 0.33))
+    assert gyro_bias == pytest.approx((0.01 - 0.002, 0.02 + 0.001, 0.03 + 0.003))
+    assert accel_bias == pytest.approx((0.11 - 0.9 * 0.2, 0.22 + 1.1 * 0.1, 0.33 + 0.3))
+
+
+def test_a_zero_accelerometer_vector_is_written_as_almost_zero() -> None:
+    calibration = plain()
+    after = accel_offset_after(calibration, (-0.1, -0.2, -0.3))
+    assert any(after)
+    assert max(map(abs, after)) < 1e-3 * 9.8e-3  # a thousandth of a milli-g
+    assert offsets_after(plain(gyro_offset_rad_s=(0.0, 0.0, 0.0)), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))[0] == (0, 0, 0)
+
+
+def test_changes_come_accelerometers_first_and_only_what_is_asked() -> None:
+    calibration = plain()
+    names = [change.parameter for change in changes_for(calibration, (0.01, 0.0, 0.0), (0.1, 0.0, 0.0))]
+    assert names == [f"INS_ACCOFFS_{a}" for a in "XYZ"] + [f"INS_GYROFFS_{a}" for a in "XYZ"]
+    only = changes_for(calibration, (0.01, 0.0, 0.0), None)
+    assert [change.parameter for change in only] == [f"INS_GYROFFS_{a}" for a in "XYZ"]
+    assert only[0].after == f32(0.011)
+    gyro, accel = output_step(calibration, only)
+    assert gyro == pytest.approx((-0.01, 0.0, 0.0), abs=1e-8)
+    assert accel == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accel", "words"),
+    [
+        ((0.09, 0, 0), (0, 0, 0), r"gyro residual X is 5\.16 deg/s, allowed are 5"),
+        ((0, 0, 0), (0, 0, -1.1), r"accelerometer residual Z is -1\.1 m/s\^2, allowed are 1"),
+        ((math.nan, 0, 0), (0, 0, 0), "gyro residual X is nan"),
+        ((0, 0, 0), (0, math.inf, 0), "accelerometer residual Y is inf"),
+    ],
+)
+def test_absurd_residuals_are_refused(
+    gyro: tuple[float, float, float], accel: tuple[float, float, float], words: str
+) -> None:
+    with pytest.raises(CalibrationRefusedError, match=words):
+        offsets_after(plain(), gyro, accel)
+
+
+def test_absurd_whole_offsets_are_refused() -> None:
+    with pytest.raises(CalibrationRefusedError, match="accelerometer offset X"):
+        accel_offset_after(plain(accel_offset_m_s2=(3.0, 0, 0)), (0.9, 0, 0))
+    with pytest.raises(CalibrationRefusedError, match="gyro offset Y"):
+        offsets_after(plain(gyro_offset_rad_s=(0, 0.34, 0)), (0, 0.05, 0), (0, 0, 0))

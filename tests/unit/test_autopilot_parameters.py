@@ -1,0 +1,332 @@
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import struct
+from collections.abc import AsyncIterator
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.float32 import float32, same_float32
+from companion.autopilot.parameters import ParameterClient
+from companion.autopilot.vehicle import Vehicle
+from companion.errors import (
+    AutopilotRebootedError,
+    NotDisarmedError,
+    ParameterMismatchError,
+    ParameterRefusedError,
+    ParameterTimeoutError,
+)
+from companion.links.mavlink import MavlinkLink
+from tests.support.scripted_autopilot import ScriptedAutopilot, f32, flying_on
+from tests.support.virtual_time import run_virtual
+from tests.support.wire import Wire
+
+X, Y, Z = ("INS_GYROFFS_X", "INS_GYROFFS_Y", "INS_GYROFFS_Z")
+
+
+@contextlib.asynccontextmanager
+async def aboard(autopilot: ScriptedAutopilot) -> AsyncIterator[tuple[ParameterClient, Vehicle, Wire]]:
+    link = MavlinkLink()
+    vehicle = Vehicle(link)
+    client = ParameterClient(link, vehicle)
+    async with flying_on(link, autopilot) as wire:
+        await vehicle.wait_found()
+        await asyncio.sleep(1.0)
+        yield client, vehicle, wire
+    client.close()
+    vehicle.close()
+
+
+def offsets(**more: float) -> dict[str, float]:
+    return {X: 0.001, Y: -0.002, Z: 0.003, **more}
+
+
+def test_reads_by_name_afresh_every_time() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+        async with aboard(autopilot) as (client, _, _):
+            assert await client.read(X) == f32(0.001)
+            autopilot.parameters[X] = f32(0.5)
+            assert await client.read(X) == 0.5
+            asked = [m for m in autopilot.requests if m.get_type() == "PARAM_REQUEST_READ"]
+            assert [(m.param_id, m.param_index) for m in asked] == [(X, -1), (X, -1)]
+
+    run_virtual(main())
+
+
+def test_a_lost_answer_is_asked_for_again() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+        async with aboard(autopilot) as (client, _, wire):
+            wire.cut = True
+            asyncio.get_running_loop().call_later(1.5, setattr, wire, "cut", False)
+            assert await client.read(X) == f32(0.001)
+
+    run_virtual(main())
+
+
+def test_silence_to_a_read_ends_in_a_timeout_after_all_tries() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+        autopilot.on_message = lambda message: message.get_type() != "PARAM_REQUEST_READ"
+        async with aboard(autopilot) as (client, _, _):
+            start_s = asyncio.get_running_loop().time()
+            with pytest.raises(ParameterTimeoutError, match="INS_GYROFFS_X"):
+                await client.read(X)
+            assert asyncio.get_running_loop().time() - start_s == pytest.approx(4.0, abs=0.01)
+            assert sum(m.get_type() == "PARAM_REQUEST_READ" for m in autopilot.requests) == 4
+
+    run_virtual(main())
+
+
+def test_optional_missing_by_param_error_is_quick() -> None:
+    async def main() -> None:
+        async with aboard(ScriptedAutopilot(parameters=offsets())) as (client, _, _):
+            start_s = asyncio.get_running_loop().time()
+            assert await client.read_optional("INS_ACC1OFFS_X") is None
+            assert asyncio.get_running_loop().time() - start_s < 0.1
+            with pytest.raises(ParameterRefusedError, match="does not exist"):
+                await client.read("INS_ACC1OFFS_X")
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("read_before", [False, True])
+def test_optional_missing_by_silence_of_old_firmware(read_before: bool) -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets(), param_errors=False)
+        async with aboard(autopilot) as (client, _, _):
+            if read_before:
+                await client.read(Y)
+            assert await client.read_optional("INS_ACC1OFFS_X") is None
+
+    run_virtual(main())
+
+
+def test_optional_on_a_dead_link_is_a_timeout() -> None:
+    async def main() -> None:
+        async with aboard(ScriptedAutopilot(parameters=offsets())) as (client, _, wire):
+            wire.cut = True
+            with pytest.raises(ParameterTimeoutError):
+                await client.read_optional(X)
+
+    run_virtual(main())
+
+
+def test_optional_when_heartbeats_come_but_our_requests_do_not_arrive_is_a_timeout() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets(), param_errors=False)
+        async with aboard(autopilot) as (client, vehicle, _):
+            autopilot.on_message = lambda message: False
+            with pytest.raises(ParameterTimeoutError, match="nor for anything else"):
+                await client.read_optional(X)
+            assert vehicle.alive
+
+    run_virtual(main())
+
+
+def test_before_any_autopilot_is_heard_there_is_a_clean_error() -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        client = ParameterClient(link, vehicle)
+        with pytest.raises(ParameterTimeoutError, match="no autopilot"):
+            await client.read(X)
+        with pytest.raises(NotDisarmedError, match="unknown"):
+            await client.write(X, 0.0)
+
+    run_virtual(main())
+
+
+def test_writes_real32_and_takes_the_echo() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+        async with aboard(autopilot) as (client, _, _):
+            assert await client.write(X, 0.1) == f32(0.1)
+            assert autopilot.parameters[X] == f32(0.1)
+            (sent,) = [m for m in autopilot.requests if m.get_type() == "PARAM_SET"]
+            assert sent.param_type == mavlink.MAV_PARAM_TYPE_REAL32
+            assert client.writes == 1
+
+    run_virtual(main())
+
+
+def test_one_ulp_off_is_accepted_two_are_not() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+        bits = struct.unpack("<i", struct.pack("<f", 0.1))[0]
+        near, far = (struct.unpack("<f", struct.pack("<i", bits + n))[0] for n in (1, 2))
+        async with aboard(autopilot) as (client, _, _):
+            autopilot.on_set = lambda name, value: near
+            assert await client.write(X, 0.1) == near
+            autopilot.on_set = lambda name, value: far
+            with pytest.raises(ParameterMismatchError):
+                await client.write(X, 0.1)
+
+    run_virtual(main())
+
+
+def test_another_value_is_waited_over_since_it_may_answer_somebody_else() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+
+        def late(name: str, value: float) -> None:
+            autopilot.value(name)
+            asyncio.get_running_loop().call_later(0.5, take, name, value)
+
+        def take(name: str, value: float) -> None:
+            autopilot.parameters[name] = f32(value)
+            autopilot.value(name)
+
+        autopilot.on_set = late
+        async with aboard(autopilot) as (client, _, _):
+            assert await client.write(X, 0.2) == f32(0.2)
+            assert client.writes == 1
+
+    run_virtual(main())
+
+
+def test_another_value_for_good_is_a_mismatch_that_names_both() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+        autopilot.on_set = lambda name, value: 0.25
+        async with aboard(autopilot) as (client, _, _):
+            with pytest.raises(ParameterMismatchError, match=r"INS_GYROFFS_X was set to 0\.5.* answers 0\.25"):
+                await client.write(X, 0.5)
+
+    run_virtual(main())
+
+
+def test_param_error_ends_a_write_at_once() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+        async with aboard(autopilot) as (client, _, _):
+            with pytest.raises(ParameterRefusedError, match="does not exist"):
+                await client.write("INS_ACC1OFFS_X", 0.5)
+            assert client.writes == 1
+
+    run_virtual(main())
+
+
+def test_param_error_for_somebody_else_is_not_ours() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+
+        def refuse_another(message: object) -> bool:
+            autopilot.send(mavlink.MAVLink_param_error_message(255, 190, X.encode(), -1, 3))
+            return True
+
+        async with aboard(autopilot) as (client, _, _):
+            autopilot.on_message = refuse_another
+            assert await client.read(X) == f32(0.001)
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e39])
+def test_what_is_no_finite_float32_never_leaves(value: float) -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+        async with aboard(autopilot) as (client, _, _):
+            with pytest.raises(ParameterRefusedError):
+                await client.write(X, value)
+            assert client.writes == 0
+
+    run_virtual(main())
+
+
+def test_armed_nothing_leaves() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+        async with aboard(autopilot) as (client, _, _):
+            autopilot.armed = True
+            await asyncio.sleep(0.5)
+            with pytest.raises(NotDisarmedError, match="armed"):
+                await client.write(X, 0.5)
+            assert autopilot.sets == []
+
+    run_virtual(main())
+
+
+def test_armed_between_tries_the_repetition_does_not_leave() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+
+        def arm_and_be_silent(name: str, value: float) -> None:
+            autopilot.armed = True
+
+        autopilot.on_set = arm_and_be_silent
+        async with aboard(autopilot) as (client, _, _):
+            with pytest.raises(NotDisarmedError):
+                await client.write(X, 0.5)
+            assert len(autopilot.sets) == 1
+            assert client.writes == 1
+
+    run_virtual(main())
+
+
+def test_heartbeats_stopping_between_tries_the_repetition_does_not_leave() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+        async with aboard(autopilot) as (client, _, _):
+            autopilot.on_set = lambda name, value: None
+            autopilot.beating = False
+            with pytest.raises(NotDisarmedError, match="unknown"):
+                await client.write(X, 0.5)
+            assert 1 <= len(autopilot.sets) <= 3  # a heartbeat may still have been on its way
+
+    run_virtual(main())
+
+
+def test_a_restart_in_the_middle_is_named() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+        async with aboard(autopilot) as (client, _, _):
+            autopilot.on_set = lambda name, value: None
+            writing = asyncio.create_task(client.write(X, 0.5))
+            await asyncio.sleep(0.1)
+            await autopilot.reboot(0.3)
+            with pytest.raises(AutopilotRebootedError, match="restarted while INS_GYROFFS_X"):
+                await writing
+
+    run_virtual(main())
+
+
+def test_watch_hears_what_anybody_writes_and_others_do_not_count() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+        stranger = ScriptedAutopilot(system=9, parameters={X: 7.0})
+        heard: list[tuple[str, float]] = []
+        async with aboard(autopilot) as (client, vehicle, _):
+            stop = client.watch(lambda name, value: heard.append((name, value)))
+            stranger.attach(lambda data: client._link.receive(data, asyncio.get_running_loop().time()))
+            stranger.value(X)
+            autopilot.value(Z)
+            await asyncio.sleep(0.1)
+            assert heard == [(Z, f32(0.003))]
+            reading = asyncio.create_task(client.read(X))
+            await asyncio.sleep(0)
+            stranger.value(X)
+            assert await reading == f32(0.001)
+            stop()
+            autopilot.value(Z)
+            await asyncio.sleep(0.1)
+            assert len(heard) == 2
+            assert vehicle.system_id == 1
+
+    run_virtual(main())
+
+
+def test_float32_comparison() -> None:
+    assert float32(0.1) != 0.1
+    assert same_float32(0.1, float32(0.1))
+    assert same_float32(0.0, -0.0)
+    smallest = 2.0**-149
+    assert same_float32(-0.0, smallest)
+    assert not same_float32(-smallest, smallest)
+    assert not same_float32(math.nan, math.nan)
+    assert not same_float32(1.0, 1.0 + 2.5 * 2**-23)
+    assert math.isinf(float32(-1e39))

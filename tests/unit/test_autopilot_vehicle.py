@@ -1,0 +1,312 @@
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.boot_clock import BootClock
+from companion.autopilot.vehicle import ArmState, Position, Vehicle
+from companion.links.mavlink import MavlinkLink
+from tests.support.scripted_autopilot import ScriptedAutopilot, flying_on
+from tests.support.virtual_time import run_virtual
+
+
+def heartbeat(
+    link: MavlinkLink,
+    *,
+    system: int = 1,
+    component: int = 1,
+    autopilot: int = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+    kind: int = mavlink.MAV_TYPE_QUADROTOR,
+    armed: bool = False,
+) -> None:
+    codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+    mode = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
+    message = mavlink.MAVLink_heartbeat_message(kind, autopilot, mode, 0, 3, 3)
+    link.receive(message.pack(codec), asyncio.get_running_loop().time())
+
+
+def state(vehicle: Vehicle) -> ArmState:
+    return vehicle.arm_state
+
+
+def latched(vehicle: Vehicle) -> int | None:
+    return vehicle.system_id
+
+
+def position(vehicle: Vehicle) -> Position | None:
+    return vehicle.position
+
+
+@contextlib.asynccontextmanager
+async def aboard(autopilot: ScriptedAutopilot, **wire: float) -> AsyncIterator[tuple[Vehicle, list[str]]]:
+    link = MavlinkLink()
+    vehicle = Vehicle(link)
+    events: list[str] = []
+    vehicle.watch(events.append)
+    async with flying_on(link, autopilot, **wire):  # type: ignore[arg-type]
+        async with asyncio.timeout(30):
+            await vehicle.wait_found()
+        await asyncio.sleep(0.3)
+        yield vehicle, events
+    vehicle.close()
+
+
+def test_state_is_unknown_before_the_first_heartbeat() -> None:
+    async def main() -> None:
+        vehicle = Vehicle(MavlinkLink())
+        assert state(vehicle) is ArmState.UNKNOWN
+        assert vehicle.heartbeat_age_s is None
+        assert latched(vehicle) is None
+        vehicle.close()
+
+    run_virtual(main())
+
+
+def test_state_follows_heartbeats_and_is_unknown_two_seconds_after_the_last() -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        events: list[tuple[float, str]] = []
+        loop = asyncio.get_running_loop()
+        vehicle.watch(lambda event: events.append((round(loop.time() - 1000.0, 3), event)))
+        heartbeat(link)
+        assert state(vehicle) is ArmState.DISARMED
+        await asyncio.sleep(1.0)
+        heartbeat(link, armed=True)
+        assert state(vehicle) is ArmState.ARMED
+        await asyncio.sleep(1.9)
+        assert state(vehicle) is ArmState.ARMED
+        await asyncio.sleep(0.2)
+        assert state(vehicle) is ArmState.UNKNOWN
+        assert vehicle.heartbeat_age_s == pytest.approx(2.1)
+        heartbeat(link, armed=True)
+        heartbeat(link, armed=False)
+        assert events == [(0, "found"), (0, "disarmed"), (1, "armed"), (3, "lost"), (3.1, "found"), (3.1, "disarmed")]
+        vehicle.close()
+        assert state(vehicle) is ArmState.UNKNOWN
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "kind"),
+    [
+        (mavlink.MAV_AUTOPILOT_INVALID, mavlink.MAV_TYPE_QUADROTOR),
+        (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_TYPE_GCS),
+        (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_TYPE_ONBOARD_CONTROLLER),
+        (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_TYPE_GIMBAL),
+        (mavlink.MAV_AUTOPILOT_GENERIC, mavlink.MAV_TYPE_ADSB),
+        (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_TYPE_ANTENNA_TRACKER),
+    ],
+)
+def test_who_is_no_autopilot_is_not_latched(autopilot: int, kind: int) -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        heartbeat(link, system=7, autopilot=autopilot, kind=kind)
+        assert latched(vehicle) is None
+        heartbeat(link, system=9)
+        assert latched(vehicle) == 9
+        assert link.system_id == 9
+        assert vehicle.firmware == "ardupilot"
+        vehicle.close()
+
+    run_virtual(main())
+
+
+def test_other_vehicles_and_other_components_say_nothing_about_ours() -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        heartbeat(link, system=3)
+        heartbeat(link, system=4, armed=True)
+        heartbeat(link, system=3, component=154, armed=True)
+        heartbeat(link, system=3, kind=mavlink.MAV_TYPE_GIMBAL, armed=True)
+        assert state(vehicle) is ArmState.DISARMED
+        await asyncio.sleep(1.5)
+        heartbeat(link, system=4)
+        heartbeat(link, system=3, component=154)
+        await asyncio.sleep(0.6)
+        assert state(vehicle) is ArmState.UNKNOWN
+        assert latched(vehicle) == 3
+        vehicle.close()
+
+    run_virtual(main())
+
+
+def test_only_the_configured_system_is_latched() -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link, system_id=42)
+        heartbeat(link, system=1)
+        assert latched(vehicle) is None
+        heartbeat(link, system=42, autopilot=mavlink.MAV_AUTOPILOT_PX4)
+        assert latched(vehicle) == 42
+        assert vehicle.firmware == "px4"
+        vehicle.close()
+
+    run_virtual(main())
+
+
+def test_component_1_is_preferred_and_another_is_taken_when_it_stays_silent() -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        heartbeat(link, component=50)
+        heartbeat(link, component=1)
+        assert (latched(vehicle), vehicle.component_id) == (1, 1)
+        vehicle.close()
+        alone = Vehicle(link)
+        heartbeat(link, component=50)
+        assert latched(alone) is None
+        await asyncio.sleep(2.0)
+        heartbeat(link, component=50)
+        assert (latched(alone), alone.component_id) == (1, 50)
+        alone.close()
+
+    run_virtual(main())
+
+
+def test_asks_for_what_it_needs_and_learns_version_time_and_place() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot()
+        async with aboard(autopilot) as (vehicle, _):
+            await asyncio.sleep(2.0)
+            assert autopilot.intervals[mavlink.MAVLINK_MSG_ID_HEARTBEAT] == pytest.approx(0.2)
+            assert vehicle.version == "4.8.0-dev"
+            assert vehicle.name == "ArduPilot 4.8.0-dev, system 1"
+            assert vehicle.position is not None
+            assert vehicle.position.latitude_deg == pytest.approx(40.0)
+            assert vehicle.position.height_m == pytest.approx(50.0)
+            assert vehicle.unix_time_s == pytest.approx(1_800_000_000 + autopilot.uptime_s(), abs=0.01)
+
+    run_virtual(main())
+
+
+def test_a_silent_command_server_is_asked_again_and_wedges_nothing() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot()
+        autopilot.on_message = lambda message: False
+        async with aboard(autopilot) as (vehicle, _):
+            await asyncio.sleep(8.0)
+            assert state(vehicle) is ArmState.DISARMED
+            asked = [int(m.param1) for m in autopilot.requests if m.get_type() == "COMMAND_LONG" and m.command == 511]
+            assert asked.count(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME) >= 2
+            assert len(asked) < 20
+            autopilot.on_message = lambda message: True
+            await asyncio.sleep(40.0)
+            assert vehicle.unix_time_s is not None
+
+    run_virtual(main())
+
+
+def test_position_zero_zero_is_no_position_and_gps_serves_instead() -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        heartbeat(link)
+        codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+        for message in (
+            mavlink.MAVLink_global_position_int_message(1000, 0, 0, 0, 0, 0, 0, 0, 0),
+            mavlink.MAVLink_gps_raw_int_message(1000, 2, 100000000, 200000000, 1000, 0, 0, 0, 0, 9),
+        ):
+            link.receive(message.pack(codec), 1000.0)
+        assert position(vehicle) is None
+        link.receive(
+            mavlink.MAVLink_gps_raw_int_message(1000, 3, 100000000, 200000000, 1000, 0, 0, 0, 0, 9).pack(codec), 1000.0
+        )
+        assert vehicle.position is not None
+        assert vehicle.position.source == "autopilot GPS_RAW_INT"
+        assert vehicle.position.longitude_deg == pytest.approx(20.0)
+        vehicle.close()
+
+    run_virtual(main())
+
+
+def test_a_restart_is_seen_and_its_arm_state_unknown_until_the_next_heartbeat() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot()
+        async with aboard(autopilot) as (vehicle, events):
+            await asyncio.sleep(2.0)
+            events.clear()
+            await autopilot.reboot(3.0)
+            await asyncio.sleep(3.0)
+            assert vehicle.boots == 1
+            assert events[:2] == ["lost", "found"]
+            assert "rebooted" in events
+            assert state(vehicle) is ArmState.DISARMED
+            await asyncio.sleep(3.0)
+            assert vehicle.version == "4.8.0-dev"
+
+    run_virtual(main())
+
+
+def test_a_restart_leaves_the_state_unknown() -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        heartbeat(link)
+        codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+        for boot_ms in (90_000, 200):
+            link.receive(mavlink.MAVLink_system_time_message(0, boot_ms).pack(codec), 1000.0)
+        assert vehicle.boots == 1
+        assert state(vehicle) is ArmState.UNKNOWN
+        heartbeat(link)
+        assert state(vehicle) is ArmState.DISARMED
+        vehicle.close()
+
+    run_virtual(main())
+
+
+def test_old_heartbeats_read_after_a_stall_of_our_own_prove_nothing() -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        heartbeat(link)
+        loop = asyncio.get_running_loop()
+        await asyncio.sleep(0.1)
+        loop._jumping.now_s += 5.0  # type: ignore[attr-defined]
+        heartbeat(link)  # it waited in a socket's buffer all that time
+        assert state(vehicle) is ArmState.UNKNOWN
+        await asyncio.sleep(0.05)
+        assert state(vehicle) is ArmState.UNKNOWN
+        await asyncio.sleep(0.2)
+        heartbeat(link)
+        assert state(vehicle) is ArmState.DISARMED
+        vehicle.close()
+
+    run_virtual(main())
+
+
+def feed(clock: BootClock, *points: tuple[float, float]) -> list[bool]:
+    return [clock.rebooted(boot_s, t_s) for boot_s, t_s in points]
+
+
+def test_boot_clock_time_going_back_is_a_restart() -> None:
+    assert feed(BootClock(), (100, 0), (101, 1), (0.3, 2), (1.3, 3)) == [False, False, True, False]
+
+
+def test_boot_clock_late_and_repeated_packets_are_none() -> None:
+    assert not any(feed(BootClock(), (100, 0), (100.02, 0.02), (100.01, 0.02), (100.02, 0.03), (100.03, 0.04)))
+
+
+def test_boot_clock_restart_during_a_lost_link_is_seen_although_time_has_overtaken() -> None:
+    assert feed(BootClock(), (20, 0), (30, 60), (30.6, 60.6)) == [False, False, True]
+
+
+def test_boot_clock_old_packets_after_a_stall_of_ours_are_none() -> None:
+    points = [(100, 0), (100.1, 10), (100.2, 10.01), (110.1, 10.1), (110.9, 10.9), (112, 12)]
+    assert not any(feed(BootClock(), *points))
+
+
+def test_boot_clock_32_bit_wrap_is_none() -> None:
+    wrap_s = 2**32 / 1000
+    assert not any(feed(BootClock(), (wrap_s - 1, 0), (0.2, 1.2), (1.2, 2.2)))
+
+
+def test_boot_clock_slow_simulation_and_drift_are_none() -> None:
+    assert not any(feed(BootClock(), *[(0.6 * t, t) for t in range(0, 300, 3)]))
