@@ -409,15 +409,18 @@ def test_one_warning_a_loss_and_word_when_it_is_back(path: Path, caplog: pytest.
                 pty.unplug()
                 assert "gone" in await port.state(connected=False)
                 assert "no such device" in await port.state(connected=False)
-                with plugged(path):
+                with plugged(path) as again:
                     await port.state(connected=True)
+                    again.unplug()
+                    await port.state(connected=False)
 
     asyncio.run(main())
     told = [(record.levelname, record.getMessage()) for record in caplog.records]
     assert told[0] == ("INFO", f"compass: {path} is open")
     assert told[1] == ("WARNING", f"compass: {path}: the device is gone; unplugged?")
-    assert {level for level, _ in told[2:-1]} == {"DEBUG"}
-    assert told[-1] == ("INFO", f"compass: {path} is back")
+    assert {level for level, _ in told[2:-2]} == {"DEBUG"}
+    assert told[-2] == ("INFO", f"compass: {path} is back")
+    assert told[-1] == told[1], "a new loss is news again"
 
 
 # Writing --------------------------------------------------------------------------------------------------------------
