@@ -30,7 +30,7 @@ def packet(mode: int = 0) -> bytes:
 async def until(condition: Callable[[], bool]) -> None:
     """Wait for something that real sockets bring."""
     async with asyncio.timeout(DEADLINE_S):
-        while not condition():  # noqa: ASYNC110 - the kernel sets no event
+        while not condition():
             await asyncio.sleep(0.002)
 
 
