@@ -146,7 +146,7 @@ def test_progress_comes_at_once_and_often_and_then_one_end(
             assert (progress[0], progress[-1] > 95) == (0, True)
             assert len(set(progress)) > 20
             assert acks[-1].progress == 0
-            assert b.ground.texts() == ["the figures"]
+            assert b.ground.texts() == [], "the words of the end are the service's"
 
     run_virtual(main())
 
@@ -212,7 +212,6 @@ class TestCancel:
                 b.ground.send_raw(Ground(254, 1).pack(command_message(CANCEL)))
                 await asyncio.sleep(3)
                 assert b.ground.finals(CALIBRATE) == [CANCELLED]
-                assert b.ground.texts() == ["Calibration cancelled by mavlink 254/1"]
                 accepted = [
                     m.result
                     for _, m in b.ground.received
