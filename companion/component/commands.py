@@ -25,7 +25,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.calibration.request import What
 from companion.component import requests
 from companion.component.identity import autopilot_version
-from companion.component.service import CalibrationService, Job, JobResult, Refusal
+from companion.component.service import CalibrationService, Job, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.links.mavlink import MavlinkLink
 
@@ -41,9 +41,9 @@ _REMEMBERED = 32
 _RETRY_S = 0.1
 
 _RESULTS = {
-    "done": (mavlink.MAV_RESULT_ACCEPTED, Severity.NOTICE),
-    "failed": (mavlink.MAV_RESULT_FAILED, Severity.ERROR),
-    "cancelled": (MAV_RESULT_CANCELLED, Severity.NOTICE),
+    "done": mavlink.MAV_RESULT_ACCEPTED,
+    "failed": mavlink.MAV_RESULT_FAILED,
+    "cancelled": MAV_RESULT_CANCELLED,
 }
 _REFUSALS = {
     "armed": mavlink.MAV_RESULT_DENIED,
@@ -106,7 +106,7 @@ class CommandServer:
         if running is None:
             return retry_s
         if running.job.finished.done():
-            self._finish(running, _result_of(running.job), now_s)
+            self._finish(running, now_s)
             return min(retry_s, now_s + _RETRY_S)
         if now_s >= self._next_ack_s:
             self._acknowledge_progress(running)
@@ -118,9 +118,12 @@ class CommandServer:
         for unsubscribe in self._subscriptions:
             unsubscribe()
         if self._running is not None:
-            job = self._running.job
-            result = _result_of(job) if job.finished.done() else JobResult("failed", "Failed: the companion stops")
-            self._finish(self._running, result, now_s)
+            if self._running.job.finished.done():
+                self._finish(self._running, now_s)
+            else:
+                self._say(Severity.ERROR, "Failed: the companion stops", Weight.RESULT)
+                self._finally(self._running.key, mavlink.MAV_RESULT_FAILED, now_s)
+                self._running = None
 
     def _on_message(self, message: requests.CommandMessage, now_s: float) -> None:
         if (message.target_system, message.target_component) != (self._link.system_id, self._link.component_id):
@@ -211,12 +214,20 @@ class CommandServer:
             self._say(Severity.INFO, "Nothing to cancel", Weight.NEWS)
         self._finally(key, mavlink.MAV_RESULT_ACCEPTED, now_s)
 
-    def _finish(self, running: _Running, result: JobResult, now_s: float) -> None:
+    def _finish(self, running: _Running, now_s: float) -> None:
+        """Acknowledge the end. Its words are the service's: it knows the ends of jobs that others asked for too."""
         self._running = None
-        ack, severity = _RESULTS[result.outcome]
-        if result.reason:
-            self._say(severity, result.reason, Weight.RESULT)
-        self._finally(running.key, ack, now_s)
+        finished = running.job.finished
+        if finished.cancelled():
+            outcome, words = "cancelled", "Cancelled"
+        elif (error := finished.exception()) is not None:
+            logger.error("a job ended with an error", exc_info=error)
+            outcome, words = "failed", "Failed: internal error, see the log"
+        else:
+            outcome, words = finished.result().outcome, ""
+        if words:
+            self._say(Severity.ERROR, words, Weight.RESULT)
+        self._finally(running.key, _RESULTS[outcome], now_s)
 
     def _refuse(
         self, key: requests.Key, result: int, reason: str, now_s: float, severity: Severity = Severity.WARNING
@@ -255,15 +266,3 @@ class CommandServer:
 
 def _doing(request: requests.Calibrate | requests.Undo) -> str:
     return "undoing" if isinstance(request, requests.Undo) else f"calibrating {_WORDS[request.what]}"
-
-
-def _result_of(job: Job) -> JobResult:
-    """How a finished job ended; one that was torn down without a result is cancelled or failed all the same."""
-    finished = job.finished
-    if finished.cancelled():
-        return JobResult("cancelled", "Calibration cancelled")
-    error = finished.exception()
-    if error is not None:
-        logger.error("a job ended with an error", exc_info=error)
-        return JobResult("failed", "Calibration failed: internal error, see the log")
-    return finished.result()

@@ -22,7 +22,7 @@ class Refusal(msgspec.Struct, frozen=True):
 
 
 class JobResult(msgspec.Struct, frozen=True):
-    """How a job ended; `reason` is one line for people (the figures when done), or empty to say nothing."""
+    """How a job ended; `reason` is one line for people (the figures when done)."""
 
     outcome: Literal["done", "failed", "cancelled"]
     reason: str = ""
@@ -41,7 +41,11 @@ class Job(Protocol):
 
 
 class CalibrationService(Protocol):
-    """Who calibrates. Every method returns at once: it neither waits nor computes for long."""
+    """Who calibrates. Every method returns at once: it neither waits nor computes for long.
+
+    The service itself says (`Component.say`) that a job starts, what it waits for and how it ended, as jobs are
+    asked for by others than MAVLink too. The component says refusals, which only it can tell.
+    """
 
     def start_calibration(self, what: What, requester: str) -> Job | Refusal:
         """Start measuring, or say why not."""
