@@ -50,9 +50,7 @@ def px4() -> Recording:
     """PX4 hardware, handled until 8 s, then at rest and warming up; time from the first sample on."""
     rows = read_topic(shared("px4_pyulog/sample.ulg"), "sensor_combined")
     time = rows["timestamp"].astype(np.float64) * 1e-6
-    return Recording(
-        time - time[0], rows["gyro_rad"].astype(np.float64), rows["accelerometer_m_s2"].astype(np.float64)
-    )
+    return Recording(time - time[0], rows["gyro_rad"].astype(np.float64), rows["accelerometer_m_s2"].astype(np.float64))
 
 
 def xsens_counts() -> Recording:

@@ -33,9 +33,7 @@ def coloured(rng: np.random.Generator, size: int, model: AllanModel) -> Floats:
     # Two-sided PSD B^2 / (2 pi f): the DFT of a unit-rate series has E|X|^2 = size * S(f).
     density = np.zeros_like(frequency)
     density[1:] = model.flicker**2 / (2.0 * math.pi * frequency[1:])
-    spectrum = np.sqrt(size * density / 2.0) * (
-        rng.normal(size=len(frequency)) + 1j * rng.normal(size=len(frequency))
-    )
+    spectrum = np.sqrt(size * density / 2.0) * (rng.normal(size=len(frequency)) + 1j * rng.normal(size=len(frequency)))
     return np.asarray(white + walk + np.fft.irfft(spectrum, size))
 
 
@@ -123,10 +121,7 @@ def test_allan_variance_reads_the_made_parameters_back() -> None:
     assert math.sqrt(float(one[0])) == pytest.approx(3.0, rel=0.02)
     assert math.sqrt(float(hundred[0])) == pytest.approx(0.3, rel=0.1)
     flicker = np.mean(
-        [
-            allan_variance(slots, coloured(rng, size, AllanModel(0.0, 2.0, 0.0))[:, None], 64)[0][0]
-            for _ in range(8)
-        ]
+        [allan_variance(slots, coloured(rng, size, AllanModel(0.0, 2.0, 0.0))[:, None], 64)[0][0] for _ in range(8)]
     )
     assert math.sqrt(float(flicker)) == pytest.approx(0.664 * 2.0, rel=0.05)
 
