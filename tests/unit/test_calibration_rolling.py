@@ -322,6 +322,16 @@ def test_lost_samples_are_said() -> None:
     assert "imu fc lost 5% of its samples" in collector.window(15.0).imus[0].warnings
 
 
+def test_lost_samples_are_said_without_a_counter_too() -> None:
+    feed = feeder(SILENT)
+    feed.run(12.0)
+    feed.rate_hz = RATE_HZ // 2
+    feed.run(4.0)
+    # Fourteen whole seconds at 50 Hz would be 750 samples; 3.5 of them came at half the rate.
+    warning = next(line for line in feed.collector.window(feed.now_s).imus[0].warnings if "lost" in line)
+    assert warning == "imu fc lost 12% of its samples"
+
+
 @pytest.mark.parametrize(("part", "axis"), [("gyro", 1), ("accel", 2)])
 def test_one_dead_axis_of_a_float_stream_is_refused(part: str, axis: int) -> None:
     feed = feeder()

@@ -36,7 +36,7 @@ def batches_of(means: Floats, *, spread: float = 1.0, first: int = 100, n: int =
             distinct=np.full(width, 50),
             clipped=False,
             largest_gap_s=0.01,
-            missing=0,
+            missing=None,
             temperature_degc=None,
         )
         for index, row in enumerate(means)
@@ -51,7 +51,7 @@ def window_of(source: ImuInput, batches: list[Batch], horizon_s: float = 180.0):
 def test_sigma_stat_covers_the_truth_in_white_noise(seconds: int) -> None:
     rng = np.random.default_rng(seconds)
     inside = total = 0
-    for _ in range(250):
+    for _ in range(150):
         window = window_of(imu("fc", QUIET), batches_of(rng.normal(0.0, 2.0, (seconds, 6))))
         miss = np.abs(np.array(window.gyro_rad_s + window.accel_m_s2))
         sigma = np.array(window.gyro_sigma_stat_rad_s + window.accel_sigma_stat_m_s2)
@@ -80,7 +80,7 @@ def test_sigma_use_covers_the_next_minutes(model: AllanModel) -> None:
     source = imu("fc", NoiseProfile("made", model, model))
     bias_only = AllanModel(0.0, model.flicker, model.walk)
     scaled = []
-    for _ in range(200):
+    for _ in range(120):
         bias = np.stack([coloured(rng, 4096, bias_only) for _ in range(6)], axis=1)[2000 : 2000 + seconds + horizon]
         readings = bias[:seconds] + rng.normal(0.0, model.white, (seconds, 6))
         window = window_of(source, batches_of(readings), float(horizon))
