@@ -47,8 +47,8 @@ class Batch(msgspec.Struct, frozen=True):
     """Some channel's commonest value is its extreme one: readings pile up at the end of the range."""
     largest_gap_s: float
     """Between samples, and to both ends of the slot."""
-    missing: int
-    """By the device's sequence counter; 0 where there is none."""
+    missing: int | None
+    """By the device's sequence counter or clock; None where it has neither."""
     temperature_degc: float | None
 
 
@@ -226,13 +226,13 @@ def _first_of_each(stamps: Floats, rows: Floats) -> NDArray[np.bool_]:
     return np.asarray((original == np.arange(len(stamps))) | (rows != rows[original]).any(axis=1))
 
 
-def _missing(stamps: Floats | None) -> int:
+def _missing(stamps: Floats | None) -> int | None:
     """Samples that a counter says were lost; a clock in seconds counts in its own steps just as well.
 
     The step is learned (some devices count at an internal rate), and a wrap, which goes down, is nobody's loss.
     """
-    if stamps is None or len(stamps) < 4:
-        return 0
+    if stamps is None:
+        return None
     steps = np.diff(stamps)
     steps = steps[steps > 0]
     if len(steps) == 0:

@@ -18,23 +18,25 @@ Floats = NDArray[np.float64]
 HUBER_C: Final = 1.345
 _MAD_TO_SIGMA: Final = 1.4826
 _MEAN_ABS_TO_SIGMA: Final = 1.2533
+_EQUAL: Final = 1e-6
 _ROUNDS: Final = 30
 _CONVERGED: Final = 1e-4
 """Of the scatter of one value: 0.1 % of the standard error of a mean of a hundred."""
 
 
 def _scale(residual: Floats) -> Floats:
-    """Robust sigma of every column; where most values are equal, the mean absolute deviation has to do."""
+    """Robust sigma of every column; where most values are equal but for rounding, the mean deviation has to do."""
     size = np.abs(residual)
     mad = _MAD_TO_SIGMA * np.median(size, axis=0)
-    return np.asarray(np.where(mad > 0.0, mad, _MEAN_ABS_TO_SIGMA * size.mean(axis=0)))
+    mean = _MEAN_ABS_TO_SIGMA * size.mean(axis=0)
+    return np.asarray(np.where(mad > _EQUAL * mean, mad, mean))
 
 
 def _weights(residual: Floats, scale: Floats) -> Floats:
     limit = HUBER_C * scale
     size = np.abs(residual)
     # A column of equal values has scale zero: every weight is one.
-    return np.asarray(np.where(size <= limit, 1.0, limit / np.where(size > 0.0, size, 1.0)))
+    return np.asarray(limit / np.where(size > limit, size, np.where(limit > 0.0, limit, 1.0)) + (limit == 0.0))
 
 
 def huber_mean(values: Floats) -> Floats:
@@ -85,11 +87,10 @@ def huber_line(times_s: Floats, values: Floats, end_s: float) -> Line:
     count = values.shape[0]
     time = (times_s - times_s.mean())[:, None]
     weight = np.ones_like(values)
-    # Starts from Theil-Sen-like halves, not least squares: one knock at the edge would otherwise tilt the start.
+    # Starts from the median slope of pairs half a window apart, not from least squares, which a knock at the edge
+    # would tilt; and from pairs, because then a slope that is added to the values is added to the line.
     half = count // 2
-    slope = (np.median(values[-half:], axis=0) - np.median(values[:half], axis=0)) / (
-        np.median(times_s[-half:]) - np.median(times_s[:half])
-    )
+    slope = np.median((values[-half:] - values[:half]) / (times_s[-half:] - times_s[:half])[:, None], axis=0)
     level = np.median(values - slope * time, axis=0)
     scale = _scale(values - level - slope * time)
     for _ in range(_ROUNDS):
@@ -109,8 +110,8 @@ def huber_line(times_s: Floats, values: Floats, end_s: float) -> Line:
     centre = (weight * time).sum(axis=0) / total
     spread = (weight * np.square(time - centre)).sum(axis=0)
     variance = (weight * np.square(residual)).sum(axis=0) / max(count - 2, 1)
-    # A perfect line through values that never vary has no standard error; the smallest normal number keeps 0/0 out.
-    error = np.sqrt(variance / spread) + np.finfo(np.float64).tiny
+    # A perfect line has no standard error; this keeps 0/0 out and is below anything that is measured.
+    error = np.sqrt(variance / spread) + 1e-100
     at_end = end_s - times_s.mean()
     return Line(
         end=np.asarray(level + slope * at_end),

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sized
 from typing import Final
 
 import msgspec
@@ -40,8 +41,8 @@ ACCEL_MOTION_M_S2: Final = 10.0 * MG
 
 GYRO_VIBRATION_RAD_S: Final = 1.0 * DEG
 ACCEL_VIBRATION_M_S2: Final = 50.0 * MG
-"""rms of the white part: three times the noisiest common sensor at its full rate. More is a running motor, under
-which accelerometers rectify: their mean is no bias then."""
+"""rms of everything, what is slow being gated already: three times the noisiest common sensor at its full rate. More
+is a running motor, under which accelerometers rectify: their mean is no bias then."""
 
 GLRT_RATIO: Final = 2.0
 """T over its value at rest. Noise at rest is stationary to some ten per cent; 2 is 40 % more amplitude."""
@@ -120,16 +121,28 @@ def _fault(words: str) -> Verdict:
     return Verdict(still=False, words=words, fault=True)
 
 
-def _motion(variance: Floats, white: Floats, n: int, gate: float, noise_at_rest: float) -> tuple[float, float]:
+def _motion(variance: Floats, white: Floats, n: int, gate: float, rest: tuple[float, float]) -> tuple[float, float]:
     """Rms of the slow part over the channels, and what is allowed: the gate, and chance.
 
-    The difference of the two variance estimates of white noise has a variance of about sigma^4 / n a channel. Fast
-    motion looks white in part, hence the bound of what may count as noise for this.
+    The difference of the two variance estimates of white noise has a variance of about sigma^4 / n a channel; that
+    sigma^2 is the batch's own white part within the bounds `rest`, for fast motion looks white in part.
     """
     noise = float(white.mean())
     slow = float(variance.mean()) - noise
-    chance = _CHANCE * min(noise, noise_at_rest) / math.sqrt(n * len(white)) if n >= MIN_IMU_SAMPLES else 0.0
+    least, most = rest
+    chance = _CHANCE * min(max(noise, least), most) / math.sqrt(n * len(white)) if n >= MIN_IMU_SAMPLES else 0.0
     return math.sqrt(max(slow, 0.0)), math.sqrt(gate**2 + chance)
+
+
+def _lower_quartile(freedom: int) -> float:
+    """Lower quartile of a variance estimate over the variance (Wilson and Hilferty's chi-square)."""
+    spread = 2.0 / (9.0 * freedom)
+    return (1.0 - spread - 0.6745 * math.sqrt(spread)) ** 3
+
+
+def _both(reference: Sized) -> float:
+    """Scatter of a difference of one mean and the mean of several, over that of one."""
+    return math.sqrt(1.0 + 1.0 / len(reference))
 
 
 class ImuGate:
@@ -154,6 +167,7 @@ class ImuGate:
         self._steps = np.repeat(np.asarray(steps, dtype=np.float64), 3)
         self._prior = gyro_prior_rad_s
         self._learned: deque[Floats] = deque(maxlen=_LEARN_FROM)
+        self._noise: Floats | None = None
         self._rest: Floats | None = None
         self._off_level = 0
         self.new_stretch()
@@ -200,27 +214,30 @@ class ImuGate:
         n, name = batch.n, self._name
         # What unfiltered white noise of the profile's density makes of one sample at this rate.
         floor = np.square(self._white) * n
-        sigma2 = self._sigma2(floor)
+        sigma2 = self._noise = self._sigma2(floor, n)
         variance, white = batch.variance, batch.white
         for part, triad, motion, vibration, unit, unit_name in _TRIADS:
             noise = math.sqrt(float(floor[triad][0]))
             shaking = max(vibration, 1.5 * noise)
-            rest = shaking**2 if sigma2 is None else GLRT_RATIO * float(sigma2[triad].mean())
+            rest = (0.0, shaking**2)
+            if sigma2 is not None:
+                known = float(sigma2[triad].mean())
+                rest = (known, GLRT_RATIO * known)
             # A known noisy sensor behind a low-pass looks like slow motion, hence the profile's noise here too.
             found, allowed = _motion(variance[triad], white[triad], n, max(motion, noise), rest)
             if found > allowed:
                 return _words(f"{part} {name}", found / unit, allowed / unit, unit_name)
-            found = math.sqrt(float(white[triad].mean()))
+            found = math.sqrt(float(variance[triad].mean()))
             if found > shaking:
                 return _words(f"{part} {name} shakes", found / unit, shaking / unit, unit_name)
         self._learned.append(variance)
         return None if sigma2 is None else self._likelihood(batch, sigma2)
 
-    def _sigma2(self, floor: Floats) -> Floats | None:
+    def _sigma2(self, floor: Floats, n: int) -> Floats | None:
         """Variance of one sample at rest, learned; None until there is enough to learn from."""
         if len(self._learned) < _LEARNED_ENOUGH:
             return None
-        quiet = np.quantile(np.asarray(self._learned), 0.25, axis=0)
+        quiet = np.quantile(np.asarray(self._learned), 0.25, axis=0) / _lower_quartile(n - 1)
         # A truncated reading that toggles between two steps has up to a quarter of a step squared.
         return np.asarray(np.maximum(quiet, floor + np.square(self._steps) / 4.0))
 
@@ -246,13 +263,15 @@ class ImuGate:
         found = float(np.abs(rate - level).max())
         if found > allowed:
             return _words(f"gyro {name} turns or is biased by", found / DEG, allowed / DEG, "deg/s")
-        chance = _CHANCE * np.sqrt(batch.variance / batch.n)
+        # A few samples say little about their own scatter; what was learned says more.
+        noise = batch.variance if self._noise is None else np.maximum(batch.variance, self._noise)
+        chance = _CHANCE * np.sqrt(noise / batch.n)
         if self._recent:
-            off = np.abs(rate - np.mean(self._recent, axis=0)) - chance[:3]
+            off = np.abs(rate - np.mean(self._recent, axis=0)) - chance[:3] * _both(self._recent)
             if float(off.max()) > GYRO_STEP_RAD_S:
                 return _words(f"gyro {name} moved by", float(off.max()) / DEG, GYRO_STEP_RAD_S / DEG, "deg/s")
         if self._start:
-            off = np.abs(force - np.mean(self._start, axis=0)) - chance[3:]
+            off = np.abs(force - np.mean(self._start, axis=0)) - chance[3:] * _both(self._start)
             if float(off.max()) > ACCEL_STEP_M_S2:
                 return _words(f"accel {name} tilted by", float(off.max()) / MG, ACCEL_STEP_M_S2 / MG, "mg")
         return self._off_rest(rate)
@@ -294,7 +313,7 @@ class PoseGate:
     def judge(self, batch: Batch) -> Verdict:
         """Whether this second was still for this sensor."""
         if batch.n > 1:
-            found, allowed = _motion(batch.variance, batch.white, batch.n, self._motion_deg, self._motion_deg**2)
+            found, allowed = _motion(batch.variance, batch.white, batch.n, self._motion_deg, (0.0, self._motion_deg**2))
             if found > allowed:
                 return _words(self._name, found, allowed, "deg")
         if self._start:

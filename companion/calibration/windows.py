@@ -39,6 +39,8 @@ _ALLAN_SIGNIFICANT: Final = 3.0
 """ADEV^2 at T/5 over what white noise explains: the upper 5 % point with its about four degrees of freedom."""
 _LOST_WARNING: Final = 0.01
 _LOST_REFUSAL: Final = 0.5
+_USUAL_SHARE: Final = 0.95
+"""A second that holds fewer samples than this share of the usual lost some; what is above is the grid's phase."""
 _TEMPERATURE_WARNING_K: Final = 3.0
 _MAX_DECIMALS: Final = 4
 _AXIS: Final = "xyz"
@@ -312,8 +314,16 @@ def _refuse_broken(imu: ImuInput, batches: Sequence[Batch]) -> None:
 
 
 def _lost(batches: Sequence[Batch]) -> float:
-    missing = sum(batch.missing for batch in batches)
-    return missing / (missing + sum(batch.n for batch in batches))
+    """Share of the samples that never came: by the device's counter, else against the usual number in a second."""
+    usual = float(np.median([batch.n for batch in batches]))
+    missing = came = 0.0
+    for batch in batches:
+        came += batch.n
+        if batch.missing is not None:
+            missing += batch.missing
+        elif batch.n < _USUAL_SHARE * usual:
+            missing += usual - batch.n
+    return missing / (missing + came)
 
 
 def _warnings(
