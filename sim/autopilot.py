@@ -147,6 +147,7 @@ class ArduPilotDouble:
 
     def write_as_another_station(self, name: str, value: float) -> None:
         """Another ground station sets a parameter: stored, and announced on every port."""
+        self.update_estimator(self.now_s())
         self.parameters.set(name, value)
         for member in self.parameters.family(name):
             self._parameter_server.announce(member)
@@ -237,7 +238,7 @@ class ArduPilotDouble:
         return output
 
     def update_estimator(self, loop_s: float) -> None:
-        """Bring the estimator to this time."""
+        """Bring the estimator to this time; to be called before anything changes the output."""
         error = self.residual(1, loop_s)
         self.estimator.update(self.aircraft.time_at(loop_s), error.gyro_rad_s, error.accel_m_s2)
 
@@ -311,7 +312,7 @@ class ArduPilotDouble:
             self.aircraft.begin(loop_s)
             self._booted_s = loop_s - self._up_s
             self.boots = 1
-            self.estimator.reset(self._up_s)
+            self.estimator.reset(self.aircraft.time_at(loop_s) - self._up_s)
             self._start_heartbeats(loop_s)
 
     def _boot(self, loop_s: float) -> None:
@@ -325,7 +326,7 @@ class ArduPilotDouble:
         self._boot_gyros(self.aircraft.time_at(loop_s))
         for path in self._paths:
             path.reset()
-        self.estimator.reset()
+        self.estimator.reset(self.aircraft.time_at(loop_s))
         for channel in self.channels:
             channel.streams.clear()
             channel.listing = False

@@ -151,7 +151,7 @@ class CommandServer:
             return UNSUPPORTED
         if self._double.armed:
             return FAILED
-        self._double.later(0.02, self._double.reboot)
+        self._double.later(0.2, self._double.reboot)  # after the acknowledgement is out
         return ACCEPTED
 
     def _storage(self, command: Command) -> int:
@@ -208,6 +208,7 @@ class CommandServer:
         double = self._double
         double.calibrating = True
         double.say(mavlink.MAV_SEVERITY_INFO, "Calibrating gyros")
+        double.update_estimator(command.loop_s)
         double.calibrations.clear_gyros()
         double.later(GYRO_TIME_S, lambda: self._finish_gyros(command, then_level=then_level))
 
@@ -236,5 +237,5 @@ class CommandServer:
             self._acknowledge(command, FAILED)
             return
         double.calibrations.simple_accel(t_s)
-        double.estimator.reset()
+        double.estimator.reset(t_s)
         self._acknowledge(command, ACCEPTED)

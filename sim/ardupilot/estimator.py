@@ -27,15 +27,15 @@ class CoarseEstimator:
         self.tilt_error_rad = np.zeros(2)
         """Roll, pitch."""
         self._start_error = np.zeros(3)
-        self._time_s: float | None = None
-        self.reset()
+        self._time_s = 0.0
+        self.reset(0.0)
 
-    def reset(self, up_s: float = 0.0) -> None:
-        """A boot `up_s` seconds ago."""
+    def reset(self, t_s: float) -> None:
+        """A start at this time: nothing known yet, and the vertical bias about to be mistaken."""
         self.gyro_bias_rad_s[:] = 0.0
         self.tilt_error_rad[:] = 0.0
-        self._start_error[:] = _START_ERROR_RAD_S * math.exp(-up_s / _BIAS_FADES_S)
-        self._time_s = None
+        self._start_error[:] = _START_ERROR_RAD_S
+        self._time_s = t_s
 
     def reset_gyro_bias(self) -> None:
         """What the autopilot's own gyro calibration does."""
@@ -49,15 +49,11 @@ class CoarseEstimator:
         return result
 
     def update(self, t_s: float, gyro_error: Array, accel_error: Array) -> None:
-        """Go to this time with these errors (output minus truth)."""
+        """Go to this time, the errors (output minus truth) having been these since the last update."""
         tilt = np.array([-accel_error[1], accel_error[0]]) / STANDARD_GRAVITY_M_S2
-        if self._time_s is None:
-            self.gyro_bias_rad_s[:] = gyro_error
-            self.tilt_error_rad[:] = tilt
-        else:
-            span = max(t_s - self._time_s, 0.0)
-            stays = math.exp(-span / _BIAS_FADES_S)
-            self.gyro_bias_rad_s += (1.0 - stays) * (gyro_error - self.gyro_bias_rad_s)
-            self._start_error *= stays
-            self.tilt_error_rad += (1.0 - math.exp(-span / _TILT_FADES_S)) * (tilt - self.tilt_error_rad)
+        span = max(t_s - self._time_s, 0.0)
+        stays = math.exp(-span / _BIAS_FADES_S)
+        self.gyro_bias_rad_s += (1.0 - stays) * (gyro_error - self.gyro_bias_rad_s)
+        self._start_error *= stays
+        self.tilt_error_rad += (1.0 - math.exp(-span / _TILT_FADES_S)) * (tilt - self.tilt_error_rad)
         self._time_s = t_s

@@ -58,6 +58,7 @@ class ParameterServer:
             self._error(channel, message, name, -1, PERMISSION_DENIED)
             self.announce(name)
             return
+        double.update_estimator(loop_s)
         double.parameters.set(name, value, takes_effect=not faults.echo_without_effect)
         if not self._after_write(loop_s):
             wrong = names_match(faults.wrong_echo, name)
