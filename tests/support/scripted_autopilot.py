@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import struct
 from collections.abc import AsyncIterator, Callable
 from typing import Any
@@ -129,7 +130,8 @@ class ScriptedAutopilot:
                 highres: Any = mavlink.MAVLink_highres_imu_message
                 self.send(highres(us, *floats, 8191, self.highres_id))
                 return
-            counts = [int(a * 1000 / 9.80665) for a in accel] + [int(g * 1000) for g in gyro] + [0, 0, 0]
+            values = [a * 1000 / 9.80665 for a in accel] + [g * 1000 for g in gyro] + [0.0, 0.0, 0.0]
+            counts = [int(value) if math.isfinite(value) else 0 for value in values]  # cut toward zero
             integers: Any = mavlink.mavlink_map[message_id]
             if message_id == mavlink.MAVLINK_MSG_ID_RAW_IMU:
                 self.send(integers(us, *counts, 0, self.imu_temperature_cdegc))
