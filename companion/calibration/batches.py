@@ -67,6 +67,8 @@ class BatchSource:
         self.closed_through: int | None = None
         """No batch of this slot or an earlier one will come any more."""
         self.last_s: float | None = None
+        self.restarts = 0
+        """How often the clock went back and everything was dropped."""
         self._limits = np.asarray(limits)
         self._keep = keep
         self._circle = circle
@@ -99,12 +101,11 @@ class BatchSource:
     def add(
         self, t_s: float, row: tuple[float, ...], temperature_degc: float | None = None, stamp: float | None = None
     ) -> bool:
-        """Take one sample; True when a second has ended with it."""
+        """Take one sample; True when a second has ended with it, or its clock is found to have gone back."""
         ended = False
         if not self._newest <= t_s < self._slot_end:
             if not self._newest <= t_s < _MAX_TIME_S:
-                self._from_the_past(t_s)
-                return False
+                return self._from_the_past(t_s)
             ended = self._open(math.floor(t_s))
         self._newest = t_s
         self.last_s = t_s
@@ -120,19 +121,22 @@ class BatchSource:
             self._temperature_count += 1
         return ended
 
-    def _from_the_past(self, t_s: float) -> None:
+    def _from_the_past(self, t_s: float) -> bool:
         if not math.isfinite(t_s) or abs(t_s) >= _MAX_TIME_S:
             self.dropped["no valid time"] += 1
-            return
+            return False
         self.dropped["late or out of order"] += 1
         self._backward = self._backward + 1 if t_s < self._newest - _BACKWARD_S else 0
-        if self._backward >= _BACKWARD_SAMPLES:
-            self.dropped["time went back"] += 1
-            self.batches.clear()
-            self.closed_through = math.floor(t_s)
-            self.last_s = t_s
-            self._restart()
-            self._newest = t_s
+        if self._backward < _BACKWARD_SAMPLES:
+            return False
+        self.dropped["time went back"] += 1
+        self.restarts += 1
+        self.batches.clear()
+        self.closed_through = math.floor(t_s)
+        self.last_s = t_s
+        self._restart()
+        self._newest = t_s
+        return True
 
     def _open(self, slot: int) -> bool:
         first = self._slot is None

@@ -94,8 +94,6 @@ class RollingCollector:
         self._keep = self._max_slots + _MARGIN
         self._inputs: dict[str, ImuInput] = {}
         self._imus: dict[str, Source] = {}
-        for imu in imus:
-            self.set_imu(imu)
         self._tilt = gradienter_source(self._keep) if gradienter else None
         self._heading = compass_source(self._keep) if compass else None
         self._stretch = Stretch(self._min_good, self._max_slots)
@@ -105,7 +103,10 @@ class RollingCollector:
         self._best_progress = 0.0
         self._estimated: tuple[int, list[ImuEstimate] | CalibrationRefusedError] | None = None
         self._restarted_because = ""
+        self._restarts = 0
         self.unknown_samples = 0
+        for imu in imus:
+            self.set_imu(imu)
 
     # ------------------------------------------------------------------------------------------------- samples in
 
@@ -144,6 +145,8 @@ class RollingCollector:
         known = self._imus.get(imu.name)
         if known is None:
             self._imus[imu.name] = imu_source(imu.name, gate, self._keep)
+            # It has no share in the seconds so far.
+            self._break()
         else:
             known.gate = gate
             self.reset("another stream", imu.name)
@@ -268,6 +271,11 @@ class RollingCollector:
     def _evaluate(self) -> None:
         """Judge every second that all sources have closed, or that has waited long enough for the missing ones."""
         sources = self._sources()
+        restarts = sum(source.batches.restarts for source in sources)
+        if restarts > self._restarts:
+            # Seconds that were good have lost a share.
+            self._break()
+        self._restarts = restarts
         through = [source.batches.closed_through for source in sources]
         known = [slot for slot in through if slot is not None]
         if not known:

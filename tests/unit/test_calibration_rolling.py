@@ -303,6 +303,41 @@ def test_every_clock_back_starts_again_instead_of_locking() -> None:
     assert feed.collector.window(feed.now_s).start_s >= 5.0
 
 
+def test_one_clock_back_in_the_middle_of_a_stretch_starts_again() -> None:
+    feed = feeder(None, "fc", "nose")
+    feed.run(20.0)
+    start_s = feed.now_s
+    for index in range(40):
+        t_s = start_s + index / RATE_HZ
+        for name, at in (("fc", t_s), ("nose", t_s - 500.0)):
+            feed.collector.add_imu(name, ImuSample(at, (0.001 * index, 0.0, 0.0), (0.0, 0.0, -9.8)))
+    assert feed.collector.status(start_s + 0.8).still_s == 0.0
+    with pytest.raises(CalibrationRefusedError):
+        feed.collector.window(start_s + 0.8)
+
+
+def test_an_imu_that_joins_late_starts_the_stretch_again() -> None:
+    feed = feeder()
+    feed.run(20.0)
+    feed.collector.set_imu(imu("nose"))
+    assert feed.waiting_for() == "no data from imu nose yet"
+    feed.names = ("fc", "nose")
+    feed.run(12.0)
+    window = feed.collector.window(feed.now_s)
+    assert [found.name for found in window.imus] == ["fc", "nose"]
+    assert window.start_s == 1021.0
+
+
+def test_other_targets_count_from_the_next_look_on() -> None:
+    feed = feeder(SILENT)
+    feed.run(12.0)
+    before = feed.collector.status(feed.now_s)
+    feed.collector.retarget(settings(target_gyro_sigma_rad_s=1.0, target_accel_sigma_m_s2=1.0))
+    after = feed.collector.status(feed.now_s)
+    assert (before.enough, after.enough) == (False, True)
+    assert after.still_s == before.still_s
+
+
 def test_a_long_sleep_is_a_new_stretch() -> None:
     feed = feeder()
     feed.run(20.0)
