@@ -166,7 +166,7 @@ def test_a_new_offset_begins_to_act_at_once_and_is_settled_to_1_percent_after_60
     play(scene)
 
 
-@pytest.mark.parametrize("rate_us", [4_000, 10_000])
+@pytest.mark.parametrize("rate_us", [8_000, 20_000])
 def test_noise_is_that_of_the_20_hz_filter_whatever_the_rate_and_averages_to_n2_over_t(rate_us: int) -> None:
     async def scene(double: ArduPilotDouble, station: Station) -> None:
         await station.command(SET_INTERVAL, HIGHRES, rate_us)
@@ -314,7 +314,7 @@ def test_motion_shows_in_the_telemetry_and_fast_vibration_is_filtered() -> None:
     ("vehicle", "request_us", "result", "rate_hz"),
     [
         ("copter", 20_000, 0, 50.0), ("copter", 10_000, 0, 100.0), ("copter", 5_000, 0, 200.0),
-        ("copter", 4_000, 0, 250.0), ("copter", 3_333, 0, 333.3), ("copter", 3_003, 0, 333.3),
+        ("copter", 4_000, 0, 250.0), ("copter", 3_333, 0, 333.3), ("copter", 3_900, 0, 333.3),
         ("copter", 2_500, 2, 0.0), ("copter", 1_000, 2, 0.0),
         ("plane", 25_000, 0, 40.0), ("plane", 24_390, 2, 0.0), ("plane", 30_303, 0, 33.3),
     ],
