@@ -37,6 +37,7 @@ class AutopilotImu:
         take: gets every sample that counts.
         void: called with a reason when everything taken so far is no longer valid.
         kind_changed: called when the telemetry changes its message or resolution.
+        rate_hz: asked of the autopilot.
     """
 
     def __init__(
@@ -50,6 +51,7 @@ class AutopilotImu:
         take: Callable[[ImuSample], None],
         void: Callable[[str], None],
         kind_changed: Callable[[StreamKind | None], None],
+        rate_hz: float,
     ) -> None:
         self.name, self.instance = name, instance
         self.calibration: ImuCalibration | None = None
@@ -63,7 +65,7 @@ class AutopilotImu:
         self._ours = 0
         self._stale = asyncio.Event()
         self._stale.set()
-        self.stream = ImuStream(link, vehicle, instance, self._on_sample, on_kind_change=kind_changed)
+        self.stream = ImuStream(link, vehicle, instance, self._on_sample, rate_hz=rate_hz, on_kind_change=kind_changed)
         self._unsubscribe = (parameters.watch(self._on_parameter), vehicle.watch(self._on_event))
 
     async def run(self) -> None:

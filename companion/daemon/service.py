@@ -50,10 +50,16 @@ class Service:
         config: what to run.
         link: the MAVLink connection; a test may have put it on a wire of its own.
         offload: runs a blocking call elsewhere.
+        imu_rate_hz: asked of the autopilot for each IMU; it may grant less.
     """
 
     def __init__(
-        self, config: Config, *, link: MavlinkLink | None = None, offload: Offload = asyncio.to_thread
+        self,
+        config: Config,
+        *,
+        link: MavlinkLink | None = None,
+        offload: Offload = asyncio.to_thread,
+        imu_rate_hz: float = 100.0,
     ) -> None:
         models.check_profiles(config)
         self.config = config
@@ -68,6 +74,7 @@ class Service:
             gradienter=config.gradienter is not None,
             compass=config.compass is not None,
         )
+        self._imu_rate_hz = imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
         self.sensors = self._serial_sensors()
         self.store = RecordStore(config.storage.path)
@@ -103,6 +110,7 @@ class Service:
             take=take,
             void=void,
             kind_changed=kind_changed,
+            rate_hz=self._imu_rate_hz,
         )
 
     def _serial_sensors(self) -> list[SerialSensor]:

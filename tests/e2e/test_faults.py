@@ -126,7 +126,7 @@ def test_arming_in_the_middle_of_the_write_is_reported_and_mended_once_disarmed(
             for name in left:
                 assert name in result.reason
                 assert record.imus[0].written[name].outcome == "failed"
-            assert not any(write.armed for write in rig.double.writes[2:])
+            assert len(rig.double.writes) == 2  # the arming came with the second write; there was no third
             assert rig.service.mender.pending
             refusal = rig.service.conductor.start_calibration(What.BOTH, "test")
             assert isinstance(refusal, Refusal)
@@ -318,10 +318,14 @@ def test_a_fc_only_set_up_with_a_turned_board(tmp_path: Path) -> None:
 
 def test_refusals_before_anything_starts(tmp_path: Path) -> None:
     async def main() -> None:
-        async with Rig(tmp_path).running() as rig:
+        rig = Rig(tmp_path)
+        rig.double.faults.heartbeat_off = True
+        async with rig.running():
             early = rig.service.conductor.start_calibration(What.BOTH, "test")
             assert isinstance(early, Refusal)
             assert early.kind == "unknown"
+            assert "no autopilot heard" in early.reason
+            rig.double.faults.heartbeat_off = False
             await rig.ready()
             rig.double.arm()
             await asyncio.sleep(2.0)

@@ -23,7 +23,7 @@ from tests.support.virtual_time import run_virtual
 
 CASES = 1000
 CASES_A_TEST = 25
-ACTS_S = 22.0
+ACTS_S = 14.0
 COMMANDS = (CALIBRATE, CANCEL, UNDO)
 
 
@@ -160,7 +160,8 @@ async def _one(folder: Path, seed: int) -> tuple[int, int, int]:
         min_still_s=2.0,
         max_s=3.0,
         duplicate=chance.choice((0.0, 0.0, 0.1, 0.5)),
-        loss=0.0,
+        imu_rate_hz=10.0,
+        feed_s=0.2,
         version=chance.choice(("4.8", "4.8", "4.5")),
     )
     witness = Witness(rig)
@@ -199,5 +200,5 @@ def test_interleavings(tmp_path: Path, first: int, monkeypatch: pytest.MonkeyPat
         writes, answered, done = writes + w, answered + a, done + d
     # The dice must really have been thrown: requests answered, parameters written, some calibrations done.
     assert answered > CASES_A_TEST
-    assert writes > 5 * CASES_A_TEST
+    assert writes > 3 * CASES_A_TEST
     assert done > CASES_A_TEST // 10

@@ -22,7 +22,6 @@ from sim.scenario import site_at
 from tests.support.component import Ground
 from tests.support.wire import Wire
 
-FEED_S = 0.05
 POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
 GYRO_BIAS_DEG_H = (162.234, 169.563, -98.289)
 ACCEL_BIAS_MG = (2.4125, -2.1596, 0.89809)
@@ -86,8 +85,11 @@ class Rig:
         more: str = "",
         loss: float = 0.0,
         duplicate: float = 0.0,
+        imu_rate_hz: float = 100.0,
+        feed_s: float = 0.05,
         **autopilot: Any,
     ) -> None:
+        self.imu_rate_hz, self.feed_s = imu_rate_hz, feed_s
         self.site: Site = site_at(40.0, 116.0, 50.0)
         self.aircraft = VirtualAircraft(pose, self.site)
         self.model = ImuModel(
@@ -144,7 +146,7 @@ class Rig:
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[Rig]:
         """Run everything; the daemon is stopped in order at the end."""
-        self.service = Service(self.config, link=self.link, offload=inline)
+        self.service = Service(self.config, link=self.link, offload=inline, imu_rate_hz=self.imu_rate_hz)
         tasks = [
             asyncio.create_task(coroutine)
             for coroutine in (
@@ -188,7 +190,7 @@ class Rig:
         for device in self.devices.values():
             device.power_on(self.aircraft.time_at(self.now_s))
         while True:
-            await asyncio.sleep(FEED_S)
+            await asyncio.sleep(self.feed_s)
             t_s = self.aircraft.time_at(self.now_s)
             for name, device in self.devices.items():
                 data = b"".join(frame.data for frame in device.frames_until(t_s))
