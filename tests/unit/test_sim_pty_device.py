@@ -33,7 +33,7 @@ class Port:
 
     async def wait_for(self, size: int) -> bytes:
         async with asyncio.timeout(5.0):
-            while len(self.read()) < size:  # noqa: ASYNC110 - a port has no event
+            while len(self.read()) < size:
                 await asyncio.sleep(0.005)
         return self.data
 
@@ -116,7 +116,7 @@ def test_a_reader_that_does_not_read_loses_bytes_and_stops_nobody(tmp_path: Path
         async with PtyDevice(device, tmp_path / "imu") as pty:
             port = Port(tmp_path / "imu")
             async with asyncio.timeout(5.0):
-                while pty.bytes_dropped == 0:  # noqa: ASYNC110 - as above
+                while pty.bytes_dropped == 0:
                     await asyncio.sleep(0.02)
             sent = pty.frames_sent
             await asyncio.sleep(0.05)
@@ -152,7 +152,7 @@ def test_commands_reach_the_device_and_a_muted_one_is_silent(tmp_path: Path) -> 
             await port.wait_for(22)
             os.write(port.descriptor, b"sV")
             async with asyncio.timeout(5.0):
-                while b"DPL2" not in port.read():  # noqa: ASYNC110 - as above
+                while b"DPL2" not in port.read():
                     await asyncio.sleep(0.01)
             os.write(port.descriptor, b"S")
             await port.wait_for(len(port.data) + 22)

@@ -83,11 +83,11 @@ def test_the_double_answers_over_udp_to_its_target_and_to_whoever_speaks() -> No
             if listening:
                 station.heartbeat()
             async with asyncio.timeout(5.0):
-                while not station.all(mavlink.MAVLink_heartbeat_message):  # noqa: ASYNC110 - a socket has no event
+                while not station.all(mavlink.MAVLink_heartbeat_message):
                     await asyncio.sleep(0.01)
             assert await station.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 105, 10_000) == 0
             async with asyncio.timeout(5.0):
-                while len(station.all(mavlink.MAVLink_highres_imu_message)) < 20:  # noqa: ASYNC110
+                while len(station.all(mavlink.MAVLink_highres_imu_message)) < 20:
                     await asyncio.sleep(0.01)
         finally:
             running.cancel()
@@ -117,7 +117,7 @@ def test_serving_everything_makes_the_ports_and_takes_them_away(tmp_path: Path) 
         await asyncio.wait_for(started.wait(), 5.0)
         assert sorted(path.name for path in (tmp_path / "ports").iterdir()) == ["compass", "gradienter", "imu"]
         async with asyncio.timeout(5.0):
-            while not station.all(mavlink.MAVLink_heartbeat_message):  # noqa: ASYNC110
+            while not station.all(mavlink.MAVLink_heartbeat_message):
                 await asyncio.sleep(0.01)
         serving.cancel()
         with pytest.raises(asyncio.CancelledError):

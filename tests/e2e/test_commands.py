@@ -1,0 +1,300 @@
+"""The commands as a person types them: real processes, ptys and sockets, in real time."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import stat
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from companion.calibration.record import ImuRecord, Record, WrittenParameter
+from sim.pty_device import PtyDevice
+from sim.scenario import Scenario, demo
+from sim.serve import configuration
+from sim.udp import open_udp
+
+DONE, FAILED, USAGE, NO_DAEMON = 0, 1, 2, 3
+
+
+class Said(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.out)
+
+
+async def companion(*words: str, within_s: float = 60.0) -> Said:
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "companion", *words, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
+    )
+    async with asyncio.timeout(within_s):
+        out, err = await process.communicate()
+    assert process.returncode is not None
+    return Said(process.returncode, out.decode(), err.decode())
+
+
+class FlightLine(NamedTuple):
+    scenario: Scenario
+    config: Path
+    daemon: asyncio.subprocess.Process | None
+
+
+@contextlib.asynccontextmanager
+async def flight_line(folder: Path, *, daemon: bool = True) -> AsyncIterator[FlightLine]:
+    """A virtual aircraft on ptys and UDP, its configuration, and the daemon as a process."""
+    scenario = demo(seed=25)
+    async with contextlib.AsyncExitStack() as stack:
+        scenario.aircraft.begin(asyncio.get_running_loop().time())
+        devices = (("imu", scenario.imu), ("gradienter", scenario.gradienter), ("compass", scenario.compass))
+        for name, device in devices:
+            await stack.enter_async_context(PtyDevice(device, folder / name))
+        link = await open_udp(scenario.autopilot, listen=("127.0.0.1", 0))
+        stack.callback(link.close)
+        autopilot = asyncio.create_task(scenario.autopilot.run())
+        stack.callback(autopilot.cancel)
+        text = configuration(scenario, directory=folder, udp=link.local).replace("udpin:", "udpout:")
+        text += f'[control]\nsocket = "{folder}/control.sock"\n[storage]\ndirectory = "{folder}/state"\n'
+        text += "[calibration]\nmin_still_s = 3\nmax_s = 4\n"
+        config = folder / "companion.toml"
+        config.write_text(text)
+        process = None
+        if daemon:
+            process = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "companion", "run", "--config", str(config), stderr=asyncio.subprocess.PIPE
+            )
+            stack.push_async_callback(_end, process)
+            await _until_disarmed(config)
+        yield FlightLine(scenario, config, process)
+
+
+async def _end(process: asyncio.subprocess.Process) -> None:
+    if process.returncode is None:
+        process.kill()
+    await process.communicate()
+
+
+async def _until_disarmed(config: Path) -> None:
+    for _ in range(40):
+        said = await companion("-c", str(config), "status", "--json")
+        if said.code == DONE and said.json["vehicle"]["armed"] == "disarmed":
+            return
+    raise AssertionError(f"the daemon did not come up: {said}")
+
+
+def test_a_day_at_the_flight_line(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with flight_line(tmp_path) as line:
+            config = str(line.config)
+            autopilot = line.scenario.autopilot
+            assert stat.S_IMODE((tmp_path / "control.sock").stat().st_mode) == 0o600
+            before = autopilot.parameter("INS_GYROFFS_X")
+
+            status = await companion("status", "-c", config)
+            assert status.code == DONE
+            for word in ("state: idle", "ArduPilot", "disarmed", "vectornav on", "hmr3300 on"):
+                assert word in status.out
+
+            undo = await companion("-c", config, "--json", "undo")
+            assert undo.code == FAILED
+            assert "nothing to undo" in undo.json["reason"]
+
+            done = await companion("-c", config, "calibrate", "--wait", "--timeout", "60", "--json")
+            assert done.code == DONE, done.err
+            _check_record(done.json)
+            assert "still" in done.err
+            assert autopilot.parameter("INS_GYROFFS_X") != before
+            x = done.json["imus"][0]["written"]["INS_GYROFFS_X"]
+            assert x["outcome"] == "verified"
+            assert autopilot.parameter("INS_GYROFFS_X") == x["read_back"]
+
+            shown = await companion("-c", config, "calibrate", "--wait", "--gyros")
+            assert shown.code == DONE
+            assert "DONE after" in shown.out
+            assert "INS_GYROFFS_X" in shown.out
+            assert "INS_ACCOFFS_X" not in shown.out
+
+            history = await companion("history", "-n", "5", "--json", "-c", config)
+            assert [record["state"] for record in history.json["records"]] == ["done", "done"]
+            assert history.json["records"][1] == done.json
+
+            value = autopilot.parameter("INS_GYROFFS_X")
+            begun = await companion("-c", config, "calibrate", "--json")
+            assert begun.code == DONE
+            assert begun.json["state"] == "waiting"
+            busy = await companion("-c", config, "calibrate", "--json")
+            assert busy.code == FAILED
+            assert "running" in busy.json["reason"]
+            cancelled = await companion("-c", config, "cancel", "--json")
+            assert cancelled.code == DONE
+            assert cancelled.json["state"] == "cancelled"
+            assert autopilot.parameter("INS_GYROFFS_X") == value
+            idle = await companion("-c", config, "cancel", "--json")
+            assert idle.code == DONE
+            assert "nothing was running" in idle.json["reason"]
+
+            check = await companion("-c", config, "check", "--json")
+            assert check.code == DONE, check.out
+            assert {finding["name"] for finding in check.json["findings"]} >= {
+                "configuration", "daemon", "autopilot", "fc", "own", "gradienter", "compass",
+            }  # fmt: skip
+
+            undone = await companion("-c", config, "undo", "--json")
+            assert undone.code == DONE, undone
+            assert undone.json["written"]["INS_GYROFFS_X"]["outcome"] == "rolled_back"
+
+            autopilot.faults.echo_without_effect = True
+            broken = await companion("-c", config, "calibrate", "--wait", "--json")
+            assert broken.code == FAILED
+            assert broken.json["state"] == "failed"
+            assert "INS_GYROFFS_X" in broken.json["reason"]
+            assert "does not use it" in broken.json["reason"]
+            assert broken.json["imus"][0]["written"]["INS_GYROFFS_X"]["outcome"] == "rolled_back"
+            autopilot.faults.echo_without_effect = False
+
+            autopilot.arm()
+            await asyncio.sleep(1.5)
+            armed = await companion("-c", config, "calibrate", "--wait", "--json")
+            assert armed.code == FAILED
+            assert "armed" in armed.json["reason"]
+            autopilot.disarm()
+
+            assert line.daemon is not None
+            line.daemon.send_signal(signal.SIGTERM)
+            _, log = await line.daemon.communicate()
+            assert line.daemon.returncode == DONE
+            assert b"Traceback" not in log
+            assert not (tmp_path / "control.sock").exists()
+            gone = await companion("-c", config, "status", "--json")
+            assert gone.code == NO_DAEMON
+            assert "no daemon answers" in gone.json["reason"]
+            assert gone.err.count("\n") == 1
+
+    asyncio.run(main())
+
+
+def _check_record(record: Any) -> None:
+    """Every key that others rely on is there, null where unknown."""
+    assert set(record) == set(Record.__struct_fields__)
+    assert record["state"] == "done"
+    for imu in record["imus"]:
+        assert set(imu) == set(ImuRecord.__struct_fields__)
+        assert len(imu["covariance"]) == 6
+        assert all(len(row) == 6 for row in imu["covariance"])
+        for written in imu["written"].values():
+            assert set(written) == set(WrittenParameter.__struct_fields__)
+    assert record["pose"]["theta_deg"] == pytest.approx(5.0, abs=0.02)
+    assert record["pose"]["gamma_deg"] == pytest.approx(-3.0, abs=0.02)
+    assert record["pose"]["psi_deg"] == pytest.approx(40.0, abs=3.0)
+    assert record["site"]["latitude_deg"] == pytest.approx(40.0, abs=1e-3)
+    own = next(imu for imu in record["imus"] if imu["name"] == "own")
+    assert own["residual_gyro_rad_s"] is None
+    assert own["written"] == {}
+
+
+def test_kill_9_and_a_second_daemon(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with flight_line(tmp_path) as line:
+            assert line.daemon is not None
+            second = await companion("-c", str(line.config), "run")
+            assert second.code == FAILED
+            assert "another companion is running" in second.err
+            line.daemon.kill()
+            await line.daemon.communicate()
+            assert (tmp_path / "control.sock").exists()  # stale
+            gone = await companion("-c", str(line.config), "status")
+            assert gone.code == NO_DAEMON
+            again = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "companion", "-c", str(line.config), "run", stderr=asyncio.subprocess.PIPE
+            )
+            try:
+                await _until_disarmed(line.config)
+            finally:
+                await _end(again)
+
+    asyncio.run(main())
+
+
+def test_check_without_a_daemon_says_what_is_wrong(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with flight_line(tmp_path, daemon=False) as line:
+            good = await companion("-c", str(line.config), "check")
+            assert good.code == DONE, good.out
+            assert "not running" in good.out
+            broken = line.config.with_name("broken.toml")
+            broken.write_text(line.config.read_text().replace(str(tmp_path / "compass"), str(tmp_path / "nothing")))
+            bad = await companion("-c", str(broken), "check", "--seconds", "1.5", "--json")
+            assert bad.code == FAILED
+            (finding,) = [finding for finding in bad.json["findings"] if not finding["good"]]
+            assert finding["name"] == "compass"
+            assert "nothing" in finding["words"]
+            assert "compass" in bad.json["reason"]
+
+    asyncio.run(main())
+
+
+def test_configuration_mistakes_end_with_2_and_one_line(tmp_path: Path) -> None:
+    config = tmp_path / "bad.toml"
+    config.write_text(
+        '[mavlink]\nurl = "udpin:127.0.0.1:0"\n[[imu]]\nname = "fc"\nsource = "autopilot"\nprofil = "x"\n'
+    )
+
+    async def main() -> None:
+        for command in ("run", "check", "status", "calibrate"):
+            said = await companion("-c", str(config), command)
+            assert said.code == USAGE
+            assert said.out == ""
+            assert said.err.count("\n") == 1
+            assert "bad.toml" in said.err
+            assert "imu[0].profil" in said.err
+            assert "profile" in said.err
+        missing = await companion("status", "-c", str(tmp_path / "none.toml"))
+        assert (missing.code, missing.err.count("\n")) == (USAGE, 1)
+        config.write_text(config.read_text().replace("profil =", "profile ="))
+        unknown = await companion("-c", str(config), "run")
+        assert (unknown.code, unknown.err.count("\n")) == (USAGE, 1)
+        assert "imu[0].profile" in unknown.err
+        assert "icm42688p" in unknown.err
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("words", [["fly"], ["calibrate", "--timeout", "-1"], ["history", "-n", "0"], []])
+def test_usage_errors_end_with_2(words: list[str]) -> None:
+    said = asyncio.run(companion(*words))
+    assert said.code == USAGE
+    assert "usage: companion" in said.err
+
+
+def test_ports_lists_what_the_kernel_has() -> None:
+    said = asyncio.run(companion("ports", "--json"))
+    assert said.code == DONE
+    assert isinstance(said.json["ports"], list)
+    assert asyncio.run(companion("ports")).code == DONE
+
+
+def test_the_daemon_stays_light() -> None:
+    """What must not be imported to run: each costs start-up time and memory on a small board."""
+    code = "import sys, companion.daemon.service, companion.cli.local; print(' '.join(sys.modules))"
+
+    async def main() -> bytes:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", code, stdout=asyncio.subprocess.PIPE, env={**os.environ, "PYTHONPATH": os.getcwd()}
+        )
+        out, _ = await process.communicate()
+        return out
+
+    modules = set(asyncio.run(main()).decode().split())
+    assert "companion.daemon.service" in modules
+    for heavy in ("pymavlink.mavutil", "lxml", "mavsdk", "rich", "matplotlib", "aiomqtt", "hypothesis", "sim"):
+        assert heavy not in modules, heavy
