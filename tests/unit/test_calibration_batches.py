@@ -150,13 +150,14 @@ def test_missing_samples_by_counter() -> None:
     assert source.batches[1].missing == 4
 
 
-def test_gaps_reach_to_the_ends_of_the_second() -> None:
+@pytest.mark.parametrize(("first_s", "gap_s"), [(1.7, 0.7), (1.1, 0.72), (1.3, 0.52)])
+def test_gaps_reach_to_the_ends_of_the_second(first_s: float, gap_s: float) -> None:
     source = BatchSource((1e3,), 5)
     source.add(0.9, (0.0,))
     for index in range(10):
-        source.add(1.7 + 0.02 * index, (1.0,))
+        source.add(first_s + 0.02 * index, (1.0,))
     source.close_before(2.0)
-    assert source.batches[1].largest_gap_s == pytest.approx(0.7)
+    assert source.batches[1].largest_gap_s == pytest.approx(gap_s)
 
 
 def test_a_pile_at_the_end_of_the_range_is_clipping() -> None:

@@ -174,6 +174,18 @@ def test_a_new_pose_is_a_new_stretch_though_each_second_is_still() -> None:
     assert window.imus[0].accel_m_s2 == pytest.approx((FORCE + lean[3:]).tolist(), abs=0.005)
 
 
+def test_a_steady_turn_after_a_rest_is_not_a_new_stretch() -> None:
+    feed = feeder(SILENT)
+    feed.run(20.0)
+    feed.change = lambda _name, _t, rows: rows + np.array([0.0, 0.0, 2.0 * DEG, 0.0, 0.0, 0.0])
+    for _ in range(25):
+        feed.run(1.0)
+    assert feed.still_s() == 0.0
+    line = feed.waiting_for()
+    assert line is not None
+    assert line.startswith("waiting for still: gyro fc turns by ")
+
+
 def test_the_window_is_at_most_max_s_long_and_memory_is_bounded() -> None:
     feed = feeder(settings(max_s=20.0), gradienter=True)
     feed.run(300.0)
