@@ -182,6 +182,8 @@ class ParameterClient:
         if not math.isfinite(wanted):
             raise ParameterRefusedError(f"{name}: {value} is not a number that may be written")
         other: float | None = None
+        # The last heartbeat may be older than an arming; one that was asked for just now is not.
+        await self.vehicle.fresh_heartbeat()
         with self._exchange(name) as inbox:
             for _ in range(self._tries):
                 self._require_disarmed(name)
@@ -194,6 +196,7 @@ class ParameterClient:
                     if same_float32(answer, wanted):
                         return answer
                     other = answer
+                await self.vehicle.fresh_heartbeat()
         if other is not None:
             raise ParameterMismatchError(f"{name} was set to {wanted:.9g}, {self.vehicle.name} answers {other:.9g}")
         raise ParameterTimeoutError(

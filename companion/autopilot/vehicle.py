@@ -28,6 +28,9 @@ HEARTBEAT_TIMEOUT_S: Final = 2.0
 HEARTBEAT_RATE_HZ: Final = 5.0
 """Asked of ArduPilot on our own link: a second is a long time not to know of an arming (autopilots 5.1)."""
 
+FRESH_WITHIN_S: Final = 0.3
+"""An autopilot that sends heartbeats on request does so within 20 ms of it; slow radios need more."""
+
 _TICK_S: Final = 0.5
 _STALL_S: Final = 1.0
 _ADOPT_OTHER_COMPONENT_S: Final = 2.0
@@ -127,6 +130,7 @@ class Vehicle:
         self._unix_minus_loop_s: float | None = None
         self._watchers: list[Callable[[VehicleEvent], None]] = []
         self._found = asyncio.Event()
+        self._heartbeat_waiters: list[asyncio.Event] = []
         self._boot_time_heard = asyncio.Event()
         self._wanted: list[_Wanted] = []
         self._version_asked_s, self._version_pause_s = -math.inf, 2.0
@@ -221,6 +225,24 @@ class Vehicle:
         """Wait, without limit, until the autopilot is being heard."""
         await self._found.wait()
 
+    async def fresh_heartbeat(self, within_s: float = FRESH_WITHIN_S) -> bool:
+        """Ask for a heartbeat and wait for it, so that an arming is known at once and not at the next beat.
+
+        False when none came in time (old firmware, a lossy link): then what `arm_state` says is all there is.
+        """
+        heard = asyncio.Event()
+        self._heartbeat_waiters.append(heard)
+        try:
+            heartbeat_id: int = mavlink.MAVLINK_MSG_ID_HEARTBEAT
+            self.commands.request_message(heartbeat_id)
+            async with asyncio.timeout(within_s):
+                await heard.wait()
+        except TimeoutError:
+            return False
+        finally:
+            self._heartbeat_waiters.remove(heard)
+        return True
+
     def close(self) -> None:
         """Stop listening; the arm state is UNKNOWN from here on."""
         self._closed = True
@@ -259,6 +281,8 @@ class Vehicle:
         self.system_status = message.system_status
         self._lost = False
         self._found.set()
+        for heard in self._heartbeat_waiters:
+            heard.set()
         self._watch_for_loss()
         if was_lost:
             self._ask_soon()

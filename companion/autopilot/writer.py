@@ -369,7 +369,7 @@ class ParameterWriter:
         """Whether it is disarmed; while that is unknown it is awaited, for a limited time in all."""
         loop = asyncio.get_running_loop()
         # The state may become known without an event, so there is none to wait for.
-        while self._vehicle.arm_state is ArmState.UNKNOWN and loop.time() < self._give_up_s:  # noqa: ASYNC110
+        while self._vehicle.arm_state is ArmState.UNKNOWN and loop.time() < self._give_up_s:
             await asyncio.sleep(0.1)
         return self._vehicle.arm_state is ArmState.DISARMED
 

@@ -21,6 +21,8 @@ M = TypeVar("M", bound=mavlink.MAVLink_message)
 Handler = Callable[[M, float], None]
 Unsubscribe = Callable[[], None]
 
+_COMPACT_BYTES = 4096
+
 
 class MavlinkLink:
     """One MAVLink connection as one component sees it.
@@ -32,14 +34,14 @@ class MavlinkLink:
     def __init__(self, *, system_id: int = 1, component_id: int = 191) -> None:
         self.component_id = component_id
         self.received: Counter[str] = Counter()
-        """Messages by type, plus "bad" (failed checks) and "handler error"."""
+        """Messages by type, plus "bad" (failed checks), "unknown" (not in the dialect) and "handler error"."""
         self.sent = 0
         self.dropped = 0
-        """Messages that could not be sent because no transport was attached."""
+        """Messages that could not be sent: no transport was attached, or its buffer was full."""
         self.last_received_s: float | None = None
         self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._codec.robust_parsing = True
-        self._transmit: Callable[[bytes], None] | None = None
+        self._transmit: Callable[[bytes], object] | None = None
         self._handlers: dict[str, list[Handler[mavlink.MAVLink_message]]] = {}
 
     @property
@@ -56,20 +58,24 @@ class MavlinkLink:
         """Whether a transport is attached; says nothing of a peer behind it."""
         return self._transmit is not None
 
-    def attach(self, transmit: Callable[[bytes], None] | None) -> None:
-        """Give the function that sends bytes, or None while there is none. What was half received is forgotten."""
+    def attach(self, transmit: Callable[[bytes], object] | None) -> None:
+        """Give the function that sends bytes, or None while there is none. What was half received is forgotten.
+
+        A `transmit` that returns False has dropped the bytes because its buffer is full.
+        """
         self._transmit = transmit
-        self._codec.buf = bytearray()
-        self._codec.buf_index = 0
+        self._forget_received()
 
     def send(self, message: mavlink.MAVLink_message) -> bool:
-        """Send a message now; False (and counted) when no transport is attached."""
+        """Send a message now; False (and counted) when no transport is attached or its buffer is full."""
         if self._transmit is None:
             self.dropped += 1
             return False
         data = message.pack(self._codec)
         self._codec.seq = (self._codec.seq + 1) % 256
-        self._transmit(data)
+        if self._transmit(data) is False:
+            self.dropped += 1
+            return False
         self.sent += 1
         return True
 
@@ -86,23 +92,42 @@ class MavlinkLink:
 
     def receive(self, data: bytes, t_s: float) -> None:
         """Take bytes that arrived at `t_s` (monotonic); never raises, whatever they are."""
+        message = self._next_message(data)
+        while message is not None:
+            self._dispatch(message, t_s)
+            message = self._next_message(b"")
+        # The codec frees its buffer only when a read happens to end on a frame's end; a busy serial link may not
+        # do that for hours.
+        if self._codec.buf_index > _COMPACT_BYTES:
+            del self._codec.buf[: self._codec.buf_index]
+            self._codec.buf_index = 0
+
+    def _next_message(self, data: bytes) -> mavlink.MAVLink_message | None:
         try:
-            messages = self._codec.parse_buffer(data) or ()
+            return self._codec.parse_char(data)
         except Exception:  # noqa: BLE001 - the generated parser's own faults must not reach the loop
             self.received["bad"] += 1
-            self._codec.buf = bytearray()
-            self._codec.buf_index = 0
+            self._forget_received()
+            return None
+
+    def _forget_received(self) -> None:
+        self._codec.buf = bytearray()
+        self._codec.buf_index = 0
+
+    def _dispatch(self, message: mavlink.MAVLink_message, t_s: float) -> None:
+        name = message.get_type()
+        if name == "BAD_DATA":
+            self.received["bad"] += 1
             return
-        for message in messages:
-            name = message.get_type()
-            if name == "BAD_DATA":
-                self.received["bad"] += 1
-                continue
-            self.received[name] += 1
-            self.last_received_s = t_s
-            for handler in tuple(self._handlers.get(name, ())):
-                try:
-                    handler(message, t_s)
-                except Exception:
-                    self.received["handler error"] += 1
-                    logger.exception("handling %s failed", name)
+        if isinstance(message, mavlink.MAVLink_unknown):
+            # One counter for all: noise can look like any of 16 million message ids.
+            self.received["unknown"] += 1
+            return
+        self.received[name] += 1
+        self.last_received_s = t_s
+        for handler in tuple(self._handlers.get(name, ())):
+            try:
+                handler(message, t_s)
+            except Exception:
+                self.received["handler error"] += 1
+                logger.exception("handling %s failed", name)

@@ -8,7 +8,7 @@ import math
 from typing import Final
 
 import numpy as np
-from pygeomag import GeoMag
+from pygeomag.geomag import GeoMag
 
 from companion.physics.frames import Array
 from companion.physics.units import DEG

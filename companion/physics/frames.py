@@ -66,3 +66,8 @@ def skew(vector: Array) -> Matrix:
 def wrap_deg(angle_deg: float) -> float:
     """An angle brought into [-180, 180)."""
     return (angle_deg + 180.0) % 360.0 - 180.0
+
+
+def roll_pitch_from_up(up: Array) -> tuple[float, float]:
+    """Roll gamma and pitch theta in radians of the body in whose FRD axes `up` (shape (3,)) points up."""
+    return math.atan2(-up[1], -up[2]), math.atan2(up[0], math.hypot(up[1], up[2]))

@@ -61,7 +61,7 @@ def up_in_sensor(law: Law, x_deg: float, y_deg: float) -> Array:
 
 
 def up_jacobian(law: Law, x_deg: float, y_deg: float) -> Matrix:
-    """d up / d (qx, qy), shape (3, 2), per radian of reading; analytic for each law.
+    """The Jacobian d up / d (qx, qy), shape (3, 2), per radian of reading; analytic for each law.
 
     For "axis" this is method section 2.1's d b_a / d q divided by -g, in FRD: up = (sin qy, -sin qx, -c) with
     c = sqrt(1 - sin^2 qx - sin^2 qy).
@@ -85,8 +85,3 @@ def up_jacobian(law: Law, x_deg: float, y_deg: float) -> Matrix:
     theta_by_x = -math.tan(qy) * math.sin(qx) * ct**2
     theta_by_y = math.cos(qx) / math.cos(qy) ** 2 * ct**2
     return np.column_stack([by_gamma + by_theta * theta_by_x, by_theta * theta_by_y])
-
-
-def roll_pitch_from_up(up: Array) -> tuple[float, float]:
-    """Roll gamma and pitch theta in radians of the body in whose FRD axes `up` (shape (3,)) points up."""
-    return math.atan2(-up[1], -up[2]), math.atan2(up[0], math.hypot(up[1], up[2]))

@@ -50,7 +50,8 @@ class Wire:
         copies = 2 if self._random.random() < self.duplicate else 1
         for _ in range(copies):
             due_s = loop.time() + self._random.uniform(*self.delay_s)
-            due_s = max(due_s, self._last_due_s.get(id(to), 0.0))  # a wire keeps the order
+            # A wire keeps the order; the loop runs timers of the very same instant in any order.
+            due_s = max(due_s, self._last_due_s.get(id(to), 0.0) + 1e-6)
             self._last_due_s[id(to)] = due_s
             loop.call_at(due_s, self._deliver, data, to)
 

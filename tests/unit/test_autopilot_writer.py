@@ -291,7 +291,7 @@ def test_a_cancel_puts_back_first() -> None:
         autopilot = ScriptedAutopilot(parameters=BEFORE)
         async with aboard(autopilot) as (writer, _, _):
             task = asyncio.create_task(writer.apply(CHANGES))
-            while len(autopilot.sets) < 2:  # noqa: ASYNC110
+            while len(autopilot.sets) < 2:
                 await asyncio.sleep(0.001)
             task.cancel()
             with pytest.raises(asyncio.CancelledError):

@@ -1,0 +1,264 @@
+"""One-second batches: all that is kept of a stream.
+
+Batches lie on one grid for all sources (slot k holds k <= t < k + 1 s of the host's clock), so that a slot of one
+IMU and the same slot of the gradienter speak of the same second. Samples are plain tuples until a slot is over;
+then numpy looks at them once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+MAX_SAMPLES: Final = 4096
+"""Kept of one slot; what comes beyond is dropped and counted. Ten times the fastest stream."""
+
+_MAX_TIME_S: Final = 1e12
+_BACKWARD_SAMPLES: Final = 20
+"""So many samples in a row from the past mean that the clock went back, not that some were late."""
+_BACKWARD_S: Final = 2.0
+_PINNED_SAMPLES: Final = 5
+_PINNED_DISTINCT: Final = 8
+
+
+class Batch(msgspec.Struct, frozen=True):
+    """What one source said in one second; arrays are (c,) over its channels, in the source's units."""
+
+    slot: int
+    n: int
+    first_s: float
+    last_s: float
+    mean: Floats
+    variance: Floats
+    """Of one sample, n - 1 in the denominator; zero for a single sample."""
+    white: Floats
+    """Half the mean square of successive differences (von Neumann): the part of the variance that is white."""
+    low: Floats
+    high: Floats
+    distinct: NDArray[np.int64]
+    clipped: bool
+    """Some channel's commonest value is its extreme one: readings pile up at the end of the range."""
+    largest_gap_s: float
+    """Between samples, and to both ends of the slot."""
+    missing: int | None
+    """By the device's sequence counter or clock; None where it has neither."""
+    temperature_degc: float | None
+
+
+class BatchSource:
+    """Collects one stream into batches. Never raises on what arrives; counts what it drops by reason.
+
+    Args:
+        limits: (c,) largest believable absolute value of every channel; a sample beyond is dropped.
+        keep: how many batches are kept; the oldest go first.
+        circle: the single channel is an angle in degrees on [0, 360); means are taken on the circle.
+    """
+
+    def __init__(self, limits: tuple[float, ...], keep: int, *, circle: bool = False) -> None:
+        self.dropped: Counter[str] = Counter()
+        self.batches: dict[int, Batch] = {}
+        self.closed_through: int | None = None
+        """No batch of this slot or an earlier one will come any more."""
+        self.last_s: float | None = None
+        self.restarts = 0
+        """How often the clock went back and everything was dropped."""
+        self._limits = np.asarray(limits)
+        self._keep = keep
+        self._circle = circle
+        self._restart()
+
+    def _restart(self) -> None:
+        self._slot: int | None = None
+        self._slot_start = self._slot_end = -math.inf
+        self._newest = -_MAX_TIME_S
+        self._partial = True
+        self._backward = 0
+        self._clear()
+
+    def _clear(self) -> None:
+        self._times: list[float] = []
+        self._rows: list[tuple[float, ...]] = []
+        self._stamps: list[float | None] = []
+        self._temperature_sum = 0.0
+        self._temperature_count = 0
+
+    def forget(self) -> None:
+        """Drop all batches and the second under way; what was counted stays."""
+        self.batches.clear()
+        if self._slot is not None:
+            self.closed_through = self._slot
+        # The rest of the running second may still hold what is to be forgotten, so it is skipped.
+        self._partial = True
+        self._clear()
+
+    def add(
+        self, t_s: float, row: tuple[float, ...], temperature_degc: float | None = None, stamp: float | None = None
+    ) -> bool:
+        """Take one sample; True when a second has ended with it, or its clock is found to have gone back."""
+        ended = False
+        if not self._newest <= t_s < self._slot_end:
+            if not self._newest <= t_s < _MAX_TIME_S:
+                return self._from_the_past(t_s)
+            ended = self._open(math.floor(t_s))
+        self._newest = t_s
+        self.last_s = t_s
+        self._backward = 0
+        if len(self._rows) >= MAX_SAMPLES:
+            self.dropped["too many a second"] += 1
+            return ended
+        self._times.append(t_s)
+        self._rows.append(row)
+        self._stamps.append(stamp)
+        if temperature_degc is not None and math.isfinite(temperature_degc):
+            self._temperature_sum += temperature_degc
+            self._temperature_count += 1
+        return ended
+
+    def _from_the_past(self, t_s: float) -> bool:
+        if not math.isfinite(t_s) or abs(t_s) >= _MAX_TIME_S:
+            self.dropped["no valid time"] += 1
+            return False
+        self.dropped["late or out of order"] += 1
+        self._backward = self._backward + 1 if t_s < self._newest - _BACKWARD_S else 0
+        if self._backward < _BACKWARD_SAMPLES:
+            return False
+        self.dropped["time went back"] += 1
+        self.restarts += 1
+        self.batches.clear()
+        self.closed_through = math.floor(t_s)
+        self.last_s = t_s
+        self._restart()
+        self._newest = t_s
+        return True
+
+    def _open(self, slot: int) -> bool:
+        first = self._slot is None
+        self._close()
+        self._slot = slot
+        self._slot_start, self._slot_end = float(slot), slot + 1.0
+        # A stream that has just begun did so in the middle of a second.
+        self._partial = first
+        self.closed_through = slot - 1
+        return not first
+
+    def close_before(self, t_s: float) -> bool:
+        """Close the second under way if it ended before `t_s`; True when it did."""
+        if self._slot is None or not self._slot_end <= t_s < _MAX_TIME_S:
+            return False
+        slot = math.floor(t_s)
+        self._open(slot)
+        # Whatever still comes from before is late now.
+        self._newest = max(self._newest, self._slot_start)
+        return True
+
+    def _close(self) -> None:
+        if self._slot is not None and self._rows and not self._partial:
+            batch = self._summarise(self._slot)
+            if batch is not None:
+                self.batches[batch.slot] = batch
+                while len(self.batches) > self._keep:
+                    del self.batches[next(iter(self.batches))]
+        self._clear()
+
+    def _summarise(self, slot: int) -> Batch | None:
+        rows = np.array(self._rows, dtype=np.float64)
+        times = np.array(self._times)
+        stamps = None if None in self._stamps else np.array(self._stamps, dtype=np.float64)
+        if self._circle:
+            rows = _unrolled(rows)
+        # NaN compares false, so this drops it too.
+        sound = (np.abs(rows) <= self._limits).all(axis=1)
+        if not sound.all():
+            self.dropped["not a believable number"] += int((~sound).sum())
+            rows, times = rows[sound], times[sound]
+            stamps = None if stamps is None else stamps[sound]
+        if stamps is not None:
+            fresh = _first_of_each(stamps, rows)
+            if not fresh.all():
+                self.dropped["repeated"] += int((~fresh).sum())
+                rows, times, stamps = rows[fresh], times[fresh], stamps[fresh]
+        n = len(rows)
+        if n == 0:
+            return None
+        ordered = np.sort(rows, axis=0)
+        distinct = 1 + (ordered[1:] != ordered[:-1]).sum(axis=0)
+        centre = rows.mean(axis=0)
+        gaps = np.diff(times, prepend=float(slot), append=slot + 1.0)
+        return Batch(
+            slot=slot,
+            n=n,
+            first_s=float(times[0]),
+            last_s=float(times[-1]),
+            mean=np.mod(centre, 360.0) if self._circle else centre,
+            variance=rows.var(axis=0, ddof=1) if n > 1 else np.zeros(rows.shape[1]),
+            white=np.square(np.diff(rows, axis=0)).mean(axis=0) / 2.0 if n > 1 else np.zeros(rows.shape[1]),
+            low=ordered[0],
+            high=ordered[-1],
+            distinct=np.asarray(distinct, dtype=np.int64),
+            clipped=_clipped(ordered, distinct),
+            largest_gap_s=float(gaps.max()),
+            missing=_missing(stamps),
+            temperature_degc=self._temperature_sum / self._temperature_count if self._temperature_count else None,
+        )
+
+
+def _unrolled(rows: Floats) -> Floats:
+    """Angles in degrees, continued across north from the first finite one."""
+    finite = rows[np.isfinite(rows[:, 0]), 0]
+    if len(finite) == 0:
+        return rows
+    with np.errstate(invalid="ignore"):
+        return np.asarray(finite[0] + np.mod(rows - finite[0] + 180.0, 360.0) - 180.0)
+
+
+def _first_of_each(stamps: Floats, rows: Floats) -> NDArray[np.bool_]:
+    """False for a row whose stamp and values were already seen: the same packet over a second route.
+
+    A stamp alone is not enough: counters wrap, and some devices' clocks stand still.
+    """
+    _, first, inverse = np.unique(stamps, return_index=True, return_inverse=True)
+    if len(first) == len(stamps):
+        return np.ones(len(stamps), dtype=np.bool_)
+    original = first[inverse]
+    return np.asarray((original == np.arange(len(stamps))) | (rows != rows[original]).any(axis=1))
+
+
+def _missing(stamps: Floats | None) -> int | None:
+    """Samples that a counter says were lost; a clock in seconds counts in its own steps just as well.
+
+    The step is learned (some devices count at an internal rate), and a wrap, which goes down, is nobody's loss.
+    """
+    if stamps is None:
+        return None
+    steps = np.diff(stamps)
+    steps = steps[steps > 0]
+    if len(steps) == 0:
+        return 0
+    usual = float(np.median(steps))
+    return int(np.maximum(np.rint(steps / usual) - 1.0, 0.0).sum())
+
+
+def _clipped(ordered: Floats, distinct: NDArray[np.int64]) -> bool:
+    """Whether some channel's commonest value is its lowest or its highest.
+
+    Noise thins out towards its ends; a pile at an end is the end of the range. Few distinct values prove nothing:
+    a quantised stream of a still sensor looks like that.
+    """
+    if len(ordered) <= _PINNED_SAMPLES:
+        return False
+    tail = _PINNED_SAMPLES - 1
+    suspects = np.flatnonzero(
+        (distinct >= _PINNED_DISTINCT) & ((ordered[0] == ordered[tail]) | (ordered[-1] == ordered[-1 - tail]))
+    )
+    for channel in suspects:
+        _, counts = np.unique(ordered[:, channel], return_counts=True)
+        if counts.argmax() in {0, len(counts) - 1}:
+            return True
+    return False

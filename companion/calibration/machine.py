@@ -1,0 +1,96 @@
+"""The life of one calibration, as one table.
+
+No clock, no I/O, no device is known here: whoever conducts a calibration reports events and obeys the state.
+The diagram in docs/calibration.md is generated from this table.
+"""
+
+from __future__ import annotations
+
+import enum
+from typing import Final
+
+
+class State(enum.Enum):
+    """Where a calibration stands; the values are what users see."""
+
+    IDLE = "idle"
+    WAITING = "waiting"
+    COLLECTING = "collecting"
+    SOLVING = "solving"
+    WRITING = "writing"
+    VERIFYING = "verifying"
+    DONE = "done"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+    @property
+    def busy(self) -> bool:
+        """Whether work is under way."""
+        return self not in RESTING
+
+
+class Event(enum.Enum):
+    """What can happen to it."""
+
+    REQUEST = "request"
+    UNDO = "undo"
+    STILL = "still long enough"
+    MOVED = "moved"
+    ENOUGH = "measured enough"
+    WRITE = "biases to write"
+    NOTHING_TO_WRITE = "nothing to write"
+    WRITTEN = "read back"
+    VERIFIED = "seen in the telemetry"
+    RESTORED = "old values back"
+    FAULT = "fault"
+    CANCEL = "cancel"
+
+
+RESTING: Final = (State.IDLE, State.DONE, State.FAILED, State.CANCELLED)
+
+TRANSITIONS: Final[dict[tuple[State, Event], State]] = {
+    **{(state, Event.REQUEST): State.WAITING for state in RESTING},
+    **{(state, Event.UNDO): State.WRITING for state in RESTING},
+    (State.WAITING, Event.STILL): State.COLLECTING,
+    (State.COLLECTING, Event.MOVED): State.WAITING,
+    (State.COLLECTING, Event.ENOUGH): State.SOLVING,
+    # What was measured can turn out stale (an offset changed under it): measure again.
+    (State.SOLVING, Event.MOVED): State.WAITING,
+    (State.SOLVING, Event.WRITE): State.WRITING,
+    (State.SOLVING, Event.NOTHING_TO_WRITE): State.DONE,
+    (State.WRITING, Event.WRITTEN): State.VERIFYING,
+    (State.WRITING, Event.RESTORED): State.DONE,
+    (State.VERIFYING, Event.VERIFIED): State.DONE,
+    **{(state, Event.FAULT): State.FAILED for state in State if state not in RESTING},
+    **{(state, Event.CANCEL): State.CANCELLED for state in State if state not in RESTING},
+}
+
+
+class IllegalEventError(Exception):
+    """An event that cannot happen in this state: a fault of the program, never of a device."""
+
+
+class Machine:
+    """One calibration's state."""
+
+    def __init__(self) -> None:
+        self.state = State.IDLE
+
+    def on(self, event: Event) -> State:
+        """Take an event; returns the new state.
+
+        Raises:
+            IllegalEventError: the table has no such transition.
+        """
+        try:
+            self.state = TRANSITIONS[self.state, event]
+        except KeyError:
+            raise IllegalEventError(f"{event.name} cannot happen while {self.state.value}") from None
+        return self.state
+
+
+def diagram() -> str:
+    """The table as a Mermaid state diagram."""
+    lines = ["stateDiagram-v2", "    [*] --> idle"]
+    lines += [f"    {old.value} --> {new.value}: {event.value}" for (old, event), new in TRANSITIONS.items()]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,122 @@
+"""Means and lines that one knock does not move: Huber's M-estimator over batch means.
+
+c = 1.345 keeps 95 % of the efficiency on clean data; the scale is the median absolute deviation. Works on batch
+means, never on samples: a median of quantised samples is worse than the mean (method section 2.4).
+Source: Huber, Annals of Mathematical Statistics 35 (1964) 73-101; method section 3.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+HUBER_C: Final = 1.345
+_MAD_TO_SIGMA: Final = 1.4826
+_MEAN_ABS_TO_SIGMA: Final = 1.2533
+_EQUAL: Final = 1e-6
+_ROUNDS: Final = 30
+_CONVERGED: Final = 1e-4
+"""Of the scatter of one value: 0.1 % of the standard error of a mean of a hundred."""
+
+
+def _scale(residual: Floats) -> Floats:
+    """Robust sigma of every column; where most values are equal but for rounding, the mean deviation has to do."""
+    size = np.abs(residual)
+    mad = _MAD_TO_SIGMA * np.median(size, axis=0)
+    mean = _MEAN_ABS_TO_SIGMA * size.mean(axis=0)
+    return np.asarray(np.where(mad > _EQUAL * mean, mad, mean))
+
+
+def _weights(residual: Floats, scale: Floats) -> Floats:
+    limit = HUBER_C * scale
+    size = np.abs(residual)
+    # A column of equal values has scale zero: every weight is one.
+    return np.asarray(limit / np.where(size > limit, size, np.where(limit > 0.0, limit, 1.0)) + (limit == 0.0))
+
+
+def huber_mean(values: Floats) -> Floats:
+    """Huber's location of every column.
+
+    Args:
+        values: (m, c), m >= 1.
+
+    Returns:
+        (c,) in the unit of the values.
+    """
+    centre = np.median(values, axis=0)
+    scale = _scale(values - centre)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    for _ in range(_ROUNDS):
+        residual = values - centre
+        weight = _weights(residual, scale)
+        step = (weight * residual).sum(axis=0) / weight.sum(axis=0)
+        centre = centre + step
+        if bool(np.all(np.abs(step) <= _CONVERGED * scale)):
+            break
+    return np.asarray(centre)
+
+
+class Line(msgspec.Struct, frozen=True):
+    """A robust straight line through every column."""
+
+    end: Floats
+    """(c,) value at the end of the window."""
+    slope: Floats
+    """(c,) per second."""
+    t_statistic: Floats
+    """(c,) slope over its standard error."""
+    residual: Floats
+    """(m, c) values minus line."""
+    end_leverage: Floats
+    """(c,) variance of `end` over the variance of one value: about 4/m, against 1/m for a mean."""
+
+
+def huber_line(times_s: Floats, values: Floats, end_s: float) -> Line:
+    """Huber's line through every column, evaluated at the window's end and not a second later.
+
+    Args:
+        times_s: (m,) ascending, m >= 3.
+        values: (m, c).
+        end_s: where the line is evaluated.
+    """
+    count = values.shape[0]
+    time = (times_s - times_s.mean())[:, None]
+    weight = np.ones_like(values)
+    # Starts from the median slope of pairs half a window apart, not from least squares, which a knock at the edge
+    # would tilt; and from pairs, because then a slope that is added to the values is added to the line.
+    half = count // 2
+    slope = np.median((values[-half:] - values[:half]) / (times_s[-half:] - times_s[:half])[:, None], axis=0)
+    level = np.median(values - slope * time, axis=0)
+    scale = _scale(values - level - slope * time)
+    for _ in range(_ROUNDS):
+        residual = values - level - slope * time
+        weight = _weights(residual, scale)
+        total = weight.sum(axis=0)
+        centre = (weight * time).sum(axis=0) / total
+        spread = (weight * np.square(time - centre)).sum(axis=0)
+        turn = (weight * (time - centre) * residual).sum(axis=0) / spread
+        shift = (weight * residual).sum(axis=0) / total - turn * centre
+        slope = slope + turn
+        level = level + shift
+        if bool(np.all(np.abs(shift) + np.abs(turn) * time[-1] <= _CONVERGED * scale)):
+            break
+    residual = values - level - slope * time
+    total = weight.sum(axis=0)
+    centre = (weight * time).sum(axis=0) / total
+    spread = (weight * np.square(time - centre)).sum(axis=0)
+    variance = (weight * np.square(residual)).sum(axis=0) / max(count - 2, 1)
+    # A perfect line has no standard error; this keeps 0/0 out and is below anything that is measured.
+    error = np.sqrt(variance / spread) + 1e-100
+    at_end = end_s - times_s.mean()
+    return Line(
+        end=np.asarray(level + slope * at_end),
+        slope=np.asarray(slope),
+        t_statistic=np.asarray(slope / error),
+        residual=np.asarray(residual),
+        end_leverage=np.asarray(1.0 / total + np.square(at_end - centre) / spread),
+    )

@@ -1,0 +1,374 @@
+"""The rolling collector: every stream in, one still stretch out.
+
+It knows no clock: time comes in with the samples and with `now_s`. All sources share one 1 s grid; a second counts
+when every source was still in it. Method section 3, items 2, 3 and 7.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.calibration.batches import Batch
+from companion.calibration.sources import Source, SourceStatus, compass_source, gradienter_source, imu_source
+from companion.calibration.stillness import ImuGate, Verdict
+from companion.calibration.stop import Settings, expected_s, is_enough
+from companion.calibration.stretch import Stretch
+from companion.calibration.windows import (
+    HeadingWindow,
+    ImuEstimate,
+    ImuInput,
+    ImuWindow,
+    TiltWindow,
+    Window,
+    heading_window,
+    imu_estimates,
+    tilt_window,
+)
+from companion.errors import CalibrationRefusedError
+from companion.samples import CompassSample, ImuSample, TiltSample
+
+__all__ = [
+    "HeadingWindow",
+    "ImuInput",
+    "ImuWindow",
+    "RollingCollector",
+    "Settings",
+    "SourceStatus",
+    "Status",
+    "TiltWindow",
+    "Window",
+]
+
+MIN_BATCHES: Final = 5
+"""Of a window that was asked for with `since_s`: fewer say nothing about their own scatter."""
+
+_GRACE_S: Final = 1.0
+"""So long after its end a second waits for a source that has said nothing: the latency of a busy telemetry link."""
+_CLOSE_S: Final = 0.25
+_MARGIN: Final = 8
+
+
+class Status(msgspec.Struct, frozen=True, kw_only=True):
+    """Where the collector stands."""
+
+    still_s: float
+    """Good seconds, common to all sources, of the stretch under way."""
+    waiting_for: str | None
+    """One line for people; None when still long enough and nothing is in the way."""
+    enough: bool
+    """The stop rule is met: `window` gives a result that more seconds would not better."""
+    progress: float
+    """0..1 towards `enough`; falls to 0 when the stretch breaks."""
+    sources: tuple[SourceStatus, ...]
+    restarted_because: str
+    """Argument of the last reset; empty before any."""
+
+
+class RollingCollector:
+    """Collects batches of all sources, judges stillness, and gives means of the still stretch.
+
+    Pure: no clock and no I/O. Nothing that a sample holds makes it raise; what is dropped is counted by reason.
+    Memory is bounded: `max_s` and a margin of one-second batches a source.
+
+    Args:
+        settings: how long and how good.
+        imus: in the order of the result; names are unique.
+        gradienter: whether a gradienter is expected.
+        compass: whether a compass is expected.
+
+    Raises:
+        ValueError: two IMUs of one name.
+    """
+
+    def __init__(self, settings: Settings, imus: Sequence[ImuInput], *, gradienter: bool, compass: bool) -> None:
+        if len({imu.name for imu in imus}) != len(imus):
+            raise ValueError("two IMUs have one name")
+        self._settings = settings
+        self._min_good = settings.min_slots
+        self._max_slots = settings.max_slots
+        self._keep = self._max_slots + _MARGIN
+        self._inputs: dict[str, ImuInput] = {}
+        self._imus: dict[str, Source] = {}
+        self._tilt = gradienter_source(self._keep) if gradienter else None
+        self._heading = compass_source(self._keep) if compass else None
+        self._stretch = Stretch(self._min_good, self._max_slots)
+        self._next: int | None = None
+        self._now_s = -math.inf
+        self._good: dict[int, bool] = {}
+        self._best_progress = 0.0
+        self._estimated: tuple[int, list[ImuEstimate] | CalibrationRefusedError] | None = None
+        self._restarted_because = ""
+        self._restarts = 0
+        self.unknown_samples = 0
+        for imu in imus:
+            self.set_imu(imu)
+
+    # ------------------------------------------------------------------------------------------------- samples in
+
+    def add_imu(self, name: str, sample: ImuSample) -> None:
+        """Take one sample of the IMU of that name; of an unknown name it is counted and dropped."""
+        source = self._imus.get(name)
+        if source is None:
+            self.unknown_samples += 1
+            return
+        stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
+        row = sample.gyro_rad_s + sample.accel_m_s2
+        if source.batches.add(sample.t_s, row, sample.temperature_degc, stamp):
+            self._evaluate()
+
+    def add_tilt(self, sample: TiltSample) -> None:
+        """Take one reading of the gradienter; dropped when none is expected."""
+        if self._tilt is None:
+            self.unknown_samples += 1
+        elif self._tilt.batches.add(sample.t_s, (sample.x_deg, sample.y_deg), sample.temperature_degc):
+            self._evaluate()
+
+    def add_compass(self, sample: CompassSample) -> None:
+        """Take one heading; dropped when no compass is expected."""
+        if self._heading is None:
+            self.unknown_samples += 1
+        elif self._heading.batches.add(sample.t_s, (sample.heading_deg,)):
+            self._evaluate()
+
+    # ------------------------------------------------------------------------------------------------- what changes
+
+    def set_imu(self, imu: ImuInput) -> None:
+        """Add an IMU, or say that its stream is another kind now: all that was learned of it is forgotten."""
+        self._inputs[imu.name] = imu
+        prior = None if imu.gyro_prior_rad_s is None else np.asarray(imu.gyro_prior_rad_s)
+        gate = ImuGate(imu.name, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2), prior)
+        known = self._imus.get(imu.name)
+        if known is None:
+            self._imus[imu.name] = imu_source(imu.name, gate, self._keep)
+            # It has no share in the seconds so far.
+            self._break()
+        else:
+            known.gate = gate
+            self.reset("another stream", imu.name)
+
+    def retarget(self, settings: Settings) -> None:
+        """Other targets from the next look on; the lengths (`min_still_s`, `max_s`) stay as they were."""
+        self._settings = msgspec.structs.replace(
+            self._settings,
+            target_gyro_sigma_rad_s=settings.target_gyro_sigma_rad_s,
+            target_accel_sigma_m_s2=settings.target_accel_sigma_m_s2,
+        )
+
+    def expect(self, *, gradienter: bool, compass: bool) -> None:
+        """Change which pose sensors are waited for, for example when one is found dead; the IMUs' history stays."""
+        added = (gradienter and self._tilt is None) or (compass and self._heading is None)
+        if gradienter != (self._tilt is not None):
+            self._tilt = gradienter_source(self._keep) if gradienter else None
+        if compass != (self._heading is not None):
+            self._heading = compass_source(self._keep) if compass else None
+        if added:
+            self._break()
+
+    def reset(self, why: str, imu: str | None = None) -> None:
+        """Forget what was measured, of one IMU or of everything: armed, offsets written, restarted.
+
+        The second under way is forgotten too. The stretch begins again; learned noise stays.
+        """
+        self._restarted_because = why
+        for source in self._sources():
+            if imu is None or (source.kind == "imu" and source.name == imu):
+                source.batches.forget()
+                source.verdict = Verdict(still=False)
+                if isinstance(source.gate, ImuGate):
+                    source.gate.forget_level()
+        self._break()
+
+    # ------------------------------------------------------------------------------------------------- what is known
+
+    def status(self, now_s: float) -> Status:
+        """Where it stands at `now_s` (the samples' clock); closes seconds that are over."""
+        self._advance(now_s)
+        sources = self._sources()
+        waiting = self._waiting_for(now_s)
+        enough = False
+        progress = 0.0
+        if self._stretch.begun and waiting is None:
+            estimates = self._estimates()
+            if isinstance(estimates, CalibrationRefusedError):
+                waiting = str(estimates)
+            else:
+                enough = self._stretch.full or is_enough(self._settings, estimates)
+                needed = max(expected_s(self._settings, estimates), self._stretch.good + 1)
+                progress = 1.0 if enough else self._stretch.good / needed
+        elif self._stretch.start is not None:
+            progress = min(self._stretch.good / self._max_slots, 0.99)
+        if self._stretch.start is None:
+            self._best_progress = 0.0
+        # The forecast moves with the noise seen so far; a bar that goes back and forth helps nobody.
+        self._best_progress = min(max(self._best_progress, progress), 1.0 if enough else 0.99)
+        return Status(
+            still_s=float(self._stretch.good),
+            waiting_for=waiting,
+            enough=enough,
+            progress=self._best_progress,
+            sources=tuple(source.status(now_s) for source in sources),
+            restarted_because=self._restarted_because,
+        )
+
+    def window(self, now_s: float, *, since_s: float | None = None) -> Window:
+        """Means over the still stretch that ends with the latest complete second, at most `max_s` long.
+
+        Args:
+            now_s: the samples' clock.
+            since_s: only seconds that lie wholly after this, for a look at what a write has done; then 5 good
+                seconds are enough, and `duration_s` says how many there were.
+
+        Raises:
+            CalibrationRefusedError: not still, not still for long enough, or a source fails its checks.
+        """
+        self._advance(now_s)
+        if (reason := self._obstacle(now_s)) is not None:
+            raise CalibrationRefusedError(reason)
+        slots = self._slots(since_s)
+        needed = self._min_good if since_s is None else min(MIN_BATCHES, self._min_good)
+        # A stretch that has begun may have had up to a fifth rejected since.
+        if len(slots) < needed and not (since_s is None and self._stretch.begun):
+            raise CalibrationRefusedError(f"still for {len(slots)} s only, needs {needed} s")
+        if since_s is None:
+            estimates = self._estimates()
+            if isinstance(estimates, CalibrationRefusedError):
+                raise estimates
+        else:
+            estimates = self._estimate(slots)
+        return Window(
+            start_s=float(slots[0]),
+            end_s=slots[-1] + 1.0,
+            imus=tuple(item.window for item in estimates),
+            tilt=tilt_window(self._pose_batches(self._tilt, slots)) if self._tilt else None,
+            heading=heading_window(self._pose_batches(self._heading, slots)) if self._heading else None,
+        )
+
+    # ------------------------------------------------------------------------------------------------- inside
+
+    def _sources(self) -> list[Source]:
+        return [*self._imus.values(), *(source for source in (self._tilt, self._heading) if source is not None)]
+
+    def _break(self) -> None:
+        self._stretch.clear()
+        self._good.clear()
+        self._estimated = None
+        self._best_progress = 0.0
+        for source in self._sources():
+            source.gate.new_stretch()
+
+    def _advance(self, now_s: float) -> None:
+        if math.isfinite(now_s):
+            self._now_s = now_s
+            for source in self._sources():
+                source.batches.close_before(now_s - _CLOSE_S)
+        self._evaluate()
+
+    def _evaluate(self) -> None:
+        """Judge every second that all sources have closed, or that has waited long enough for the missing ones."""
+        sources = self._sources()
+        restarts = sum(source.batches.restarts for source in sources)
+        if restarts > self._restarts:
+            # Seconds that were good have lost a share.
+            self._break()
+        self._restarts = restarts
+        through = [source.batches.closed_through for source in sources]
+        known = [slot for slot in through if slot is not None]
+        if not known:
+            return
+        ready = min(known) if len(known) == len(through) else -math.inf
+        if math.isfinite(self._now_s):
+            ready = max(ready, math.floor(self._now_s - _GRACE_S) - 1)
+        if not math.isfinite(ready):
+            return
+        last = int(ready)
+        if self._next is None or max(known) < self._next - self._keep:
+            # The beginning, or every clock went back.
+            self._break()
+            self._next = min(last, *known)
+        if last - self._next > self._keep:
+            # Nobody closed anything for so long that nothing of it is left.
+            self._break()
+            self._next = last - 1
+        for slot in range(self._next, last + 1):
+            self._judge(slot, sources)
+        self._next = max(self._next, last + 1)
+
+    def _judge(self, slot: int, sources: list[Source]) -> None:
+        # Every gate sees every second: one that is skipped learns nothing.
+        verdicts = [source.judge(slot) for source in sources]
+        good = all(verdicts)
+        if not self._stretch.add(slot, good=good):
+            self._break()
+        if not good and self._stretch.start is None:
+            return
+        self._good[slot] = good
+        while len(self._good) > self._keep:
+            del self._good[next(iter(self._good))]
+        if not good:
+            return
+        for source in sources:
+            batch = source.batches.batches.get(slot)
+            if batch is None:
+                continue
+            if isinstance(source.gate, ImuGate):
+                source.gate.accept(batch, settled=self._stretch.begun)
+            else:
+                source.gate.accept(batch)
+
+    def _obstacle(self, now_s: float) -> str | None:
+        """What is in the way right now: a silent source, or the latest second was not still."""
+        for source in self._sources():
+            if (silence := source.silence(now_s)) is not None:
+                return silence
+        if self._stretch.good_now:
+            return None
+        for source in self._sources():
+            if words := source.verdict.words:
+                return words if source.verdict.fault else f"waiting for still: {words}"
+        return f"hold still {self._min_good} s"
+
+    def _waiting_for(self, now_s: float) -> str | None:
+        obstacle = self._obstacle(now_s)
+        if obstacle is not None or self._stretch.begun:
+            return obstacle
+        return f"hold still {self._min_good - self._stretch.good} s more"
+
+    def _slots(self, since_s: float | None) -> list[int]:
+        start = self._stretch.start
+        if start is None or self._next is None:
+            return []
+        start = max(start, self._next - self._max_slots)
+        if since_s is not None:
+            start = max(start, math.ceil(since_s))
+        return [slot for slot in range(start, self._next) if self._good.get(slot, False)]
+
+    def _estimates(self) -> list[ImuEstimate] | CalibrationRefusedError:
+        """Of the whole window; computed once a second, however often it is asked for."""
+        slots = self._slots(None)
+        if self._estimated is None or self._estimated[0] != slots[-1]:
+            try:
+                self._estimated = (slots[-1], self._estimate(slots))
+            except CalibrationRefusedError as error:
+                self._estimated = (slots[-1], error)
+        return self._estimated[1]
+
+    def _estimate(self, slots: list[int]) -> list[ImuEstimate]:
+        rejected = slots[-1] - slots[0] + 1 - len(slots)
+        return imu_estimates(
+            [self._inputs[name] for name in self._imus],
+            [[source.batches.batches[slot] for slot in slots] for source in self._imus.values()],
+            end_s=slots[-1] + 1.0,
+            horizon_s=self._settings.horizon_s,
+            rejected=rejected,
+        )
+
+    def _pose_batches(self, source: Source, slots: list[int]) -> list[Batch]:
+        found = [source.batches.batches[slot] for slot in slots if slot in source.batches.batches]
+        if not found:
+            raise CalibrationRefusedError(f"no reading from {source.label} in {len(slots)} s")
+        return found

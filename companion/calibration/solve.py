@@ -1,0 +1,244 @@
+"""From the averages of one still stretch to biases with covariances.
+
+The gradienter gives the direction of up, the compass the heading, the site gravity and the Earth's rate; what each
+sensor should have read follows, and the rest is its bias. "Bias" is the effective one at this pose: a scale error
+times 1 g on the vertical axis cannot be told from a bias in one pose (method section 2.3) and is what the
+autopilot's offset has to carry here; it is not part of sigma.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Final
+
+import numpy as np
+
+from companion.calibration.bias import accelerometer_bias, attitude_error_jacobian, bias_covariance, gyro_bias
+from companion.calibration.record import Pose, PoseSigma, Site
+from companion.calibration.request import What
+from companion.calibration.rolling import HeadingWindow, ImuWindow, TiltWindow, Window
+from companion.calibration.site import LocalEarth
+from companion.errors import CalibrationRefusedError
+from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
+from companion.physics.gradienter import Law, up_in_sensor, up_jacobian
+from companion.physics.units import DEG
+
+# Without a gradienter the accelerometers level the Earth's rate; a 50 mg bias tilts it by 3 degrees (0.8 deg/h).
+LEVEL_BY_ACCELEROMETER_SIGMA_DEG: Final = 3.0
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class GradienterModel:
+    """How a gradienter's readings become the direction of up in the vehicle: law, zero offset, mounting, sigma."""
+
+    law: Law
+    vehicle_from_sensor: Matrix
+    offset_deg: tuple[float, float]
+    sigma_deg: float
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class CompassModel:
+    """How a compass reading becomes a true heading: reference, offset, mounting, sigma."""
+
+    magnetic: bool
+    vehicle_from_sensor: Matrix
+    offset_deg: float
+    sigma_deg: float
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class ImuSolution:
+    """What is left in one IMU's output: mean minus truth, in vehicle FRD, shape (3,); None where not asked for.
+
+    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of the estimate as a prediction of the next
+    minutes: sigma_use is the root of its diagonal.
+    """
+
+    name: str
+    samples: int
+    temperature_degc: float | None
+    gyro_rad_s: Array | None
+    accel_m_s2: Array | None
+    gyro_sigma_stat_rad_s: Array
+    accel_sigma_stat_m_s2: Array
+    covariance: Matrix
+    warnings: tuple[str, ...]
+
+    @property
+    def gyro_sigma_use_rad_s(self) -> Array:
+        """One sigma per axis, shape (3,)."""
+        return np.sqrt(np.diag(self.covariance)[:3])
+
+    @property
+    def accel_sigma_use_m_s2(self) -> Array:
+        """One sigma per axis, shape (3,)."""
+        return np.sqrt(np.diag(self.covariance)[3:])
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What the sensors should have read, from everything but the sensors themselves."""
+
+    up: Array
+    attitude_covariance_rad2: Matrix
+    heading_rad: float | None
+    heading_sigma_rad: float | None
+    from_gradienter: bool
+    tilt_sigma_rad: tuple[float, float]
+    """Of theta and gamma."""
+
+    @property
+    def body_from_ned(self) -> Matrix:
+        """The attitude; with an unknown heading, that of heading north."""
+        gamma, theta = roll_pitch_from_up(self.up)
+        return body_from_ned(gamma, theta, self.heading_rad or 0.0)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """The biases of all IMUs from one still stretch."""
+
+    pose: Pose
+    site: Site
+    imus: tuple[ImuSolution, ...]
+    warnings: tuple[str, ...]
+
+
+def solve(
+    window: Window,
+    local: LocalEarth,
+    gradienter: GradienterModel | None,
+    compass: CompassModel | None,
+    what: What,
+) -> Solution:
+    """Work out the biases of every IMU of the window.
+
+    Raises:
+        CalibrationRefusedError: the readings cannot be right together, or accelerometers were asked for without
+            a gradienter.
+    """
+    warnings = list(local.warnings)
+    tilted = window.tilt if gradienter is not None else None
+    accelerometers = what.accelerometers and tilted is not None
+    if what.accelerometers and tilted is None:
+        if what is What.ACCELEROMETERS:
+            raise CalibrationRefusedError(
+                "accelerometers need a gradienter: without one the tilt is unknown; configure [gradienter] or"
+                " calibrate the gyros only"
+            )
+        warnings.append("no gradienter: gyros only, accelerometers not calibrated")
+    if compass is None or window.heading is None:
+        warnings.append("no compass: the horizontal part of the Earth's rate is unknown, gyro sigma widened")
+    truth = _truth(window, gradienter if tilted is not None else None, compass, local, warnings)
+    return Solution(
+        pose=_pose(truth),
+        site=local.site,
+        imus=tuple(
+            _estimate(imu, truth, local, gyros=what.gyros, accelerometers=accelerometers) for imu in window.imus
+        ),
+        warnings=tuple(warnings),
+    )
+
+
+def _truth(
+    window: Window,
+    gradienter: GradienterModel | None,
+    compass: CompassModel | None,
+    local: LocalEarth,
+    warnings: list[str],
+) -> Truth:
+    if gradienter is not None and window.tilt is not None:
+        up, up_covariance = _up(window.tilt, gradienter)
+    else:
+        mean = np.mean([imu.accel_m_s2 for imu in window.imus], axis=0)
+        up = mean / np.linalg.norm(mean)
+        across = np.eye(3) - np.outer(up, up)
+        up_covariance = across * (LEVEL_BY_ACCELEROMETER_SIGMA_DEG * DEG) ** 2
+    if math.hypot(up[1], up[2]) < 0.1:
+        raise CalibrationRefusedError("the aircraft stands on its nose or tail (pitch beyond 84 deg): lay it down")
+    jacobian = attitude_error_jacobian(up)
+    covariance = jacobian @ up_covariance @ jacobian.T
+    gamma_variance = np.array([0.0, up[2], -up[1]]) / (up[1] ** 2 + up[2] ** 2)
+    tilt_sigma = (
+        math.sqrt(up_covariance[0, 0] / (1.0 - up[0] ** 2)),
+        math.sqrt(gamma_variance @ up_covariance @ gamma_variance),
+    )
+    heading = heading_sigma = None
+    if compass is not None and window.heading is not None:
+        heading, heading_sigma = _heading(window.heading, compass, up, local)
+        covariance = covariance + np.outer(up, up) * heading_sigma**2
+        if compass.magnetic and local.site.declination_deg is None:
+            warnings.append("declination unknown (no position or date): magnetic heading used, sigma widened")
+    return Truth(up, covariance, heading, heading_sigma, gradienter is not None, tilt_sigma)
+
+
+def _up(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix]:
+    """Up in the vehicle's axes and its covariance (3x3, radian squared)."""
+    x_deg, y_deg = tilt.x_deg - model.offset_deg[0], tilt.y_deg - model.offset_deg[1]
+    try:
+        up = model.vehicle_from_sensor @ up_in_sensor(model.law, x_deg, y_deg)
+        jacobian = model.vehicle_from_sensor @ up_jacobian(model.law, x_deg, y_deg)
+    except ValueError as error:
+        raise CalibrationRefusedError(str(error)) from None
+    variance = [(math.hypot(model.sigma_deg, sigma) * DEG) ** 2 for sigma in (tilt.x_sigma_deg, tilt.y_sigma_deg)]
+    return up, jacobian @ np.diag(variance) @ jacobian.T
+
+
+def _heading(window: HeadingWindow, compass: CompassModel, up: Array, local: LocalEarth) -> tuple[float, float]:
+    """True heading of the vehicle and its sigma, radians.
+
+    A compass gives the azimuth of its own forward axis. The azimuth that this axis has when the vehicle heads
+    north, at the tilt it has, is what the mounting adds.
+    """
+    gamma, theta = roll_pitch_from_up(up)
+    forward_ned = body_from_ned(gamma, theta, 0.0).T @ compass.vehicle_from_sensor[:, 0]
+    mounted_rad = math.atan2(forward_ned[1], forward_ned[0])
+    sigma_deg = math.hypot(compass.sigma_deg, window.sigma_deg)
+    heading_deg = window.heading_deg + compass.offset_deg
+    if compass.magnetic:
+        heading_deg += local.declination_deg
+        sigma_deg = math.hypot(sigma_deg, local.declination_sigma_deg)
+    return heading_deg * DEG - mounted_rad, sigma_deg * DEG
+
+
+def _pose(truth: Truth) -> Pose:
+    gamma, theta = roll_pitch_from_up(truth.up)
+    known, heading = truth.from_gradienter, truth.heading_rad
+    return Pose(
+        theta_deg=theta / DEG if known else None,
+        gamma_deg=gamma / DEG if known else None,
+        psi_deg=(heading / DEG) % 360.0 if heading is not None else None,
+        sigma_deg=PoseSigma(
+            theta=truth.tilt_sigma_rad[0] / DEG if known else None,
+            gamma=truth.tilt_sigma_rad[1] / DEG if known else None,
+            psi=truth.heading_sigma_rad / DEG if truth.heading_sigma_rad is not None else None,
+        ),
+    )
+
+
+def _estimate(imu: ImuWindow, truth: Truth, local: LocalEarth, *, gyros: bool, accelerometers: bool) -> ImuSolution:
+    rate = local.rate_in_body(truth.body_from_ned, heading_known=truth.heading_rad is not None)
+    covariance = bias_covariance(
+        attitude_covariance_rad2=truth.attitude_covariance_rad2,
+        up=truth.up,
+        gravity_m_s2=local.gravity_m_s2,
+        gravity_sigma_m_s2=local.gravity_sigma_m_s2,
+        earth_rate_body=rate,
+        gyro_variance=np.square(imu.gyro_sigma_use_rad_s),
+        accel_variance=np.square(imu.accel_sigma_use_m_s2),
+    )
+    return ImuSolution(
+        name=imu.name,
+        samples=imu.samples,
+        temperature_degc=imu.temperature_degc,
+        gyro_rad_s=gyro_bias(np.array(imu.gyro_rad_s), rate.mean) if gyros else None,
+        accel_m_s2=accelerometer_bias(np.array(imu.accel_m_s2), truth.up, local.gravity_m_s2)
+        if accelerometers
+        else None,
+        gyro_sigma_stat_rad_s=np.array(imu.gyro_sigma_stat_rad_s),
+        accel_sigma_stat_m_s2=np.array(imu.accel_sigma_stat_m_s2),
+        covariance=covariance,
+        warnings=imu.warnings,
+    )

@@ -1,0 +1,106 @@
+"""One stream of the collector: its batches, its gate, its last verdict, and what it tells people."""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+import msgspec
+
+from companion.calibration.batches import Batch, BatchSource
+from companion.calibration.stillness import ImuGate, PoseGate, Verdict, compass_gate, gradienter_gate
+
+Kind = Literal["imu", "gradienter", "compass"]
+
+_SILENT_S: Final = 2.5
+_CARRY: Final = 2
+"""Seconds for which a slow gradienter's or compass' last reading stands."""
+_LIMITS_IMU: Final = (1e3,) * 3 + (1e4,) * 3
+_LIMITS_TILT: Final = (180.0,) * 2
+_LIMITS_HEADING: Final = (1e3,)
+
+
+class SourceStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """One source now."""
+
+    kind: Kind
+    name: str
+    still: bool
+    words: str
+    """Why not still; empty when still."""
+    rate_hz: int
+    """Samples in its last whole second."""
+    dropped: dict[str, int]
+
+
+class Source:
+    """One stream: its batches, its gate, its last verdict."""
+
+    def __init__(self, kind: Kind, name: str, batches: BatchSource, gate: ImuGate | PoseGate) -> None:
+        self.kind = kind
+        self.name = name
+        self.batches = batches
+        self.gate = gate
+        self.verdict = Verdict(still=False)
+
+    @property
+    def label(self) -> str:
+        """As a pilot calls it."""
+        return f"imu {self.name}" if self.kind == "imu" else self.name
+
+    def batch_for(self, slot: int) -> Batch | None:
+        """The batch of that second; of a slow pose sensor the last one, for a short while."""
+        found = self.batches.batches.get(slot)
+        if found is None and self.kind != "imu":
+            for earlier in range(slot - 1, slot - _CARRY - 1, -1):
+                found = self.batches.batches.get(earlier)
+                if found is not None:
+                    break
+        return found
+
+    def judge(self, slot: int) -> bool:
+        """Whether this source was still in that second; remembers the verdict."""
+        batch = self.batch_for(slot)
+        if batch is None:
+            # Before the first whole second there is nothing to complain about.
+            words = f"{self.label} was silent for a second" if self.batches.batches else ""
+            self.verdict = Verdict(still=False, words=words, fault=True)
+        elif batch.slot == slot:
+            self.verdict = self.gate.judge(batch)
+        return self.verdict.still
+
+    def silence(self, now_s: float) -> str | None:
+        """One line when nothing comes; None when data flows."""
+        last = self.batches.last_s
+        if last is None:
+            return f"no data from {self.label} yet"
+        if now_s - last > _SILENT_S:
+            return f"no data from {self.label} for {now_s - last:.0f} s"
+        return None
+
+    def status(self, now_s: float) -> SourceStatus:
+        """What can be shown of it."""
+        silence = self.silence(now_s)
+        newest = next(reversed(self.batches.batches.values()), None)
+        return SourceStatus(
+            kind=self.kind,
+            name=self.name,
+            still=self.verdict.still and silence is None,
+            words=silence or self.verdict.words,
+            rate_hz=newest.n if newest is not None and silence is None else 0,
+            dropped=dict(self.batches.dropped),
+        )
+
+
+def imu_source(name: str, gate: ImuGate, keep: int) -> Source:
+    """A source of six channels: gyro in rad/s, accelerometer in m/s^2."""
+    return Source("imu", name, BatchSource(_LIMITS_IMU, keep), gate)
+
+
+def gradienter_source(keep: int) -> Source:
+    """A source of two channels in degrees."""
+    return Source("gradienter", "gradienter", BatchSource(_LIMITS_TILT, keep), gradienter_gate())
+
+
+def compass_source(keep: int) -> Source:
+    """A source of one heading in degrees."""
+    return Source("compass", "compass", BatchSource(_LIMITS_HEADING, keep, circle=True), compass_gate())

@@ -1,0 +1,400 @@
+"""From the batches of a still stretch to means with honest sigmas.
+
+Two sigmas a reading: `sigma_stat` is what averaging left, `sigma_use` what the next H seconds can expect of the
+sensor. Method sections 2.2, 2.4, 2.5 and 3.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.allan import (
+    FLOOR_OF_FLICKER,
+    NoiseProfile,
+    allan_variance,
+    floor_variance,
+    student_ratio,
+)
+from companion.calibration.batches import Batch
+from companion.calibration.robust import huber_line, huber_mean
+from companion.errors import CalibrationRefusedError
+from companion.physics.units import DEG_H, MG
+
+Floats = NDArray[np.float64]
+Axes = tuple[float, float, float]
+
+RAMP_T: Final = 5.0
+"""|t| of a slope that counts as one. On sensors without a ramp a lower one costs more than it saves (2.4)."""
+RAMP_BATCHES: Final = 8
+WHITE_SHARE: Final = 0.09
+"""White variance over floor variance below which more averaging buys nothing: white part 30 % of the floor."""
+_ALLAN_SPANS: Final = 5
+_ALLAN_SIGNIFICANT: Final = 3.0
+"""ADEV^2 at T/5 over what white noise explains: the upper 5 % point with its about four degrees of freedom."""
+_LOST_WARNING: Final = 0.01
+_LOST_REFUSAL: Final = 0.5
+_USUAL_SHARE: Final = 0.95
+"""A second that holds fewer samples than this share of the usual lost some; what is above is the grid's phase."""
+_TEMPERATURE_WARNING_K: Final = 3.0
+_MAX_DECIMALS: Final = 4
+_AXIS: Final = "xyz"
+
+
+class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU as the collector needs to know it."""
+
+    name: str
+    rotation: NDArray[np.float64]
+    """3x3, sensor to vehicle FRD."""
+    profile: NoiseProfile
+    gyro_step_rad_s: float = 0.0
+    """Quantisation of the stream; 0 for floats."""
+    accel_step_m_s2: float = 0.0
+    truncates: bool = False
+    """Whether the stream truncates toward zero instead of rounding."""
+    gyro_prior_rad_s: Axes | None = None
+    """Bias known from before, in the sensor's axes and of this very stream; gates a steady turn at start."""
+
+
+class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
+    """Means of one IMU over one still stretch; axes are the vehicle's FRD."""
+
+    name: str
+    samples: int
+    duration_s: float
+    """Good seconds that went into the means."""
+    gyro_rad_s: Axes
+    accel_m_s2: Axes
+    gyro_sigma_stat_rad_s: Axes
+    accel_sigma_stat_m_s2: Axes
+    gyro_sigma_use_rad_s: Axes
+    """sqrt(V(T, H)) of the sensor alone; what the pose adds comes in `solve`."""
+    accel_sigma_use_m_s2: Axes
+    temperature_degc: float | None
+    warnings: tuple[str, ...]
+
+
+class TiltWindow(msgspec.Struct, frozen=True, kw_only=True):
+    """Means of the gradienter in its own axes; sigmas are statistical."""
+
+    samples: int
+    x_deg: float
+    y_deg: float
+    x_sigma_deg: float
+    y_sigma_deg: float
+    temperature_degc: float | None
+
+
+class HeadingWindow(msgspec.Struct, frozen=True, kw_only=True):
+    """Mean on the circle of the compass' heading in [0, 360); sigma is statistical."""
+
+    samples: int
+    heading_deg: float
+    sigma_deg: float
+
+
+class Window(msgspec.Struct, frozen=True, kw_only=True):
+    """One still stretch: everything that a calibration is computed from."""
+
+    start_s: float
+    end_s: float
+    imus: tuple[ImuWindow, ...]
+    tilt: TiltWindow | None
+    heading: HeadingWindow | None
+
+
+class Estimate(msgspec.Struct, frozen=True, kw_only=True):
+    """One triad in the sensor's own axes; arrays are (3,)."""
+
+    mean: Floats
+    stat_variance: Floats
+    use_variance: Floats
+    white_variance: Floats
+    """The part of `use_variance` that more seconds take away."""
+    white: Floats
+    """N in force: measured, or the profile's where that is larger."""
+    flicker: Floats
+    walk: Floats
+    ramp_per_s: Floats
+    """Zero where no ramp is significant."""
+    half_step: NDArray[np.bool_]
+
+
+class ImuEstimate(msgspec.Struct, frozen=True, kw_only=True):
+    """Both triads of one IMU, and its window."""
+
+    gyro: Estimate
+    accel: Estimate
+    window: ImuWindow
+
+
+def white_noise(slots: NDArray[np.int64], values: Floats) -> Floats:
+    """N of every column from the Allan deviation between neighbouring seconds, widened for few degrees of freedom.
+
+    Falls back on the scatter of the means where no two seconds are neighbours (a gradienter slower than 1 Hz).
+    """
+    variance, freedom = allan_variance(slots, values, 1)
+    if freedom == 0.0:
+        freedom = float(len(values) - 1)
+        variance = values.var(axis=0, ddof=1) if len(values) > 1 else np.zeros(values.shape[1])
+    return np.asarray(np.sqrt(variance) * student_ratio(freedom))
+
+
+def estimates(
+    imus: Sequence[ImuInput], batches: Sequence[Sequence[Batch]], *, end_s: float, horizon_s: float
+) -> list[tuple[Estimate, Estimate]]:
+    """Gyro and accelerometer of every IMU over the same good seconds, each in its sensor's axes.
+
+    All columns of all IMUs go through each step at once: numpy's cost is by the call, not by the column.
+
+    Args:
+        imus: their noise and their steps.
+        batches: for every IMU its good batches, ascending, of the same at least 2 slots.
+        end_s: end of the window; a ramp is evaluated here and never later.
+        horizon_s: H of V(T, H).
+    """
+    gyros, accels = [imu.profile.gyro for imu in imus], [imu.profile.accel for imu in imus]
+    slots = np.array([batch.slot for batch in batches[0]], dtype=np.int64)
+    values = _columns([[batch.mean for batch in item] for item in batches])
+    seconds = float(len(slots))
+    mean = huber_mean(values)
+    leverage = np.full(values.shape[1], 1.0 / seconds)
+    slope = np.zeros(values.shape[1])
+    level: Floats = values
+    if len(values) >= RAMP_BATCHES:
+        times = slots.astype(np.float64) + 0.5
+        line = huber_line(times, values, end_s)
+        ramps = np.abs(line.t_statistic) > RAMP_T
+        mean = np.where(ramps, line.end, mean)
+        leverage = np.where(ramps, line.end_leverage, leverage)
+        slope = np.where(ramps, line.slope, 0.0)
+        level = values - slope * (times - times.mean())[:, None]
+    measured = white_noise(slots, level)
+    white = np.maximum(measured, _per_axis([m.white for m in gyros], [m.white for m in accels]))
+    flicker = _flicker(slots, level, measured, _per_axis([m.flicker for m in gyros], [m.flicker for m in accels]))
+    walk = _per_axis([m.walk for m in gyros], [m.walk for m in accels])
+    quantum, half_step = _quantisation(
+        batches,
+        _per_axis([imu.gyro_step_rad_s for imu in imus], [imu.accel_step_m_s2 for imu in imus]),
+        np.repeat([imu.truncates for imu in imus], 6),
+    )
+    # Where a ramp is seen, the next H seconds lie between "it ends now" and "it goes on": the mean over them is off
+    # by anything from nothing to slope * H / 2.
+    going_on = np.square(slope * horizon_s / 2.0) / 3.0
+    stat = np.square(measured) * leverage + np.square(quantum)
+    white_part = np.square(white) * leverage
+    use = white_part + floor_variance(flicker, walk, seconds, horizon_s) + np.square(quantum) + going_on
+
+    def triad(part: slice) -> Estimate:
+        return Estimate(
+            mean=mean[part],
+            stat_variance=stat[part],
+            use_variance=use[part],
+            white_variance=white_part[part],
+            white=white[part],
+            flicker=flicker[part],
+            walk=walk[part],
+            ramp_per_s=slope[part],
+            half_step=half_step[part],
+        )
+
+    return [(triad(slice(at, at + 3)), triad(slice(at + 3, at + 6))) for at in range(0, 6 * len(imus), 6)]
+
+
+def _columns(values: list[list[Floats]]) -> Floats:
+    """(imus, seconds, 6) as (seconds, 6 * imus)."""
+    stacked = np.array(values)
+    return np.asarray(stacked.transpose(1, 0, 2).reshape(stacked.shape[1], -1))
+
+
+def _per_axis(gyro: Sequence[float], accel: Sequence[float]) -> Floats:
+    """One figure a triad and IMU as one a column."""
+    return np.repeat(np.array([gyro, accel], dtype=np.float64).T.ravel(), 3)
+
+
+def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: Floats) -> Floats:
+    """B of every column: the profile's, or what the Allan deviation at T/5 says more than it and white noise."""
+    span = int(slots[-1] - slots[0] + 1) // _ALLAN_SPANS
+    if span < 2:
+        return profile
+    variance, _ = allan_variance(slots, values, span)
+    explained = np.square(white) / span
+    more = np.where(variance > _ALLAN_SIGNIFICANT * explained, variance - explained, 0.0)
+    return np.maximum(np.sqrt(more) / FLOOR_OF_FLICKER, profile)
+
+
+def _quantisation(
+    batches: Sequence[Sequence[Batch]], steps: Floats, truncates: NDArray[np.bool_]
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """What the reading's steps may hide, as one sigma a column, and where there are fewer than 3 distinct values.
+
+    Half a step for truncation and for fewer than 3 distinct values; else, for rounding, the bound that noise of
+    sigma leaves, (q / pi) exp(-2 pi^2 sigma^2 / q^2) (method sections 2.2 and 2.5).
+    """
+    low = _columns([[batch.low for batch in item] for item in batches]).min(axis=0)
+    high = _columns([[batch.high for batch in item] for item in batches]).max(axis=0)
+    distinct = np.array([[batch.distinct for batch in item] for item in batches]).max(axis=1).ravel()
+    known = steps > 0.0
+    few = np.where(known, high - low < 1.5 * steps, distinct < 3)
+    # A stream of floats may carry coarse steps all the same: then the step is what lies between its two values.
+    half = np.where(known, steps, high - low) / 2.0
+    variance = _columns([[batch.variance for batch in item] for item in batches]).mean(axis=0)
+    divisor = np.where(known, steps, 1.0)
+    bound = steps / math.pi * np.exp(-2.0 * math.pi**2 * variance / np.square(divisor))
+    return np.where(few | (truncates & known), half, bound), few
+
+
+def imu_estimates(
+    imus: Sequence[ImuInput], batches: Sequence[Sequence[Batch]], *, end_s: float, horizon_s: float, rejected: int
+) -> list[ImuEstimate]:
+    """The windows of all IMUs from their good batches, which are of the same seconds.
+
+    Raises:
+        CalibrationRefusedError: an axis never changes, or most samples were lost.
+    """
+    if not imus:
+        return []
+    for imu, own in zip(imus, batches, strict=True):
+        _refuse_broken(imu, own)
+    triads = estimates(imus, batches, end_s=end_s, horizon_s=horizon_s)
+    return [
+        _imu_estimate(imu, own, gyro, accel, rejected)
+        for imu, own, (gyro, accel) in zip(imus, batches, triads, strict=True)
+    ]
+
+
+def _imu_estimate(
+    imu: ImuInput, batches: Sequence[Batch], gyro: Estimate, accel: Estimate, rejected: int
+) -> ImuEstimate:
+    temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
+    rotation = np.asarray(imu.rotation, dtype=np.float64)
+    window = ImuWindow(
+        name=imu.name,
+        samples=sum(batch.n for batch in batches),
+        duration_s=float(len(batches)),
+        gyro_rad_s=_axes(rotation @ gyro.mean),
+        accel_m_s2=_axes(rotation @ accel.mean),
+        gyro_sigma_stat_rad_s=_turned(rotation, gyro.stat_variance),
+        accel_sigma_stat_m_s2=_turned(rotation, accel.stat_variance),
+        gyro_sigma_use_rad_s=_turned(rotation, gyro.use_variance),
+        accel_sigma_use_m_s2=_turned(rotation, accel.use_variance),
+        temperature_degc=float(np.mean(temperatures)) if temperatures else None,
+        warnings=tuple(_warnings(imu, batches, gyro, accel, temperatures, rejected)),
+    )
+    return ImuEstimate(gyro=gyro, accel=accel, window=window)
+
+
+def _axes(values: Floats) -> Axes:
+    return float(values[0]), float(values[1]), float(values[2])
+
+
+def _turned(rotation: Floats, variance: Floats) -> Axes:
+    """Sigmas of independent axes after a rotation."""
+    return _axes(np.sqrt(np.square(rotation) @ variance))
+
+
+def _refuse_broken(imu: ImuInput, batches: Sequence[Batch]) -> None:
+    low = np.min([batch.low for batch in batches], axis=0)
+    high = np.max([batch.high for batch in batches], axis=0)
+    for triad, part, step in ((0, "gyro", imu.gyro_step_rad_s), (3, "accel", imu.accel_step_m_s2)):
+        for axis in range(3):
+            if step == 0.0 and low[triad + axis] == high[triad + axis]:
+                raise CalibrationRefusedError(
+                    f"{part} {imu.name} is stuck: axis {_AXIS[axis]} did not change in {len(batches)} s"
+                )
+    lost = _lost(batches)
+    if lost > _LOST_REFUSAL:
+        raise CalibrationRefusedError(f"imu {imu.name} lost {lost:.0%} of its samples, more than {_LOST_REFUSAL:.0%}")
+
+
+def _lost(batches: Sequence[Batch]) -> float:
+    """Share of the samples that never came: by the device's counter, else against the usual number in a second."""
+    usual = float(np.median([batch.n for batch in batches]))
+    missing = came = 0.0
+    for batch in batches:
+        came += batch.n
+        if batch.missing is not None:
+            missing += batch.missing
+        elif batch.n < _USUAL_SHARE * usual:
+            missing += usual - batch.n
+    return missing / (missing + came)
+
+
+def _warnings(
+    imu: ImuInput,
+    batches: Sequence[Batch],
+    gyro: Estimate,
+    accel: Estimate,
+    temperatures: list[float],
+    rejected: int,
+) -> list[str]:
+    found: list[str] = []
+    if gyro.ramp_per_s.any():
+        rate = float(np.abs(gyro.ramp_per_s).max()) / DEG_H
+        found.append(f"warm-up: gyro {imu.name} drifts {rate:.1f} deg/h per second")
+    if accel.ramp_per_s.any():
+        rate = float(np.abs(accel.ramp_per_s).max()) / MG * 60.0
+        found.append(f"warm-up: accel {imu.name} drifts {rate:.2f} mg per minute")
+    for part, triad in (("gyro", gyro), ("accel", accel)):
+        axes = "".join(_AXIS[axis] for axis in range(3) if triad.half_step[axis])
+        if axes:
+            found.append(f"{part} {imu.name} {axes}: fewer than 3 distinct readings, half a step may be hidden")
+    if imu.truncates:
+        found.append(f"imu {imu.name} sends truncated integers: half a step added to its sigmas")
+    if (lost := _lost(batches)) > _LOST_WARNING:
+        found.append(f"imu {imu.name} lost {lost:.0%} of its samples")
+    if rejected:
+        found.append(f"{rejected} of {rejected + len(batches)} s were not still and are left out")
+    if temperatures and (span := max(temperatures) - min(temperatures)) > _TEMPERATURE_WARNING_K:
+        found.append(f"temperature of imu {imu.name} moved by {span:.1f} K")
+    return found
+
+
+def tilt_window(batches: Sequence[Batch]) -> TiltWindow:
+    """The gradienter's window from its good batches, at least one."""
+    mean, sigma = _pose_mean(batches, np.array([batch.mean for batch in batches]))
+    temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
+    return TiltWindow(
+        samples=sum(batch.n for batch in batches),
+        x_deg=float(mean[0]),
+        y_deg=float(mean[1]),
+        x_sigma_deg=float(sigma[0]),
+        y_sigma_deg=float(sigma[1]),
+        temperature_degc=float(np.mean(temperatures)) if temperatures else None,
+    )
+
+
+def heading_window(batches: Sequence[Batch]) -> HeadingWindow:
+    """The compass' window from its good batches, at least one."""
+    first = batches[0].mean
+    turned = np.array([np.mod(batch.mean - first + 180.0, 360.0) - 180.0 for batch in batches])
+    mean, sigma = _pose_mean(batches, turned)
+    return HeadingWindow(
+        samples=sum(batch.n for batch in batches),
+        heading_deg=float(np.mod(mean[0] + first[0], 360.0)),
+        sigma_deg=float(sigma[0]),
+    )
+
+
+def _pose_mean(batches: Sequence[Batch], values: Floats) -> tuple[Floats, Floats]:
+    slots = np.array([batch.slot for batch in batches], dtype=np.int64)
+    variance = np.square(white_noise(slots, values)) / len(values) + np.square(_resolution(batches)) / 12.0
+    return huber_mean(values), np.asarray(np.sqrt(variance))
+
+
+def _resolution(batches: Sequence[Batch]) -> Floats:
+    """Step of a reading that shows fewer than 3 values: their distance, or that of the last decimal it prints."""
+    low = np.min([batch.low for batch in batches], axis=0)
+    high = np.max([batch.high for batch in batches], axis=0)
+    few = np.max([batch.distinct for batch in batches], axis=0) < 3
+    decimal = np.full(len(low), 10.0**-_MAX_DECIMALS)
+    for digits in range(_MAX_DECIMALS - 1, -1, -1):
+        prints = (np.abs(low - np.round(low, digits)) < 1e-9) & (np.abs(high - np.round(high, digits)) < 1e-9)
+        decimal = np.where(prints, 10.0**-digits, decimal)
+    return np.where(few, np.where(high > low, high - low, decimal), 0.0)

@@ -1,0 +1,124 @@
+"""The command line.
+
+Exit codes of every command: 0 done, 1 failed or refused (the reason in `reason`), 2 usage or configuration error
+(one line on stderr), 3 no daemon answers. With --json stdout holds exactly one JSON object; words go to stderr.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import sys
+from collections.abc import Awaitable, Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from companion import __version__, config
+from companion.errors import CompanionError, ConfigError, DaemonUnreachableError
+
+DONE: Final = 0
+FAILED: Final = 1
+USAGE: Final = 2
+NO_DAEMON: Final = 3
+
+Command = Callable[[argparse.Namespace], Awaitable[int]]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        return asyncio.run(_dispatch(options))
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return USAGE
+    except DaemonUnreachableError as error:
+        _fail(options, "unreachable", str(error))
+        return NO_DAEMON
+    except CompanionError as error:
+        _fail(options, "failed", str(error))
+        return FAILED
+    except KeyboardInterrupt:
+        return FAILED
+    except BrokenPipeError:
+        # The reader of our output is gone (| head): nothing is left to say, and nobody to say it to.
+        sys.stderr.close()
+        return FAILED
+
+
+async def _dispatch(options: argparse.Namespace) -> int:
+    command: Command = options.command
+    return await command(options)
+
+
+def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
+    print(f"companion: {reason}", file=sys.stderr)
+    if getattr(options, "json", False):
+        print(json.dumps({"state": state, "reason": reason}))
+
+
+def load_config(options: argparse.Namespace) -> config.Config:
+    """The configuration that -c names, or the default one."""
+    path: Path = getattr(options, "config", config.DEFAULT_PATH)
+    return config.load(path)
+
+
+def _parser() -> argparse.ArgumentParser:
+    from companion.cli import client, local
+
+    # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
+    common = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
+    common.add_argument("-c", "--config", type=Path, metavar="FILE", help=f"default: {config.DEFAULT_PATH}")
+    common.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+
+    parser = argparse.ArgumentParser(
+        prog="companion", parents=[common], description="Field self-calibration of gyro and accelerometer biases."
+    )
+    parser.add_argument("--version", action="version", version=f"companion {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    def add(name: str, command: Command, words: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, parents=[common], help=words, description=words)
+        sub.set_defaults(command=command)
+        return sub
+
+    run = add("run", local.run, "run the daemon in the foreground")
+    run.add_argument("-v", "--verbose", action="store_true", help="log what happens in detail")
+    check = add("check", local.check, "check configuration, ports, sensors and autopilot; say what is wrong")
+    check.add_argument("--seconds", type=_seconds, default=3.0, metavar="S", help="how long to listen (default 3)")
+    add("ports", local.ports, "list serial ports with their stable names")
+    add("status", client.status, "what the daemon is doing")
+    calibrate = add("calibrate", client.calibrate, "calibrate now (the aircraft must be disarmed and still)")
+    what = calibrate.add_mutually_exclusive_group()
+    what.add_argument("--gyros", action="store_true", help="gyros only")
+    what.add_argument("--accelerometers", action="store_true", help="accelerometers only")
+    calibrate.add_argument("--wait", action="store_true", help="wait for the end, show progress, print the record")
+    calibrate.add_argument(
+        "--timeout", type=_seconds, metavar="S", help="cancel when it has not finished by then (default: no limit)"
+    )
+    add("cancel", client.cancel, "cancel a running calibration")
+    add("undo", client.undo, "put the autopilot's values from before the last calibration back")
+    history = add("history", client.history, "list past calibrations")
+    history.add_argument("-n", "--limit", type=_count, default=20, metavar="N", help="the latest N (default 20)")
+    add("monitor", client.monitor, "watch the daemon until Ctrl-C")
+    return parser
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a time in seconds above 0")
+    return value
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return value
+
+
+def print_json(value: Any) -> None:
+    """Print the one JSON object of a command."""
+    print(json.dumps(value))

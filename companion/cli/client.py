@@ -1,0 +1,95 @@
+"""The commands that talk to the running daemon."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+from companion.cli import DONE, FAILED, load_config, print_json, show
+from companion.daemon.control import ask
+
+Object = dict[str, Any]
+
+
+async def _request(options: argparse.Namespace, request: Object) -> Object:
+    """Send a request, show its progress on stderr, return its last reply."""
+    reply: Object = {}
+    shown = ""
+    async for reply in ask(load_config(options).control.path, request):
+        if reply["kind"] == "progress" and reply["text"] != shown:
+            shown = reply["text"]
+            print(f"[{reply['percent']:3d} %] {reply['state']}: {shown}", file=sys.stderr, flush=True)
+    return reply
+
+
+def _finish(options: argparse.Namespace, reply: Object, answer: Object, lines: list[str], *, good: bool) -> int:
+    """Print an answer, as JSON or as lines for people, and give the exit code."""
+    if reply["kind"] == "error":
+        answer, lines, good = {"state": "refused", "reason": reply["reason"]}, [], False
+        print(f"companion: {reply['reason']}", file=sys.stderr)
+    if getattr(options, "json", False):
+        print_json(answer)
+    else:
+        for line in lines:
+            print(line)
+    return DONE if good else FAILED
+
+
+async def status(options: argparse.Namespace) -> int:
+    """`companion status`."""
+    reply = await _request(options, {"command": "status"})
+    answer = reply.get("status", {})
+    return _finish(options, reply, answer, show.status_lines(answer) if answer else [], good=True)
+
+
+async def calibrate(options: argparse.Namespace) -> int:
+    """`companion calibrate`."""
+    what = "gyros" if options.gyros else "accelerometers" if options.accelerometers else "both"
+    request = {"command": "calibrate", "what": what, "wait": options.wait, "timeout_s": options.timeout}
+    reply = await _request(options, request)
+    if "record" in reply:
+        record = reply["record"]
+        return _finish(options, reply, record, show.record_lines(record), good=record["state"] == "done")
+    answer = {key: reply.get(key) for key in ("state", "reason")}
+    return _finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=True)
+
+
+async def cancel(options: argparse.Namespace) -> int:
+    """`companion cancel`."""
+    reply = await _request(options, {"command": "cancel"})
+    answer = {key: reply.get(key) for key in ("state", "reason")}
+    return _finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=True)
+
+
+async def undo(options: argparse.Namespace) -> int:
+    """`companion undo`."""
+    reply = await _request(options, {"command": "undo"})
+    answer = {key: reply.get(key) for key in ("state", "reason", "written")}
+    return _finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=answer["state"] == "done")
+
+
+async def history(options: argparse.Namespace) -> int:
+    """`companion history`."""
+    reply = await _request(options, {"command": "history", "limit": options.limit})
+    records = reply.get("records", [])
+    return _finish(options, reply, {"records": records}, show.history_lines(records), good=True)
+
+
+async def monitor(options: argparse.Namespace) -> int:
+    """`companion monitor`: a line whenever something changes, until Ctrl-C."""
+    before: list[str] = []
+    as_json = getattr(options, "json", False)
+    async for reply in ask(load_config(options).control.path, {"command": "monitor"}):
+        if reply["kind"] != "progress":
+            break
+        if as_json:
+            print_json(reply["status"])
+            sys.stdout.flush()
+            continue
+        lines = show.status_lines(reply["status"])
+        for line in lines:
+            if line not in before:
+                print(line, flush=True)
+        before = lines
+    return DONE

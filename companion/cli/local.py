@@ -1,0 +1,64 @@
+"""The commands that need no daemon: run it, check what it would find, list ports."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import logging
+import os
+import sys
+
+from companion.cli import DONE, FAILED, load_config, print_json, show
+
+
+async def run(options: argparse.Namespace) -> int:
+    """`companion run`."""
+    config = load_config(options)
+    logging.basicConfig(
+        level=logging.DEBUG if options.verbose else logging.INFO,
+        # Under systemd the journal stamps the time itself.
+        format="%(levelname)s %(message)s"
+        if "JOURNAL_STREAM" in os.environ
+        else "%(asctime)s %(levelname)s %(message)s",
+        stream=sys.stderr,
+    )
+    from companion.daemon import service
+
+    await service.run(config)
+    return DONE
+
+
+async def ports(options: argparse.Namespace) -> int:
+    """`companion ports`."""
+    from companion.links.ports import list_ports
+
+    found = list_ports()
+    if getattr(options, "json", False):
+        print_json({"ports": [dataclasses.asdict(port) for port in found]})
+        return DONE
+    for line in show.port_lines(found):
+        print(line)
+    return DONE
+
+
+async def check(options: argparse.Namespace) -> int:
+    """`companion check`."""
+    from companion.daemon.check import run_check
+
+    config = load_config(options)
+    findings = await run_check(config, options.seconds)
+    good = all(finding.good for finding in findings)
+    reason = "; ".join(f"{finding.name}: {finding.words}" for finding in findings if not finding.good)
+    if getattr(options, "json", False):
+        print_json(
+            {
+                "state": "good" if good else "failed",
+                "reason": reason,
+                "findings": [dataclasses.asdict(finding) for finding in findings],
+            }
+        )
+    else:
+        width = max(len(finding.name) for finding in findings)
+        for finding in findings:
+            print(f"{'ok ' if finding.good else 'BAD'}  {finding.name:{width}}  {finding.words}")
+    return DONE if good else FAILED

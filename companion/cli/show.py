@@ -1,0 +1,110 @@
+"""Records and states in words and tables, for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from companion.physics.units import DEG_H, MG
+
+if TYPE_CHECKING:
+    from companion.links.ports import SerialPort
+
+Object = dict[str, Any]
+
+
+def record_lines(record: Object) -> list[str]:
+    """A record as a person reads it: outcome first, then pose, then one block an IMU."""
+    lines = [f"{record['state'].upper()} after {record['duration_s']:.0f} s: {record['reason']}"]
+    pose = record.get("pose")
+    if pose is not None:
+        sigma = pose["sigma_deg"]
+        lines.append(
+            "pose: "
+            + ", ".join(
+                f"{words} {_number(pose[key], '.2f')} deg (sigma {_number(sigma[short], '.2f')})"
+                for words, key, short in (
+                    ("pitch", "theta_deg", "theta"),
+                    ("roll", "gamma_deg", "gamma"),
+                    ("heading", "psi_deg", "psi"),
+                )
+            )
+        )
+    for imu in record["imus"]:
+        lines += _imu_lines(imu)
+    lines += [f"warning: {warning}" for warning in record["warnings"]]
+    return lines
+
+
+def _imu_lines(imu: Object) -> list[str]:
+    temperature = imu["temperature_degc"]
+    lines = [
+        f"{imu['name']}: {imu['samples']} samples" + (f", {temperature:.1f} degC" if temperature is not None else "")
+    ]
+    for words, unit, scale, form, bias, sigma in (
+        ("gyro bias ", "deg/h", DEG_H, "+9.1f", "gyro_bias_rad_s", "gyro_sigma_use_rad_s"),
+        ("accel bias", "mg   ", MG, "+9.3f", "accel_bias_m_s2", "accel_sigma_use_m_s2"),
+    ):
+        if imu[bias] is None:
+            continue
+        axes = "  ".join(
+            f"{axis} {value / scale:{form}} +- {one / scale:.{form[-2]}f}"
+            for axis, value, one in zip("xyz", imu[bias], imu[sigma], strict=True)
+        )
+        lines.append(f"  {words} {unit} {axes}")
+    for name, written in imu["written"].items():
+        lines.append(
+            f"  {name:16} {_number(written['before'], '+.6f')} -> {written['after']:+.6f}  {written['outcome']}"
+        )
+    lines += [f"  warning: {warning}" for warning in imu["warnings"]]
+    return lines
+
+
+def _number(value: float | None, form: str) -> str:
+    return "unknown" if value is None else format(value, form)
+
+
+def status_lines(status: Object) -> list[str]:
+    """The daemon's state as a person reads it."""
+    lines = [f"state: {status['state']}" + (f" - {status['reason']}" if status["reason"] else "")]
+    vehicle = status["vehicle"]
+    lines.append(f"autopilot: {vehicle['summary']}")
+    lines += [f"{device['name']}: {device['summary']}" for device in status["devices"]]
+    last = status["last"]
+    lines.append(
+        "last calibration: "
+        + (f"{last['state']} at {last['started_at']}: {last['reason']}" if last is not None else "none yet")
+    )
+    return lines
+
+
+def history_lines(records: Sequence[Object]) -> list[str]:
+    """Past calibrations, one line each, newest first."""
+    if not records:
+        return ["no calibrations yet"]
+    lines = [f"{'started (UTC)':20} {'state':10} {'took':>6}  what came of it"]
+    lines += [
+        f"{record['started_at'][:19]:20} {record['state']:10} {record['duration_s']:5.0f}s  {record['reason']}"
+        for record in records
+    ]
+    return lines
+
+
+def port_lines(ports: Sequence[SerialPort]) -> list[str]:
+    """Serial ports: the name to put into the configuration first, then what it is and who holds it."""
+    if not ports:
+        return ["no serial ports with hardware behind them (plugged in? dmesg says what the kernel saw)"]
+    lines: list[str] = []
+    for port in ports:
+        lines.append(port.stable_name or port.device)
+        name = f"{port.device}: " if port.stable_name not in (None, port.device) else ""
+        lines.append(f"    {name}{port.description}" + (f", driver {port.driver}" if port.driver else ""))
+        if port.stable_name is None:
+            lines.append("    no stable name: this one may change at the next plugging (is udev running?)")
+        if port.latency_timer_ms is not None and port.latency_timer_ms > 1:
+            lines.append(f"    latency timer {port.latency_timer_ms} ms: samples come in bunches; 1 ms is better")
+        if port.is_console:
+            lines.append("    the kernel's console is on it: remove its console= from the kernel's command line")
+        if port.holders:
+            lines.append("    in use by " + ", ".join(f"{holder.name} ({holder.pid})" for holder in port.holders))
+    return lines

@@ -1,0 +1,268 @@
+"""The command server of component 191: exactly one final COMMAND_ACK for each request.
+
+A request is (sender's system, sender's component, command), because a COMMAND_ACK tells no more apart. Three kinds
+of repeat must be told apart too:
+
+- the network's copy of a packet (two routes, a duplicated datagram): equal to the last byte, sequence number
+  included, within half a second. It is no new request.
+- the sender's own repeat while the job runs: IN_PROGRESS and no second job, since ground stations take any other
+  result for the end.
+- a retransmission (confirmation > 0) of a request that was answered within the last seconds: the final ACK was
+  lost or crossed it on the way. It gets the same result again, and may do so until none has come for 3 s; anything
+  else would calibrate twice for one press of a button. A request with confirmation 0 is a new press and starts anew.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from typing import NamedTuple
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.calibration.request import What
+from companion.component import requests
+from companion.component.identity import autopilot_version
+from companion.component.service import CalibrationService, Job, Refusal
+from companion.component.statustext import Severity, Weight
+from companion.links.mavlink import MavlinkLink
+
+logger = logging.getLogger(__name__)
+
+MAV_RESULT_CANCELLED = 6
+"""In MAVLink's common messages; ArduPilot's dialect lacks the name."""
+ACK_PERIOD_S = 0.4
+"""QGroundControl gives up 1.2 s after the last IN_PROGRESS, so that two may be lost in a row."""
+REMEMBER_FINAL_S = 3.0
+SAME_PACKET_S = 0.5
+_REMEMBERED = 32
+_RETRY_S = 0.1
+
+_RESULTS = {
+    "done": mavlink.MAV_RESULT_ACCEPTED,
+    "failed": mavlink.MAV_RESULT_FAILED,
+    "cancelled": MAV_RESULT_CANCELLED,
+}
+_REFUSALS = {
+    "armed": mavlink.MAV_RESULT_DENIED,
+    "unknown": mavlink.MAV_RESULT_DENIED,
+    "nothing_to_undo": mavlink.MAV_RESULT_DENIED,
+    "other": mavlink.MAV_RESULT_DENIED,
+    "busy": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
+    # The service calls it the same, but we have no job whose end we could promise an ACK for.
+    "same": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
+}
+_WORDS = {
+    What.BOTH: "gyros and accelerometers",
+    What.GYROS: "gyros",
+    What.ACCELEROMETERS: "accelerometers",
+}
+# Arm authorisation is a verdict, not a job, and silence is one of its answers.
+_LEFT_TO_OTHERS = frozenset({mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST})
+
+
+class _Running(NamedTuple):
+    key: requests.Key
+    request: requests.Calibrate | requests.Undo
+    job: Job
+
+
+class _Final(NamedTuple):
+    result: int
+    at_s: float
+    sent: bool
+
+
+class CommandServer:
+    """Takes commands addressed to us and answers them; `step` must be called at the times it asks for.
+
+    Commands to other components, and to component 0 (everyone), are none of our business: an ACK of ours would be
+    taken for the autopilot's.
+    """
+
+    def __init__(
+        self,
+        link: MavlinkLink,
+        service: CalibrationService,
+        say: Callable[[Severity, str, Weight], object],
+        wake: Callable[[], None],
+    ) -> None:
+        self._link, self._service, self._say, self._wake = link, service, say, wake
+        self._running: _Running | None = None
+        self._next_ack_s = 0.0
+        self._finals: OrderedDict[requests.Key, _Final] = OrderedDict()
+        self._packets: deque[tuple[float, bytes]] = deque(maxlen=_REMEMBERED)
+        self._subscriptions = (
+            link.subscribe(mavlink.MAVLink_command_long_message, self._on_message),
+            link.subscribe(mavlink.MAVLink_command_int_message, self._on_message),
+        )
+
+    def step(self, now_s: float) -> float:
+        """Report on the running job; returns when to report next (infinity: nothing to report)."""
+        retry_s = self._send_unsent(now_s)
+        running = self._running
+        if running is None:
+            return retry_s
+        if running.job.finished.done():
+            self._finish(running, now_s)
+            return min(retry_s, now_s + _RETRY_S)
+        if now_s >= self._next_ack_s:
+            self._acknowledge_progress(running)
+            self._next_ack_s = now_s + ACK_PERIOD_S
+        return min(retry_s, self._next_ack_s)
+
+    def close(self, now_s: float) -> None:
+        """Take no more commands; who still waits is told, so that no requester waits for ever."""
+        for unsubscribe in self._subscriptions:
+            unsubscribe()
+        if self._running is not None:
+            if self._running.job.finished.done():
+                self._finish(self._running, now_s)
+            else:
+                self._say(Severity.ERROR, "Failed: the companion stops", Weight.RESULT)
+                self._finally(self._running.key, mavlink.MAV_RESULT_FAILED, now_s)
+                self._running = None
+
+    def _on_message(self, message: requests.CommandMessage, now_s: float) -> None:
+        if (message.target_system, message.target_component) != (self._link.system_id, self._link.component_id):
+            return
+        if (message.get_srcSystem(), message.get_srcComponent()) == (self._link.system_id, self._link.component_id):
+            return
+        if message.command in _LEFT_TO_OTHERS:
+            return
+        command = requests.from_message(message)
+        request = requests.judge(command)
+        copy = self._is_copy(command, now_s)
+        running = self._running
+        if running is not None and running.key == command.key and not isinstance(request, requests.Refused):
+            if request != running.request:
+                # Only words can tell: any other ACK would be taken for the end of the job that runs.
+                self._say(Severity.WARNING, f"Still {_doing(running.request)}", Weight.REFUSAL)
+            self._acknowledge_progress(running)
+            return
+        if copy:
+            return
+        final = self._finals.get(command.key)
+        if command.confirmation > 0 and final is not None and now_s - final.at_s <= REMEMBER_FINAL_S:
+            # Remembered anew: this copy of the ACK may be lost as well.
+            self._finally(command.key, final.result, now_s)
+            return
+        self._obey(command.key, request, now_s)
+
+    def _is_copy(self, command: requests.Command, now_s: float) -> bool:
+        """Whether the network delivered this very packet before."""
+        while self._packets and now_s - self._packets[0][0] > SAME_PACKET_S:
+            self._packets.popleft()
+        if any(packet == command.packet for _, packet in self._packets):
+            return True
+        self._packets.append((now_s, command.packet))
+        return False
+
+    def _obey(self, key: requests.Key, request: requests.Request | requests.Refused, now_s: float) -> None:
+        match request:
+            case requests.Calibrate() | requests.Undo():
+                self._start(key, request, now_s)
+            case requests.Cancel():
+                self._cancel(key, now_s)
+            case requests.SendVersion():
+                self._acknowledge(key, mavlink.MAV_RESULT_ACCEPTED)
+                self._link.send(autopilot_version())
+            case requests.Refused(result, reason):
+                # Ground stations try out by themselves what a component supports: that is worth no warning.
+                unsupported = result == mavlink.MAV_RESULT_UNSUPPORTED
+                self._refuse(key, result, reason, now_s, Severity.INFO if unsupported else Severity.WARNING)
+
+    def _start(self, key: requests.Key, request: requests.Calibrate | requests.Undo, now_s: float) -> None:
+        name = "Undo" if isinstance(request, requests.Undo) else "Calibration"
+        if self._running is not None and self._running.job.finished.done():
+            self.step(now_s)
+        if self._running is not None:
+            other = "an undo" if isinstance(self._running.request, requests.Undo) else "a calibration"
+            reason = f"{name} refused: {other} is running"
+            self._refuse(key, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, reason, now_s)
+            return
+        requester = f"mavlink {key.system_id}/{key.component_id}"
+        try:
+            if isinstance(request, requests.Undo):
+                job = self._service.start_undo(requester)
+            else:
+                job = self._service.start_calibration(request.what, requester)
+        except Exception:
+            logger.exception("starting %s failed", name.lower())
+            self._refuse(key, mavlink.MAV_RESULT_FAILED, f"{name} failed: internal error, see the log", now_s)
+            return
+        if isinstance(job, Refusal):
+            self._refuse(key, _REFUSALS[job.kind], f"{name} refused: {job.reason}", now_s)
+            return
+        self._finals.pop(key, None)
+        self._running = _Running(key, request, job)
+        self._acknowledge_progress(self._running)
+        self._next_ack_s = now_s + ACK_PERIOD_S
+        job.finished.add_done_callback(lambda _: self._wake())
+        self._wake()
+
+    def _cancel(self, key: requests.Key, now_s: float) -> None:
+        try:
+            was_running = self._service.cancel(f"mavlink {key.system_id}/{key.component_id}")
+        except Exception:
+            logger.exception("cancelling failed")
+            self._refuse(key, mavlink.MAV_RESULT_FAILED, "Cancel failed: internal error, see the log", now_s)
+            return
+        if not was_running:
+            self._say(Severity.INFO, "Nothing to cancel", Weight.NEWS)
+        self._finally(key, mavlink.MAV_RESULT_ACCEPTED, now_s)
+
+    def _finish(self, running: _Running, now_s: float) -> None:
+        """Acknowledge the end. Its words are the service's: it knows the ends of jobs that others asked for too."""
+        self._running = None
+        finished = running.job.finished
+        if finished.cancelled():
+            outcome, words = "cancelled", "Cancelled"
+        elif (error := finished.exception()) is not None:
+            logger.error("a job ended with an error", exc_info=error)
+            outcome, words = "failed", "Failed: internal error, see the log"
+        else:
+            outcome, words = finished.result().outcome, ""
+        if words:
+            self._say(Severity.ERROR, words, Weight.RESULT)
+        self._finally(running.key, _RESULTS[outcome], now_s)
+
+    def _refuse(
+        self, key: requests.Key, result: int, reason: str, now_s: float, severity: Severity = Severity.WARNING
+    ) -> None:
+        self._say(severity, reason, Weight.REFUSAL)
+        self._finally(key, result, now_s)
+
+    def _finally(self, key: requests.Key, result: int, now_s: float) -> None:
+        sent = self._acknowledge(key, result)
+        self._finals[key] = _Final(result, now_s, sent)
+        self._finals.move_to_end(key)
+        if len(self._finals) > _REMEMBERED:
+            self._finals.popitem(last=False)
+        if not sent:
+            self._wake()
+
+    def _send_unsent(self, now_s: float) -> float:
+        """Try again what a transport that was gone or full did not take, for as long as somebody may still wait."""
+        retry_s = math.inf
+        for key, final in self._finals.items():
+            if not final.sent and now_s - final.at_s <= REMEMBER_FINAL_S:
+                sent = self._link.connected and self._acknowledge(key, final.result)
+                self._finals[key] = final._replace(sent=sent)
+                retry_s = retry_s if sent else now_s + _RETRY_S
+        return retry_s
+
+    def _acknowledge_progress(self, running: _Running) -> None:
+        progress = min(max(int(running.job.progress_percent), 0), 100)
+        self._acknowledge(running.key, mavlink.MAV_RESULT_IN_PROGRESS, progress)
+
+    def _acknowledge(self, key: requests.Key, result: int, progress: int = 0) -> bool:
+        return self._link.send(
+            mavlink.MAVLink_command_ack_message(key.command, result, progress, 0, key.system_id, key.component_id)
+        )
+
+
+def _doing(request: requests.Calibrate | requests.Undo) -> str:
+    return "undoing" if isinstance(request, requests.Undo) else f"calibrating {_WORDS[request.what]}"

@@ -1,0 +1,88 @@
+"""Component 191 as a whole: one working loop that beats the heart, answers commands, speaks and serves parameters."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.component.commands import CommandServer
+from companion.component.identity import heartbeat
+from companion.component.own_parameters import OwnParameters
+from companion.component.service import CalibrationService, VehicleView
+from companion.component.statustext import Severity, StatusText, Weight
+from companion.links.mavlink import MavlinkLink
+
+HEARTBEAT_PERIOD_S = 1.0
+_RETRY_S = 0.05
+
+
+class Component:
+    """The companion on the MAVLink network.
+
+    Everything is sent from `run`: when that loop stalls, so does the heartbeat, and the network can see it. Define
+    `parameters` before `run` starts.
+    """
+
+    def __init__(self, link: MavlinkLink, vehicle: VehicleView, service: CalibrationService) -> None:
+        self._link, self._vehicle, self._service = link, vehicle, service
+        self._woken = asyncio.Event()
+        self._next_heartbeat_s = -math.inf
+        self.texts = StatusText(link, self._woken.set)
+        self.parameters = OwnParameters(link, self.texts.say, self._woken.set)
+        self._commands = CommandServer(link, service, self.texts.say, self._woken.set)
+        self._unsubscribe = link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
+
+    def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
+        """Say something to the people at the ground stations; False when it is a repeat or the queue is full."""
+        return self.texts.say(severity, text, weight)
+
+    async def run(self) -> None:
+        """Be the component until cancelled."""
+        loop = asyncio.get_running_loop()
+        try:
+            while True:
+                self._woken.clear()
+                due_s = self._step(loop.time())
+                timer = loop.call_at(due_s, self._woken.set)
+                try:
+                    await self._woken.wait()
+                finally:
+                    timer.cancel()
+        finally:
+            self._unsubscribe()
+            self.parameters.close()
+            self._commands.close(loop.time())
+            self.texts.step(loop.time())
+
+    def _step(self, now_s: float) -> float:
+        """Do what is due; returns when something is due next."""
+        self._follow_vehicle()
+        if now_s >= self._next_heartbeat_s:
+            if self._link.connected:
+                self._link.send(heartbeat(self._service.mav_state))
+                # The rhythm is kept, but what a stall has missed is not made up for.
+                next_s = self._next_heartbeat_s + HEARTBEAT_PERIOD_S
+                self._next_heartbeat_s = next_s if next_s > now_s else now_s + HEARTBEAT_PERIOD_S
+            else:
+                # The first heartbeat on a new connection must not wait for its turn: ArduPilot executes itself
+                # what is addressed to a component that it has not heard.
+                self._next_heartbeat_s = now_s + _RETRY_S
+        return min(
+            self._next_heartbeat_s,
+            self._commands.step(now_s),
+            self.parameters.step(now_s),
+            self.texts.step(now_s),
+        )
+
+    def _follow_vehicle(self) -> None:
+        """Take over the vehicle's system id, and be heard under it at once."""
+        system_id = self._vehicle.system_id
+        if system_id is not None and system_id != self._link.system_id:
+            self._link.system_id = system_id
+            self._next_heartbeat_s = -math.inf
+
+    def _on_heartbeat(self, _message: mavlink.MAVLink_heartbeat_message, _t_s: float) -> None:
+        if self._vehicle.system_id not in (None, self._link.system_id):
+            self._woken.set()

@@ -1,0 +1,124 @@
+"""What a command asks of us: COMMAND_LONG and COMMAND_INT alike, judged before anything is done."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.calibration.request import What
+
+CommandMessage = mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_int_message
+
+
+class Key(NamedTuple):
+    """What makes two commands the same request: a COMMAND_ACK names no more than its requester and the command."""
+
+    system_id: int
+    component_id: int
+    command: int
+
+
+class Command(NamedTuple):
+    """A command as it came, whichever message carried it."""
+
+    key: Key
+    parameters: tuple[float, float, float, float, float, float, float]
+    confirmation: int
+    """How often this was sent before; COMMAND_INT cannot say and always counts as new."""
+    packet: bytes
+    """The whole packet with its sequence number: only a copy that the network made is equal."""
+
+
+class Calibrate(NamedTuple):
+    """Measure and write biases."""
+
+    what: What
+
+
+class Undo(NamedTuple):
+    """Put the previous values back."""
+
+
+class Cancel(NamedTuple):
+    """Stop what runs."""
+
+
+class SendVersion(NamedTuple):
+    """Send AUTOPILOT_VERSION."""
+
+
+class Refused(NamedTuple):
+    """Not to be done: the MAV_RESULT and the reason."""
+
+    result: int
+    reason: str
+
+
+Request = Calibrate | Undo | Cancel | SendVersion
+
+
+def from_message(message: CommandMessage) -> Command:
+    """The command in a COMMAND_LONG or COMMAND_INT; the latter's x, y, z are parameters 5, 6, 7."""
+    key = Key(message.get_srcSystem(), message.get_srcComponent(), message.command)
+    if isinstance(message, mavlink.MAVLink_command_int_message):
+        last, confirmation = (float(message.x), float(message.y), message.z), 0
+    else:
+        last, confirmation = (message.param5, message.param6, message.param7), message.confirmation
+    first = (message.param1, message.param2, message.param3, message.param4)
+    return Command(key, (*first, *last), confirmation, bytes(message.get_msgbuf()))
+
+
+def judge(command: Command) -> Request | Refused:
+    """What is asked for. Parameters count exactly: NaN, 0.5 and 3 are refused where 0, 1 and 2 are allowed."""
+    match command.key.command:
+        case mavlink.MAV_CMD_USER_1:
+            return _calibrate(command.parameters[0])
+        case mavlink.MAV_CMD_USER_2:
+            return Cancel()
+        case mavlink.MAV_CMD_USER_3:
+            return Undo()
+        case mavlink.MAV_CMD_PREFLIGHT_CALIBRATION:
+            return _preflight_calibration(command.parameters)
+        case mavlink.MAV_CMD_REQUEST_MESSAGE:
+            return _request_message(command.parameters[0])
+        case mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES if command.parameters[0] == 1:
+            return SendVersion()
+        case other:
+            return Refused(mavlink.MAV_RESULT_UNSUPPORTED, f"Command {other} is not supported by the companion")
+
+
+def _calibrate(which: float) -> Calibrate | Refused:
+    for what in What:
+        if which == what.value:
+            return Calibrate(what)
+    return _denied(f"Calibration refused: param1 {which:g}, allowed 0, 1, 2")
+
+
+def _preflight_calibration(parameters: tuple[float, ...]) -> Calibrate | Refused:
+    """MAV_CMD_PREFLIGHT_CALIBRATION: param1 gyros, param5 accelerometers; we have nothing else to calibrate."""
+    for number, value in enumerate(parameters, start=1):
+        if value != 0 and not (number in (1, 5) and value == 1):
+            allowed = "0 or 1" if number in (1, 5) else "0"
+            return _denied(f"Calibration refused: param{number} {value:g}, allowed {allowed}")
+    match (parameters[0] == 1, parameters[4] == 1):
+        case (True, True):
+            return Calibrate(What.BOTH)
+        case (True, False):
+            return Calibrate(What.GYROS)
+        case (False, True):
+            return Calibrate(What.ACCELEROMETERS)
+        case _:
+            return _denied("Calibration refused: set param1 or param5 to 1")
+
+
+def _request_message(message_id: float) -> SendVersion | Refused:
+    if message_id == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
+        return SendVersion()
+    if 0 <= message_id < 1 << 24 and message_id.is_integer():
+        return Refused(mavlink.MAV_RESULT_UNSUPPORTED, f"Message {message_id:.0f} cannot be requested here")
+    return _denied(f"Message request refused: param1 {message_id:g}")
+
+
+def _denied(reason: str) -> Refused:
+    return Refused(mavlink.MAV_RESULT_DENIED, reason)

@@ -1,0 +1,69 @@
+"""What the component needs from the rest of the house: someone who calibrates, and the vehicle's system id.
+
+Whether the aircraft is armed, and everything else that decides if a calibration may start, is the service's to
+know; the component carries requests in and verdicts out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Literal, Protocol
+
+import msgspec
+
+from companion.calibration.request import What
+
+
+class Refusal(msgspec.Struct, frozen=True):
+    """Why a request was not taken; `reason` is one line for people, without a leading "refused"."""
+
+    kind: Literal["armed", "unknown", "busy", "same", "nothing_to_undo", "other"]
+    reason: str
+
+
+class JobResult(msgspec.Struct, frozen=True):
+    """How a job ended; `reason` is one line for people (the figures when done)."""
+
+    outcome: Literal["done", "failed", "cancelled"]
+    reason: str = ""
+
+
+class Job(Protocol):
+    """A calibration or an undo under way."""
+
+    @property
+    def progress_percent(self) -> int:
+        """0 to 100; never falls."""
+
+    @property
+    def finished(self) -> asyncio.Future[JobResult]:
+        """Done once, with the result."""
+
+
+class CalibrationService(Protocol):
+    """Who calibrates. Every method returns at once: it neither waits nor computes for long.
+
+    The service itself says (`Component.say`) that a job starts, what it waits for and how it ended, as jobs are
+    asked for by others than MAVLink too. The component says refusals, which only it can tell.
+    """
+
+    def start_calibration(self, what: What, requester: str) -> Job | Refusal:
+        """Start measuring, or say why not."""
+
+    def start_undo(self, requester: str) -> Job | Refusal:
+        """Start putting the previous values back, or say why not."""
+
+    def cancel(self, requester: str) -> bool:
+        """Cancel what runs, whoever asked for it; whether something was running."""
+
+    @property
+    def mav_state(self) -> int:
+        """MAV_STATE_* for the heartbeat: CALIBRATING while busy, ACTIVE or STANDBY when idle, CRITICAL on a fault."""
+
+
+class VehicleView(Protocol):
+    """The vehicle as far as the component must know it."""
+
+    @property
+    def system_id(self) -> int | None:
+        """The autopilot's system id; None until it has been heard."""

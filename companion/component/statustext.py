@@ -1,0 +1,184 @@
+"""STATUSTEXT: words for people, in few and short lines.
+
+Three limits protect a slow telemetry link: the same text is not repeated within seconds, a token bucket bounds the
+lines per second, and the queue is bounded. What is dropped from a full queue is the least weighty text, and among
+those the oldest, so that a stream of news or of refused commands can never push out a result.
+
+Texts must not begin with "[cal]": QGroundControl takes such lines from any component of the vehicle as the progress
+of PX4's own calibration.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import enum
+import math
+import unicodedata
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from typing import NamedTuple
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.links.mavlink import MavlinkLink
+
+CHUNK_BYTES = 50
+MAX_TEXT_BYTES = 4 * CHUNK_BYTES - 1
+"""Longer texts lose their tail; one byte is left for the NUL that marks the last chunk."""
+QUEUE_TEXTS = 16
+LINES_PER_S = 2.0
+BURST_LINES = 8.0
+REPEAT_S = 3.0
+STALE_S = 20.0
+"""What could not be said for so long (no link) is no news any more; results are kept."""
+_REMEMBERED_TEXTS = 32
+_FULL_RETRY_S = 0.1
+
+_ASCII = str.maketrans(
+    {"°": " deg", "σ": "sigma", "µ": "u", "μ": "u", "²": "^2", "±": "+-", "×": "x", "≤": "<=", "≥": ">=", "≠": "!=",
+     "–": "-", "—": "-", "−": "-", "’": "'", "‘": "'", "“": '"', "”": '"', "…": "...", "·": "*", "→": "->"}
+)  # fmt: skip
+
+
+class Severity(enum.IntEnum):
+    """MAV_SEVERITY. QGroundControl speaks NOTICE and worse aloud, and opens a window for ERROR and worse."""
+
+    EMERGENCY = 0
+    ALERT = 1
+    CRITICAL = 2
+    ERROR = 3
+    WARNING = 4
+    NOTICE = 5
+    INFO = 6
+    DEBUG = 7
+
+
+class Weight(enum.IntEnum):
+    """What a text is worth when the queue is full or the link is slow; heavier texts go first."""
+
+    NEWS = 0
+    REFUSAL = 1
+    RESULT = 2
+
+
+def to_ascii(text: str) -> str:
+    """One line of plain ASCII: ground stations disagree on everything else."""
+    text = unicodedata.normalize("NFKD", " ".join(text.translate(_ASCII).split()))
+    text = "".join(character for character in text if not unicodedata.combining(character))
+    return "".join(character if " " <= character <= "~" else "?" for character in text)
+
+
+def split_chunks(text: str) -> list[bytes]:
+    """Cut a text into the chunks of STATUSTEXT; all but the last are full, and the last holds a NUL.
+
+    A text that fits one line is one chunk, full or not. Only a NUL tells the receiver that a chunk is the last, so
+    that a longer text of exactly n full chunks ends with an empty one (MAVLink STATUSTEXT, field `chunk_seq`).
+    """
+    data = to_ascii(text).encode("ascii")
+    if len(data) > MAX_TEXT_BYTES:
+        data = data[: MAX_TEXT_BYTES - 3] + b"..."
+    if len(data) <= CHUNK_BYTES:
+        return [data]
+    return [data[start : start + CHUNK_BYTES] for start in range(0, len(data) + 1, CHUNK_BYTES)]
+
+
+class _Text(NamedTuple):
+    severity: Severity
+    text: str
+    said_s: float
+
+
+class StatusText:
+    """The component's voice.
+
+    `step` sends what may be sent now; `wake` is called when there is something new to send.
+    """
+
+    def __init__(self, link: MavlinkLink, wake: Callable[[], None] = lambda: None) -> None:
+        self.dropped = 0
+        """Texts that a full queue pushed out, or that waited for a link until they were stale."""
+        self.suppressed = 0
+        """Repeats that were not said again."""
+        self._link = link
+        self._wake = wake
+        self._waiting: dict[Weight, deque[_Text]] = {weight: deque() for weight in reversed(Weight)}
+        self._said_s: OrderedDict[tuple[Severity, str], float] = OrderedDict()
+        self._sending: deque[mavlink.MAVLink_statustext_message] = deque()
+        self._tokens = BURST_LINES
+        self._refilled_s: float | None = None
+        self._next_id = 1
+
+    def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
+        """Queue a text; False when it repeats one said within the last seconds, or when the queue is full."""
+        text = to_ascii(text)
+        now_s = asyncio.get_running_loop().time()
+        if not text or self._is_repeat(severity, text, now_s):
+            return False
+        if sum(map(len, self._waiting.values())) >= QUEUE_TEXTS and not self._make_room(weight):
+            return False
+        self._remember(severity, text, now_s)
+        self._waiting[weight].append(_Text(severity, text, now_s))
+        self._wake()
+        return True
+
+    def step(self, now_s: float) -> float:
+        """Send what the bucket allows; return when there is more to do (infinity: nothing waits)."""
+        if self._refilled_s is not None:
+            self._tokens = min(BURST_LINES, self._tokens + (now_s - self._refilled_s) * LINES_PER_S)
+        self._refilled_s = now_s
+        if not self._link.connected:
+            # Texts wait; the heartbeat, which is due as soon as there is a transport, brings us back here.
+            return math.inf
+        while self._tokens >= 1.0 - 1e-9:
+            if not self._sending:
+                self._take_next(now_s)
+            if not self._sending:
+                return math.inf
+            if not self._link.send(self._sending[0]):
+                return now_s + _FULL_RETRY_S
+            self._sending.popleft()
+            self._tokens -= 1.0
+        if not self._sending and not any(self._waiting.values()):
+            return math.inf
+        return now_s + (1.0 - self._tokens) / LINES_PER_S
+
+    def _take_next(self, now_s: float) -> None:
+        for weight, waiting in self._waiting.items():
+            while weight is not Weight.RESULT and waiting and now_s - waiting[0].said_s > STALE_S:
+                waiting.popleft()
+                self.dropped += 1
+            if waiting:
+                self._cut(waiting.popleft())
+                return
+
+    def _cut(self, text: _Text) -> None:
+        chunks = split_chunks(text.text)
+        text_id = 0
+        if len(chunks) > 1:
+            text_id, self._next_id = self._next_id, self._next_id % 0xFFFF + 1
+        for sequence, chunk in enumerate(chunks):
+            self._sending.append(mavlink.MAVLink_statustext_message(text.severity, chunk, text_id, sequence))
+
+    def _make_room(self, weight: Weight) -> bool:
+        """Drop the oldest of the lightest texts, unless all that waits is heavier than the new one."""
+        self.dropped += 1
+        for lighter in Weight:
+            if lighter > weight:
+                return False
+            if self._waiting[lighter]:
+                self._waiting[lighter].popleft()
+                return True
+        return False
+
+    def _is_repeat(self, severity: Severity, text: str, now_s: float) -> bool:
+        said_s = self._said_s.get((severity, text))
+        if said_s is None or now_s - said_s >= REPEAT_S:
+            return False
+        self.suppressed += 1
+        return True
+
+    def _remember(self, severity: Severity, text: str, now_s: float) -> None:
+        self._said_s[(severity, text)] = now_s
+        self._said_s.move_to_end((severity, text))
+        if len(self._said_s) > _REMEMBERED_TEXTS:
+            self._said_s.popitem(last=False)

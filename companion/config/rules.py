@@ -1,0 +1,129 @@
+"""The rules that span several keys of the configuration file."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+
+from companion.config.sections import Config, Imu, Mounting
+from companion.config.words import allowed
+from companion.errors import ConfigError
+from companion.rotations import ROTATIONS_DEG
+
+UPRIGHT_COSINE = 0.5
+PORT_WORDS = "a device path (/dev/...) or tcp://HOST:PORT"
+
+
+def check_together(config: Config, name: str) -> None:
+    """Check what no single key can tell.
+
+    Raises:
+        ConfigError: one line that names the file, the key, what was found and what is allowed.
+    """
+    seen: dict[str, int] = {}
+    autopilot_instances: dict[int, str] = {}
+    for index, imu in enumerate(config.imu):
+        here = f"imu[{index}]"
+        if imu.name in seen:
+            raise ConfigError(
+                f"{name}: '{here}.name': found {imu.name!r}, which imu[{seen[imu.name]}] has already;"
+                " allowed: a name of its own for each IMU"
+            )
+        seen[imu.name] = index
+        _check_imu(imu, here, name)
+        _check_mounting(imu.mounting, f"{here}.mounting", name)
+        target = imu.instance if imu.source == "autopilot" else imu.autopilot_instance
+        if target is not None and target in autopilot_instances:
+            raise ConfigError(
+                f"{name}: '{here}': found autopilot IMU {target} a second time (imu"
+                f" {autopilot_instances[target]!r} has it); allowed: one source for each autopilot IMU"
+            )
+        if target is not None:
+            autopilot_instances[target] = imu.name
+    for section in ("gradienter", "compass"):
+        device = getattr(config, section)
+        if device is not None:
+            _check_mounting(device.mounting, f"{section}.mounting", name)
+            _check_upright(device.mounting, f"{section}.mounting", name)
+            _check_port(device.port, f"{section}.port", name)
+    _check_ports_differ(config, name)
+    _check_mavlink_url(config.mavlink.url, name)
+    if (config.vehicle.latitude_deg is None) != (config.vehicle.longitude_deg is None):
+        raise ConfigError(
+            f"{name}: 'vehicle': found only one of latitude_deg and longitude_deg; allowed: both or neither"
+        )
+    if config.calibration.max_s < config.calibration.min_still_s:
+        raise ConfigError(
+            f"{name}: 'calibration.max_s': found {config.calibration.max_s:g}; allowed: at least"
+            f" min_still_s ({config.calibration.min_still_s:g})"
+        )
+
+
+def _check_imu(imu: Imu, here: str, name: str) -> None:
+    if imu.source == "serial":
+        for key in ("port", "protocol"):
+            if getattr(imu, key) is None:
+                what = PORT_WORDS if key == "port" else allowed(f"imu.{key}")
+                raise ConfigError(f"{name}: '{here}.{key}' is missing; allowed: {what} (needed by source = \"serial\")")
+        _check_port(imu.port or "", f"{here}.port", name)
+        return
+    for key in ("port", "baud", "protocol", "autopilot_instance"):
+        if getattr(imu, key) is not None:
+            raise ConfigError(
+                f"{name}: '{here}.{key}': found {getattr(imu, key)!r}; allowed: only with"
+                ' source = "serial" (this IMU is read over MAVLink)'
+            )
+
+
+def _check_port(port: str, here: str, name: str) -> None:
+    if port.startswith("/") or re.fullmatch(r"tcp://\S+:\d{1,5}", port):
+        return
+    raise ConfigError(f"{name}: {here!r}: found {port!r}; allowed: {PORT_WORDS}")
+
+
+def _check_ports_differ(config: Config, name: str) -> None:
+    used: dict[str, str] = {}
+    ports = [(f"imu[{index}].port", imu.port) for index, imu in enumerate(config.imu)]
+    ports += [(f"{section}.port", device.port) for section in ("gradienter", "compass")
+              if (device := getattr(config, section)) is not None]  # fmt: skip
+    if config.mavlink.url.startswith("serial:"):
+        ports.append(("mavlink.url", config.mavlink.url.split(":")[1]))
+    for here, port in ports:
+        if port is not None and port in used:
+            raise ConfigError(
+                f"{name}: {here!r}: found {port!r}, which {used[port]} has already; allowed: a port of its own"
+            )
+        if port is not None:
+            used[port] = here
+
+
+_MAVLINK_URL = re.compile(r"(udpin|udpout|tcp):[^:\s]+:\d{1,5}|serial:[^:\s]+:\d{3,7}")
+
+
+def _check_mavlink_url(url: str, name: str) -> None:
+    if not _MAVLINK_URL.fullmatch(url):
+        raise ConfigError(
+            f"{name}: 'mavlink.url': found {url!r}; allowed: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT"
+            " or serial:PATH:BAUD"
+        )
+
+
+def _check_mounting(mounting: Mounting, here: str, name: str) -> None:
+    if not isinstance(mounting, str) or mounting in ROTATIONS_DEG:
+        return
+    near = difflib.get_close_matches(mounting, ROTATIONS_DEG, n=1)
+    hint = f" (did you mean {near[0]}?)" if near else ""
+    raise ConfigError(
+        f"{name}: {here!r}: found {mounting!r}{hint}; allowed: a MAVLink rotation name such as"
+        ' "ROTATION_YAW_90", or [roll, pitch, yaw] in degrees'
+    )
+
+
+def _check_upright(mounting: Mounting, here: str, name: str) -> None:
+    """Neither liquid nor pendulum nor tilt-compensated compass works on its side or head, nor can it tell."""
+    roll_deg, pitch_deg, _ = ROTATIONS_DEG[mounting] if isinstance(mounting, str) else mounting
+    if math.cos(math.radians(roll_deg)) * math.cos(math.radians(pitch_deg)) < UPRIGHT_COSINE:
+        raise ConfigError(
+            f"{name}: {here!r}: found {mounting!r}, on its side or upside down; allowed: within 60 degrees of upright"
+        )

@@ -1,0 +1,165 @@
+"""The sections of the configuration file and what may stand in them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+ImuProtocol = Literal["vectornav", "imu_line"]
+GradienterProtocol = Literal["inclinometer_xy"]
+CompassProtocol = Literal["hmr3300"]
+Law = Literal["axis", "slope", "euler"]
+Parity = Literal["none", "even", "odd"]
+AtArm = Literal["gate", "warn", "off"]
+
+Latitude = Annotated[float, Meta(ge=-90, le=90)]
+Longitude = Annotated[float, Meta(ge=-180, le=180)]
+Height = Annotated[float, Meta(ge=-500, le=9000)]
+Baud = Annotated[int, Meta(ge=300, le=4_000_000)]
+PositiveFloat = Annotated[float, Meta(gt=0)]
+NonEmpty = Annotated[str, Meta(min_length=1)]
+# Plain str on purpose: msgspec (0.19 to 0.22) confuses a length limit inside a union with a tuple and corrupts memory.
+Mounting = str | tuple[float, float, float]
+"""A MAVLink rotation name, or [roll, pitch, yaw] in degrees, sensor to vehicle FRD."""
+
+
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table of the file; unknown keys are refused."""
+
+
+class Vehicle(Section, frozen=True):
+    """Where the aircraft stands, if the autopilot is not to be asked, and its MAVLink system id."""
+
+    latitude_deg: Latitude | None = None
+    longitude_deg: Longitude | None = None
+    height_m: Height | None = None
+    system_id: Annotated[int, Meta(ge=1, le=255)] | None = None
+
+
+class Mavlink(Section, frozen=True):
+    """How to reach the autopilot, and which component we are."""
+
+    url: NonEmpty
+    component_id: Annotated[int, Meta(ge=1, le=255)] = 191
+
+
+class Imu(Section, frozen=True):
+    """One IMU to be calibrated: the autopilot's, read over MAVLink, or our own on a serial port."""
+
+    name: NonEmpty
+    source: Literal["autopilot", "serial"]
+    instance: Annotated[int, Meta(ge=1, le=3)] = 1
+    port: NonEmpty | None = None
+    baud: Baud | None = None
+    protocol: ImuProtocol | None = None
+    mounting: Mounting = "ROTATION_NONE"
+    autopilot_instance: Annotated[int, Meta(ge=1, le=3)] | None = None
+    profile: NonEmpty | None = None
+
+
+class Gradienter(Section, frozen=True):
+    """The two-axis tilt sensor."""
+
+    port: NonEmpty
+    protocol: GradienterProtocol
+    law: Law
+    baud: Baud | None = None
+    parity: Parity | None = None
+    mounting: Mounting = "ROTATION_NONE"
+    offset_deg: tuple[float, float] = (0.0, 0.0)
+    sigma_deg: PositiveFloat = 0.05
+
+
+class Compass(Section, frozen=True):
+    """The magnetic compass."""
+
+    port: NonEmpty
+    protocol: CompassProtocol
+    baud: Baud | None = None
+    parity: Parity | None = None
+    reference: Literal["magnetic", "true"] = "magnetic"
+    mounting: Mounting = "ROTATION_NONE"
+    offset_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
+    sigma_deg: PositiveFloat = 3.0
+
+
+class Calibration(Section, frozen=True):
+    """How long, how good, and what happens at arming."""
+
+    min_still_s: Annotated[float, Meta(ge=2, le=600)] = 10.0
+    max_s: Annotated[float, Meta(ge=2, le=3600)] = 60.0
+    target_gyro_sigma_deg_h: PositiveFloat = 5.0
+    target_accel_sigma_mg: PositiveFloat = 0.2
+    at_arm: AtArm = "warn"
+
+
+class Push(Section, frozen=True):
+    """What is sent to the autopilot."""
+
+    parameters: bool = True
+    attitude: Literal["off", "yaw", "full"] = "off"
+    attitude_rate_hz: Annotated[float, Meta(gt=0, le=50)] = 30.0
+
+
+class Mqtt(Section, frozen=True):
+    """A broker to speak to; the section absent means no MQTT."""
+
+    host: NonEmpty
+    port: Annotated[int, Meta(ge=1, le=65535)] = 1883
+    base_topic: NonEmpty = "companion"
+    username: NonEmpty | None = None
+    password_file: NonEmpty | None = None
+    tls: bool = False
+    tls_ca_file: NonEmpty | None = None
+
+
+class Control(Section, frozen=True):
+    """The socket on which `companion status`, `calibrate`, ... find the daemon."""
+
+    socket: NonEmpty | None = None
+
+    @property
+    def path(self) -> Path:
+        """The socket's path: as configured, else in systemd's runtime directory, else /run/companion."""
+        if self.socket is not None:
+            return Path(self.socket)
+        return Path(os.environ.get("RUNTIME_DIRECTORY", "/run/companion")) / "control.sock"
+
+
+class Storage(Section, frozen=True):
+    """Where records and the values for undo are kept."""
+
+    directory: NonEmpty | None = None
+
+    @property
+    def path(self) -> Path:
+        """The folder: as configured, else systemd's state directory, else /var/lib/companion."""
+        if self.directory is not None:
+            return Path(self.directory)
+        return Path(os.environ.get("STATE_DIRECTORY", "/var/lib/companion"))
+
+
+class Web(Section, frozen=True):
+    """The page; the section absent means no page."""
+
+    bind: NonEmpty
+
+
+class Config(Section, frozen=True):
+    """The whole file."""
+
+    mavlink: Mavlink
+    imu: Annotated[list[Imu], Meta(min_length=1)]
+    vehicle: Vehicle = Vehicle()
+    gradienter: Gradienter | None = None
+    compass: Compass | None = None
+    calibration: Calibration = Calibration()
+    push: Push = Push()
+    mqtt: Mqtt | None = None
+    control: Control = Control()
+    storage: Storage = Storage()
+    web: Web | None = None

@@ -1,0 +1,135 @@
+"""What went wrong in a configuration file, in the file's own words."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import types
+import typing
+from typing import Annotated, Any, Literal, Union
+
+import msgspec
+from msgspec import Meta
+
+from companion.config.sections import Config
+from companion.errors import ConfigError
+
+
+def refuse_unknown_keys(raw: dict[str, Any], section: type[msgspec.Struct], path: str, name: str) -> None:
+    """Refuse the first key that no section knows, and numbers that are none.
+
+    Raises:
+        ConfigError: names the key and the nearest known one, or what is allowed.
+    """
+    known = typing.get_type_hints(section)
+    for key, value in raw.items():
+        here = f"{path}.{key}" if path else key
+        if key not in known:
+            kind = "section" if isinstance(value, dict) else "key"
+            near = difflib.get_close_matches(key, known, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"allowed: {', '.join(sorted(known))}"
+            raise ConfigError(f"{name}: unknown {kind} {here!r}; {hint}")
+        _refuse_not_finite(value, here, name)
+        inner = _section_in(known[key])
+        if inner is None:
+            continue
+        if isinstance(value, dict):
+            refuse_unknown_keys(value, inner, here, name)
+        elif isinstance(value, list):
+            for index, item in enumerate(value):
+                if isinstance(item, dict):
+                    refuse_unknown_keys(item, inner, f"{here}[{index}]", name)
+
+
+def _refuse_not_finite(value: object, here: str, name: str) -> None:
+    """TOML can write nan and inf; no quantity here can be either."""
+    for item in value if isinstance(value, list) else [value]:
+        if isinstance(item, float) and not math.isfinite(item):
+            raise ConfigError(f"{name}: {here!r}: found {shown(value)}; allowed: {allowed(here)}, finite")
+
+
+def shown(value: object) -> str:
+    """A value as it stands in the file."""
+    return {True: "true", False: "false"}[value] if isinstance(value, bool) else repr(value)
+
+
+def _section_in(annotation: object) -> type[msgspec.Struct] | None:
+    """The section type inside an annotation such as `Section | None` or `list[Section]`."""
+    if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct):
+        return annotation
+    for inner in typing.get_args(annotation):
+        found = _section_in(inner)
+        if found is not None:
+            return found
+    return None
+
+
+_AT_PATH = re.compile(r"^(?P<what>.*?)(?: - at `\$(?P<path>[^`]*)`)?$", re.DOTALL)
+_MISSING = re.compile(r"missing required field `(?P<field>\w+)`")
+
+
+def explain(message: str, raw: dict[str, Any]) -> str:
+    """Turn msgspec's message into `key: found ..., allowed ...` in the file's own words."""
+    match = _AT_PATH.match(message)
+    what, path = (match["what"], (match["path"] or "").lstrip(".")) if match else (message, "")
+    missing = _MISSING.search(what)
+    if missing:
+        key = f"{path}.{missing['field']}" if path else missing["field"]
+        return f"{key!r} is missing; allowed: {allowed(key)}"
+    found = _value_at(raw, path)
+    return f"{path!r}: found {shown(found)}; allowed: {allowed(path)}"
+
+
+def _value_at(raw: object, path: str) -> object:
+    for key, index in re.findall(r"(\w+)|\[(\d+|\.\.\.)\]", path):
+        if key and isinstance(raw, dict) and key in raw:
+            raw = raw[key]
+        elif index.isdigit() and isinstance(raw, list) and int(index) < len(raw):
+            raw = raw[int(index)]
+        else:
+            break
+    return raw
+
+
+def allowed(path: str) -> str:
+    """Say what may stand at a path such as `imu[0].source`, in words."""
+    annotation: object = Config
+    for key in re.findall(r"\w+(?=\[|\.|$)", re.sub(r"\[[^\]]*\]", "", path)):
+        section = _section_in(annotation)
+        if section is None:
+            break
+        annotation = typing.get_type_hints(section, include_extras=True).get(key, annotation)
+    return _describe(annotation)
+
+
+_WORDS: dict[object, str] = {
+    str: "a text", int: "a whole number", float: "a number", bool: "true or false", types.NoneType: "",
+}  # fmt: skip
+
+
+def _describe(annotation: object) -> str:
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Annotated:
+        return _describe(arguments[0]) + _describe_limits(arguments[1])
+    if origin is Literal:
+        return ", ".join(f'"{value}"' for value in arguments)
+    if origin in (Union, types.UnionType):
+        return " or ".join(words for words in map(_describe, arguments) if words)
+    if origin is tuple:
+        return f"[{', '.join('number' for _ in arguments)}]"
+    if origin is list or (isinstance(annotation, type) and issubclass(annotation, msgspec.Struct)):
+        section = _section_in(annotation)
+        brackets = "[[{}]]" if origin is list else "[{}]"
+        return f"a section {brackets.format(section.__name__.lower() if section else '')}"
+    return _WORDS.get(annotation, str(annotation))
+
+
+def _describe_limits(meta: Meta) -> str:
+    if meta.ge is not None and meta.le is not None:
+        return f" from {meta.ge:g} to {meta.le:g}"
+    if meta.gt is not None:
+        return f" above {meta.gt:g}" + (f", at most {meta.le:g}" if meta.le is not None else "")
+    if meta.min_length is not None:
+        return ", not empty"
+    return ""

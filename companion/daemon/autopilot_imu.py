@@ -1,0 +1,188 @@
+"""One IMU of the autopilot: its telemetry, and the offsets that were in force while that was sent.
+
+The telemetry has the autopilot's offsets subtracted already. So samples count only while these offsets are known, and
+when anybody changes one of them (a ground station, another companion, a reboot), what was collected before is void.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Iterator
+from typing import Final
+
+import numpy as np
+
+from companion.autopilot.ardupilot import ImuCalibration, read_calibration
+from companion.autopilot.float32 import same_float32
+from companion.autopilot.imu_stream import ImuStream, StreamKind
+from companion.autopilot.parameters import ParameterClient
+from companion.autopilot.vehicle import Vehicle, VehicleEvent
+from companion.errors import AutopilotError
+from companion.links.mavlink import MavlinkLink
+from companion.samples import ImuSample
+
+logger = logging.getLogger(__name__)
+
+RETRY_S: Final = 3.0
+
+
+class AutopilotImu:
+    """Samples of one autopilot IMU to `take`, while the offsets behind them are known.
+
+    Args:
+        name: the IMU's name in the configuration.
+        instance: 1 to 3.
+        take: gets every sample that counts.
+        void: called with a reason when everything taken so far is no longer valid.
+        kind_changed: called when the telemetry changes its message or resolution.
+        rate_hz: asked of the autopilot.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        instance: int,
+        link: MavlinkLink,
+        vehicle: Vehicle,
+        parameters: ParameterClient,
+        *,
+        take: Callable[[ImuSample], None],
+        void: Callable[[str], None],
+        kind_changed: Callable[[StreamKind | None], None],
+        rate_hz: float,
+    ) -> None:
+        self.name, self.instance = name, instance
+        self.calibration: ImuCalibration | None = None
+        """What the autopilot subtracts, as read; None while that is not known."""
+        self.problem = "not read yet"
+        """Why the offsets are not known, in one line."""
+        self.failures = 0
+        """How often reading the offsets has failed in a row."""
+        self._vehicle, self._parameters = vehicle, parameters
+        self._take, self._void = take, void
+        self._ours = 0
+        self._stale = asyncio.Event()
+        self._stale.set()
+        self.stream = ImuStream(link, vehicle, instance, self._on_sample, rate_hz=rate_hz, on_kind_change=kind_changed)
+        self._unsubscribe = (parameters.watch(self._on_parameter), vehicle.watch(self._on_event))
+
+    async def run(self) -> None:
+        """Ask for the telemetry and follow the offsets until cancelled."""
+        try:
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self.stream.run(), name=f"{self.name} telemetry")
+                group.create_task(self._follow(), name=f"{self.name} offsets")
+        finally:
+            for unsubscribe in self._unsubscribe:
+                unsubscribe()
+
+    @contextlib.contextmanager
+    def changing(self) -> Iterator[None]:
+        """While we write its offsets ourselves: no samples count, and nobody reads in between."""
+        self._ours += 1
+        self.calibration = None
+        try:
+            yield
+        finally:
+            self._ours -= 1
+            self._invalidate("offsets written")
+
+    @property
+    def in_force(self) -> ImuCalibration:
+        """What the autopilot subtracts.
+
+        Raises:
+            AutopilotError: not known at the moment.
+        """
+        if self.calibration is None:
+            raise AutopilotError(f"imu {self.name}: {self.problem}")
+        return self.calibration
+
+    async def refresh(self) -> bool:
+        """Read the offsets afresh; False, and what was collected is void, if they are not those assumed.
+
+        Raises:
+            AutopilotError: they cannot be read, or this IMU cannot be calibrated.
+        """
+        assumed, fresh = self.calibration, await read_calibration(self._parameters, self.instance)
+        self.calibration, self.problem, self.failures = fresh, "", 0
+        if assumed is None or not _same(assumed, fresh):
+            self._void("the autopilot's offsets were read anew")
+            return False
+        return True
+
+    def _on_sample(self, sample: ImuSample) -> None:
+        if self.calibration is not None:
+            self._take(sample)
+
+    def _invalidate(self, why: str) -> None:
+        self.calibration = None
+        self.problem = f"offsets being read again: {why}"
+        self._void(why)
+        self._stale.set()
+
+    def _on_parameter(self, name: str, value: float) -> None:
+        if self.calibration is not None and not self._ours and _contradicts(self.calibration, name, value):
+            logger.warning("%s: somebody set %s to %.6g; measuring afresh", self.name, name, value)
+            self._invalidate(f"{name} was changed")
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        if event == "rebooted":
+            self._invalidate("the autopilot rebooted")
+        elif event == "found":
+            # Somebody may have changed them while we heard nothing; if so, `refresh` voids what was collected.
+            self._stale.set()
+
+    async def _follow(self) -> None:
+        while True:
+            await self._stale.wait()
+            self._stale.clear()
+            await self._vehicle.wait_found()
+            if self._ours:
+                continue
+            try:
+                await self.refresh()
+            except AutopilotError as error:
+                self.problem = str(error)
+                self.failures += 1
+                logger.warning("%s: %s", self.name, error)
+                self._stale.set()
+                await asyncio.sleep(RETRY_S)
+
+    def status(self) -> dict[str, object]:
+        """For `companion status` and `check`."""
+        problem = self.stream.problem or self.problem
+        kind = self.stream.kind
+        return {
+            "name": self.name,
+            "kind": "autopilot imu",
+            "good": not problem,
+            "summary": problem or f"autopilot IMU {self.instance}, {kind.message if kind else 'no message'}",
+            "frames": self.stream.samples,
+        }
+
+
+def _corrections(calibration: ImuCalibration) -> dict[str, float]:
+    """By parameter: everything that acts on this IMU's output, as far as single parameters tell."""
+    names = calibration.parameters
+    return {
+        **dict(zip(names.gyro_offset, calibration.gyro_offset_rad_s, strict=True)),
+        **dict(zip(names.accel_offset, calibration.accel_offset_m_s2, strict=True)),
+        **dict(zip(names.accel_scale, calibration.accel_scale, strict=True)),
+    }
+
+
+def _same(one: ImuCalibration, other: ImuCalibration) -> bool:
+    return (
+        _corrections(one) == _corrections(other)
+        and one.tcal_enable == other.tcal_enable
+        and (one.gyro_id, one.accel_id) == (other.gyro_id, other.accel_id)
+        and np.array_equal(one.orientation, other.orientation)
+    )
+
+
+def _contradicts(calibration: ImuCalibration, name: str, value: float) -> bool:
+    known = _corrections(calibration)
+    return name in known and not same_float32(known[name], value)

@@ -1,0 +1,71 @@
+"""`companion check`: does everything the configuration names answer?
+
+With a daemon running the ports are its, so it is asked; otherwise every port is opened and listened to for a while.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+from pathlib import Path
+
+from companion.config import Config
+from companion.daemon.control import Object, ask
+from companion.daemon.service import Service
+from companion.errors import DaemonUnreachableError
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the check."""
+
+    name: str
+    good: bool
+    words: str
+
+
+async def run_check(config: Config, seconds: float) -> list[Finding]:
+    """Check everything the configuration names, listening for some seconds.
+
+    Raises:
+        CompanionError: something that makes the check itself impossible.
+    """
+    findings = [Finding("configuration", good=True, words="understood")]
+    status: Object | None = None
+    with contextlib.suppress(DaemonUnreachableError):
+        async for reply in ask(config.control.path, {"command": "status"}):
+            status = reply.get("status")
+    if status is not None:
+        findings.append(Finding("daemon", good=True, words=f"running, {status['state']}"))
+    else:
+        findings.append(Finding("daemon", good=True, words="not running: ports opened by this check"))
+        findings.append(_storage(config.storage.path))
+        status = await _listen(config, seconds)
+    vehicle = status["vehicle"]
+    findings.append(Finding("autopilot", good=vehicle["system_id"] is not None, words=vehicle["summary"]))
+    findings += [Finding(device["name"], device["good"], device["summary"]) for device in status["devices"]]
+    for kind in ("gradienter", "compass"):
+        if getattr(config, kind) is None:
+            without = {"gradienter": "gyros only", "compass": "gyro sigma widened by the Earth's rate"}[kind]
+            findings.append(Finding(kind, good=True, words=f"not configured: {without}"))
+    return findings
+
+
+async def _listen(config: Config, seconds: float) -> Object:
+    """The status that a daemon would have after some seconds; writes nothing anywhere."""
+    service = Service(config)
+    try:
+        return await service.listen(seconds)
+    finally:
+        service.vehicle.close()
+
+
+def _storage(directory: Path) -> Finding:
+    """Whether records can be kept."""
+    place = directory
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    good = place.is_dir() and os.access(place, os.W_OK)
+    words = f"{directory}" + ("" if good else f": cannot be written by this user ({place})")
+    return Finding("storage", good, words)

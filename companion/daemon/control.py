@@ -1,0 +1,180 @@
+"""The control socket: how the command line talks to the running daemon.
+
+A Unix stream socket (mode 0600). One request a connection, one JSON object a line: the client sends
+{"command": ..., ...}; the daemon answers with any number of {"kind": "progress", ...} and one last line
+{"kind": "result", ...} or {"kind": "error", "reason": ...}. A client that goes away stops nothing: what it started
+goes on, and another client can watch or cancel it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import json
+import logging
+import os
+import socket
+import stat
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any, Final, Self
+
+import msgspec
+
+from companion.errors import CompanionError, DaemonUnreachableError, LinkError
+
+logger = logging.getLogger(__name__)
+
+Object = dict[str, Any]
+Handler = Callable[[Object], AsyncIterator[Object]]
+
+# A request is below 1 kB, the longest answer (a history of 1000 records) below 8 MB.
+REQUEST_LIMIT: Final = 64 * 1024
+ANSWER_LIMIT: Final = 32 * 1024 * 1024
+REQUEST_TIMEOUT_S: Final = 5.0
+MAX_CLIENTS: Final = 16
+
+
+class ControlServer:
+    """Serves the control socket; `async with` it."""
+
+    def __init__(self, path: Path, handler: Handler) -> None:
+        self._path = path
+        self._handler = handler
+        self._server: asyncio.Server | None = None
+        self._clients: set[asyncio.Task[None]] = set()
+
+    async def __aenter__(self) -> Self:
+        """Bind the socket, replacing a stale one.
+
+        Raises:
+            LinkError: another daemon answers there, or the path cannot be bound.
+        """
+        listener = _bind(self._path)
+        self._server = await asyncio.start_unix_server(self._accept, sock=listener, limit=REQUEST_LIMIT)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        if self._server is not None:
+            self._server.close()
+        for client in list(self._clients):
+            client.cancel()
+        await asyncio.gather(*self._clients, return_exceptions=True)
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+
+    def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if len(self._clients) >= MAX_CLIENTS:
+            writer.close()
+            return
+        client = asyncio.get_running_loop().create_task(self._serve(reader, writer), name="control client")
+        self._clients.add(client)
+        client.add_done_callback(self._clients.discard)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            await self._answer(reader, writer)
+        except (ConnectionError, TimeoutError):
+            pass  # the client went away; what it asked for goes on
+        finally:
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+
+    async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            async with asyncio.timeout(REQUEST_TIMEOUT_S):
+                line = await reader.readline()
+            request = msgspec.json.decode(line, type=Object)
+        except (ValueError, msgspec.MsgspecError) as error:
+            await _write(writer, {"kind": "error", "reason": f"request not understood: {error}"})
+            return
+        try:
+            async for reply in self._handler(request):
+                await _write(writer, reply)
+        except CompanionError as error:
+            await _write(writer, {"kind": "error", "reason": str(error)})
+        except ConnectionError:
+            raise
+        except Exception:
+            logger.exception("control request %r failed", request.get("command"))
+            await _write(writer, {"kind": "error", "reason": "internal error of the daemon; its log has the details"})
+
+
+async def _write(writer: asyncio.StreamWriter, reply: Object) -> None:
+    writer.write(json.dumps(reply).encode() + b"\n")
+    await writer.drain()
+
+
+def _bind(path: Path) -> socket.socket:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _remove_stale(path)
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        # The mode must be right before anyone can connect: bind makes the file with the umask's mode.
+        old_mask = os.umask(0o177)
+        try:
+            listener.bind(str(path))
+        except BaseException:
+            listener.close()
+            raise
+        finally:
+            os.umask(old_mask)
+    except OSError as error:
+        raise LinkError(f"control socket {path}: cannot be opened: {error.strerror or error}") from error
+    return listener
+
+
+def _remove_stale(path: Path) -> None:
+    """Remove a socket that nobody listens on any more.
+
+    Raises:
+        LinkError: somebody answers there, or what is there is no socket.
+    """
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return
+    if not stat.S_ISSOCK(mode):
+        raise LinkError(f"control socket {path}: a file that is not a socket is in the way; remove it")
+    probe = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        probe.connect(str(path))
+    except ConnectionRefusedError:
+        path.unlink()
+    else:
+        raise LinkError(f"control socket {path}: another companion is running (see: companion status)")
+    finally:
+        probe.close()
+
+
+async def ask(path: Path, request: Object) -> AsyncIterator[Object]:
+    """Send one request to the daemon and yield its replies; the last has kind "result" or "error".
+
+    Raises:
+        DaemonUnreachableError: nobody answers at the socket, or the daemon went away in the middle.
+    """
+    try:
+        reader, writer = await asyncio.open_unix_connection(str(path), limit=ANSWER_LIMIT)
+    except OSError as error:
+        why = {
+            errno.ENOENT: "no such socket",
+            errno.ECONNREFUSED: "nobody listens there",
+            errno.EACCES: "permission denied, try with sudo",
+        }.get(error.errno or 0, str(error))
+        raise DaemonUnreachableError(f"no daemon answers at {path} ({why}); start it with: companion run") from None
+    try:
+        await _write(writer, request)
+        while line := await reader.readline():
+            reply: Object = json.loads(line)
+            yield reply
+            if reply.get("kind") in ("result", "error"):
+                return
+        raise DaemonUnreachableError(f"the daemon at {path} went away in the middle of the answer")
+    except ConnectionError:
+        raise DaemonUnreachableError(f"the daemon at {path} went away in the middle of the answer") from None
+    finally:
+        writer.close()
+        with contextlib.suppress(ConnectionError):
+            await writer.wait_closed()

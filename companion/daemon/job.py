@@ -1,0 +1,74 @@
+"""One request under way, as its requesters see it."""
+
+from __future__ import annotations
+
+import asyncio
+
+from companion.calibration.record import Record, WrittenParameter
+from companion.calibration.request import What
+from companion.component.service import JobResult
+
+
+class JobCancelledError(Exception):
+    """Raised inside a job at the next safe point after somebody cancelled it."""
+
+
+class Job:
+    """A calibration or an undo; `finished` is done exactly once."""
+
+    def __init__(self, kind: str, what: What, requester: str, deadline_s: float | None) -> None:
+        self.kind, self.what, self.requester = kind, what, requester
+        self.deadline_s = deadline_s
+        """Loop time until which measuring may take; None: no limit."""
+        self.finished: asyncio.Future[JobResult] = asyncio.get_running_loop().create_future()
+        self.record: Record | None = None
+        self.written: dict[str, WrittenParameter] = {}
+        self.words = ""
+        """What is going on now, for people."""
+        self._percent = 0
+        self._cancelled_by: str | None = None
+        self._nudge = asyncio.Event()
+
+    @property
+    def progress_percent(self) -> int:
+        """0 to 100, never falling."""
+        return self._percent
+
+    def progress(self, percent: float, words: str) -> None:
+        """Say how far it is and what is going on."""
+        self._percent = max(self._percent, min(99, int(percent)))
+        self.words = words
+
+    def cancel(self, by: str) -> None:
+        """Ask it to stop at the next safe point."""
+        self._cancelled_by = self._cancelled_by or by
+        self._nudge.set()
+
+    def check_cancelled(self) -> None:
+        """The safe point.
+
+        Raises:
+            JobCancelledError: somebody cancelled it; says who.
+        """
+        if self._cancelled_by is not None:
+            raise JobCancelledError(f"cancelled by {self._cancelled_by}")
+
+    async def pause(self, seconds: float) -> None:
+        """Wait, but not past a cancel.
+
+        Raises:
+            JobCancelledError: somebody cancelled it.
+        """
+        self.check_cancelled()
+        try:
+            async with asyncio.timeout(seconds):
+                await self._nudge.wait()
+        except TimeoutError:
+            return
+        self.check_cancelled()
+
+    def finish(self, result: JobResult) -> None:
+        """Tell everybody who waits."""
+        self._percent = 100
+        if not self.finished.done():
+            self.finished.set_result(result)

@@ -1,0 +1,77 @@
+"""What was changed in the autopilot, in memory and on disk at once.
+
+Open: a write is under way. Orphaned: a write was interrupted (the daemon died, or the old values could not all be
+put back) and somebody has to bring it to an end. Undoable: the last finished write.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from companion.errors import StorageError
+from companion.storage.changes import ChangeLog, ChangeSet
+
+Offload = Callable[..., Awaitable[Any]]
+"""Runs a blocking call elsewhere: `asyncio.to_thread` in the daemon."""
+
+
+class Ledger:
+    """The change files of one storage folder and what they say."""
+
+    def __init__(self, log: ChangeLog, offload: Offload) -> None:
+        self._log, self._offload = log, offload
+        self.fault: str | None = None
+        """Why nothing may be written at all, for people; None while all is well."""
+        self.open: ChangeSet | None = None
+        self.undoable: ChangeSet | None = None
+        self.orphaned = asyncio.Event()
+
+    def load(self) -> None:
+        """Read both files at start."""
+        try:
+            self.open = self._log.journal.read()
+            self.undoable = self._log.undo.read()
+        except StorageError as error:
+            self.fault = f"{error}; compare the autopilot's parameters with your notes, then remove the file"
+        if self.open is not None:
+            self.orphaned.set()
+
+    async def begin(self, changes: ChangeSet) -> None:
+        """Keep the old values before the first of them is overwritten.
+
+        Raises:
+            StorageError: they could not be kept; do not write.
+        """
+        await self._offload(self._log.journal.write, changes)
+        self.open = changes
+
+    async def commit(self, changes: ChangeSet) -> None:
+        """The write is finished and stays: from now on it can be undone.
+
+        Raises:
+            StorageError: the disk refuses; the write stays open.
+        """
+        await self._offload(self._log.undo.write, changes)
+        self.undoable = changes
+        await self.abandon()
+
+    async def abandon(self) -> None:
+        """The old values are in force again: nothing is open any more.
+
+        Raises:
+            StorageError: the disk refuses; the write stays open.
+        """
+        await self._offload(self._log.journal.clear)
+        self.open = None
+        self.orphaned.clear()
+
+    async def forget_undo(self) -> None:
+        """What could be undone has been.
+
+        Raises:
+            StorageError: the disk refuses.
+        """
+        await self._offload(self._log.undo.clear)
+        self.undoable = None

@@ -1,0 +1,140 @@
+"""Old values back: after an interrupted write by itself, and when a person asks for an undo."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from companion.autopilot.float32 import same_float32
+from companion.autopilot.parameters import ParameterClient
+from companion.autopilot.vehicle import ArmState, Vehicle
+from companion.autopilot.writer import Change, ParameterWriter, WriteFailedError
+from companion.calibration.record import WrittenParameter
+from companion.component.statustext import Severity, Weight
+from companion.daemon.ledger import Ledger
+from companion.errors import AutopilotError, StorageError
+from companion.storage.changes import Changed, ChangeSet
+
+logger = logging.getLogger(__name__)
+
+Say = Callable[[Severity, str, Weight], object]
+
+RETRY_S: Final = 3.0
+POLL_S: Final = 0.2
+
+
+class Mender:
+    """Puts values back, guarded like every write."""
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        parameters: ParameterClient,
+        writer: ParameterWriter,
+        ledger: Ledger,
+        say: Say,
+    ) -> None:
+        self._vehicle, self._parameters, self._writer, self._ledger, self._say = (
+            vehicle, parameters, writer, ledger, say,
+        )  # fmt: skip
+
+    @property
+    def fault(self) -> str | None:
+        """Why nothing may be written at all, for people."""
+        return self._ledger.fault
+
+    @property
+    def pending(self) -> bool:
+        """Whether an interrupted write still waits to be put back."""
+        return self._ledger.orphaned.is_set()
+
+    def why_no_undo(self) -> str | None:
+        """Why there is nothing to undo, or None when there is."""
+        undoable = self._ledger.undoable
+        if undoable is None:
+            return "nothing to undo: no calibration has written since the last undo"
+        if undoable.system_id != self._vehicle.system_id:
+            return f"nothing to undo here: the last write was to system {undoable.system_id}"
+        return None
+
+    async def run(self) -> None:
+        """Bring interrupted writes to an end, whenever there is one, until cancelled."""
+        while True:
+            await self._ledger.orphaned.wait()
+            try:
+                await self._mend()
+            except (AutopilotError, StorageError) as error:
+                logger.warning("putting old values back: %s; trying again", error)
+                await asyncio.sleep(RETRY_S)
+
+    async def _mend(self) -> None:
+        open_set = self._ledger.open
+        if open_set is None:
+            self._ledger.orphaned.clear()
+            return
+        await self._vehicle.wait_found()
+        if open_set.system_id != self._vehicle.system_id:
+            names = ", ".join(changed.parameter for changed in open_set.changes)
+            words = f"An interrupted write on system {open_set.system_id} is not this aircraft's; there check: {names}"
+            logger.warning("%s", words)
+            self._say(Severity.WARNING, words, Weight.REFUSAL)
+            await self._ledger.abandon()
+            return
+        while self._vehicle.arm_state is not ArmState.DISARMED:
+            await asyncio.sleep(POLL_S)
+        ours, foreign = await self._sort(open_set)
+        if ours:
+            await self._writer.restore(ours)
+        await self._ledger.abandon()
+        words = f"Interrupted write: {len(ours)} old values put back" + (
+            f"; changed by others, left alone: {', '.join(foreign)}" if foreign else ""
+        )
+        logger.warning("%s", words)
+        self._say(Severity.WARNING, words, Weight.RESULT)
+
+    async def undo(self) -> dict[str, WrittenParameter]:
+        """Put back the values from before the last calibration, all or none; returns what was done.
+
+        Raises:
+            AutopilotError: somebody else has changed one of them since (named; nothing is written), or the writing
+                failed (what could not be put back will be, as soon as the aircraft is disarmed).
+            StorageError: the disk refuses.
+        """
+        undoable = self._ledger.undoable
+        why = self.why_no_undo()
+        if undoable is None or why is not None:
+            raise AutopilotError(why or "nothing to undo")
+        await self._ledger.begin(undoable)
+        try:
+            written = await self._writer.undo([_change(changed) for changed in undoable.changes])
+        except WriteFailedError as error:
+            # In force is what was before the undo, unless something could not be put back: then the mender looks.
+            if error.left_changed:
+                self._ledger.orphaned.set()
+            else:
+                await self._ledger.abandon()
+            raise
+        except BaseException:
+            self._ledger.orphaned.set()
+            raise
+        await self._ledger.forget_undo()
+        await self._ledger.abandon()
+        return written
+
+    async def _sort(self, changes: ChangeSet) -> tuple[Sequence[Change], Sequence[str]]:
+        """Which changes are still as we made them, and what others have put in their place."""
+        ours: list[Change] = []
+        foreign: list[str] = []
+        for changed in changes.changes:
+            now = await self._parameters.read(changed.parameter)
+            if same_float32(now, changed.after):
+                ours.append(_change(changed))
+            elif not same_float32(now, changed.before):
+                foreign.append(f"{changed.parameter} is {now:.6g}, we had set {changed.after:.6g}")
+        return ours, foreign
+
+
+def _change(changed: Changed) -> Change:
+    return Change(changed.parameter, changed.before, changed.after)

@@ -1,0 +1,98 @@
+"""From the configuration to the models that the lower rooms work with."""
+
+from __future__ import annotations
+
+import datetime
+
+from companion.autopilot.imu_stream import StreamKind
+from companion.autopilot.vehicle import Vehicle
+from companion.calibration.allan import noise_profile
+from companion.calibration.rolling import ImuInput, Settings
+from companion.calibration.site import Whereabouts
+from companion.calibration.solve import CompassModel, GradienterModel
+from companion.config import Compass, Config, Gradienter, Imu
+from companion.errors import ConfigError
+from companion.physics.frames import rotation_matrix
+from companion.physics.units import DEG_H, MG
+
+
+def settings(config: Config) -> Settings:
+    """How long and how good."""
+    wanted = config.calibration
+    return Settings(
+        min_still_s=wanted.min_still_s,
+        max_s=wanted.max_s,
+        target_gyro_sigma_rad_s=wanted.target_gyro_sigma_deg_h * DEG_H,
+        target_accel_sigma_m_s2=wanted.target_accel_sigma_mg * MG,
+    )
+
+
+def check_profiles(config: Config) -> None:
+    """Refuse noise profiles that do not exist before anything is opened.
+
+    Raises:
+        ConfigError: names the key, what was found and what is allowed.
+    """
+    for index, imu in enumerate(config.imu):
+        try:
+            noise_profile(imu.profile)
+        except ConfigError as error:
+            raise ConfigError(f"'imu[{index}].profile': found {imu.profile!r}: {error}") from None
+
+
+def imu_input(imu: Imu, kind: StreamKind | None) -> ImuInput:
+    """One IMU as the collector takes it; an autopilot's telemetry is in the vehicle's axes already."""
+    return ImuInput(
+        name=imu.name,
+        rotation=rotation_matrix(imu.mounting),
+        profile=noise_profile(imu.profile),
+        gyro_step_rad_s=kind.gyro_step_rad_s if kind else 0.0,
+        accel_step_m_s2=kind.accel_step_m_s2 if kind else 0.0,
+        truncates=kind.truncates if kind else False,
+    )
+
+
+def gradienter_model(gradienter: Gradienter | None) -> GradienterModel | None:
+    """How the gradienter's readings become the direction of up."""
+    if gradienter is None:
+        return None
+    return GradienterModel(
+        law=gradienter.law,
+        vehicle_from_sensor=rotation_matrix(gradienter.mounting),
+        offset_deg=gradienter.offset_deg,
+        sigma_deg=gradienter.sigma_deg,
+    )
+
+
+def compass_model(compass: Compass | None) -> CompassModel | None:
+    """How the compass' readings become a true heading."""
+    if compass is None:
+        return None
+    return CompassModel(
+        magnetic=compass.reference == "magnetic",
+        vehicle_from_sensor=rotation_matrix(compass.mounting),
+        offset_deg=compass.offset_deg,
+        sigma_deg=compass.sigma_deg,
+    )
+
+
+def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:
+    """Place and date: the configuration's where it says so, else the autopilot's.
+
+    The date is the autopilot's (from its GNSS), else the host's; it only picks the year of the magnetic model.
+    """
+    if vehicle.unix_time_s is not None:
+        date = datetime.datetime.fromtimestamp(vehicle.unix_time_s, tz=datetime.UTC).date()
+    else:
+        date = datetime.datetime.now(tz=datetime.UTC).date()
+    place, position = config.vehicle, vehicle.position
+    if place.latitude_deg is not None:
+        height_m, source = place.height_m, "configuration"
+        if height_m is None and position is not None:
+            height_m, source = position.height_m, f"configuration; height: {position.source}"
+        return Whereabouts(place.latitude_deg, place.longitude_deg, height_m, source, date)
+    if position is not None:
+        height_m = position.height_m if place.height_m is None else place.height_m
+        source = position.source if place.height_m is None else f"{position.source}; height: configuration"
+        return Whereabouts(position.latitude_deg, position.longitude_deg, height_m, source, date)
+    return Whereabouts(height_m=place.height_m, source=None, date=date)

@@ -1,0 +1,82 @@
+"""From estimates to the record."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from typing import Literal
+
+import numpy as np
+
+from companion.calibration.record import Axes, ImuRecord, Record, WrittenParameter
+from companion.calibration.solve import ImuSolution, Solution
+from companion.physics.frames import Array, Matrix
+
+
+@dataclasses.dataclass(slots=True)
+class Draft:
+    """A record in the making: filled as the calibration proceeds, so that a failure keeps what was known."""
+
+    started_at: datetime.datetime
+    solution: Solution | None = None
+    whole: dict[str, tuple[Array | None, Array | None]] = dataclasses.field(default_factory=dict)
+    """By IMU: whole gyro and accelerometer bias, where the owner of the IMU subtracts offsets already."""
+    written: dict[str, dict[str, WrittenParameter]] = dataclasses.field(default_factory=dict)
+    """By IMU: parameters."""
+    warnings: list[str] = dataclasses.field(default_factory=list)
+    imu_warnings: dict[str, list[str]] = dataclasses.field(default_factory=dict)
+
+    def warn(self, imu: str, words: str) -> None:
+        """Add a warning to one IMU, once."""
+        warnings = self.imu_warnings.setdefault(imu, [])
+        if words not in warnings:
+            warnings.append(words)
+
+    def record(self, state: Literal["done", "failed", "cancelled"], reason: str, duration_s: float) -> Record:
+        """The finished record."""
+        solution = self.solution
+        return Record(
+            state=state,
+            reason=reason,
+            warnings=(*(solution.warnings if solution else ()), *self.warnings),
+            started_at=self.started_at.isoformat(timespec="milliseconds"),
+            duration_s=round(duration_s, 3),
+            pose=solution.pose if solution else None,
+            site=solution.site if solution else None,
+            imus=tuple(self._imu(estimate) for estimate in solution.imus) if solution else (),
+        )
+
+    def _imu(self, estimate: ImuSolution) -> ImuRecord:
+        owner_corrects = estimate.name in self.whole
+        gyro, accel = self.whole.get(estimate.name, (estimate.gyro_rad_s, estimate.accel_m_s2))
+        has_gyro, has_accel = estimate.gyro_rad_s is not None, estimate.accel_m_s2 is not None
+        return ImuRecord(
+            name=estimate.name,
+            samples=estimate.samples,
+            temperature_degc=estimate.temperature_degc,
+            gyro_bias_rad_s=_axes(gyro),
+            gyro_sigma_stat_rad_s=_axes(estimate.gyro_sigma_stat_rad_s if has_gyro else None),
+            gyro_sigma_use_rad_s=_axes(estimate.gyro_sigma_use_rad_s if has_gyro else None),
+            accel_bias_m_s2=_axes(accel),
+            accel_sigma_stat_m_s2=_axes(estimate.accel_sigma_stat_m_s2 if has_accel else None),
+            accel_sigma_use_m_s2=_axes(estimate.accel_sigma_use_m_s2 if has_accel else None),
+            covariance=_covariance(estimate.covariance, gyro=has_gyro, accel=has_accel),
+            residual_gyro_rad_s=_axes(estimate.gyro_rad_s if owner_corrects else None),
+            residual_accel_m_s2=_axes(estimate.accel_m_s2 if owner_corrects else None),
+            warnings=(*estimate.warnings, *self.imu_warnings.get(estimate.name, ())),
+            written=self.written.get(estimate.name, {}),
+        )
+
+
+def _axes(vector: Array | None) -> Axes | None:
+    if vector is None:
+        return None
+    x, y, z = (float(value) for value in vector)
+    return x, y, z
+
+
+def _covariance(matrix: Matrix, *, gyro: bool, accel: bool) -> tuple[tuple[float | None, ...], ...] | None:
+    if not gyro and not accel:
+        return None
+    known = np.array([gyro] * 3 + [accel] * 3)
+    return tuple(tuple(float(matrix[i, j]) if known[i] and known[j] else None for j in range(6)) for i in range(6))

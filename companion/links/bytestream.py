@@ -1,0 +1,273 @@
+"""A port that comes back by itself: the one place that knows a serial port from `tcp://`.
+
+Whatever was opened ends as one non-blocking descriptor on the event loop, read with `os.read`: one code path, no
+thread in the hot path, and full control over the instant of the time stamp and over when a dead port is closed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import os
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+from urllib.parse import urlsplit
+
+from companion.errors import LinkError
+from companion.links.backoff import Backoff
+from companion.links.serial_port import SerialOpener
+
+logger = logging.getLogger(__name__)
+
+READ_BYTES = 4096
+"""As much as a tty buffers: one wake-up empties the port, so one time stamp holds for all that it brought."""
+OUT_BUFFER_BYTES = 16384
+"""Over a second at 115200 baud; what waits longer than that is better dropped than sent."""
+CONNECT_DEADLINE_S = 5.0
+WORTH_S = 2.0
+"""A connection that lived this long, or that brought bytes, starts the back-off afresh."""
+
+
+@dataclass(frozen=True, slots=True)
+class PortSettings:
+    """Which port, and how its line is set; baud and parity mean nothing for `tcp://HOST:PORT`."""
+
+    url: str
+    baud: int
+    parity: Literal["none", "even", "odd"] = "none"
+
+    @property
+    def is_tcp(self) -> bool:
+        """Whether the other end is a socket (ser2net, a simulator) and not a device."""
+        return self.url.startswith("tcp://")
+
+    @property
+    def seconds_per_byte(self) -> float:
+        """Line time of one byte: start bit, 8 data bits, parity bit if any, stop bit. 0 for tcp://, where unknown."""
+        if self.is_tcp:
+            return 0.0
+        return (10 if self.parity == "none" else 11) / self.baud
+
+    def address(self) -> tuple[str, int]:
+        """Host and port of a tcp:// url.
+
+        Raises:
+            LinkError: the url names no host or no port from 1 to 65535.
+        """
+        try:
+            parts = urlsplit(self.url)
+            host, port = parts.hostname, parts.port
+        except ValueError:
+            host, port = None, None
+        if not host or not port:
+            raise LinkError(f"{self.url}: not an address; allowed: tcp://HOST:PORT with PORT from 1 to 65535")
+        return host, port
+
+
+class ByteLink:
+    """Bytes of one port to `on_bytes(data, t_s)`, for as long as `run` runs; opens again after every loss.
+
+    `t_s` is the loop's time at which the chunk was read. `on_state(connected, reason)` tells of every change, of the
+    reason too while attempts go on; a decoder should be told (`Decoder.interrupted`), as bytes are missing between
+    two connections. All calls are made on the loop's thread; the callbacks must neither block nor raise.
+    """
+
+    def __init__(
+        self,
+        settings: PortSettings,
+        on_bytes: Callable[[bytes, float], None],
+        *,
+        name: str,
+        on_state: Callable[[bool, str], None] | None = None,
+    ) -> None:
+        self.settings = settings
+        self.name = name
+        self.last_error = ""
+        """Why the port is, or last was, not open; one line for people."""
+        self.bytes_received = 0
+        self.bytes_dropped = 0
+        """Bytes that `write` refused because the port was closed or the out-buffer full."""
+        self.reconnects = 0
+        """How often the port was opened again after it had been open."""
+        self.last_byte_s: float | None = None
+        """The loop's time of the last read that brought bytes."""
+        self._on_bytes, self._on_state = on_bytes, on_state
+        self._descriptor: int | None = None
+        self._lost: asyncio.Future[str] | None = None
+        self._out = bytearray()
+        self._opener = SerialOpener(settings.url, settings.baud, settings.parity)
+        self._backoff = Backoff()
+        self._warned = False
+        self._opened_before = False
+        self._said: tuple[bool, str] | None = None
+
+    @property
+    def connected(self) -> bool:
+        """Whether the port is open; says nothing of a device that keeps silent."""
+        return self._descriptor is not None
+
+    async def run(self) -> None:
+        """Keep the port open until cancelled; a loss is an event to report, never an exception."""
+        loop = asyncio.get_running_loop()
+        try:
+            while True:
+                try:
+                    descriptor = await self._open()
+                except LinkError as error:
+                    self._report_down(str(error))
+                else:
+                    since_s, before = loop.time(), self.bytes_received
+                    self._lost = loop.create_future()
+                    self._attach(loop, descriptor)
+                    reason = await self._lost
+                    if self.bytes_received > before or loop.time() - since_s >= WORTH_S:
+                        self._backoff.reset()
+                    self._report_down(reason)
+                await asyncio.sleep(self._backoff.next_s())
+        finally:
+            if self._descriptor is not None:
+                self._close()
+                self._say(connected=False, reason="stopped")
+
+    def write(self, data: bytes) -> bool:
+        """Send, or keep in the bounded out-buffer; False when closed or full: then nothing of `data` is sent."""
+        if self._descriptor is None or len(self._out) + len(data) > OUT_BUFFER_BYTES:
+            self.bytes_dropped += len(data)
+            return False
+        waiting = bool(self._out)
+        self._out += data
+        if not waiting:
+            self._flush()
+        return self._descriptor is not None
+
+    async def _open(self) -> int:
+        if self.settings.is_tcp:
+            return await _connect_tcp(self.settings)
+        return await self._opener.open()
+
+    def _attach(self, loop: asyncio.AbstractEventLoop, descriptor: int) -> None:
+        self._descriptor = descriptor
+        if self._opened_before:
+            self.reconnects += 1
+        self._opened_before = True
+        loop.add_reader(descriptor, self._readable)
+        logger.info("%s: %s is %s", self.name, self.settings.url, "back" if self._warned else "open")
+        self._warned = False
+        self._say(connected=True, reason=f"{self.settings.url} is open")
+
+    def _readable(self) -> None:
+        now_s = asyncio.get_running_loop().time()
+        if self._descriptor is None:
+            return
+        try:
+            data = os.read(self._descriptor, READ_BYTES)
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError as error:
+            self._lose(self._explain(error))
+            return
+        if not data:
+            # A tty that was hung up is readable for ever and yields nothing: closing is the only way out of the spin.
+            self._lose(self._explain(None))
+            return
+        self.bytes_received += len(data)
+        self.last_byte_s = now_s
+        self._on_bytes(data, now_s)
+
+    def _flush(self) -> None:
+        if self._descriptor is None:
+            return
+        loop = asyncio.get_running_loop()
+        try:
+            while self._out:
+                del self._out[: os.write(self._descriptor, self._out)]
+        except (BlockingIOError, InterruptedError):
+            loop.add_writer(self._descriptor, self._flush)
+            return
+        except OSError as error:
+            self._lose(self._explain(error))
+            return
+        loop.remove_writer(self._descriptor)
+
+    def _explain(self, error: OSError | None) -> str:
+        """What a failed read or write means; None for a read that brought no bytes."""
+        url = self.settings.url
+        if self.settings.is_tcp:
+            return f"{url}: {'the other side closed the connection' if error is None else _words(error)}"
+        if error is None or error.errno in (errno.EIO, errno.ENXIO, errno.ENODEV):
+            return f"{url}: the device is gone; unplugged?"
+        return f"{url}: {_words(error)}"
+
+    def _lose(self, reason: str) -> None:
+        # At once, not when `run` gets to it: while a dead descriptor is open, the device comes back under another name.
+        self._close()
+        if self._lost is not None and not self._lost.done():
+            self._lost.set_result(reason)
+
+    def _close(self) -> None:
+        descriptor, self._descriptor = self._descriptor, None
+        self._out.clear()
+        if descriptor is None:
+            return
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(descriptor)
+        loop.remove_writer(descriptor)
+        os.close(descriptor)
+
+    def _report_down(self, reason: str) -> None:
+        self.last_error = reason
+        logger.log(logging.DEBUG if self._warned else logging.WARNING, "%s: %s", self.name, reason)
+        self._warned = True
+        self._say(connected=False, reason=reason)
+
+    def _say(self, *, connected: bool, reason: str) -> None:
+        if self._on_state is not None and (connected, reason) != self._said:
+            self._said = (connected, reason)
+            self._on_state(connected, reason)
+
+
+def _words(error: OSError) -> str:
+    """The system's own words: asyncio puts "Connect call failed" and an address in their place."""
+    return os.strerror(error.errno) if error.errno else str(error)
+
+
+async def _connect_tcp(settings: PortSettings) -> int:
+    """Connect to the first address that answers; return the socket's descriptor.
+
+    Raises:
+        LinkError: one line that names the address and the cause.
+    """
+    host, port = settings.address()
+    loop = asyncio.get_running_loop()
+    reason = f"{settings.url}: the host has no address"
+    try:
+        async with asyncio.timeout(CONNECT_DEADLINE_S):
+            for family, kind, protocol, _, address in await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+                try:
+                    return await _connect(loop, socket.socket(family, kind, protocol), address)
+                except OSError as error:
+                    reason = f"{settings.url}: {_words(error)}"
+    except TimeoutError:
+        reason = f"{settings.url}: no answer within {CONNECT_DEADLINE_S:g} s"
+    except (OSError, UnicodeError) as error:
+        reason = f"{settings.url}: host {host} is not known ({error})"
+    raise LinkError(reason)
+
+
+async def _connect(loop: asyncio.AbstractEventLoop, endpoint: socket.socket, address: tuple[object, ...]) -> int:
+    try:
+        endpoint.settimeout(0)
+        endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        # A peer that vanished without a word (power cut, Wi-Fi gone) is noticed within 5 + 3 * 2 s.
+        endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for option, value in (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 2), ("TCP_KEEPCNT", 3)):
+            if hasattr(socket, option):
+                endpoint.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+        await loop.sock_connect(endpoint, address)
+        return endpoint.detach()
+    except BaseException:
+        endpoint.close()
+        raise

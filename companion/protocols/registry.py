@@ -1,0 +1,53 @@
+"""Which protocols there are, under the names that the configuration uses, and how their lines are set by default."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from companion.errors import ConfigError
+from companion.protocols.base import Decoder
+from companion.protocols.hmr3300 import Hmr3300Decoder
+from companion.protocols.imu_line import ImuLineDecoder
+from companion.protocols.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.vectornav import VectorNavDecoder
+
+Kind = Literal["imu", "gradienter", "compass"]
+
+
+@dataclass(frozen=True, slots=True)
+class ProtocolInfo:
+    """One protocol: its decoder, and the line settings of a device as it comes from the factory."""
+
+    name: str
+    baud: int
+    parity: Literal["none", "even", "odd"]
+    decoder: type[Decoder]
+
+
+PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
+    "imu": {
+        "vectornav": ProtocolInfo("vectornav", 115200, "none", VectorNavDecoder),
+        "imu_line": ProtocolInfo("imu_line", 500000, "none", ImuLineDecoder),
+    },
+    "gradienter": {
+        # MEAS DPG2; the P-series sends at 2400 baud, BEI with even parity.
+        "inclinometer_xy": ProtocolInfo("inclinometer_xy", 9600, "none", InclinometerXyDecoder),
+    },
+    "compass": {
+        "hmr3300": ProtocolInfo("hmr3300", 19200, "none", Hmr3300Decoder),
+    },
+}
+
+
+def make_decoder(kind: Kind, name: str, seconds_per_byte: float = 0.0) -> Decoder:
+    """A new decoder for a kind of device and a protocol name.
+
+    Raises:
+        ConfigError: there is no such protocol for that kind of device.
+    """
+    info = PROTOCOLS[kind].get(name)
+    if info is None:
+        allowed = ", ".join(f'"{known}"' for known in PROTOCOLS[kind])
+        raise ConfigError(f"'{kind}.protocol': found {name!r}; allowed: {allowed}")
+    return info.decoder(seconds_per_byte)

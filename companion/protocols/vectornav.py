@@ -1,0 +1,191 @@
+r"""VectorNav VN-100 and relatives: ASCII and binary asynchronous outputs on one port, in any mixture.
+
+    $VNYMR,yaw,pitch,roll,mag x 3,accel x 3,gyro x 3*hh\r\n            degrees, gauss, m/s^2, rad/s
+    $VNIMU,mag x 3,accel x 3,gyro x 3,temperature,pressure*hh\r\n      uncompensated; degrees Celsius, kPa
+    0xFA ...                                                           see vectornav_binary
+
+Source: VectorNav UM001. Axes are X forward, Y right, Z down; level and at rest the accelerometer reads z = -9.8.
+"""
+
+from __future__ import annotations
+
+import binascii
+import re
+from collections import deque
+
+from companion.protocols.base import (
+    CHECKSUM,
+    CUT_SHORT,
+    FIELD_COUNT,
+    REPLY,
+    TOO_LONG,
+    UNKNOWN_SENTENCE,
+    Decoder,
+    RejectedError,
+    body_of_sentence,
+)
+from companion.protocols.checks import check_attitude, check_imu, check_vector, numbers
+from companion.protocols.vectornav_binary import Layout, header_bytes, layout_of
+from companion.samples import AttitudeSample, ImuSample, MagSample, Sample
+
+SENTENCE_LIMIT = 250
+"""Bytes of a sentence after its "$"; the longest asynchronous one has some 200."""
+LAYOUTS_KEPT = 16
+
+_SYNC = 0xFA
+_DOLLAR = ord("$")
+_START = re.compile(rb"[\xfa$]")
+_END_OF_TEXT = re.compile(rb"[^ -#%-~]")
+"""The first byte that cannot be inside a sentence: a line end, a "$", or nothing printable."""
+_WAIT = -1
+
+_REPLIES = frozenset((b"VNRRG", b"VNWRG", b"VNWNV", b"VNRFS", b"VNRST", b"VNTAR", b"VNASY", b"VNSGB", b"VNCMD"))
+
+
+class VectorNavDecoder(Decoder):
+    """VectorNav outputs; gives `ImuSample`, `AttitudeSample` and `MagSample` as far as a frame has them."""
+
+    def __init__(self, seconds_per_byte: float = 0.0) -> None:
+        super().__init__(seconds_per_byte)
+        self._buffer = b""
+        """What may be the beginning of a frame; never longer than the longest frame."""
+        self._received = 0
+        self._chunks: deque[tuple[int, float]] = deque()
+        """Stream position of the end of each chunk that still has bytes in the buffer, and when it was read.
+
+        A false start holds back what came behind it until it is found out; the times of that must not suffer.
+        """
+        self._layouts: dict[bytes, Layout] = {}
+
+    def feed(self, data: bytes, t_s: float) -> list[Sample]:  # noqa: D102 - as in the base class
+        if not data:
+            return []
+        self._received += len(data)
+        self._chunks.append((self._received, t_s))
+        buffer = self._buffer + data
+        origin = self._received - len(buffer)
+        samples: list[Sample] = []
+        at, size = 0, len(buffer)
+        while at < size:
+            if buffer[at] == _SYNC:
+                end = self._binary(buffer, at, origin, samples)
+            elif buffer[at] == _DOLLAR:
+                end = self._sentence(buffer, at, origin, samples)
+            else:
+                match = _START.search(buffer, at)
+                end = match.start() if match else size
+                self.skipped += len(buffer[at:end].translate(None, b"\r\n"))
+            if end == _WAIT:
+                break
+            at = end
+        self._buffer = buffer[at:]
+        while self._chunks and self._chunks[0][0] <= origin + at:
+            self._chunks.popleft()
+        return samples
+
+    def interrupted(self) -> None:  # noqa: D102 - as in the base class
+        if self._buffer:
+            self.rejected[CUT_SHORT] += 1
+        self._buffer = b""
+        self._chunks.clear()
+
+    def _time_of(self, end: int) -> float:
+        """When the byte before stream position `end` was on the line."""
+        while self._chunks[0][0] < end:
+            self._chunks.popleft()
+        chunk_end, t_s = self._chunks[0]
+        return t_s - self.seconds_per_byte * (chunk_end - end)
+
+    def _binary(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
+        """Where to go on after what begins with a sync byte, or `_WAIT` for more bytes."""
+        available = len(buffer) - at
+        if available < 2:
+            return _WAIT
+        try:
+            header_size = header_bytes(buffer[at + 1])
+            if available < header_size:
+                return _WAIT
+            header = buffer[at : at + header_size]
+            layout = self._layouts.get(header) or layout_of(header)
+            if available < layout.frame_bytes:
+                return _WAIT
+        except RejectedError as error:
+            self.rejected[error.reason] += 1
+            return at + 1
+        end = at + layout.frame_bytes
+        if binascii.crc_hqx(buffer[at + 1 : end], 0) != 0:
+            self.rejected[CHECKSUM] += 1
+            return at + 1  # not `end`: in what a false start took for its own, a good frame may begin
+        if header not in self._layouts:
+            if len(self._layouts) >= LAYOUTS_KEPT:
+                self._layouts.clear()
+            self._layouts[header] = layout
+        try:
+            samples += layout.samples(buffer, at, self._time_of(origin + end))
+            self.accepted += 1
+        except RejectedError as error:
+            self.rejected[error.reason] += 1
+        return end
+
+    def _sentence(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
+        """Where to go on after what begins with a "$", or `_WAIT` for more bytes."""
+        begin = buffer[at : at + 3]
+        if not b"$VN".startswith(begin):
+            self.skipped += 1
+            return at + 1
+        limit = at + 1 + SENTENCE_LIMIT
+        match = _END_OF_TEXT.search(buffer, at + 1, limit)
+        if match is None:
+            if len(buffer) < limit:
+                return _WAIT
+            self.rejected[TOO_LONG] += 1
+            return at + 1
+        end = match.start()
+        if buffer[end] not in b"\r\n":
+            self.rejected[CUT_SHORT] += 1
+            return end
+        try:
+            samples += _decode(buffer[at + 1 : end], self._time_of(origin + end + 1))
+            self.accepted += 1
+        except RejectedError as error:
+            self.rejected[error.reason] += 1
+        return end
+
+
+def _decode(sentence: bytes, t_s: float) -> list[Sample]:
+    """The samples in one sentence, `VN...*hh`.
+
+    Raises:
+        RejectedError: wrong checksum, not a measurement that is used here, or values that cannot be.
+    """
+    head, *fields = body_of_sentence(sentence).split(b",")
+    if head == b"VNYMR":
+        return _decode_ymr(fields, t_s)
+    if head == b"VNIMU":
+        return _decode_imu(fields, t_s)
+    if head == b"VNERR":
+        raise RejectedError("VNERR")
+    raise RejectedError(REPLY if head in _REPLIES else UNKNOWN_SENTENCE)
+
+
+def _decode_ymr(fields: list[bytes], t_s: float) -> list[Sample]:
+    if len(fields) != 12:
+        raise RejectedError(FIELD_COUNT)
+    yaw_deg, pitch_deg, roll_deg, mx, my, mz, ax, ay, az, gx, gy, gz = numbers(fields)
+    check_attitude(yaw_deg, pitch_deg, roll_deg)
+    check_imu((gx, gy, gz), (ax, ay, az), None)
+    check_vector((mx, my, mz))
+    return [
+        ImuSample(t_s, (gx, gy, gz), (ax, ay, az)),
+        AttitudeSample(t_s, yaw_deg, pitch_deg, roll_deg),
+        MagSample(t_s, (mx, my, mz)),
+    ]
+
+
+def _decode_imu(fields: list[bytes], t_s: float) -> list[Sample]:
+    if len(fields) != 11:
+        raise RejectedError(FIELD_COUNT)
+    mx, my, mz, ax, ay, az, gx, gy, gz, temperature_degc, _pressure_kpa = numbers(fields)
+    check_imu((gx, gy, gz), (ax, ay, az), temperature_degc)
+    check_vector((mx, my, mz))
+    return [ImuSample(t_s, (gx, gy, gz), (ax, ay, az), temperature_degc), MagSample(t_s, (mx, my, mz))]

@@ -1,0 +1,28 @@
+"""`python -m sim devices | autopilot | all | demo`."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a subcommand; returns the exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments[:1] == ["demo"]:
+        try:
+            demo = importlib.import_module("sim.demo")
+        except ModuleNotFoundError as error:
+            if error.name != "sim.demo":
+                raise
+            print("python -m sim demo: not part of this copy; try `python -m sim all`", file=sys.stderr)
+            return 1
+        return int(demo.main(arguments[1:]) or 0)
+    from sim.serve import main as serve
+
+    return serve(arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,207 @@
+"""The one virtual aircraft: where it stands, how it is held, how warm it is. Everything else measures this truth.
+
+Frames: navigation NED, body FRD. Angles: heading clockwise from true north, pitch nose up +, roll right side down +
+(method section 1.1). Time is the aircraft's own, in seconds from 0; `begin` ties it to an event loop's clock.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sim.earth import Array, angles_of, body_from_ned, earth_rate_ned_rad_s, normal_gravity_m_s2
+from sim.motions import Motion
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """How the aircraft stands: degrees, heading from true north."""
+
+    pitch_deg: float = 0.0
+    roll_deg: float = 0.0
+    heading_deg: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """Where it stands. The height is above the ellipsoid, and taken as above sea level too: no geoid is modelled."""
+
+    latitude_deg: float = 40.0
+    longitude_deg: float = 116.0
+    height_m: float = 50.0
+    declination_deg: float = 0.0
+    """East of true north +: magnetic heading = true heading - declination."""
+
+    @property
+    def gravity_m_s2(self) -> float:
+        """Local normal gravity."""
+        return normal_gravity_m_s2(self.latitude_deg, self.height_m)
+
+
+LEVEL = Pose()
+DEFAULT_SITE = Site()
+
+
+class Truth(NamedTuple):
+    """What a perfect sensor in body axes reads at the times asked for."""
+
+    rate_rad_s: Array
+    """Angular rate against inertial space, Earth rate included (n, 3)."""
+    force_m_s2: Array
+    """Specific force (n, 3): (0, 0, -g) when level at rest."""
+
+
+def warming(start_degc: float, end_degc: float, time_constant_s: float) -> Callable[[float], float]:
+    """A temperature that goes exponentially from one value to another, as a box that was just switched on."""
+    return lambda t_s: end_degc + (start_degc - end_degc) * math.exp(-max(t_s, 0.0) / time_constant_s)
+
+
+class VirtualAircraft:
+    """The truth.
+
+    Args:
+        pose: how it stands when no motion acts.
+        site: where.
+        motions: what happens, in aircraft time; more can be added later with `add`.
+        temperature_degc: a number, or a function of aircraft time.
+        unix_s: date at aircraft time 0, for the messages that tell the date.
+    """
+
+    def __init__(
+        self,
+        pose: Pose = LEVEL,
+        site: Site = DEFAULT_SITE,
+        *,
+        motions: Sequence[Motion] = (),
+        temperature_degc: float | Callable[[float], float] = 25.0,
+        unix_s: float = 1_795_219_200.0,
+    ) -> None:
+        self.pose, self.site, self.unix_s = pose, site, unix_s
+        self._motions = list(motions)
+        self._temperature = temperature_degc
+        self._gravity_ned = np.array([0.0, 0.0, site.gravity_m_s2])
+        self._earth_rate_ned = earth_rate_ned_rad_s(site.latitude_deg)
+        self._epoch_s: float | None = None
+        self._still: tuple[float, float, Array, Truth] | None = None
+
+    def begin(self, loop_s: float) -> None:
+        """Let aircraft time 0 be this instant of the loop's clock, unless it has begun already."""
+        if self._epoch_s is None:
+            self._epoch_s = loop_s
+
+    def time_at(self, loop_s: float) -> float:
+        """Aircraft time of an instant of the loop's clock; begins the aircraft's time if nothing has yet."""
+        self.begin(loop_s)
+        assert self._epoch_s is not None
+        return loop_s - self._epoch_s
+
+    def loop_time_of(self, t_s: float) -> float:
+        """The loop's clock at an aircraft time; the inverse of `time_at`."""
+        if self._epoch_s is None:
+            raise ValueError("the aircraft's time has not begun: nothing serves it on a loop yet")
+        return self._epoch_s + t_s
+
+    def add(self, motion: Motion) -> None:
+        """Let something happen; `motion.start_s` is aircraft time and should not lie in the past."""
+        self._motions.append(motion)
+        self._still = None
+
+    def still_at(self, t_s: float) -> bool:
+        """Whether no motion acts at that time."""
+        return all(not motion.start_s <= t_s < motion.end_s for motion in self._motions)
+
+    def temperature_degc(self, t_s: float) -> float:
+        """Temperature of the aircraft and everything on it."""
+        return self._temperature(t_s) if callable(self._temperature) else self._temperature
+
+    def angles_rad(self, t_s: float) -> tuple[float, float, float]:
+        """True roll, pitch, heading (not wrapped)."""
+        angles, _ = self._euler(np.array([t_s]))
+        return float(angles[0, 0]), float(angles[0, 1]), float(angles[0, 2])
+
+    def pose_at(self, t_s: float) -> Pose:
+        """The true pose, heading in [0, 360)."""
+        roll, pitch, heading = self.angles_rad(t_s)
+        return Pose(math.degrees(pitch), math.degrees(roll), math.degrees(heading) % 360.0)
+
+    def body_from_ned(self, t_s: float) -> Array:
+        """The attitude matrix (3, 3)."""
+        still = self._still_at(t_s)
+        return still[2] if still is not None else body_from_ned(*self.angles_rad(t_s))
+
+    def mounted_angles_rad(self, t_s: float, mounting: Array) -> tuple[float, float, float]:
+        """Roll, pitch, heading of a device mounted with this sensor-to-vehicle matrix."""
+        return angles_of(mounting.T @ self.body_from_ned(t_s))
+
+    def truth(self, t_s: Array) -> Truth:
+        """Rates and specific forces in body axes at times (n)."""
+        count = len(t_s)
+        if count:
+            still = self._still_at(float(t_s[0]))
+            if still is not None and t_s[-1] < still[1]:
+                return Truth(np.tile(still[3].rate_rad_s, (count, 1)), np.tile(still[3].force_m_s2, (count, 1)))
+        return self._moving(t_s)
+
+    def truth_at(self, t_s: float) -> Truth:
+        """The same at one time; arrays of shape (3,). Do not change them: they are shared while the aircraft stands."""
+        still = self._still_at(t_s)
+        if still is not None:
+            return still[3]
+        rate, force = self._moving(np.array([t_s]))
+        return Truth(rate[0], force[0])
+
+    def _still_at(self, t_s: float) -> tuple[float, float, Array, Truth] | None:
+        """(from, until, attitude, truth) of the quiet time around t_s; None while something moves."""
+        if self._still is not None and self._still[0] <= t_s < self._still[1]:
+            return self._still
+        if not self.still_at(t_s):
+            return None
+        since = max((motion.end_s for motion in self._motions if motion.end_s <= t_s), default=-math.inf)
+        until = min((motion.start_s for motion in self._motions if motion.start_s > t_s), default=math.inf)
+        rate, force = self._moving(np.array([t_s]))
+        self._still = (since, until, body_from_ned(*self.angles_rad(t_s)), Truth(rate[0], force[0]))
+        return self._still
+
+    def _euler(self, t_s: Array) -> tuple[Array, Array]:
+        """Roll, pitch, heading (n, 3) in rad and their derivatives."""
+        angles = np.tile(np.radians([self.pose.roll_deg, self.pose.pitch_deg, self.pose.heading_deg]), (len(t_s), 1))
+        rates = np.zeros_like(angles)
+        for motion in self._motions:
+            if len(t_s) == 0 or t_s[-1] < motion.start_s:
+                continue
+            if t_s[0] >= motion.end_s:
+                angles += motion.leaves_rad()
+                continue
+            inside = np.clip(t_s, motion.start_s, motion.end_s)
+            added, slopes = motion.euler_rad(inside)
+            acting = (t_s >= motion.start_s) & (t_s < motion.end_s)
+            over = t_s >= motion.end_s
+            angles += np.where(over[:, None], motion.leaves_rad(), np.where(acting[:, None], added, 0.0))
+            rates += np.where(acting[:, None], slopes, 0.0)
+        return angles, rates
+
+    def _moving(self, t_s: Array) -> Truth:
+        angles, slopes = self._euler(t_s)
+        roll, pitch, yaw = angles.T
+        sr, cr, sp, cp, sy, cy = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch), np.sin(yaw), np.cos(yaw)
+        to_body = np.empty((len(t_s), 3, 3))
+        to_body[:, 0] = np.column_stack([cp * cy, cp * sy, -sp])
+        to_body[:, 1] = np.column_stack([sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp])
+        to_body[:, 2] = np.column_stack([cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp])
+        turning = np.column_stack(
+            [
+                slopes[:, 0] - sp * slopes[:, 2],
+                cr * slopes[:, 1] + sr * cp * slopes[:, 2],
+                -sr * slopes[:, 1] + cr * cp * slopes[:, 2],
+            ]
+        )
+        force = -(to_body @ self._gravity_ned)
+        for motion in self._motions:
+            acting = (t_s >= motion.start_s) & (t_s < motion.end_s)
+            if acting.any():
+                force[acting] += motion.acceleration_m_s2(t_s[acting])
+        return Truth(turning + to_body @ self._earth_rate_ned, force)

@@ -1,0 +1,1 @@
+"""The parts of the ArduPilot double: channels, parameters, inertial path, messages, calibrations, faults."""

@@ -1,0 +1,85 @@
+"""ArduPilot's own calibrations, with what they assume: no Earth rate, a level vehicle, standard gravity."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sim.ardupilot.inertial import InertialPath
+from sim.ardupilot.parameters import ParameterStore, device_id, offset_names
+from sim.earth import STANDARD_GRAVITY_M_S2, Array
+
+GYRO_TIME_S = 0.55
+GYRO_GIVES_UP_S = 30.0
+ACCEL_TIME_S = 1.05
+ACCEL_PAUSE_S = 5.0
+AVERAGED_S = 0.5
+
+
+@dataclass(slots=True)
+class Calibrations:
+    """Works on the parameters of all IMUs at once. Offsets are found in board axes, before scale and orientation."""
+
+    paths: list[InertialPath]
+    store: ParameterStore
+    random: np.random.Generator
+    last_accel_s: float = field(default=-math.inf)
+
+    def _mean(self, path: InertialPath, t_s: float) -> Array:
+        """The sensor's mean over the averaging time that ends now, with its white noise."""
+        times = np.linspace(t_s - AVERAGED_S, t_s, 21)[1:]
+        mean: Array = path.model.expected_block(times).mean(axis=0)
+        return mean + self.random.standard_normal(6) * path.model.white / math.sqrt(AVERAGED_S)
+
+    def clear_gyros(self) -> None:
+        """The start of a gyro calibration: what is read meanwhile is zero."""
+        for path in self.paths:
+            for name in offset_names(path.instance, "gyro"):
+                self.store.set(name, 0.0)
+
+    def gyros(self, t_s: float) -> None:
+        """Mean rate becomes the offset: the Earth's rotation goes into it."""
+        for path in self.paths:
+            mean = self._mean(path, t_s)
+            for name, value in zip(offset_names(path.instance, "gyro"), mean[:3], strict=True):
+                self.store.set(name, float(value))
+            self._stamp(path, t_s, "GYR")
+
+    def simple_accel(self, t_s: float) -> None:
+        """Whatever differs from exactly level becomes the offset; scale 1, trim 0."""
+        for path in self.paths:
+            level = path.board().T @ np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
+            offset = self._mean(path, t_s)[3:] - level
+            for name, value in zip(offset_names(path.instance, "accel"), offset, strict=True):
+                self.store.set(name, float(value))
+            for name in offset_names(path.instance, "scale"):
+                self.store.set(name, 1.0)
+            self._stamp(path, t_s, "ACC")
+        for axis in "XYZ":
+            self.store.set(f"AHRS_TRIM_{axis}", 0.0)
+        self.last_accel_s = t_s
+
+    def level(self, t_s: float) -> bool:
+        """The attitude of the autopilot becomes the trim; False (and nothing written) beyond 10 degrees."""
+        x, y, z = self.paths[0].corrected(t_s)[3:]
+        roll, pitch = math.atan2(-y, -z), math.atan2(x, math.hypot(y, z))
+        if max(abs(roll), abs(pitch)) > math.radians(10.0):
+            return False
+        self.store.set("AHRS_TRIM_X", roll)
+        self.store.set("AHRS_TRIM_Y", pitch)
+        return True
+
+    def save_ids(self) -> None:
+        """param5 = 76: what is fitted counts as calibrated."""
+        for path in self.paths:
+            self.store.set(f"INS_ACC{_number(path)}_ID", device_id(path.instance))
+
+    def _stamp(self, path: InertialPath, t_s: float, kind: str) -> None:
+        self.store.set(f"INS_{kind}{path.instance}_CALTEMP", path.model.temperature_degc(t_s))
+        self.store.set(f"INS_{kind}{_number(path)}_ID", device_id(path.instance))
+
+
+def _number(path: InertialPath) -> str:
+    return "" if path.instance == 1 else str(path.instance)

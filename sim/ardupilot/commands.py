@@ -1,0 +1,241 @@
+"""The commands the double understands, with ArduPilot's results; all others are UNSUPPORTED."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.ardupilot.calibrations import ACCEL_PAUSE_S, ACCEL_TIME_S, AVERAGED_S, GYRO_GIVES_UP_S, GYRO_TIME_S
+from sim.ardupilot.channel import Channel
+from sim.ardupilot.messages import BUILDERS, STREAM_GROUPS
+
+if TYPE_CHECKING:
+    from sim.autopilot import ArduPilotDouble
+
+ACCEPTED, DENIED, UNSUPPORTED, FAILED = (
+    mavlink.MAV_RESULT_ACCEPTED,
+    mavlink.MAV_RESULT_DENIED,
+    mavlink.MAV_RESULT_UNSUPPORTED,
+    mavlink.MAV_RESULT_FAILED,
+)
+ACK_DELAY_S = 0.003
+_FORCE_ARM = (2989.0, 21196.0)
+
+
+class Command(NamedTuple):
+    """COMMAND_LONG or COMMAND_INT, and where to answer."""
+
+    channel: Channel
+    number: int
+    params: tuple[float, ...]
+    system_id: int
+    component_id: int
+    loop_s: float
+
+
+def command_of(
+    channel: Channel, message: mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_int_message, loop_s: float
+) -> Command:
+    """The common content of the two kinds; in COMMAND_INT x, y, z are params 5 to 7."""
+    first = (message.param1, message.param2, message.param3, message.param4)
+    if isinstance(message, mavlink.MAVLink_command_int_message):
+        params = (*first, float(message.x), float(message.y), message.z)
+    else:
+        params = (*first, message.param5, message.param6, message.param7)
+    return Command(channel, message.command, params, message.get_srcSystem(), message.get_srcComponent(), loop_s)
+
+
+class CommandServer:
+    """Carries out commands; a handler returns the result, or None when the acknowledgement comes later."""
+
+    def __init__(self, double: ArduPilotDouble) -> None:
+        self._double = double
+        self._handlers: dict[int, Callable[[Command], int | None]] = {
+            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_message_interval,
+            mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_message_interval,
+            mavlink.MAV_CMD_REQUEST_MESSAGE: self._request_message,
+            mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._request_capabilities,
+            mavlink.MAV_CMD_PREFLIGHT_CALIBRATION: self._calibrate,
+            mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
+            mavlink.MAV_CMD_PREFLIGHT_STORAGE: self._storage,
+            mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
+            mavlink.MAV_CMD_RUN_PREARM_CHECKS: self._run_prearm_checks,
+        }
+
+    def handle(self, command: Command) -> None:
+        """Do it, and acknowledge."""
+        handler = self._handlers.get(command.number)
+        result = UNSUPPORTED if handler is None else handler(command)
+        if result is not None:
+            self._acknowledge(command, result)
+
+    def data_stream(self, channel: Channel, message: mavlink.MAVLink_request_data_stream_message, now_s: float) -> None:
+        """The legacy REQUEST_DATA_STREAM."""
+        rate = message.req_message_rate
+        group = message.req_stream_id
+        groups = STREAM_GROUPS if group == mavlink.MAV_DATA_STREAM_ALL else {group: STREAM_GROUPS.get(group, ())}
+        for ids in groups.values():
+            for message_id in ids:
+                wanted = 1.0 / rate if message.start_stop and rate > 0 else None
+                channel.set_stream(message_id, wanted, now_s)
+        self._double.wake()
+
+    def _acknowledge(self, command: Command, result: int, *, delay_s: float = ACK_DELAY_S) -> None:
+        answer = mavlink.MAVLink_command_ack_message(
+            command.number, result, 0, 0, command.system_id, command.component_id
+        )
+        self._double.later(delay_s, lambda: self._double.answer(command.channel, answer))
+
+    def _known(self, message_id: int) -> bool:
+        if message_id == mavlink.MAVLINK_MSG_ID_HIGHRES_IMU and not self._double.has_highres_imu:
+            return False
+        return message_id in BUILDERS
+
+    def _set_message_interval(self, command: Command) -> int:
+        double = self._double
+        message_id, interval_us, where = int(command.params[0]), command.params[1], command.params[2]
+        if not self._known(message_id):
+            double.say(mavlink.MAV_SEVERITY_INFO, f"No ap_message for mavlink id ({message_id})")
+            return DENIED
+        if where != 0.0 or not math.isfinite(interval_us):
+            return DENIED
+        if interval_us in (0.0, -1.0):
+            is_heartbeat = message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT
+            default = 1.0 if is_heartbeat and interval_us == 0.0 else None
+            command.channel.set_stream(message_id, default, command.loop_s)
+            return ACCEPTED
+        if interval_us < 0.0:
+            return DENIED
+        interval_ms = int(interval_us / 1000.0)
+        fastest_ms = double.fastest_interval_ms
+        if interval_ms < fastest_ms:
+            if double.version != "4.5":
+                double.say(
+                    mavlink.MAV_SEVERITY_INFO,
+                    f"Requested rate for message ID {message_id} too fast. Increase SCHED_LOOP_RATE",
+                )
+                return DENIED
+            interval_ms = fastest_ms
+        command.channel.set_stream(message_id, min(interval_ms, 60000) / 1000.0, command.loop_s)
+        double.wake()
+        return ACCEPTED
+
+    def _get_message_interval(self, command: Command) -> int:
+        message_id = int(command.params[0])
+        stream = command.channel.streams.get(message_id)
+        interval_us = -1 if stream is None else round(stream.interval_s * 1e6)
+        if not self._known(message_id):
+            interval_us = 0
+        self._double.answer(command.channel, mavlink.MAVLink_message_interval_message(message_id, interval_us))
+        return ACCEPTED
+
+    def _request_message(self, command: Command) -> int:
+        message_id = int(command.params[0])
+        if not self._known(message_id):
+            return FAILED
+        self._double.answer(command.channel, BUILDERS[message_id](self._double, command.loop_s))
+        return ACCEPTED
+
+    def _request_capabilities(self, command: Command) -> int:
+        if command.params[0] != 1.0:
+            return FAILED
+        version = BUILDERS[mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION](self._double, command.loop_s)
+        self._double.answer(command.channel, version)
+        return ACCEPTED
+
+    def _reboot(self, command: Command) -> int:
+        if command.params[0] not in (1.0, 3.0):
+            return UNSUPPORTED
+        if self._double.armed:
+            return FAILED
+        self._double.later(0.2, self._double.reboot)  # after the acknowledgement is out
+        return ACCEPTED
+
+    def _storage(self, command: Command) -> int:
+        if command.params[0] in (2.0, 4.0):
+            self._double.erase_parameters()  # with no look at the armed state, as the real one
+            return ACCEPTED
+        return DENIED
+
+    def _arm(self, command: Command) -> int:
+        double = self._double
+        if command.params[0] == 0.0:
+            double.disarm()
+            return ACCEPTED
+        if command.params[0] != 1.0:
+            return UNSUPPORTED
+        failures = [] if command.params[1] in _FORCE_ARM else double.prearm_failures(command.loop_s)
+        for failure in failures:
+            double.say(mavlink.MAV_SEVERITY_CRITICAL, f"Arm: {failure}")
+        if failures or double.calibrating:
+            return FAILED
+        double.arm()
+        return ACCEPTED
+
+    def _run_prearm_checks(self, command: Command) -> int:
+        if self._double.armed:
+            return mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+        for failure in self._double.prearm_failures(command.loop_s):
+            self._double.say(mavlink.MAV_SEVERITY_CRITICAL, f"PreArm: {failure}")
+        return ACCEPTED
+
+    def _calibrate(self, command: Command) -> int | None:
+        double = self._double
+        gyros, accelerometers = command.params[0] == 1.0, command.params[4]
+        if double.armed:
+            double.say(mavlink.MAV_SEVERITY_NOTICE, "Disarm to allow calibration")
+            return FAILED
+        if double.calibrating:
+            return ACCEPTED if gyros else FAILED  # the real one says so too early, while offsets still read zero
+        if gyros or accelerometers == 2.0:
+            self._start_gyros(command, then_level=accelerometers == 2.0)
+            return None
+        if accelerometers == 4.0:
+            if double.aircraft.time_at(command.loop_s) - double.calibrations.last_accel_s < ACCEL_PAUSE_S:
+                return mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+            double.calibrating = True
+            double.later(ACCEL_TIME_S, lambda: self._finish_accel(command))
+            return None
+        if accelerometers == 76.0:
+            double.calibrations.save_ids()
+            return ACCEPTED
+        return UNSUPPORTED
+
+    def _start_gyros(self, command: Command, *, then_level: bool) -> None:
+        double = self._double
+        double.calibrating = True
+        double.say(mavlink.MAV_SEVERITY_INFO, "Calibrating gyros")
+        double.update_estimator(command.loop_s)
+        double.calibrations.clear_gyros()
+        double.later(GYRO_TIME_S, lambda: self._finish_gyros(command, then_level=then_level))
+
+    def _finish_gyros(self, command: Command, *, then_level: bool) -> None:
+        double = self._double
+        now_s = double.now_s()
+        t_s = double.aircraft.time_at(now_s)
+        still = double.aircraft.still_at(t_s) and double.aircraft.still_at(t_s - AVERAGED_S)
+        if not still and now_s - command.loop_s < GYRO_GIVES_UP_S:
+            double.later(0.25, lambda: self._finish_gyros(command, then_level=then_level))
+            return
+        double.calibrations.gyros(t_s)  # stored even when it has not converged
+        double.calibrating = False
+        result = ACCEPTED if still else FAILED
+        if still:
+            double.estimator.reset_gyro_bias()
+        if still and then_level and not double.calibrations.level(t_s):
+            result = FAILED
+        self._acknowledge(command, result)
+
+    def _finish_accel(self, command: Command) -> None:
+        double = self._double
+        t_s = double.aircraft.time_at(double.now_s())
+        double.calibrating = False
+        if not double.aircraft.still_at(t_s):
+            self._acknowledge(command, FAILED)
+            return
+        double.calibrations.simple_accel(t_s)
+        double.estimator.reset(t_s)
+        self._acknowledge(command, ACCEPTED)

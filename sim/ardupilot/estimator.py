@@ -1,0 +1,59 @@
+"""A coarse stand-in for EKF3: a gyro bias estimate that goes stale after a write, and an attitude that follows.
+
+Only what a companion can see and must reckon with (autopilots 1.7 and 9.3.1): after a step in the offsets the old
+estimate stays and fades over about two minutes; the autopilot's own gyro calibration resets it; a horizontal
+accelerometer error becomes a tilt error; after a boot the vertical estimate is wrong by hundreds of deg/h for a while.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sim.earth import STANDARD_GRAVITY_M_S2, Array
+from sim.imu_model import DEG_H
+
+_BIAS_FADES_S = 40.0
+_TILT_FADES_S = 10.0
+_START_ERROR_RAD_S = np.array([60.0, 40.0, -1500.0]) * DEG_H
+
+
+class CoarseEstimator:
+    """States in vehicle FRD; `update` wants the current errors of the corrected IMU output."""
+
+    def __init__(self) -> None:
+        self.gyro_bias_rad_s = np.zeros(3)
+        self.tilt_error_rad = np.zeros(2)
+        """Roll, pitch."""
+        self._start_error = np.zeros(3)
+        self._time_s = 0.0
+        self.reset(0.0)
+
+    def reset(self, t_s: float) -> None:
+        """A start at this time: nothing known yet, and the vertical bias about to be mistaken."""
+        self.gyro_bias_rad_s[:] = 0.0
+        self.tilt_error_rad[:] = 0.0
+        self._start_error[:] = _START_ERROR_RAD_S
+        self._time_s = t_s
+
+    def reset_gyro_bias(self) -> None:
+        """What the autopilot's own gyro calibration does."""
+        self.gyro_bias_rad_s[:] = 0.0
+        self._start_error[:] = 0.0
+
+    @property
+    def omega_i(self) -> Array:
+        """What AHRS.omegaI shows: minus the estimated gyro bias."""
+        result: Array = -(self.gyro_bias_rad_s + self._start_error)
+        return result
+
+    def update(self, t_s: float, gyro_error: Array, accel_error: Array) -> None:
+        """Go to this time, the errors (output minus truth) having been these since the last update."""
+        tilt = np.array([-accel_error[1], accel_error[0]]) / STANDARD_GRAVITY_M_S2
+        span = max(t_s - self._time_s, 0.0)
+        stays = math.exp(-span / _BIAS_FADES_S)
+        self.gyro_bias_rad_s += (1.0 - stays) * (gyro_error - self.gyro_bias_rad_s)
+        self._start_error *= stays
+        self.tilt_error_rad += (1.0 - math.exp(-span / _TILT_FADES_S)) * (tilt - self.tilt_error_rad)
+        self._time_s = t_s

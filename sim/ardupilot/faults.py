@@ -1,0 +1,41 @@
+"""What can go wrong with an autopilot; every field may be changed at any time while the double runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+
+
+@dataclass(slots=True)
+class Faults:
+    """Switches. Sets of names may contain patterns such as "INS_ACC*"."""
+
+    echo_without_effect: bool = False
+    """PARAM_SET is stored and echoed, but the telemetry goes on with the old value until the next reboot."""
+    refuse: set[str] = field(default_factory=set)
+    """PARAM_SET of these is refused as ArduPilot does: "Param write denied", PARAM_ERROR (4.8), the old value."""
+    ignore: set[str] = field(default_factory=set)
+    """PARAM_SET and PARAM_REQUEST_READ of these are not answered, and not obeyed."""
+    wrong_echo: set[str] = field(default_factory=set)
+    """The answer to PARAM_SET of these carries another value than the one that was set and stored."""
+    silent: bool = False
+    """Answers nothing: no parameters, no acknowledgements; heartbeats and telemetry go on."""
+    heartbeat_off: bool = False
+    telemetry_off: bool = False
+    """Nothing but heartbeats and answers is sent."""
+    frozen_imu: bool = False
+    """IMU messages repeat the last values."""
+    int_only: bool = False
+    """A board with 1 MB of flash: HIGHRES_IMU is not in the firmware."""
+    reboot_after_writes: int | None = None
+    """Reboot at the n-th PARAM_SET from now, after storing it and before answering; then None again."""
+    arm_after_writes: int | None = None
+    """The pilot arms at the n-th PARAM_SET from now, which is still obeyed and answered; then None again."""
+    foreign_write_after: tuple[int, str, float] | None = None
+    """(n, name, value): another ground station sets a parameter right after the n-th PARAM_SET from now."""
+
+
+def names_match(patterns: Iterable[str], name: str) -> bool:
+    """Whether a name is one of, or fits one of, the patterns."""
+    return any(fnmatchcase(name, pattern) for pattern in patterns)

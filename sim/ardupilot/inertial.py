@@ -1,0 +1,163 @@
+"""From the sensor to the autopilot's output: offsets, scales, board orientation and the 20 Hz filter.
+
+    gyro_body  = R_b (raw - GYROFFS)
+    accel_body = R_b diag(ACCSCAL) (raw - ACCOFFS)
+
+then a second-order low-pass. Telemetry shows samples of the filtered value, not means; their noise is therefore that of
+the filter's output (N^2 times 44 Hz at 20 Hz cut-off), whatever the message rate, and correlated over some 20 ms. The
+filter is carried forward exactly between messages, so the mean over a long time has the variance N^2/T.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.ardupilot.parameters import ParameterStore, offset_names
+from sim.earth import Array, mounting_matrix
+from sim.imu_model import ImuModel
+
+RAW_RATE_HZ = 1000.0
+"""Rate of the sensor's own samples; their rounding adds white noise."""
+ORIENTATION_PERIOD_S = 1.0
+_MOVING_STEP_S = 0.0025
+_DAMPING = math.sqrt(0.5)
+_FINE_DEG = {68.0: 68.8, 293.0: 293.3}
+_PREFIX = "MAV_SENSOR_ROTATION_"
+
+
+def orientation_matrix(store: ParameterStore) -> Array:
+    """Board to vehicle for AHRS_ORIENTATION, with 101 and 102 the custom rotations; unknown numbers are none."""
+    number = int(store.effective["AHRS_ORIENTATION"])
+    if number in (101, 102):
+        if not store.effective["CUST_ROT_ENABLE"]:
+            return np.eye(3)
+        prefix = f"CUST_ROT{number - 100}_"
+        return mounting_matrix(*(store.effective[prefix + angle] for angle in ("ROLL", "PITCH", "YAW")))
+    later = {41: (0.0, 7.0, 0.0), 42: (45.0, 0.0, 0.0), 43: (315.0, 0.0, 0.0)}
+    if number in later:
+        return mounting_matrix(*later[number])
+    entry = mavlink.enums["MAV_SENSOR_ORIENTATION"].get(number)
+    if entry is None or number >= 100:
+        return np.eye(3)
+    words = entry.name.removeprefix(_PREFIX).split("_")
+    angles = {word: float(value) for word, value in zip(words[0::2], words[1::2], strict=False)}
+    roll, pitch, yaw = (_FINE_DEG.get(angle, angle) for angle in (angles.get(w, 0.0) for w in ("ROLL", "PITCH", "YAW")))
+    return mounting_matrix(roll, pitch, yaw)
+
+
+class InertialPath:
+    """One IMU as the autopilot reports it. Times are aircraft time and must not go back between `reset`s."""
+
+    def __init__(self, model: ImuModel, instance: int, store: ParameterStore, *, seed: int) -> None:
+        self.model, self.instance = model, instance
+        self._store = store
+        self._random = np.random.default_rng([seed, 3, instance])
+        self._noise: list[Array] = []
+        self._noise_key = (0.0, 0.0)
+        self._transition = np.eye(2)
+        steps = np.repeat([model.spec.gyro.step, model.spec.accel.step], 3)
+        self._density = np.sqrt(model.white**2 + steps**2 / 12.0 / RAW_RATE_HZ)
+        self._state = np.zeros((2, 6))
+        self._time_s: float | None = None
+        self._kernels: dict[tuple[float, float], tuple[Array, Array]] = {}
+        self._revision = -1
+        self._offset = np.zeros(6)
+        self._scale = np.ones(6)
+        self._board = np.eye(3)
+        self._board_checked_s = -math.inf
+
+    def reset(self) -> None:
+        """A boot: the filter starts anew."""
+        self._time_s = None
+        self._board_checked_s = -math.inf
+
+    def corrected(self, t_s: float, *, armed: bool = False) -> Array:
+        """What the output would be without noise and filter (6): rates and specific forces in vehicle FRD."""
+        return self._correct(self.model.expected(t_s), t_s, armed=armed)
+
+    def output(self, t_s: float, *, armed: bool = False) -> Array:
+        """The filtered reading at this time (6), in vehicle FRD by the orientation that is set."""
+        if self._time_s is None:
+            self._start(t_s)
+        assert self._time_s is not None
+        span = t_s - self._time_s
+        if span <= 0.0:
+            return self._value()
+        aircraft = self.model.aircraft
+        if aircraft.still_at(t_s) and aircraft.still_at(self._time_s):
+            self._advance(self._correct(self.model.expected(t_s), t_s, armed=armed), span)
+        else:
+            steps = min(math.ceil(span / _MOVING_STEP_S), 400)  # the last second is all that the filter remembers
+            begin = max(self._time_s, t_s - steps * _MOVING_STEP_S)
+            times = np.linspace(begin, t_s, steps + 1)[1:]
+            for expected, time in zip(self.model.expected_block(times), times, strict=True):
+                self._advance(self._correct(expected, float(time), armed=armed), (t_s - begin) / steps)
+        self._time_s = t_s
+        return self._value()
+
+    def _value(self) -> Array:
+        value: Array = self._state[0].copy()
+        return value
+
+    def _start(self, t_s: float) -> None:
+        cutoff = 2.0 * math.pi * self._cutoff_hz()
+        sigma = np.outer([1.0, cutoff], self._density) * math.sqrt(cutoff / (4.0 * _DAMPING))
+        self._state = sigma * self._random.standard_normal((2, 6))
+        self._state[0] += self._correct(self.model.expected(t_s), t_s, armed=False)
+        self._time_s = t_s
+
+    def _cutoff_hz(self) -> float:
+        return max(self._store.effective["INS_GYRO_FILTER"], 1.0)
+
+    def _correct(self, raw: Array, t_s: float, *, armed: bool) -> Array:
+        store = self._store
+        if self._revision != store.revision:
+            self._revision = store.revision
+            self._offset[:3] = store.vector(offset_names(self.instance, "gyro"))
+            self._offset[3:] = store.vector(offset_names(self.instance, "accel"))
+            self._scale[3:] = store.vector(offset_names(self.instance, "scale"))
+        if not armed and t_s >= self._board_checked_s + ORIENTATION_PERIOD_S:
+            self._board = orientation_matrix(store)
+            self._board_checked_s = t_s
+        board_axes = (raw - self._offset) * self._scale
+        result: Array = (board_axes.reshape(2, 3) @ self._board.T).ravel()
+        return result
+
+    def board(self) -> Array:
+        """The orientation in use, board to vehicle."""
+        return self._board
+
+    def _advance(self, target: Array, span_s: float) -> None:
+        key = (round(span_s, 6), self._cutoff_hz())
+        if key != self._noise_key or not self._noise:
+            transition, root = self._kernel(key)
+            count = 128 if key == self._noise_key else 1  # a block once the same span has come twice
+            kicks = (root @ self._random.standard_normal((count, 2, 6))) * self._density
+            self._noise_key, self._transition, self._noise = key, transition, list(kicks)
+        state = self._state
+        state[0] -= target
+        state = self._transition @ state
+        state += self._noise.pop()
+        state[0] += target
+        self._state = state
+
+    def _kernel(self, key: tuple[float, float]) -> tuple[Array, Array]:
+        """Transition matrix, and square root of the covariance that unit white noise adds, over a span."""
+        found = self._kernels.get(key)
+        if found is None:
+            omega = 2.0 * math.pi * key[1]
+            decay = omega * _DAMPING  # with this damping the ringing has the same frequency as the decay
+            e, c, s = math.exp(-decay * key[0]), math.cos(decay * key[0]), math.sin(decay * key[0])
+            transition = e * np.array([[c + s, s / decay], [-(omega**2) * s / decay, c - s]])
+            stationary = omega / (4.0 * _DAMPING) * np.diag([1.0, omega**2])
+            added = stationary - transition @ stationary @ transition.T
+            scale = np.array([1.0, omega])
+            low = np.linalg.cholesky(added / np.outer(scale, scale) + 1e-15 * np.eye(2))
+            found = (transition, scale[:, None] * low)
+            if len(self._kernels) > 256:
+                self._kernels.clear()
+            self._kernels[key] = found
+        return found

@@ -1,0 +1,162 @@
+"""ArduPilot's parameter table: names as the firmware has them, float32 values, and what the IMU path really uses."""
+
+from __future__ import annotations
+
+import struct
+from typing import Literal
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+Version = Literal["4.8", "4.5"]
+REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
+INT8 = mavlink.MAV_PARAM_TYPE_INT8
+INT16 = mavlink.MAV_PARAM_TYPE_INT16
+INT32 = mavlink.MAV_PARAM_TYPE_INT32
+_LIMITS = {INT8: (-128, 127), INT16: (-32768, 32767), INT32: (-(2**31), 2**31 - 1)}
+
+AXES = ("X", "Y", "Z")
+
+
+def float32(value: float) -> float:
+    """The nearest float32, as everything the autopilot stores."""
+    return float(struct.unpack("<f", struct.pack("<f", value))[0])
+
+
+def offset_names(instance: int, kind: Literal["gyro", "accel", "scale"]) -> tuple[str, str, str]:
+    """Parameter names of instance 1 to 3; the first one is irregular (there is no INS_ACC1OFFS_X)."""
+    first = {"gyro": "INS_GYROFFS", "accel": "INS_ACCOFFS", "scale": "INS_ACCSCAL"}
+    later = {"gyro": "INS_GYR{}OFFS", "accel": "INS_ACC{}OFFS", "scale": "INS_ACC{}SCAL"}
+    base = first[kind] if instance == 1 else later[kind].format(instance)
+    return f"{base}_X", f"{base}_Y", f"{base}_Z"
+
+
+class ParameterStore:
+    """Name to value. `values` is what is read back; `effective` is what the firmware works with."""
+
+    def __init__(self, defaults: dict[str, tuple[float, int]]) -> None:
+        self._types = {name: kind for name, (_, kind) in defaults.items()}
+        self.values = {name: float32(value) for name, (value, _) in defaults.items()}
+        self.effective = dict(self.values)
+        self.revision = 0
+        """Grows with every change of `effective`."""
+        self.names = tuple(self.values)
+        """In the order of their indices."""
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.values
+
+    def type_of(self, name: str) -> int:
+        """MAV_PARAM_TYPE."""
+        return self._types[name]
+
+    def set(self, name: str, value: float, *, takes_effect: bool = True) -> float:
+        """Store as the firmware would (float32; integers rounded and limited); returns what is stored."""
+        kind = self._types[name]
+        if kind == REAL32:
+            value = float32(value)
+        else:
+            low, high = _LIMITS[kind]
+            value = float(min(max(round(value), low), high))
+        self.values[name] = value
+        if takes_effect:
+            self.effective[name] = value
+            self.revision += 1
+        return value
+
+    def reload(self) -> None:
+        """A boot: what is stored is what is used."""
+        self.effective = dict(self.values)
+        self.revision += 1
+
+    def vector(self, names: tuple[str, str, str]) -> tuple[float, float, float]:
+        """Three effective values."""
+        x, y, z = (self.effective[name] for name in names)
+        return x, y, z
+
+    def family(self, name: str) -> tuple[str, ...]:
+        """Names whose values are sent after a write: X of a vector brings Y and Z."""
+        if name.endswith("_X"):
+            family = tuple(name[:-1] + axis for axis in AXES)
+            if all(member in self.values for member in family):
+                return family
+        return (name,)
+
+
+def default_parameters(version: Version, imus: int) -> dict[str, tuple[float, int]]:
+    """The parameters a companion meets, in a fixed order, with values of a calibrated board with `imus` IMUs.
+
+    Offsets of 0.001 m/s^2 stand for "has been accelerometer-calibrated", as ArduPilot's own simulator does.
+    """
+    table: dict[str, tuple[float, int]] = {"FORMAT_VERSION": (120 if version == "4.8" else 16, INT16)}
+    old = version == "4.5"
+    table["SYSID_THISMAV" if old else "MAV_SYSID"] = (1, INT16)
+    table["SYSID_MYGCS" if old else "MAV_GCS_SYSID"] = (255, INT16)
+    table["ARMING_CHECK" if old else "ARMING_SKIPCHK"] = (1 if old else 0, INT32)
+    table |= {"ARMING_REQUIRE": (1, INT8), "ARMING_ACCTHRESH": (0.75, REAL32)}
+    table |= {f"AHRS_TRIM_{axis}": (0.0, REAL32) for axis in AXES}
+    table |= {"AHRS_ORIENTATION": (0, INT8), "AHRS_EKF_TYPE": (3, INT8), "CUST_ROT_ENABLE": (0, INT8)}
+    for number in (1, 2):
+        table |= {f"CUST_ROT{number}_{angle}": (0.0, REAL32) for angle in ("ROLL", "PITCH", "YAW")}
+    for instance in (1, 2, 3):
+        table |= _imu_parameters(instance, exists=instance <= imus)
+    table |= {
+        "INS_GYR_CAL": (1, INT8),
+        "INS_ENABLE_MASK": (127, INT8),
+        "INS_FAST_SAMPLE": (1, INT8),
+        "INS_GYRO_FILTER": (20, INT16),
+        "INS_ACCEL_FILTER": (20, INT16),
+        "INS_GYRO_RATE": (0, INT8),
+        "INS_ACC_BODYFIX": (2, INT8),
+        "INS_STILL_THRESH": (2.5, REAL32),
+        "INS_TRIM_OPTION": (1, INT8),
+        "INS_TCAL_OPTIONS": (0, INT8),
+        "INS_LOG_BAT_MASK": (0, INT8),
+        "BRD_BOOT_DELAY": (0, INT16),
+        "BRD_OPTIONS": (0, INT32),
+        "BRD_RTC_TYPES": (1, INT8),
+        "BRD_SERIAL_NUM": (0, INT32),
+        "EK3_ENABLE": (1, INT8),
+        "EK3_IMU_MASK": (2 ** min(imus, 3) - 1, INT8),
+        "EK3_SRC1_YAW": (1, INT8),
+        "EK3_GBIAS_P_NSE": (0.001, REAL32),
+        "EK3_ABIAS_P_NSE": (0.02, REAL32),
+        "EK3_ACC_BIAS_LIM": (1.0, REAL32),
+        "COMPASS_ENABLE": (1, INT8),
+        "COMPASS_USE": (1, INT8),
+        "COMPASS_AUTODEC": (1, INT8),
+        "COMPASS_DEC": (0.0, REAL32),
+        "SCHED_LOOP_RATE": (400, INT16),
+        "SCR_ENABLE": (0, INT8),
+        "VISO_TYPE": (0, INT8),
+        "GPS_TYPE" if old else "GPS1_TYPE": (1, INT8),
+        "LOG_BITMASK": (176126, INT32),
+        "LOG_DISARMED": (0, INT8),
+        "STAT_BOOTCNT": (1, INT16),
+        "STAT_RUNTIME": (0, INT32),
+    }
+    groups = ("RAW_SENS", "EXT_STAT", "RC_CHAN", "RAW_CTRL", "POSITION", "EXTRA1", "EXTRA2", "EXTRA3", "PARAMS")
+    for port in range(2):
+        table |= {f"SR{port}_{group}" if old else f"MAV{port + 1}_{group}": (0, INT16) for group in groups}
+    return table
+
+
+def _imu_parameters(instance: int, *, exists: bool) -> dict[str, tuple[float, int]]:
+    number = "" if instance == 1 else str(instance)
+    table: dict[str, tuple[float, int]] = dict.fromkeys(offset_names(instance, "gyro"), (0.0, REAL32))
+    table |= dict.fromkeys(offset_names(instance, "scale"), (1.0 if exists else 0.0, REAL32))
+    table |= dict.fromkeys(offset_names(instance, "accel"), (0.001 if exists else 0.0, REAL32))
+    table |= {
+        f"INS_GYR{number}_ID": (device_id(instance) if exists else 0, INT32),
+        f"INS_ACC{number}_ID": (device_id(instance) if exists else 0, INT32),
+        f"INS_USE{number}": (1, INT8),
+        f"INS_GYR{instance}_CALTEMP": (-300.0, REAL32),
+        f"INS_ACC{instance}_CALTEMP": (-300.0, REAL32),
+        f"INS_TCAL{instance}_ENABLE": (0, INT8),
+    }
+    table |= {f"INS_POS{instance}_{axis}": (0.0, REAL32) for axis in AXES}
+    return table
+
+
+def device_id(instance: int) -> int:
+    """A 24-bit id such as ArduPilot makes: SPI bus, chip select, device type."""
+    return 0x3A0002 + (instance << 8)

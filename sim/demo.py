@@ -1,0 +1,208 @@
+"""`make demo`: the real daemon calibrates a virtual aircraft, and the truth judges it.
+
+The daemon runs as its own process with an ordinary configuration: serial ports (ptys) for IMU, gradienter and compass,
+MAVLink over UDP to the autopilot double. Afterwards an observer on the autopilot's second link measures what is left
+in its telemetry. Exit code 0 only if every axis lies within 3 sigma_use of the truth and the flight controller's
+residual is within 10 deg/h and 0.3 mg.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from sim.ardupilot.parameters import offset_names
+from sim.earth import Array
+from sim.imu_model import DEG_H, MG, ImuModel
+from sim.observer import Observer
+from sim.pty_device import PtyDevice
+from sim.scenario import Scenario, demo
+from sim.serve import configuration, describe
+from sim.udp import open_udp
+
+RESIDUAL_GYRO_DEG_H: Final = 10.0
+RESIDUAL_ACCEL_MG: Final = 0.3
+SIGMAS: Final = 3.0
+OBSERVE_S: Final = 15.0
+READY_WITHIN_S: Final = 20.0
+CALIBRATE_WITHIN_S: Final = 150.0
+
+Record = dict[str, Any]
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the demonstration; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m sim demo", description="A virtual aircraft is calibrated.")
+    parser.add_argument("--seed", type=int, default=0, help="the same seed gives the same noise (default 0)")
+    arguments = parser.parse_args(argv)
+    with tempfile.TemporaryDirectory(prefix="companion-demo-") as folder:
+        try:
+            return asyncio.run(_run(Path(folder), arguments.seed))
+        except KeyboardInterrupt:
+            return 1
+        except (TimeoutError, OSError, RuntimeError) as error:
+            print(f"demo: {error}", file=sys.stderr)
+            return 1
+
+
+async def _run(folder: Path, seed: int) -> int:
+    started_s = time.monotonic()
+    scenario = demo(seed=seed, unix_s=time.time())
+    async with contextlib.AsyncExitStack() as stack:
+        observer = await _serve(scenario, folder, stack)
+        print(describe(scenario, devices=True, autopilot=True).replace("# ", ""), end="")
+        print("\nStarting the daemon: companion run", flush=True)
+        daemon = await _start_daemon(folder)
+        stack.push_async_callback(_stop_daemon, daemon)
+        await _wait_ready(folder, daemon)
+        print("Calibrating both IMUs at once: companion calibrate --wait\n", flush=True)
+        record = await _calibrate(folder)
+        if record["state"] != "done":
+            print(f"\nThe calibration {record['state']}: {record['reason']}", file=sys.stderr)
+            return 1
+        print(f"\nCalibrated in {record['duration_s']:.0f} s. Now {OBSERVE_S:.0f} s of the autopilot's own telemetry,")
+        print("seen by a ground station that knows nothing of the companion...", flush=True)
+        await asyncio.sleep(1.0)
+        loop = asyncio.get_running_loop()
+        begin_s = scenario.aircraft.time_at(loop.time())
+        mean = await observer.mean_imu(OBSERVE_S)
+        end_s = scenario.aircraft.time_at(loop.time())
+        truth = scenario.aircraft.truth_at(end_s)
+        residual = mean - np.concatenate([truth.rate_rad_s, truth.force_m_s2])
+        stored = np.array(
+            [await observer.parameter(name) for kind in ("gyro", "accel") for name in offset_names(1, kind)]
+        )
+        good = _report(scenario, record, begin_s, end_s, residual, stored)
+    print(f"\n{'All within limits.' if good else 'NOT within limits.'} Took {time.monotonic() - started_s:.0f} s.")
+    return 0 if good else 1
+
+
+async def _serve(scenario: Scenario, folder: Path, stack: contextlib.AsyncExitStack) -> Observer:
+    """Bring the aircraft to life and write the configuration that fits it."""
+    scenario.aircraft.begin(asyncio.get_running_loop().time())
+    for name, device in (("imu", scenario.imu), ("gradienter", scenario.gradienter), ("compass", scenario.compass)):
+        await stack.enter_async_context(PtyDevice(device, folder / name))
+    link = await open_udp(scenario.autopilot, listen=("127.0.0.1", 0))
+    stack.callback(link.close)
+    ground = await open_udp(scenario.autopilot.ground, listen=("127.0.0.1", 0))
+    stack.callback(ground.close)
+    autopilot = asyncio.get_running_loop().create_task(scenario.autopilot.run(), name="autopilot")
+    stack.push_async_callback(_cancel, autopilot)
+    observer = Observer(ground.local)
+    await observer.open()
+    stack.callback(observer.close)
+    text = configuration(scenario, directory=folder, udp=link.local).replace("udpin:", "udpout:")
+    text += f'\n[control]\nsocket = "{folder / "control.sock"}"\n\n[storage]\ndirectory = "{folder / "state"}"\n'
+    (folder / "companion.toml").write_text(text, encoding="utf-8")
+    return observer
+
+
+def _command(folder: Path, *words: str) -> list[str]:
+    return [sys.executable, "-m", "companion", "-c", str(folder / "companion.toml"), *words]
+
+
+async def _start_daemon(folder: Path) -> asyncio.subprocess.Process:
+    with (folder / "daemon.log").open("wb") as log:
+        return await asyncio.create_subprocess_exec(*_command(folder, "run"), stderr=log)
+
+
+async def _stop_daemon(daemon: asyncio.subprocess.Process) -> None:
+    if daemon.returncode is None:
+        daemon.terminate()
+    await daemon.wait()
+
+
+async def _cancel(task: asyncio.Task[None]) -> None:
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+async def _wait_ready(folder: Path, daemon: asyncio.subprocess.Process) -> None:
+    """Wait until the daemon answers and knows that the aircraft is disarmed.
+
+    Raises:
+        RuntimeError: it ended; its log is in the message.
+        TimeoutError: it did not become ready.
+    """
+    deadline_s = time.monotonic() + READY_WITHIN_S
+    while time.monotonic() < deadline_s:
+        if daemon.returncode is not None:
+            raise RuntimeError(f"the daemon ended:\n{(folder / 'daemon.log').read_text()}")
+        status = await asyncio.create_subprocess_exec(
+            *_command(folder, "status", "--json"),
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.DEVNULL,
+        )
+        output, _ = await status.communicate()
+        if status.returncode == 0 and json.loads(output)["vehicle"]["armed"] == "disarmed":
+            return
+    raise TimeoutError(f"the daemon is not ready after {READY_WITHIN_S:g} s:\n{(folder / 'daemon.log').read_text()}")
+
+
+async def _calibrate(folder: Path) -> Record:
+    """Run `companion calibrate --wait`, its progress on our stderr, and return the record."""
+    words = ("calibrate", "--wait", "--timeout", str(CALIBRATE_WITHIN_S), "--json")
+    process = await asyncio.create_subprocess_exec(*_command(folder, *words), stdout=asyncio.subprocess.PIPE)
+    output, _ = await process.communicate()
+    if not output.strip():
+        raise RuntimeError(f"companion calibrate printed no record (exit code {process.returncode})")
+    record: Record = json.loads(output)
+    return record
+
+
+def _report(scenario: Scenario, record: Record, begin_s: float, end_s: float, residual: Array, stored: Array) -> bool:
+    """Print truth beside result; whether all is within limits."""
+    pose = record["pose"]
+    print(
+        f"\npose found: pitch {pose['theta_deg']:.3f}, roll {pose['gamma_deg']:.3f},"
+        f" heading {pose['psi_deg']:.1f} deg (sigma {pose['sigma_deg']['theta']:.3f},"
+        f" {pose['sigma_deg']['gamma']:.3f}, {pose['sigma_deg']['psi']:.1f})"
+    )
+    good = True
+    models = {"fc": scenario.flight_controller_imus[0], "own": scenario.serial_imu}
+    for imu in record["imus"]:
+        name = imu["name"]
+        words = "the flight controller's IMU" if name == "fc" else "the companion's own IMU, serial, 200 Hz"
+        print(f"\n{name}: {words}, {imu['samples']} samples")
+        autopilot = (stored, residual) if name == "fc" else None
+        good &= _print_imu(imu, models[name], (begin_s, end_s), autopilot)
+        for warning in imu["warnings"]:
+            print(f"  note: {warning}")
+    return good
+
+
+def _print_imu(
+    imu: Record, model: ImuModel, span_s: tuple[float, float], autopilot: tuple[Array, Array] | None
+) -> bool:
+    true = np.concatenate(model.mean_bias(*span_s))
+    found = np.array([*imu["gyro_bias_rad_s"], *imu["accel_bias_m_s2"]])
+    sigma = np.array([*imu["gyro_sigma_use_rad_s"], *imu["accel_sigma_use_m_s2"]])
+    header = f"  {'axis':10} {'unit':>6} {'true':>9} {'found':>9} {'sigma':>8} {'off by':>11}"
+    print(header + (f" {'in autopilot':>13} {'residual':>9}" if autopilot else ""))
+    good = True
+    for k in range(6):
+        unit, scale, digits = ("deg/h", DEG_H, 1) if k < 3 else ("mg", MG, 3)
+        off = (found[k] - true[k]) / sigma[k]
+        within = abs(off) <= SIGMAS
+        line = (
+            f"  {('gyro', 'accel')[k // 3]:5} {'xyz'[k % 3]:4} {unit:>6} {true[k] / scale:9.{digits}f}"
+            f" {found[k] / scale:9.{digits}f} {sigma[k] / scale:8.{digits}f} {off:+5.1f} sigma"
+        )
+        if autopilot is not None:
+            stored, residual = autopilot
+            limit = RESIDUAL_GYRO_DEG_H if k < 3 else RESIDUAL_ACCEL_MG
+            within &= abs(residual[k] / scale) <= limit
+            line += f" {stored[k] / scale:13.{digits}f} {residual[k] / scale:+9.{digits}f}"
+        print(line + ("" if within else "  <-- out of limits"))
+        good &= bool(within)
+    return good

@@ -1,0 +1,331 @@
+"""A MEMS IMU with everything that makes its bias a moving target, and the true bias always at hand.
+
+Noise words and figures are those of the method, section 2.2: white noise N (unit * sqrt(s), two-sided PSD N^2),
+flicker B (PSD B^2 / (2 pi f), Allan floor 0.664 B), rate random walk K. The slow part (flicker and walk) is one path
+in time, the same for every reader and every sampling rate; only white noise and rounding belong to a reading.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sim.aircraft import Truth, VirtualAircraft
+from sim.earth import STANDARD_GRAVITY_M_S2, Array, mounting_matrix
+
+DEG_H = math.radians(1.0) / 3600.0
+"""rad/s per deg/h."""
+MG = STANDARD_GRAVITY_M_S2 * 1e-3
+"""m/s^2 per mg."""
+UG = STANDARD_GRAVITY_M_S2 * 1e-6
+
+SLOW_STEP_S = 0.1
+"""Grid of the slow path. Faster flicker lies far below the white noise of every part listed here."""
+_BLOCK = 512
+_KEPT_BLOCKS = 400
+"""About 5.7 hours of slow path are kept; older times can no longer be asked for."""
+_TAU_RATIO = 3.0
+_TAUS_S = 0.3 * _TAU_RATIO ** np.arange(11.0)
+"""Time constants of the Gauss-Markov processes whose sum is the flicker: 0.3 s to 5 hours."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AxisNoise:
+    """Figures of one triad in SI: rad/s for gyros, m/s^2 for accelerometers."""
+
+    white: float
+    """N, unit * sqrt(s)."""
+    flicker: float = 0.0
+    """B, unit; the Allan floor is 0.664 B."""
+    walk: float = 0.0
+    """K, unit / sqrt(s)."""
+    per_kelvin: float = 0.0
+    """Bias per kelvin away from the reference temperature."""
+    step: float = 0.0
+    """Quantisation of the output; 0 for floats."""
+    limit: float = math.inf
+    """Saturation."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuSpec:
+    """A named part."""
+
+    name: str
+    gyro: AxisNoise
+    accel: AxisNoise
+    reference_degc: float = 25.0
+
+
+def _triad(*, white: float, floor: float, per_kelvin: float, step: float, limit: float) -> AxisNoise:
+    """Figures from an Allan floor, with K such that the walk reaches the floor at 1000 s (as the method assumes)."""
+    return AxisNoise(
+        white=white,
+        flicker=floor / 0.664,
+        walk=floor * math.sqrt(3.0 / 1000.0),
+        per_kelvin=per_kelvin,
+        step=step,
+        limit=limit,
+    )
+
+
+_DPS = math.radians(1.0)
+_G = STANDARD_GRAVITY_M_S2
+
+# Noise and floors: method section 2.2. Steps and ranges are the parts' usual digital formats; temperature figures of
+# the two Analog Devices parts, which are compensated inside, and the ADIS16405's accelerometer are assumptions.
+PARTS: dict[str, ImuSpec] = {
+    "icm42688p": ImuSpec(
+        name="icm42688p",
+        gyro=_triad(white=7.1 * DEG_H, floor=3 * DEG_H, per_kelvin=18 * DEG_H, step=_DPS / 262.4, limit=2000 * _DPS),
+        accel=_triad(white=49.5 * UG, floor=10 * UG, per_kelvin=0.15 * MG, step=_G / 32768, limit=16 * _G),
+    ),
+    "bmi088": ImuSpec(
+        name="bmi088",
+        gyro=_triad(white=35.6 * DEG_H, floor=2 * DEG_H, per_kelvin=54 * DEG_H, step=_DPS / 16.384, limit=2000 * _DPS),
+        accel=_triad(white=124 * UG, floor=20 * UG, per_kelvin=0.2 * MG, step=24 * _G / 32768, limit=24 * _G),
+    ),
+    "adis16470": ImuSpec(
+        name="adis16470",
+        gyro=_triad(white=20.4 * DEG_H, floor=8 * DEG_H, per_kelvin=4 * DEG_H, step=0.0, limit=2000 * _DPS),
+        accel=_triad(white=63 * UG, floor=13 * UG, per_kelvin=0.02 * MG, step=0.0, limit=40 * _G),
+    ),
+    "adis16405": ImuSpec(
+        name="adis16405",
+        gyro=_triad(white=120 * DEG_H, floor=25 * DEG_H, per_kelvin=36 * DEG_H, step=0.05 * _DPS, limit=300 * _DPS),
+        accel=_triad(white=350 * UG, floor=200 * UG, per_kelvin=0.3 * MG, step=3.33 * MG, limit=18 * _G),
+    ),
+    "white_only": ImuSpec(
+        name="white_only", gyro=AxisNoise(white=7.1 * DEG_H), accel=AxisNoise(white=49.5 * UG)
+    ),
+    "perfect": ImuSpec(name="perfect", gyro=AxisNoise(white=0.0), accel=AxisNoise(white=0.0)),
+}  # fmt: skip
+
+
+class Bias(NamedTuple):
+    """Gyro bias in rad/s and accelerometer bias in m/s^2, arrays of shape (3,)."""
+
+    gyro_rad_s: Array
+    accel_m_s2: Array
+
+
+class _SlowPath:
+    """Flicker plus rate random walk of six axes on a fixed time grid, zero at time 0, made as it is needed.
+
+    The flicker is a sum of stationary first-order Gauss-Markov processes with time constants in the ratio r, each of
+    variance B^2 ln(r) / pi: their spectra add up to B^2 / (2 pi f) between the slowest and the fastest.
+    """
+
+    def __init__(self, flicker: Array, walk: Array, seed: Sequence[int]) -> None:
+        self._random = np.random.default_rng(seed)
+        self._flicker = flicker
+        self._walk_step = walk * math.sqrt(SLOW_STEP_S)
+        self._decay = np.exp(-SLOW_STEP_S / _TAUS_S)[:, None]
+        sigma = flicker * math.sqrt(math.log(_TAU_RATIO) / math.pi)
+        self._kick = np.sqrt(1.0 - self._decay**2) * sigma
+        self._state = self._random.standard_normal((len(_TAUS_S), 6)) * sigma
+        self._walked = np.zeros(6)
+        self._origin = self._state.sum(axis=0)
+        self._blocks: dict[int, Array] = {}
+        self._made = 0
+        self._last = np.zeros(6)
+        self.silent = not (flicker.any() or walk.any())
+
+    def at(self, t_s: Array) -> Array:
+        """Values (n, 6) by linear interpolation of the grid; before time 0 they are those of time 0."""
+        position = np.maximum(t_s, 0.0) / SLOW_STEP_S
+        index = position.astype(np.int64)
+        share = (position - index)[:, None]
+        first, last = int(index.min()), int(index.max()) + 1
+        grid = self._grid(first, last)
+        return (1.0 - share) * grid[index - first] + share * grid[index - first + 1]
+
+    def at_one(self, t_s: float) -> Array:
+        """The value (6) at one time."""
+        position = max(t_s, 0.0) / SLOW_STEP_S
+        index = int(position)
+        share = position - index
+        block, offset = divmod(index, _BLOCK)
+        while block >= self._made:
+            self._make_block()
+        here = self._get_block(block)
+        result: Array = (1.0 - share) * here[offset] + share * here[offset + 1]
+        return result
+
+    def _grid(self, first: int, last: int) -> Array:
+        """Grid values first..last inclusive."""
+        while last // _BLOCK >= self._made:
+            self._make_block()
+        parts = []
+        for block in range(first // _BLOCK, last // _BLOCK + 1):
+            start = max(first - block * _BLOCK, 0)
+            parts.append(self._get_block(block)[start : min(last - block * _BLOCK + 1, _BLOCK)])
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def _get_block(self, block: int) -> Array:
+        try:
+            return self._blocks[block]
+        except KeyError:
+            raise ValueError(
+                f"the bias at {block * _BLOCK * SLOW_STEP_S:.0f} s is no longer kept;"
+                f" the last {_KEPT_BLOCKS * _BLOCK * SLOW_STEP_S / 3600:.1f} h are"
+            ) from None
+
+    def _make_block(self) -> None:
+        """Values of one block, and the first of the next one so that interpolation stays inside a block."""
+        out = np.empty((_BLOCK + 1, 6))
+        out[0] = self._last
+        kicks = self._random.standard_normal((_BLOCK, len(_TAUS_S), 6)) * self._kick
+        steps = np.cumsum(self._random.standard_normal((_BLOCK, 6)) * self._walk_step, axis=0)
+        state = self._state
+        for row in range(_BLOCK):
+            state = self._decay * state + kicks[row]
+            out[row + 1] = state.sum(axis=0)
+        out[1:] += self._walked + steps - self._origin
+        self._state, self._walked, self._last = state, self._walked + steps[-1], out[-1].copy()
+        self._blocks[self._made] = out
+        self._blocks.pop(self._made - _KEPT_BLOCKS, None)
+        self._made += 1
+
+
+class ImuModel:
+    """One IMU on the aircraft. Vectors are in the IMU's own axes unless a name says otherwise.
+
+    Reading = M (truth in sensor axes) + bias(t) + white noise, rounded to the step, cut at the limit; with
+    bias(t) = turn-on bias + flicker + walk + per_kelvin (T - T_ref) and M = scale and misalignment.
+
+    Args:
+        spec: a part of `PARTS`, by name or as a structure of your own.
+        gyro_bias_rad_s, accel_bias_m_s2: bias at aircraft time 0 and reference temperature.
+        gyro_scale, accel_scale: relative scale errors of the three axes.
+        gyro_misalignment_rad, accel_misalignment_rad: small rotation of the triad.
+        mounting_deg: roll, pitch, yaw of the sensor's axes seen from the vehicle's (a MAVLink rotation's angles).
+    """
+
+    def __init__(
+        self,
+        aircraft: VirtualAircraft,
+        spec: ImuSpec | str = "icm42688p",
+        *,
+        seed: int = 0,
+        gyro_bias_rad_s: Sequence[float] = (0.0, 0.0, 0.0),
+        accel_bias_m_s2: Sequence[float] = (0.0, 0.0, 0.0),
+        gyro_scale: Sequence[float] = (0.0, 0.0, 0.0),
+        accel_scale: Sequence[float] = (0.0, 0.0, 0.0),
+        gyro_misalignment_rad: Sequence[float] = (0.0, 0.0, 0.0),
+        accel_misalignment_rad: Sequence[float] = (0.0, 0.0, 0.0),
+        mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        self.aircraft = aircraft
+        self.spec = PARTS[spec] if isinstance(spec, str) else spec
+        self.mounting = mounting_matrix(*mounting_deg)
+        """Sensor to vehicle FRD."""
+        self._turn_on = np.concatenate([gyro_bias_rad_s, accel_bias_m_s2]).astype(np.float64)
+        gyro, accel = self.spec.gyro, self.spec.accel
+        self._per_kelvin = np.repeat([gyro.per_kelvin, accel.per_kelvin], 3)
+        self._white = np.repeat([gyro.white, accel.white], 3)
+        self._slow = _SlowPath(
+            np.repeat([gyro.flicker, accel.flicker], 3), np.repeat([gyro.walk, accel.walk], 3), [seed, 1]
+        )
+        self._random = np.random.default_rng([seed, 2])
+        self._noise = np.empty((0, 6))
+        self._seen: Truth | None = None
+        self._ideal = np.zeros(6)
+        self._gyro_matrix = _response(gyro_scale, gyro_misalignment_rad) @ self.mounting.T
+        self._accel_matrix = _response(accel_scale, accel_misalignment_rad) @ self.mounting.T
+
+    @property
+    def white(self) -> Array:
+        """N of the six axes: three in rad/s * sqrt(s), three in m/s^2 * sqrt(s)."""
+        return self._white
+
+    def temperature_degc(self, t_s: float) -> float:
+        """What its own thermometer says."""
+        return self.aircraft.temperature_degc(t_s)
+
+    def true_bias(self, t_s: float) -> Bias:
+        """The additive bias now: turn-on, flicker, walk and temperature."""
+        both = self._bias_at(t_s)
+        return Bias(both[:3], both[3:])
+
+    def mean_bias(self, start_s: float, end_s: float) -> Bias:
+        """The mean of `true_bias` over a window, on a grid of 0.1 s."""
+        times = np.arange(start_s, end_s, SLOW_STEP_S) if end_s > start_s else np.array([start_s])
+        both = self._bias(times).mean(axis=0)
+        return Bias(both[:3], both[3:])
+
+    def true_bias_in_vehicle(self, t_s: float) -> Bias:
+        """The same turned into the vehicle's FRD."""
+        gyro, accel = self.true_bias(t_s)
+        return Bias(self.mounting @ gyro, self.mounting @ accel)
+
+    def error_in_vehicle(self, t_s: float) -> Bias:
+        """All of the reading that is not truth, scale and misalignment included, without noise, in vehicle FRD."""
+        expected, truth = self.expected(t_s), self.aircraft.truth_at(t_s)
+        return Bias(
+            self.mounting @ expected[:3] - truth.rate_rad_s,
+            self.mounting @ expected[3:] - truth.force_m_s2,
+        )
+
+    def expected(self, t_s: float) -> Array:
+        """The reading without noise, rounding and limit: three rates, three specific forces."""
+        truth = self.aircraft.truth_at(t_s)
+        if truth is not self._seen:  # a standing aircraft gives the same object again and again
+            ideal = np.concatenate((self._gyro_matrix @ truth.rate_rad_s, self._accel_matrix @ truth.force_m_s2))
+            self._seen, self._ideal = truth, ideal
+        return self._ideal + self._bias_at(t_s)
+
+    def expected_block(self, t_s: Array) -> Array:
+        """The same at times (n), ascending: (n, 6)."""
+        rate, force = self.aircraft.truth(t_s)
+        return np.hstack((rate @ self._gyro_matrix.T, force @ self._accel_matrix.T)) + self._bias(t_s)
+
+    def read(self, t_s: Array, interval_s: float) -> Array:
+        """Readings (n, 6) at ascending times of samples that each average over `interval_s`.
+
+        White noise is drawn in the order of reading, so one model has one reader; the bias does not care.
+        """
+        out = self.expected_block(t_s)
+        out += self._draw(len(t_s)) * (self._white / math.sqrt(interval_s))
+        for part, triad in ((out[:, :3], self.spec.gyro), (out[:, 3:], self.spec.accel)):
+            if triad.step > 0.0:
+                np.rint(part / triad.step, out=part)
+                part *= triad.step
+            np.clip(part, -triad.limit, triad.limit, out=part)
+        return out
+
+    def _draw(self, count: int) -> Array:
+        if len(self._noise) < count:
+            self._noise = np.concatenate([self._noise, self._random.standard_normal((max(256, count), 6))])
+        drawn, self._noise = self._noise[:count], self._noise[count:]
+        return drawn
+
+    def _bias(self, t_s: Array) -> Array:
+        warm = np.array([self.aircraft.temperature_degc(float(t)) for t in _thin(t_s)])
+        kelvin = np.interp(t_s, _thin(t_s), warm) - self.spec.reference_degc
+        out = self._turn_on + kelvin[:, None] * self._per_kelvin
+        result: Array = out if self._slow.silent else out + self._slow.at(t_s)
+        return result
+
+    def _bias_at(self, t_s: float) -> Array:
+        kelvin = self.aircraft.temperature_degc(t_s) - self.spec.reference_degc
+        out = self._turn_on + kelvin * self._per_kelvin
+        return out if self._slow.silent else out + self._slow.at_one(t_s)
+
+
+def _thin(t_s: Array) -> Array:
+    """Times about 0.1 s apart that span a block: often enough to ask for a temperature."""
+    if len(t_s) < 3:
+        return t_s
+    return np.linspace(t_s[0], t_s[-1], max(2, int((t_s[-1] - t_s[0]) / SLOW_STEP_S) + 2))
+
+
+def _response(scale: Sequence[float], misalignment_rad: Sequence[float]) -> Array:
+    x, y, z = misalignment_rad
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    result: Array = np.diag(1.0 + np.asarray(scale, dtype=np.float64)) @ (np.eye(3) - skew)
+    return result

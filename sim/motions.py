@@ -1,0 +1,186 @@
+"""What may happen to a standing aircraft: turned, handled, knocked, shaken.
+
+A motion adds to the Euler angles of the still pose, and to the acceleration. Each one gives its angles and their exact
+derivatives, so the true body rate needs no numerical differentiation. Times are seconds of the aircraft's own clock.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.earth import Array
+
+Euler = tuple[float, float, float]
+"""Roll, pitch, heading."""
+
+
+def _smooth_step(u: Array) -> tuple[Array, Array]:
+    """A step from 0 to 1 over u in [0, 1] with continuous second derivative, and its derivative in u."""
+    u = np.clip(u, 0.0, 1.0)
+    return u**3 * (10.0 - 15.0 * u + 6.0 * u**2), 30.0 * u**2 * (1.0 - u) ** 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motion(ABC):
+    """Something that happens from `start_s` for `duration_s`."""
+
+    start_s: float
+    duration_s: float
+
+    @property
+    def end_s(self) -> float:
+        """When it is over; what it leaves behind then stays."""
+        return self.start_s + self.duration_s
+
+    @abstractmethod
+    def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
+        """Added roll, pitch, heading (n, 3) in rad, and their derivatives in rad/s."""
+
+    def acceleration_m_s2(self, t_s: Array) -> Array:
+        """Added acceleration (n, 3) of the IMU, in body axes."""
+        return np.zeros((len(t_s), 3))
+
+    def leaves_rad(self) -> Array:
+        """What stays of the angles afterwards (3)."""
+        result: Array = self.euler_rad(np.array([self.end_s]))[0][0]
+        return result
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Turn(Motion):
+    """A smooth change of pose that stays: somebody sets the aircraft down differently."""
+
+    roll_deg: float = 0.0
+    pitch_deg: float = 0.0
+    heading_deg: float = 0.0
+
+    def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
+        """Added angles and rates."""
+        step, slope = _smooth_step((t_s - self.start_s) / self.duration_s)
+        change = np.radians([self.roll_deg, self.pitch_deg, self.heading_deg])
+        return step[:, None] * change, slope[:, None] * change / self.duration_s
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlowTurn(Motion):
+    """A steady turn of the heading, the motion that a spread of the readings does not show."""
+
+    rate_deg_s: float = 1.0
+    ramp_s: float = 1.0
+
+    def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
+        """Added angles and rates: the rate rises smoothly over `ramp_s`, stays, and falls likewise."""
+        ramp = min(self.ramp_s, self.duration_s / 2.0)
+        since, until = t_s - self.start_s, self.end_s - t_s
+        u = np.clip(np.minimum(since, until) / ramp, 0.0, 1.0)
+        rate = np.radians(self.rate_deg_s) * u**2 * (3.0 - 2.0 * u)
+
+        def turned(elapsed: Array) -> Array:
+            v = np.clip(elapsed / ramp, 0.0, 1.0)
+            return ramp * (v**3 - v**4 / 2.0) + np.maximum(elapsed - ramp, 0.0)
+
+        half = self.duration_s / 2.0
+        whole = 2.0 * turned(np.array([half]))[0]
+        angle = np.where(since <= half, turned(since), whole - turned(np.maximum(until, 0.0)))
+        zero = np.zeros_like(t_s)
+        angle = np.radians(self.rate_deg_s) * np.where(since <= 0.0, 0.0, angle)
+        return np.column_stack([zero, zero, angle]), np.column_stack([zero, zero, rate])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Handling(Motion):
+    """Somebody holds the aircraft: irregular turning and shaking that ends where it began."""
+
+    angle_deg: float = 4.0
+    acceleration: float = 0.7
+    """m/s^2, about the largest."""
+    seed: int = 0
+
+    def _waves(self) -> tuple[Array, Array]:
+        """Angular frequencies (3 axes, 4 waves) in rad/s and phases in rad."""
+        generator = np.random.default_rng([self.seed, 17])
+        return 2.0 * math.pi * generator.uniform(0.3, 1.7, (3, 4)), generator.uniform(0.0, 2.0 * math.pi, (3, 4))
+
+    def _window(self, t_s: Array) -> tuple[Array, Array]:
+        """A bump that is zero, with its slope, at both ends, and its derivative in 1/s."""
+        u = np.clip((t_s - self.start_s) / self.duration_s, 0.0, 1.0)
+        return np.sin(math.pi * u) ** 2, math.pi / self.duration_s * np.sin(2.0 * math.pi * u)
+
+    def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
+        """Added angles and rates."""
+        frequencies, phases = self._waves()
+        window, window_slope = self._window(t_s)
+        arguments = frequencies[None] * (t_s - self.start_s)[:, None, None] + phases[None]
+        scale = math.radians(self.angle_deg) / 2.0
+        wave = scale * np.sin(arguments).sum(axis=2)
+        slope = scale * (frequencies[None] * np.cos(arguments)).sum(axis=2)
+        return window[:, None] * wave, window_slope[:, None] * wave + window[:, None] * slope
+
+    def acceleration_m_s2(self, t_s: Array) -> Array:
+        """Shaking of the hand in body axes."""
+        frequencies, phases = self._waves()
+        window, _ = self._window(t_s)
+        arguments = 2.3 * frequencies[None] * (t_s - self.start_s)[:, None, None] - phases[None]
+        result: Array = self.acceleration / 2.0 * window[:, None] * np.sin(arguments).sum(axis=2)
+        return result
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Knock(Motion):
+    """Somebody bumps into the table: a short swing about roll and pitch that comes back."""
+
+    duration_s: float = 0.4
+    peak_deg_s: float = 5.0
+    peak_m_s2: float = 2.0
+
+    def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
+        """Added angles and rates: one smooth bump, whose steepest rate is `peak_deg_s`."""
+        u = np.clip((t_s - self.start_s) / self.duration_s, 0.0, 1.0)
+        amplitude = math.radians(self.peak_deg_s) * self.duration_s / math.pi
+        angle = amplitude * np.sin(math.pi * u) ** 2
+        rate = amplitude * math.pi / self.duration_s * np.sin(2.0 * math.pi * u)
+        share = np.array([1.0, -0.6, 0.2])
+        return angle[:, None] * share, rate[:, None] * share
+
+    def acceleration_m_s2(self, t_s: Array) -> Array:
+        """One push and its return in body axes."""
+        u = np.clip((t_s - self.start_s) / self.duration_s, 0.0, 1.0)
+        push = self.peak_m_s2 * np.sin(2.0 * math.pi * u) * np.sin(math.pi * u) ** 2
+        result: Array = push[:, None] * np.array([0.8, 0.5, -0.3])
+        return result
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Vibration(Motion):
+    """A running motor or generator near by: no turning, a steady shake."""
+
+    frequency_hz: float = 87.0
+    amplitude_m_s2: float = 1.0
+    rocking_deg_s: float = 0.5
+
+    def _gate(self, t_s: Array) -> Array:
+        return ((t_s >= self.start_s) & (t_s < self.end_s)).astype(np.float64)
+
+    def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
+        """Rocking about roll and pitch at the vibration's frequency."""
+        omega = 2.0 * math.pi * self.frequency_hz
+        phase = omega * (t_s - self.start_s)
+        peak = math.radians(self.rocking_deg_s)
+        share = np.array([1.0, 0.7, 0.0])
+        gate = self._gate(t_s)[:, None]
+        return gate * (peak / omega) * np.sin(phase)[:, None] * share, gate * peak * np.cos(phase)[:, None] * share
+
+    def acceleration_m_s2(self, t_s: Array) -> Array:
+        """Shake in body axes, strongest along z."""
+        phase = 2.0 * math.pi * self.frequency_hz * (t_s - self.start_s)
+        waves = np.column_stack([np.sin(phase), np.sin(phase + 1.0), np.sin(phase + 2.0)])
+        result: Array = self._gate(t_s)[:, None] * self.amplitude_m_s2 * waves * np.array([0.4, 0.4, 1.0])
+        return result
+
+    def leaves_rad(self) -> Array:
+        """Nothing."""
+        return np.zeros(3)

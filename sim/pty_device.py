@@ -1,0 +1,155 @@
+"""A serial device on a pseudo-terminal: a path that can be opened, listened to, unplugged and plugged in again."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import fcntl
+import os
+import select
+import tty
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from sim.aircraft import VirtualAircraft
+from sim.devices import SerialDevice
+
+_SHORTEST_SLEEP_S = 0.001
+
+
+class PtyDevice:
+    """Serves a device's frames on the event loop, in its clock's time, under a symlink with a stable name.
+
+    Like a UART it does not wait for anyone: what nobody reads is lost, and a reader that is too slow loses bytes in the
+    middle of frames. Only the path is shared with the reader, so it works with any program.
+
+    Use: `async with PtyDevice(HMR3300(aircraft), directory / "compass") as device: ...`
+    """
+
+    def __init__(self, device: SerialDevice, path: Path) -> None:
+        self.device, self.path = device, path
+        self.frames_sent = 0
+        self.bytes_dropped = 0
+        self.muted = False
+        """True: the device is there and says nothing."""
+        self._master: int | None = None
+        self._poll = select.poll()
+        self._banner = b""
+        self._serving: asyncio.Task[None] | None = None
+
+    async def __aenter__(self) -> Self:
+        self.replug()
+        self._serving = asyncio.create_task(self._serve(), name=f"sim device {self.path.name}")
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._serving is not None:
+            self._serving.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._serving
+            self._serving = None
+        self.unplug()
+
+    async def wait_closed(self) -> None:
+        """Until serving ends, which is only by a fault of the simulator."""
+        if self._serving is not None:
+            await asyncio.shield(self._serving)
+
+    @property
+    def plugged(self) -> bool:
+        """Whether the path exists."""
+        return self._master is not None
+
+    @property
+    def opened(self) -> bool:
+        """Whether somebody has the path open."""
+        return self._master is not None and not any(event & select.POLLHUP for _, event in self._poll.poll(0))
+
+    def unplug(self) -> None:
+        """Pull it out: the path is gone, and whoever has it open gets a hang-up."""
+        if self._master is None:
+            return
+        self._poll.unregister(self._master)
+        os.close(self._master)
+        self._master = None
+        self.path.unlink(missing_ok=True)
+
+    def replug(self) -> None:
+        """Put it (back) in: a new pseudo-terminal under the same path; the device starts anew.
+
+        Raises:
+            FileExistsError: the path is something other than a symlink.
+        """
+        if self._master is not None:
+            return
+        if self.path.exists() and not self.path.is_symlink():
+            raise FileExistsError(f"{self.path}: exists and is no symlink; give a folder of its own")
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+        fcntl.fcntl(master, fcntl.F_SETFD, fcntl.FD_CLOEXEC)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        staged = self.path.with_name(f".{self.path.name}.new")
+        staged.unlink(missing_ok=True)
+        staged.symlink_to(os.ttyname(slave))
+        staged.replace(self.path)
+        os.close(slave)  # from here on the kernel tells by POLLHUP whether anybody has it open
+        self._master = master
+        self._poll.register(master, select.POLLHUP)
+        self._banner = self.device.power_on(self._now_s())
+
+    def _now_s(self) -> float:
+        return self._aircraft.time_at(asyncio.get_running_loop().time())
+
+    @property
+    def _aircraft(self) -> VirtualAircraft:
+        return self.device.aircraft
+
+    async def _serve(self) -> None:
+        while True:
+            now_s = self._now_s()
+            if self._master is None:
+                await asyncio.sleep(0.05)
+                continue
+            if self._banner and self.opened:  # as behind an adapter that powers its device when it is opened
+                self._write(self._banner)
+                self._banner = b""
+            self._take_commands(now_s)
+            for frame in self.device.frames_until(now_s):
+                wait_s = frame.complete_s - self._now_s()
+                if wait_s > 0.0:
+                    await asyncio.sleep(wait_s)
+                self._write(frame.data)
+                self.frames_sent += 1
+            wait_s = self.device.next_sample_s - self._now_s()
+            await asyncio.sleep(min(max(wait_s, _SHORTEST_SLEEP_S), 0.1))
+
+    def _write(self, data: bytes) -> None:
+        """Into the port, or nowhere: never waits, never raises."""
+        if not data:
+            return
+        if self._master is None or self.muted or not self.opened:
+            self.bytes_dropped += len(data)
+            return
+        try:
+            written = os.write(self._master, data)
+        except BlockingIOError:
+            written = 0
+        except OSError as error:
+            if error.errno not in (errno.EIO, errno.EAGAIN):
+                raise
+            written = 0
+        self.bytes_dropped += len(data) - written
+
+    def _take_commands(self, now_s: float) -> None:
+        assert self._master is not None
+        try:
+            data = os.read(self._master, 4096)
+        except OSError:  # nothing to read, or nobody there
+            return
+        if data:
+            self._write(self.device.command(data, now_s))

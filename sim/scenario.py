@@ -1,0 +1,96 @@
+"""Ready-made worlds: an aircraft, its sensors and its autopilot, made together from one seed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from pygeomag.geomag import GeoMag
+
+from sim.aircraft import Pose, Site, VirtualAircraft
+from sim.autopilot import ArduPilotDouble
+from sim.devices import HMR3300, Gradienter, Law, VectorNavBinary
+from sim.imu_model import DEG_H, MG, ImuModel
+from sim.motions import Motion
+
+DEMO_POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
+DEMO_UNIX_S = 1_795_219_200.0
+"""21 November 2026, 00:00 UTC."""
+
+
+def site_at(latitude_deg: float, longitude_deg: float, height_m: float, unix_s: float = DEMO_UNIX_S) -> Site:
+    """A site with the declination of the World Magnetic Model at that date."""
+    date = datetime.fromtimestamp(unix_s, UTC)
+    year = date.year + (date.timetuple().tm_yday - 1) / 365.25
+    model = GeoMag(coefficients_file="wmm/WMM_2025.COF")
+    declination = float(model.calculate(glat=latitude_deg, glon=longitude_deg, alt=height_m / 1000.0, time=year).d)
+    return Site(latitude_deg, longitude_deg, height_m, declination)
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """Everything that shares one truth."""
+
+    aircraft: VirtualAircraft
+    flight_controller_imus: tuple[ImuModel, ...]
+    serial_imu: ImuModel
+    autopilot: ArduPilotDouble
+    imu: VectorNavBinary
+    gradienter: Gradienter
+    compass: HMR3300
+    gradienter_law: Law
+
+
+def demo(
+    *,
+    pose: Pose = DEMO_POSE,
+    seed: int = 0,
+    unix_s: float = DEMO_UNIX_S,
+    motions: Sequence[Motion] = (),
+    law: Law = "axis",
+    gyr_cal_at_boot: bool = False,
+) -> Scenario:
+    """A small aircraft on uneven ground near Beijing, 40 N, 116 E, 50 m: pitch 5, roll -3, heading 40 degrees.
+
+    The flight controller's first IMU has biases of the size of the paper's tables (162, 170, 98 deg/h; 2.4, 2.2, 0.9
+    mg: its fourth row), its second and the serial IMU others. The compass is 0.8 degrees off; the gradienter shows 3
+    and -2 millidegrees too much.
+
+    Args:
+        pose: how it stands.
+        seed: of all noise.
+        unix_s: the date at the beginning.
+        motions: what happens to it.
+        law: of the gradienter.
+        gyr_cal_at_boot: the autopilot's default INS_GYR_CAL = 1, with which it has already found most of the gyro bias
+            (and has swallowed the Earth's rotation). The demonstration starts without, to have something to show.
+    """
+    aircraft = VirtualAircraft(pose, site_at(40.0, 116.0, 50.0, unix_s), motions=motions, unix_s=unix_s)
+
+    def imu(number: int, gyro_deg_h: tuple[float, ...], accel_mg: tuple[float, ...], part: str) -> ImuModel:
+        return ImuModel(
+            aircraft,
+            part,
+            seed=seed * 10 + number,
+            gyro_bias_rad_s=[value * DEG_H for value in gyro_deg_h],
+            accel_bias_m_s2=[value * MG for value in accel_mg],
+        )
+
+    flight_controller = (
+        imu(1, (162.234, 169.563, 98.289), (2.4125, 2.1596, 0.89809), "icm42688p"),
+        imu(2, (-89.532, -98.564, -72.196), (-0.55739, -1.0068, 0.34809), "icm42688p"),
+    )
+    serial = imu(3, (60.294, 124.657, 108.289), (0.21593, -2.2118, 1.2953), "adis16470")
+    return Scenario(
+        aircraft=aircraft,
+        flight_controller_imus=flight_controller,
+        serial_imu=serial,
+        autopilot=ArduPilotDouble(
+            aircraft, flight_controller, parameters={"INS_GYR_CAL": float(gyr_cal_at_boot)}, seed=seed
+        ),
+        imu=VectorNavBinary(serial),
+        gradienter=Gradienter(aircraft, seed=seed, law=law, offset_deg=(0.003, -0.002)),
+        compass=HMR3300(aircraft, seed=seed, heading_error_deg=0.8),
+        gradienter_law=law,
+    )

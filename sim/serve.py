@@ -1,0 +1,221 @@
+"""The simulator on the command line: devices on pseudo-terminals, the autopilot on UDP, and how to connect to them."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import os
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from sim.aircraft import Pose
+from sim.imu_model import DEG_H, MG, ImuModel
+from sim.pty_device import PtyDevice
+from sim.scenario import DEMO_POSE, Scenario, demo
+from sim.udp import open_udp
+
+DEFAULT_UDP = "127.0.0.1:14550"
+
+
+def parser() -> argparse.ArgumentParser:
+    """Arguments of `python -m sim devices | autopilot | all`."""
+    top = argparse.ArgumentParser(
+        prog="python -m sim",
+        description="A virtual aircraft that stands still somewhere near Beijing: its sensors and its autopilot.",
+    )
+    commands = top.add_subparsers(dest="command", required=True, metavar="devices | autopilot | all | demo")
+    for name, text in (
+        ("devices", "serial IMU, gradienter and compass on pseudo-terminals"),
+        ("autopilot", "an ArduPilot double on UDP"),
+        ("all", "both, on one aircraft"),
+    ):
+        command = commands.add_parser(name, help=text, description=text)
+        command.add_argument(
+            "--pose",
+            type=float,
+            nargs=3,
+            metavar=("PITCH", "ROLL", "HEADING"),
+            default=(DEMO_POSE.pitch_deg, DEMO_POSE.roll_deg, DEMO_POSE.heading_deg),
+            help="degrees: nose up +, right side down +, clockwise from true north (default 5 -3 40)",
+        )
+        command.add_argument("--seed", type=int, default=0, help="the same seed gives the same noise (default 0)")
+        command.add_argument(
+            "--law",
+            choices=("axis", "slope", "euler"),
+            default="axis",
+            help="what the gradienter's two readings mean (default axis)",
+        )
+        if name != "autopilot":
+            command.add_argument("--dir", type=Path, help="folder for the ports (default: a new one)")
+        if name != "devices":
+            command.add_argument(
+                "--udp", type=address, metavar="HOST:PORT", default=DEFAULT_UDP,
+                help=f"where the autopilot sends to (default {DEFAULT_UDP})",
+            )  # fmt: skip
+            command.add_argument(
+                "--ground", type=address, metavar="HOST:PORT", help="second port, for a ground station"
+            )  # fmt: skip
+            command.add_argument(
+                "--gyr-cal", action="store_true", help="INS_GYR_CAL = 1: the autopilot calibrates its gyros at boot"
+            )
+    commands.add_parser("demo", help="the whole chain, with a result to look at")
+    return top
+
+
+def address(text: str) -> tuple[str, int]:
+    """HOST:PORT."""
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise argparse.ArgumentTypeError(f"found {text!r}; allowed: HOST:PORT with a port from 1 to 65535")
+    return host, int(port)
+
+
+def configuration(scenario: Scenario, *, directory: Path | None, udp: tuple[str, int] | None) -> str:
+    """A configuration of the companion that fits what is served; comments say what is missing."""
+    lines = ["[mavlink]"]
+    if udp is None:
+        lines.append("# no autopilot is simulated here; `python -m sim autopilot` is one")
+    lines.append(f'url = "udpin:{udp[0]}:{udp[1]}"' if udp else f'url = "udpin:{DEFAULT_UDP}"')
+    if udp is not None:
+        for number, model in enumerate(scenario.flight_controller_imus, 1):
+            if number == 1:
+                lines += ["", "[[imu]]", 'name = "fc"', 'source = "autopilot"', f"instance = {number}"]
+                lines.append(f'profile = "{model.spec.name}"')
+    if directory is None:
+        site = scenario.aircraft.site
+        lines += ["", f"# no gradienter, no compass; the site is {site.latitude_deg} {site.longitude_deg}"]
+        return "\n".join(lines) + "\n"
+    lines += ["", "[[imu]]", 'name = "own"', 'source = "serial"', f'port = "{directory / "imu"}"']
+    lines += [f"baud = {scenario.imu.baud}", f'protocol = "{scenario.imu.protocol}"']
+    lines.append(f'profile = "{scenario.serial_imu.spec.name}"')
+    lines += ["", "[gradienter]", f'port = "{directory / "gradienter"}"']
+    lines += [f'protocol = "{scenario.gradienter.protocol}"', f'law = "{scenario.gradienter_law}"']
+    lines += ["sigma_deg = 0.005", "", "[compass]", f'port = "{directory / "compass"}"']
+    lines += [f'protocol = "{scenario.compass.protocol}"', 'reference = "magnetic"', "sigma_deg = 1.0"]
+    if udp is None:
+        site = scenario.aircraft.site
+        lines += ["", "[vehicle]", f"latitude_deg = {site.latitude_deg}", f"longitude_deg = {site.longitude_deg}"]
+        lines.append(f"height_m = {site.height_m}")
+    return "\n".join(lines) + "\n"
+
+
+def describe(scenario: Scenario, *, devices: bool, autopilot: bool) -> str:
+    """The truth in a few lines: what a calibration should find."""
+    pose = scenario.aircraft.pose
+    angles = f"pitch {pose.pitch_deg:g}, roll {pose.roll_deg:g}, heading {pose.heading_deg:g} deg"
+    lines = [f"# The truth: {angles}; declination {scenario.aircraft.site.declination_deg:.2f} deg"]
+    models: list[tuple[str, ImuModel]] = []
+    if autopilot:
+        models += [(f"autopilot IMU {n}", model) for n, model in enumerate(scenario.flight_controller_imus, 1)]
+    if devices:
+        models.append(("serial IMU", scenario.serial_imu))
+    for name, model in models:
+        gyro, accel = model.true_bias(0.0)
+        rates = ", ".join(f"{value / DEG_H:.1f}" for value in gyro)
+        forces = ", ".join(f"{value / MG:.3f}" for value in accel)
+        lines.append(f"# {name} ({model.spec.name}): gyro bias {rates} deg/h; accelerometer bias {forces} mg")
+    return "\n".join(lines) + "\n"
+
+
+async def serve(
+    scenario: Scenario,
+    *,
+    directory: Path | None = None,
+    udp: tuple[str, int] | None = None,
+    ground: tuple[str, int] | None = None,
+    started: asyncio.Event | None = None,
+) -> None:
+    """Serve until cancelled: devices if there is a directory, the autopilot if there is an address to send to."""
+    async with contextlib.AsyncExitStack() as stack:
+        scenario.aircraft.begin(asyncio.get_running_loop().time())
+        running: list[asyncio.Task[None]] = []
+        if directory is not None:
+            for name, device in (
+                ("imu", scenario.imu),
+                ("gradienter", scenario.gradienter),
+                ("compass", scenario.compass),
+            ):
+                pty = await stack.enter_async_context(PtyDevice(device, directory / name))
+                running.append(asyncio.create_task(pty.wait_closed(), name=f"watch {name}"))
+        if udp is not None:
+            companion = await open_udp(scenario.autopilot, target=udp)
+            stack.callback(companion.close)
+            running.append(asyncio.create_task(scenario.autopilot.run(), name="sim autopilot"))
+        if udp is not None and ground is not None:
+            station = await open_udp(scenario.autopilot.ground, target=ground)
+            stack.callback(station.close)
+        if started is not None:
+            started.set()
+        try:
+            await asyncio.gather(*running)
+        finally:
+            for task in running:
+                task.cancel()
+            await asyncio.gather(*running, return_exceptions=True)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run `devices`, `autopilot` or `all` until interrupted; returns the exit code."""
+    arguments = parser().parse_args(argv)
+    devices, autopilot = arguments.command != "autopilot", arguments.command != "devices"
+    pitch, roll, heading = arguments.pose
+    scenario = demo(
+        pose=Pose(pitch, roll, heading),
+        seed=arguments.seed,
+        unix_s=time.time(),
+        law=arguments.law,
+        gyr_cal_at_boot=autopilot and arguments.gyr_cal,
+    )
+    directory: Path | None = None
+    made_here = devices and arguments.dir is None
+    if devices:
+        directory = Path(tempfile.mkdtemp(prefix="companion-sim-")) if made_here else arguments.dir.absolute()
+    udp = arguments.udp if autopilot else None
+    text = describe(scenario, devices=devices, autopilot=autopilot)
+    text += configuration(scenario, directory=directory, udp=udp)
+    try:
+        return asyncio.run(
+            _serve_until_stopped(scenario, text, directory, udp, arguments.ground if autopilot else None)
+        )
+    except OSError as error:
+        print(f"python -m sim: {error}", file=sys.stderr)
+        return 1
+    finally:
+        if made_here and directory is not None:
+            with contextlib.suppress(OSError):
+                os.rmdir(directory)
+
+
+async def _serve_until_stopped(
+    scenario: Scenario,
+    text: str,
+    directory: Path | None,
+    udp: tuple[str, int] | None,
+    ground: tuple[str, int] | None,
+) -> int:
+    loop = asyncio.get_running_loop()
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    started = asyncio.Event()
+    serving = asyncio.create_task(serve(scenario, directory=directory, udp=udp, ground=ground, started=started))
+    waiting = asyncio.create_task(stop.wait())
+    ready = asyncio.create_task(started.wait())
+    await asyncio.wait({serving, ready}, return_when=asyncio.FIRST_COMPLETED)
+    if started.is_set():
+        print("# Ready. Save these lines as companion.toml and run: companion run -c companion.toml")
+        print("# Ctrl-C ends the simulation.")
+        print(text, flush=True)
+    await asyncio.wait({serving, waiting}, return_when=asyncio.FIRST_COMPLETED)
+    failed = serving.done()
+    for task in (serving, waiting, ready):
+        task.cancel()
+    results = await asyncio.gather(serving, waiting, ready, return_exceptions=True)
+    if failed and isinstance(results[0], BaseException):
+        raise results[0]
+    return 0

@@ -1,0 +1,349 @@
+"""Autopilots, pilots and people that get in the way: detected, said by name, old values back."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from companion.calibration.machine import State
+from companion.calibration.record import Record
+from companion.calibration.request import What
+from companion.component.service import JobResult, Refusal
+from companion.storage.changes import Changed, ChangeLog, ChangeSet
+from sim.autopilot import ArduPilotDouble, offset_names
+from sim.imu_model import DEG_H, MG
+from sim.motions import Handling, SlowTurn
+from tests.e2e.test_calibration import FC_PARAMETERS, calibrated, started
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+
+def values(double: ArduPilotDouble) -> dict[str, float]:
+    return {name: double.parameter(name) for name in FC_PARAMETERS}
+
+
+def outcomes(record: Record) -> set[str]:
+    return {written.outcome for written in record.imus[0].written.values()}
+
+
+async def _with_fault(folder: Path, fault: Callable[[Rig], None]) -> tuple[JobResult, Record, bool]:
+    """A calibration with a fault switched on before it; whether the old values are in force at its end."""
+    async with Rig(folder, max_s=12.0).running() as rig:
+        await rig.ready()
+        before = values(rig.double)
+        fault(rig)
+        result, record = await calibrated(rig)
+        return result, record, values(rig.double) == before
+
+
+def test_an_autopilot_that_echoes_but_does_not_use_the_value(tmp_path: Path) -> None:
+    def fault(rig: Rig) -> None:
+        rig.double.faults.echo_without_effect = True
+
+    result, record, back = run_virtual(_with_fault(tmp_path, fault))
+    assert result.outcome == record.state == "failed"
+    assert "INS_GYROFFS_X" in record.reason
+    assert "does not use it" in record.reason
+    assert back
+    assert outcomes(record) == {"rolled_back"}
+
+
+def test_an_autopilot_that_refuses_one_parameter(tmp_path: Path) -> None:
+    def fault(rig: Rig) -> None:
+        rig.double.faults.refuse = {"INS_GYROFFS_Y"}
+
+    result, record, back = run_virtual(_with_fault(tmp_path, fault))
+    assert result.outcome == "failed"
+    assert "refuse" in record.reason
+    assert "INS_GYROFFS_Y" in record.reason
+    assert back
+    written = record.imus[0].written
+    assert written["INS_ACCOFFS_X"].outcome == "rolled_back"
+    assert written["INS_GYROFFS_Y"].outcome in ("failed", "rolled_back")
+
+
+@pytest.mark.parametrize("version", ["4.8", "4.5"])
+def test_an_autopilot_that_does_not_answer_for_one_parameter(tmp_path: Path, version: str) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0, version=version).running() as rig:
+            await rig.ready()
+            before = values(rig.double)
+            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.conductor.state is State.WRITING, 60.0)
+            rig.double.faults.ignore = {"INS_GYROFFS_Y"}
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "INS_GYROFFS_Y" in result.reason
+            assert "no answer" in result.reason
+            rig.double.faults.ignore = set()
+            await rig.until(lambda: values(rig.double) == before, 60.0)
+            await rig.until(lambda: not rig.service.mender.pending, 60.0)
+
+    run_virtual(main())
+
+
+def test_an_autopilot_that_answers_another_value(tmp_path: Path) -> None:
+    def fault(rig: Rig) -> None:
+        rig.double.faults.wrong_echo = {"INS_ACCOFFS_Z"}
+
+    result, record, _ = run_virtual(_with_fault(tmp_path, fault))
+    assert result.outcome == "failed"
+    assert "INS_ACCOFFS_Z" in record.reason
+
+
+def test_an_autopilot_that_answers_nothing_is_a_fault_and_not_an_endless_wait(tmp_path: Path) -> None:
+    async def main() -> JobResult:
+        rig = Rig(tmp_path)
+        rig.double.faults.silent = True
+        async with rig.running():
+            await rig.until(lambda: rig.service.vehicle.system_id == 1, 10.0)
+            result, record = await calibrated(rig)
+            assert record.imus == ()
+            assert rig.double.writes == []
+            return result
+
+    result = run_virtual(main())
+    assert result.outcome == "failed"
+    assert "does not answer" in result.reason or "answers neither" in result.reason
+    assert "fc" in result.reason
+
+
+def test_arming_in_the_middle_of_the_write_is_reported_and_mended_once_disarmed(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            before = values(rig.double)
+            rig.double.faults.arm_after_writes = 2
+            result, record = await calibrated(rig)
+            assert result.outcome == "failed"
+            assert "armed" in result.reason
+            left = {name for name, value in values(rig.double).items() if value != before[name]}
+            assert left
+            for name in left:
+                assert name in result.reason
+                assert record.imus[0].written[name].outcome == "failed"
+            assert len(rig.double.writes) == 2  # the arming came with the second write; there was no third
+            assert rig.service.mender.pending
+            refusal = rig.service.conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(refusal, Refusal)
+            assert refusal.kind == "armed"
+            writes = len(rig.double.writes)
+            await asyncio.sleep(20.0)
+            assert len(rig.double.writes) == writes  # armed: hands off, however long it takes
+            rig.double.disarm()
+            await rig.until(lambda: not rig.service.mender.pending, 20.0)
+            assert values(rig.double) == before
+            assert any("put back" in text for text in rig.ground.texts())
+
+    run_virtual(main())
+
+
+def test_a_write_interrupted_by_a_power_cut_is_mended_at_the_next_start(tmp_path: Path) -> None:
+    # What a daemon leaves that died after the second of three writes.
+    names = offset_names(1, "gyro")
+    changes = tuple(Changed(name, before=0.0, after=float(np.float32(0.001 * (k + 1)))) for k, name in enumerate(names))
+    ChangeLog(tmp_path).journal.write(ChangeSet(1, changes))
+
+    async def main() -> None:
+        half_written = {change.parameter: change.after for change in changes[:2]}
+        async with Rig(tmp_path, parameters={**dict.fromkeys(names, 0.0), **half_written}).running() as rig:
+            await rig.until(lambda: not rig.service.mender.pending, 20.0)
+            assert [rig.double.parameter(name) for name in names] == [0.0, 0.0, 0.0]
+            assert ChangeLog(tmp_path).journal.read() is None
+
+    run_virtual(main())
+
+
+def test_values_that_somebody_else_has_set_since_are_left_alone(tmp_path: Path) -> None:
+    names = offset_names(1, "gyro")
+    changes = tuple(Changed(name, before=0.0, after=0.5) for name in names)
+    ChangeLog(tmp_path).journal.write(ChangeSet(1, changes))
+
+    async def main() -> None:
+        async with Rig(tmp_path, parameters=dict.fromkeys(names, 0.0025)).running() as rig:
+            await rig.until(lambda: not rig.service.mender.pending, 20.0)
+            assert rig.double.writes == []
+            assert any("left alone" in text for text in rig.ground.texts())
+
+    run_virtual(main())
+
+
+def test_undo_is_refused_when_somebody_else_has_changed_a_value_since(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            assert (await calibrated(rig))[0].outcome == "done"
+            rig.double.write_as_another_station("INS_GYROFFS_Z", 0.001)
+            now = values(rig.double)
+            job = started(rig.service.conductor.start_undo("test"))
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "INS_GYROFFS_Z" in result.reason
+            assert values(rig.double) == now
+
+    run_virtual(main())
+
+
+def test_undo_survives_a_restart_and_works_once(tmp_path: Path) -> None:
+    async def main() -> None:
+        rig = Rig(tmp_path, max_s=12.0)
+        before = values(rig.double)
+        async with rig.running():
+            await rig.ready()
+            assert (await calibrated(rig))[0].outcome == "done"
+        rig.wire.__init__(rig.link, rig.double)  # type: ignore[misc]
+        rig.radio.__init__(rig.ground, rig.double.ground)  # type: ignore[misc]
+        async with rig.running():
+            await rig.ready()
+            result = await started(rig.service.conductor.start_undo("test")).finished
+            assert result.outcome == "done", result
+            assert values(rig.double) == before
+            refusal = rig.service.conductor.start_undo("test")
+            assert isinstance(refusal, Refusal)
+            assert refusal.kind == "nothing_to_undo"
+
+    run_virtual(main())
+
+
+def test_a_foreign_write_during_the_measurement_starts_it_afresh(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.conductor.state is State.COLLECTING, 30.0)
+            rig.double.write_as_another_station("INS_GYROFFS_X", 0.003)
+            result = await job.finished
+            assert result.outcome == "done", result
+            left = rig.double.residual(1, rig.now_s)
+            assert np.abs(left.gyro_rad_s).max() < 25 * DEG_H
+
+    run_virtual(main())
+
+
+def test_movement_is_waited_out_and_named(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            start_s = rig.aircraft.time_at(rig.now_s)
+            rig.aircraft.add(Handling(start_s=start_s + 1.0, duration_s=15.0, seed=3))
+            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            said: set[str] = set()
+            while not job.finished.done():
+                said.add(job.words)
+                await asyncio.sleep(0.5)
+            assert (await job.finished).outcome == "done"
+            assert any("deg/s" in words and "fc" in words for words in said), said
+            assert job.record is not None
+            assert job.record.duration_s > 20.0
+            left = rig.double.residual(1, rig.now_s)
+            assert np.abs(left.gyro_rad_s).max() < 25 * DEG_H
+            assert np.abs(left.accel_m_s2).max() < 0.4 * MG
+
+    run_virtual(main())
+
+
+def test_a_slow_steady_turn_is_not_taken_for_a_bias(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            start_s = rig.aircraft.time_at(rig.now_s)
+            rig.aircraft.add(SlowTurn(start_s=start_s, duration_s=60.0, rate_deg_s=0.5))
+            result, _ = await calibrated(rig, timeout_s=45.0)
+            assert result.outcome == "failed"
+            assert rig.double.writes == []
+
+    run_virtual(main())
+
+
+def test_a_timeout_says_for_what_it_waited(tmp_path: Path) -> None:
+    async def main() -> None:
+        rig = Rig(tmp_path)
+        rig.unplugged = {"gradienter"}
+        async with rig.running():
+            await rig.ready()
+            result, record = await calibrated(rig, timeout_s=20.0)
+            assert result.outcome == record.state == "failed"
+            assert "gradienter" in result.reason
+            assert record.duration_s == pytest.approx(20.0, abs=0.5)
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("state", [State.WAITING, State.COLLECTING, State.WRITING, State.VERIFYING])
+def test_cancelled_anywhere_nothing_is_left_changed(tmp_path: Path, state: State) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=14.0).running() as rig:
+            await rig.ready()
+            before = values(rig.double)
+            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.conductor.state is state, 60.0)
+            assert rig.service.conductor.cancel("the test")
+            result = await job.finished
+            assert result.outcome == "cancelled"
+            assert "the test" in result.reason
+            assert values(rig.double) == before
+            assert not rig.service.mender.pending
+            assert rig.service.conductor.state is State.CANCELLED
+            assert not rig.service.conductor.cancel("the test")
+
+    run_virtual(main())
+
+
+def test_a_fc_only_set_up_with_a_turned_board(tmp_path: Path) -> None:
+    # AHRS_ORIENTATION 2 is YAW_90: offsets live in the board's axes, residuals in the vehicle's.
+    async def main() -> None:
+        rig = Rig(tmp_path, max_s=15.0, parameters={"AHRS_ORIENTATION": 2.0, "INS_ACCSCAL_X": 1.02})
+        rig.model.mounting[:] = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        rig.model._gyro_matrix = rig.model.mounting.T.copy()
+        rig.model._accel_matrix = np.diag([1 / 1.02, 1.0, 1.0]) @ rig.model.mounting.T
+        async with rig.running():
+            await rig.ready()
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            left = rig.double.residual(1, rig.now_s)
+            assert np.abs(left.gyro_rad_s).max() < 20 * DEG_H
+            assert np.abs(left.accel_m_s2).max() < 0.4 * MG
+            # The whole bias is in the vehicle's axes, the parameters in the board's.
+            true = rig.model.true_bias_in_vehicle(rig.aircraft.time_at(rig.now_s))
+            assert record.imus[0].gyro_bias_rad_s is not None
+            np.testing.assert_allclose(record.imus[0].gyro_bias_rad_s, true.gyro_rad_s, atol=20 * DEG_H)
+            assert rig.double.parameter("INS_GYROFFS_X") == pytest.approx(162 * DEG_H, abs=20 * DEG_H)
+
+    run_virtual(main())
+
+
+def test_refusals_before_anything_starts(tmp_path: Path) -> None:
+    async def main() -> None:
+        rig = Rig(tmp_path)
+        rig.double.faults.heartbeat_off = True
+        async with rig.running():
+            early = rig.service.conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(early, Refusal)
+            assert early.kind == "unknown"
+            assert "no autopilot heard" in early.reason
+            rig.double.faults.heartbeat_off = False
+            await rig.ready()
+            rig.double.arm()
+            await asyncio.sleep(2.0)
+            armed = rig.service.conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(armed, Refusal)
+            assert armed.kind == "armed"
+            assert any("Armed: not calibrated" in text for text in rig.ground.texts())
+            rig.double.disarm()
+            rig.double.faults.heartbeat_off = True
+            await asyncio.sleep(4.0)
+            lost = rig.service.conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(lost, Refusal)
+            assert lost.kind == "unknown"
+            rig.double.faults.heartbeat_off = False
+            await asyncio.sleep(3.0)
+            started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            busy = rig.service.conductor.start_calibration(What.GYROS, "another")
+            assert isinstance(busy, Refusal)
+            assert busy.kind == "busy"
+
+    run_virtual(main())

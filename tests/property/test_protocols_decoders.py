@@ -1,0 +1,211 @@
+"""What holds for every decoder, whatever comes down the wire."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import struct
+from collections import Counter
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.protocols.base import Decoder, LineDecoder, xor_checksum
+from companion.protocols.hmr3300 import Hmr3300Decoder
+from companion.protocols.imu_line import ImuLineDecoder
+from companion.protocols.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.vectornav import SENTENCE_LIMIT, VectorNavDecoder
+from companion.protocols.vectornav_binary import MAX_FRAME_BYTES
+from companion.samples import CompassSample, ImuSample, Sample, TiltSample
+from tests.support.frames import floats, imu_line, sentence, vectornav_binary, vectornav_imu, xor
+
+SECONDS_PER_BYTE = 1 / 1024  # exact in binary, so that times can be compared exactly
+DECODERS: list[type[Decoder]] = [Hmr3300Decoder, InclinometerXyDecoder, ImuLineDecoder, VectorNavDecoder]
+
+finite = st.floats(-50, 50, allow_nan=False, width=32)
+triples = st.tuples(finite, finite, finite)
+tenths = st.integers(-900, 900).map(lambda n: n / 10)
+thousandths = st.integers(-90_000, 90_000).map(lambda n: n / 1000)
+
+hmr_lines = st.one_of(
+    st.builds(lambda h, p, r: f"{h / 10}, {p}, {r}\r\n".encode(), st.integers(0, 3599), tenths, tenths),
+    st.integers(0, 3599).map(lambda h: f"{h / 10}\r\n".encode()),
+    st.sampled_from([b"#I\r\n", b"12, 34, 56\r\n", b"360.0, 1.0, 1.0\r\n", b"\r\n", b"1.0\n"]),
+)
+xy_lines = st.one_of(
+    st.builds(lambda axis, value: f"{axis}={value:+07.3f}\r\n".encode(), st.sampled_from("XY"), thousandths),
+    st.builds(lambda x, y: f"X={x:+07.3f}\r\nY={y:+07.3f}\r\n".encode(), thousandths, thousandths),
+    st.sampled_from([b"X=+++++++\r\n", b"Y=-------\r\n", b"s", b"X=+01.20\r\n", b"+01.200\r\n", b"SN:1\r\n"]),
+)
+imu_lines = st.one_of(
+    st.builds(imu_line, st.integers(0, 65535), st.integers(0, 2**32 - 1), triples, triples),
+    st.sampled_from([b"$IMU,1,2*00\r\n", sentence("IMU,1,2,nan,0,0,0,0,0,0"), sentence("GPGGA,1"), b"$"]),
+)
+vectornav_frames = st.one_of(
+    st.builds(vectornav_imu, st.integers(0, 2**64 - 1), triples, triples, finite),
+    triples.map(lambda ypr: vectornav_binary({1: {3: floats(*ypr)}})),
+    st.builds(lambda v: sentence("VNYMR," + ",".join(map(str, v))), st.tuples(*[finite] * 12)),
+    st.sampled_from(
+        [b"\xfa\x05\xff\x7f\xff\x0f", b"\xfa\x04", b"$VNYMR,", b"$VN", sentence("VNERR,1"), b"\xfa\x01\x00"]
+    ),
+)
+FRAMES: dict[type[Decoder], st.SearchStrategy[bytes]] = {
+    Hmr3300Decoder: hmr_lines,
+    InclinometerXyDecoder: xy_lines,
+    ImuLineDecoder: imu_lines,
+    VectorNavDecoder: vectornav_frames,
+}
+
+
+@st.composite
+def damaged(draw: st.DrawFn, frames: st.SearchStrategy[bytes]) -> bytes:
+    """A frame with a few bytes lost, changed or doubled."""
+    frame = bytearray(draw(frames))
+    for _ in range(draw(st.integers(0, 3))):
+        if frame:
+            at = draw(st.integers(0, len(frame) - 1))
+            frame[at : at + 1] = draw(
+                st.sampled_from([b"", b"\n", b"$", b"\xfa", b"\x80", bytes(frame[at : at + 1] * 2)])
+            )
+    return bytes(frame)
+
+
+def streams(decoder: type[Decoder]) -> st.SearchStrategy[bytes]:
+    piece = st.one_of(
+        FRAMES[decoder],
+        damaged(FRAMES[decoder]),
+        st.binary(max_size=20),
+        st.binary(min_size=1, max_size=1).map(lambda byte: byte * 400),
+    )
+    return st.lists(piece, max_size=12).map(b"".join)
+
+
+def feed_in(decoder: Decoder, stream: bytes, cuts: list[int]) -> list[Sample]:
+    """Feed a stream cut at some places, each chunk read when its last byte has just arrived."""
+    samples: list[Sample] = []
+    edges = [0, *sorted({cut for cut in cuts if 0 < cut < len(stream)}), len(stream)]
+    for start, end in itertools.pairwise(edges):
+        samples += decoder.feed(stream[start:end], end * SECONDS_PER_BYTE)
+    return samples
+
+
+def held_bytes(decoder: Decoder) -> int:
+    if isinstance(decoder, VectorNavDecoder):
+        return len(decoder._buffer)
+    assert isinstance(decoder, LineDecoder | ImuLineDecoder)
+    return len(decoder._partial)
+
+
+def limit_of(decoder: Decoder) -> int:
+    if isinstance(decoder, VectorNavDecoder):
+        return max(MAX_FRAME_BYTES, SENTENCE_LIMIT + 1)
+    assert isinstance(decoder, LineDecoder | ImuLineDecoder)
+    return decoder.LIMIT
+
+
+@pytest.mark.parametrize("kind", DECODERS)
+@settings(deadline=None, max_examples=80)
+@given(data=st.data())
+def test_how_a_stream_is_cut_changes_nothing(kind: type[Decoder], data: st.DataObject) -> None:
+    stream = data.draw(streams(kind))
+    cuts = data.draw(st.lists(st.integers(0, max(len(stream), 1)), max_size=20))
+    whole, by_byte, cut = (kind(SECONDS_PER_BYTE) for _ in range(3))
+    expected = feed_in(whole, stream, [])
+    assert feed_in(by_byte, stream, list(range(len(stream)))) == expected
+    assert feed_in(cut, stream, cuts) == expected
+    for other in (by_byte, cut):
+        assert (other.accepted, other.rejected, other.skipped) == (whole.accepted, whole.rejected, whole.skipped)
+        assert held_bytes(other) == held_bytes(whole)
+
+
+@pytest.mark.parametrize("kind", DECODERS)
+@settings(deadline=None, max_examples=80)
+@given(data=st.data())
+def test_nothing_raises_and_what_waits_is_bounded(kind: type[Decoder], data: st.DataObject) -> None:
+    decoder = kind()
+    for chunk in data.draw(st.lists(st.one_of(streams(kind), st.binary(max_size=600)), max_size=8)):
+        samples = decoder.feed(chunk, 0.0)
+        assert held_bytes(decoder) <= limit_of(decoder)
+        assert all(is_sane(sample) for sample in samples)
+        if data.draw(st.booleans()):
+            decoder.interrupted()
+            assert held_bytes(decoder) == 0
+    assert all(count > 0 for count in decoder.rejected.values())
+    assert all(reason for reason in decoder.rejected)
+
+
+def is_sane(sample: Sample) -> bool:
+    """Finite everywhere, angles within their circles."""
+    values = [x for x in msgspec.structs.astuple(sample) if x is not None]
+    flat = [x for value in values for x in (value if isinstance(value, tuple) else (value,))]
+    if not all(x == x and abs(x) != float("inf") for x in flat):
+        return False
+    if isinstance(sample, CompassSample):
+        return 0 <= sample.heading_deg < 360 and abs(sample.pitch_deg or 0) <= 90 and abs(sample.roll_deg or 0) <= 90
+    return not isinstance(sample, TiltSample) or max(abs(sample.x_deg), abs(sample.y_deg)) <= 90
+
+
+GOOD: dict[type[Decoder], bytes] = {
+    Hmr3300Decoder: b"\r\n123.4, 18.6, -0.5\r\n",  # without a start mark, only a line end shows where a line begins
+    InclinometerXyDecoder: b"X=+00.430\r\nY=-00.084\r\n",
+    ImuLineDecoder: imu_line(1, 2),
+    VectorNavDecoder: vectornav_imu(),
+}
+
+
+@pytest.mark.parametrize("kind", DECODERS)
+@settings(deadline=None, max_examples=80)
+@given(data=st.data())
+def test_a_good_frame_after_anything_is_found(kind: type[Decoder], data: st.DataObject) -> None:
+    before = data.draw(st.one_of(st.binary(max_size=400), damaged(FRAMES[kind]), FRAMES[kind].map(lambda f: f[:-3])))
+    alone = kind().feed(GOOD[kind], 0.0)
+    assert len(alone) == 1
+    decoder = kind()
+    # A false start may claim up to the longest frame; only what comes after that shows it to be one.
+    samples = decoder.feed(before + GOOD[kind], 0.0) + decoder.feed(bytes(MAX_FRAME_BYTES), 0.0)
+    assert samples[-1:] == alone
+
+
+@settings(deadline=None, max_examples=80)
+@given(st.binary(max_size=400))
+def test_the_folded_checksum_is_the_bytewise_one(body: bytes) -> None:
+    assert xor_checksum(body) == xor(body)
+
+
+@settings(deadline=None, max_examples=80)
+@given(st.integers(0, 65535), st.integers(0, 2**32 - 1), triples, triples)
+def test_an_imu_line_is_read_as_it_was_written(
+    sequence: int, t_us: int, gyro: tuple[float, float, float], accel: tuple[float, float, float]
+) -> None:
+    (sample,) = ImuLineDecoder().feed(imu_line(sequence, t_us, gyro, accel), 0.0)
+    assert isinstance(sample, ImuSample)
+    assert sample.gyro_rad_s == tuple(round(x, 6) for x in gyro)
+    assert sample.accel_m_s2 == tuple(round(x, 4) for x in accel)
+    assert (sample.sequence, sample.t_device_s) == (sequence, t_us / 1e6)
+
+
+@settings(deadline=None, max_examples=80)
+@given(st.integers(0, 2**64 - 1), triples, triples, finite)
+def test_a_binary_frame_is_read_as_it_was_written(
+    time_ns: int, gyro: tuple[float, float, float], accel: tuple[float, float, float], temperature: float
+) -> None:
+    (sample,) = VectorNavDecoder().feed(vectornav_imu(time_ns, gyro, accel, temperature), 0.0)
+    assert sample == ImuSample(0.0, gyro, accel, temperature, None, time_ns / 1e9)
+    assert struct.pack("<3f", *gyro) == floats(*sample.gyro_rad_s)
+
+
+@settings(deadline=None, max_examples=80)
+@given(st.lists(st.tuples(st.sampled_from("XYxG"), thousandths), max_size=30))
+def test_only_an_x_and_the_y_right_after_it_make_a_reading(lines: list[tuple[str, float]]) -> None:
+    """Against a plain reading of the rule with a regular expression over the axes."""
+    stream = "".join(f"{axis}={value:+07.3f}\r\n" for axis, value in lines).encode()
+    decoder = InclinometerXyDecoder()
+    samples = decoder.feed(stream, 0.0)
+    axes = "".join(axis for axis, _ in lines)
+    expected = [TiltSample(0.0, lines[m.start()][1], lines[m.start() + 1][1]) for m in re.finditer("XY", axes)]
+    assert samples == expected
+    unpaired = Counter(axes.replace("XY", ""))
+    waiting = int(axes.endswith("X"))
+    assert decoder.rejected.total() == unpaired.total() - waiting

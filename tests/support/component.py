@@ -1,0 +1,188 @@
+"""Component 191 on a wire with a scripted calibration service at one end and a ground station at the other."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from typing import Literal, NamedTuple
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.calibration.request import What
+from companion.component.component import Component
+from companion.component.service import Job, JobResult, Refusal
+from companion.links.mavlink import MavlinkLink
+from tests.support.wire import Wire
+
+CALIBRATE, CANCEL, UNDO, PREFLIGHT = 31010, 31011, 31012, 241
+ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED, IN_PROGRESS, CANCELLED = range(7)
+
+
+class Ground:
+    """A ground station: pymavlink's own parser and packer, and a list of all that came."""
+
+    def __init__(self, system_id: int = 255, component_id: int = 190) -> None:
+        self.system_id, self.component_id = system_id, component_id
+        self.received: list[tuple[float, mavlink.MAVLink_message]] = []
+        self.raw: list[bytes] = []
+        self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+        self._transmit: Callable[[bytes], None] | None = None
+
+    def attach(self, transmit: Callable[[bytes], None] | None) -> None:
+        self._transmit = transmit
+
+    def receive(self, data: bytes, t_s: float) -> None:
+        self.raw.append(data)
+        for message in self._codec.parse_buffer(data) or ():
+            self.received.append((t_s, message))
+
+    def pack(self, message: mavlink.MAVLink_message) -> bytes:
+        data: bytes = message.pack(self._codec)
+        self._codec.seq = (self._codec.seq + 1) % 256
+        return data
+
+    def send(self, message: mavlink.MAVLink_message) -> None:
+        self.send_raw(self.pack(message))
+
+    def send_raw(self, data: bytes) -> None:
+        assert self._transmit is not None
+        self._transmit(data)
+
+    def command(
+        self,
+        command: int,
+        *params: float,
+        target: tuple[int, int] = (1, 191),
+        confirmation: int = 0,
+        int_: bool = False,
+    ) -> None:
+        self.send(command_message(command, *params, target=target, confirmation=confirmation, int_=int_))
+
+    def acks(self, command: int | None = None) -> list[int]:
+        """The results of all COMMAND_ACKs to us."""
+        return [ack.result for ack in self.ack_messages() if command in (None, ack.command)]
+
+    def ack_messages(self) -> list[mavlink.MAVLink_command_ack_message]:
+        return [
+            message
+            for _, message in self.received
+            if isinstance(message, mavlink.MAVLink_command_ack_message)
+            and (message.target_system, message.target_component) == (self.system_id, self.component_id)
+        ]
+
+    def finals(self, command: int | None = None) -> list[int]:
+        return [result for result in self.acks(command) if result != IN_PROGRESS]
+
+    def texts(self) -> list[str]:
+        return [m.text for _, m in self.received if isinstance(m, mavlink.MAVLink_statustext_message)]
+
+    def times(self, name: str) -> list[float]:
+        return [t_s for t_s, message in self.received if message.get_type() == name]
+
+
+def command_message(
+    command: int, *params: float, target: tuple[int, int] = (1, 191), confirmation: int = 0, int_: bool = False
+) -> mavlink.MAVLink_message:
+    p = [*params, *[0.0] * (7 - len(params))]
+    if int_:
+        x, y = int(p[4]), int(p[5])
+        return mavlink.MAVLink_command_int_message(*target, 0, command, 0, 0, p[0], p[1], p[2], p[3], x, y, p[6])
+    return mavlink.MAVLink_command_long_message(
+        *target, command, confirmation, p[0], p[1], p[2], p[3], p[4], p[5], p[6]
+    )
+
+
+class ScriptedJob:
+    def __init__(self) -> None:
+        self.progress_percent = 0
+        self.finished: asyncio.Future[JobResult] = asyncio.get_running_loop().create_future()
+
+    def finish(self, outcome: Literal["done", "failed", "cancelled"], reason: str = "") -> None:
+        if not self.finished.done():
+            self.finished.set_result(JobResult(outcome, reason))
+
+
+class Started(NamedTuple):
+    what: What | Literal["undo"]
+    requester: str
+    job: ScriptedJob
+
+
+class ScriptedService:
+    """Does what the test tells it; `takes_s` None: until the test finishes the job."""
+
+    def __init__(self) -> None:
+        self.mav_state = int(mavlink.MAV_STATE_ACTIVE)
+        self.started: list[Started] = []
+        self.refusal: Refusal | None = None
+        self.error: Exception | None = None
+        self.takes_s: float | None = None
+
+    def start_calibration(self, what: What, requester: str) -> Job | Refusal:
+        return self._start(what, requester)
+
+    def start_undo(self, requester: str) -> Job | Refusal:
+        return self._start("undo", requester)
+
+    def cancel(self, requester: str) -> bool:
+        if self.error is not None:
+            raise self.error
+        running = [started.job for started in self.started if not started.job.finished.done()]
+        for job in running:
+            job.finish("cancelled", f"Calibration cancelled by {requester}")
+        return bool(running)
+
+    @property
+    def jobs(self) -> list[ScriptedJob]:
+        return [started.job for started in self.started]
+
+    def _start(self, what: What | Literal["undo"], requester: str) -> Job | Refusal:
+        if self.error is not None:
+            raise self.error
+        if self.refusal is not None:
+            return self.refusal
+        job = ScriptedJob()
+        self.started.append(Started(what, requester, job))
+        if self.takes_s == 0:
+            job.finish("done")
+        elif self.takes_s is not None:
+            asyncio.get_running_loop().call_later(self.takes_s, job.finish, "done")
+        return job
+
+
+class FakeVehicle:
+    def __init__(self, system_id: int | None = None) -> None:
+        self.system_id = system_id
+
+
+class Bench(NamedTuple):
+    link: MavlinkLink
+    component: Component
+    service: ScriptedService
+    vehicle: FakeVehicle
+    ground: Ground
+    wire: Wire
+    task: asyncio.Task[None]
+
+
+@asynccontextmanager
+async def bench(
+    *, seed: int = 0, loss: float = 0.0, duplicate: float = 0.0, prepare: Callable[[Component], None] | None = None
+) -> AsyncIterator[Bench]:
+    """The component running at one end of a wire."""
+    link, ground = MavlinkLink(), Ground()
+    service, vehicle = ScriptedService(), FakeVehicle()
+    component = Component(link, vehicle, service)
+    if prepare is not None:
+        prepare(component)
+    wire = Wire(link, ground, seed=seed, loss=loss, duplicate=duplicate)
+    task = asyncio.create_task(component.run())
+    try:
+        yield Bench(link, component, service, vehicle, ground, wire, task)
+    finally:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+        await asyncio.sleep(0.1)
+    assert link.received["handler error"] == 0

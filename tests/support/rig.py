@@ -1,0 +1,209 @@
+"""The whole daemon on a virtual aircraft, on virtual time: minutes of flight line in a fraction of a second.
+
+Real are the daemon's parts from decoder to record and the MAVLink bytes; in memory are only wires and ports.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+from companion.config import parse
+from companion.daemon.service import Service
+from companion.links.mavlink import MavlinkLink
+from sim.aircraft import Pose, Site, VirtualAircraft
+from sim.autopilot import ArduPilotDouble
+from sim.devices import HMR3300, Gradienter, Law, SerialDevice, VectorNavBinary
+from sim.imu_model import DEG_H, MG, ImuModel
+from sim.scenario import site_at
+from tests.support.component import Ground
+from tests.support.wire import Wire
+
+POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
+GYRO_BIAS_DEG_H = (162.234, 169.563, -98.289)
+ACCEL_BIAS_MG = (2.4125, -2.1596, 0.89809)
+
+CONFIG = """
+[mavlink]
+url = "udpout:127.0.0.1:9"
+[[imu]]
+name = "fc"
+source = "autopilot"
+profile = "{part}"
+{own}
+[gradienter]
+port = "/nowhere/gradienter"
+protocol = "inclinometer_xy"
+law = "{law}"
+sigma_deg = 0.005
+[compass]
+port = "/nowhere/compass"
+protocol = "hmr3300"
+sigma_deg = 1.0
+[calibration]
+min_still_s = {min_still_s}
+max_s = {max_s}
+[storage]
+directory = "{folder}"
+{more}
+"""
+OWN = """
+[[imu]]
+name = "own"
+source = "serial"
+port = "/nowhere/imu"
+protocol = "vectornav"
+profile = "adis16470"
+"""
+
+
+async def inline(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Runs a blocking call on the spot: there are no threads on virtual time."""
+    return function(*arguments)
+
+
+class Rig:
+    """One aircraft, its autopilot, its devices, the daemon, and a ground station behind the autopilot."""
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        seed: int = 0,
+        pose: Pose = POSE,
+        law: Law = "slope",
+        part: str = "icm42688p",
+        own_imu: bool = False,
+        vehicle: str = "copter",
+        min_still_s: float = 10.0,
+        max_s: float = 30.0,
+        parameters: dict[str, float] | None = None,
+        imus: int = 2,
+        more: str = "",
+        loss: float = 0.0,
+        duplicate: float = 0.0,
+        imu_rate_hz: float = 100.0,
+        feed_s: float = 0.05,
+        **autopilot: Any,
+    ) -> None:
+        self.imu_rate_hz, self.feed_s = imu_rate_hz, feed_s
+        self.site: Site = site_at(40.0, 116.0, 50.0)
+        self.aircraft = VirtualAircraft(pose, self.site)
+        self.model = ImuModel(
+            self.aircraft,
+            part,
+            seed=seed,
+            gyro_bias_rad_s=[value * DEG_H for value in GYRO_BIAS_DEG_H],
+            accel_bias_m_s2=[value * MG for value in ACCEL_BIAS_MG],
+        )
+        models = [self.model, *(ImuModel(self.aircraft, part, seed=seed + 10 + k) for k in range(imus - 1))]
+        self.double = ArduPilotDouble(
+            self.aircraft,
+            models,
+            vehicle=vehicle,  # type: ignore[arg-type]
+            parameters={"INS_GYR_CAL": 0.0, **(parameters or {})},
+            seed=seed,
+            **autopilot,
+        )
+        text = CONFIG.format(
+            part=part,
+            own=OWN if own_imu else "",
+            law=law,
+            min_still_s=min_still_s,
+            max_s=max_s,
+            folder=folder,
+            more=more,
+        )
+        self.config = parse(text, "rig.toml")
+        self.link = MavlinkLink()
+        self.devices: dict[str, SerialDevice] = {
+            "gradienter": Gradienter(self.aircraft, seed=seed, law=law),
+            "compass": HMR3300(self.aircraft, seed=seed),
+        }
+        if own_imu:
+            self.own_model = ImuModel(
+                self.aircraft,
+                "adis16470",
+                seed=seed + 5,
+                gyro_bias_rad_s=[60.294 * DEG_H, -124.657 * DEG_H, 108.289 * DEG_H],
+                accel_bias_m_s2=[0.21593 * MG, -2.2118 * MG, 1.2953 * MG],
+            )
+            self.devices["own"] = VectorNavBinary(self.own_model)
+        self.ground = Ground()
+        self.wire = Wire(self.link, self.double, seed=seed, loss=loss, duplicate=duplicate)
+        self.radio = Wire(self.ground, self.double.ground, seed=seed + 1)
+        self.unplugged: set[str] = set()
+        """Devices that say nothing."""
+        self.service: Service
+
+    @property
+    def now_s(self) -> float:
+        return asyncio.get_running_loop().time()
+
+    @contextlib.asynccontextmanager
+    async def running(self) -> AsyncIterator[Rig]:
+        """Run everything; the daemon is stopped in order at the end."""
+        self.service = Service(self.config, link=self.link, offload=inline, imu_rate_hz=self.imu_rate_hz)
+        tasks = [
+            asyncio.create_task(coroutine)
+            for coroutine in (
+                self.double.run(),
+                self._feed(),
+                self._ground_heartbeat(),
+                self.service.serve(mavlink=False, ports=False),
+            )
+        ]
+        await asyncio.sleep(0.01)
+        try:
+            yield self
+        finally:
+            await self._stop(tasks[3])
+            for task in tasks[:3]:
+                await self._stop(task)
+            self.wire.unplug()
+            self.radio.unplug()
+
+    @staticmethod
+    async def _stop(task: asyncio.Task[None]) -> None:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+    async def until(self, condition: Callable[[], bool], within_s: float) -> None:
+        """Wait for something to become true; fails when it does not."""
+        deadline_s = self.now_s + within_s
+        while not condition():
+            assert self.now_s < deadline_s, f"not within {within_s} s; status: {self.service.status()}"
+            await asyncio.sleep(0.05)
+
+    async def ready(self) -> Rig:
+        """Wait until the daemon knows the autopilot and its offsets."""
+        imu = self.service.imus["fc"]
+        await self.until(lambda: imu.calibration is not None and imu.stream.samples > 0, 15.0)
+        return self
+
+    async def _feed(self) -> None:
+        sensors = {sensor.name: sensor for sensor in self.service.sensors}
+        for device in self.devices.values():
+            device.power_on(self.aircraft.time_at(self.now_s))
+        while True:
+            await asyncio.sleep(self.feed_s)
+            t_s = self.aircraft.time_at(self.now_s)
+            for name, device in self.devices.items():
+                data = b"".join(frame.data for frame in device.frames_until(t_s))
+                if data and name not in self.unplugged:
+                    sensors[name].receive(data, self.now_s)
+
+    async def _ground_heartbeat(self) -> None:
+        from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+        while True:
+            self.ground.send(
+                mavlink.MAVLink_heartbeat_message(
+                    mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
+                )
+            )
+            await asyncio.sleep(1.0)

@@ -1,0 +1,53 @@
+"""The state table: what must be possible from everywhere, and that the diagram in the documentation is this table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from companion.calibration.machine import RESTING, TRANSITIONS, Event, IllegalEventError, Machine, State, diagram
+
+
+def test_the_main_road() -> None:
+    machine = Machine()
+    road = [
+        (Event.REQUEST, "waiting"),
+        (Event.STILL, "collecting"),
+        (Event.MOVED, "waiting"),
+        (Event.STILL, "collecting"),
+        (Event.ENOUGH, "solving"),
+        (Event.WRITE, "writing"),
+        (Event.WRITTEN, "verifying"),
+        (Event.VERIFIED, "done"),
+        (Event.UNDO, "writing"),
+        (Event.RESTORED, "done"),
+    ]
+    for event, state in road:
+        assert machine.on(event).value == state
+
+
+@pytest.mark.parametrize("state", [state for state in State if state not in RESTING])
+def test_every_busy_state_can_fail_and_be_cancelled(state: State) -> None:
+    assert TRANSITIONS[state, Event.FAULT] is State.FAILED
+    assert TRANSITIONS[state, Event.CANCEL] is State.CANCELLED
+
+
+def test_every_state_can_be_reached_and_left() -> None:
+    assert set(TRANSITIONS.values()) | {State.IDLE} == set(State)
+    assert {old for old, _ in TRANSITIONS} == set(State)
+
+
+def test_nothing_is_written_without_having_been_solved_or_asked_to_undo() -> None:
+    into_writing = {(old, event) for (old, event), new in TRANSITIONS.items() if new is State.WRITING}
+    assert into_writing == {(State.SOLVING, Event.WRITE)} | {(state, Event.UNDO) for state in RESTING}
+
+
+def test_an_event_out_of_place_is_a_programs_fault() -> None:
+    with pytest.raises(IllegalEventError, match="VERIFIED cannot happen while idle"):
+        Machine().on(Event.VERIFIED)
+
+
+def test_the_documented_diagram_is_the_table() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "calibration.md").read_text()
+    assert f"```mermaid\n{diagram()}```" in text

@@ -1,0 +1,162 @@
+"""Configuration mistakes: one line that names file, key, what was found and what is allowed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from companion.config import Config, load, parse
+from companion.errors import ConfigError
+
+GOOD = """
+[mavlink]
+url = "udpout:127.0.0.1:14550"
+[[imu]]
+name = "fc"
+source = "autopilot"
+"""
+SERIAL = '[[imu]]\nname = "own"\nsource = "serial"\nport = "/dev/ttyUSB0"\nprotocol = "vectornav"\n'
+
+
+def test_the_smallest_file_and_its_defaults() -> None:
+    config = parse(GOOD, "x.toml")
+    assert isinstance(config, Config)
+    assert config.mavlink.component_id == 191
+    assert config.imu[0].instance == 1
+    assert config.calibration.min_still_s == 10
+    assert config.calibration.max_s == 60
+    assert config.calibration.at_arm == "warn"
+    assert config.push.parameters
+    assert config.mqtt is None
+
+
+def test_a_full_file() -> None:
+    config = parse(
+        GOOD
+        + SERIAL
+        + """
+mounting = [180, 0, 90.5]
+profile = "bmi088"
+[vehicle]
+latitude_deg = 40
+longitude_deg = 116.5
+height_m = 50
+system_id = 7
+[gradienter]
+port = "tcp://127.0.0.1:4001"
+protocol = "inclinometer_xy"
+parity = "even"
+law = "axis"
+mounting = "ROTATION_YAW_90"
+offset_deg = [0.01, -0.02]
+sigma_deg = 0.01
+[compass]
+port = "/dev/ttyS1"
+protocol = "hmr3300"
+reference = "true"
+[calibration]
+target_gyro_sigma_deg_h = 3
+at_arm = "off"
+[control]
+socket = "/tmp/c.sock"
+[storage]
+directory = "/tmp/c"
+[mqtt]
+host = "localhost"
+[web]
+bind = "127.0.0.1:8080"
+""",
+        "x.toml",
+    )
+    assert config.imu[1].mounting == (180.0, 0.0, 90.5)
+    assert config.gradienter is not None
+    assert config.gradienter.offset_deg == (0.01, -0.02)
+    assert config.vehicle.latitude_deg == 40.0
+    assert config.control.path == Path("/tmp/c.sock")
+    assert config.storage.path == Path("/tmp/c")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[vehcile]\nx = 1", ["vehcile", "did you mean 'vehicle'"]),
+        ("[calibration]\nmin_stil_s = 3", ["calibration.min_stil_s", "did you mean 'min_still_s'"]),
+        ("[vehicle]\nlatitude_deg = 'x'", ["vehicle.latitude_deg", "found 'x'", "a number from -90 to 90"]),
+        ("[vehicle]\nlatitude_deg = 91\nlongitude_deg = 1", ["latitude_deg", "found 91", "-90 to 90"]),
+        ("[vehicle]\nlatitude_deg = nan\nlongitude_deg = 1", ["latitude_deg", "found nan", "-90 to 90"]),
+        ("[vehicle]\nlatitude_deg = 3", ["vehicle", "both or neither"]),
+        ("[calibration]\nmin_still_s = true", ["min_still_s", "found true", "2 to 600"]),
+        ("[calibration]\nmax_s = 5", ["calibration.max_s", "found 5", "min_still_s (10)"]),
+        ("[calibration]\ntarget_gyro_sigma_deg_h = 0", ["target_gyro_sigma_deg_h", "found 0", "above 0"]),
+        ("[calibration]\nat_arm = 'always'", ["at_arm", "found 'always'", '"gate", "warn", "off"']),
+        (
+            "[[imu]]\nname = 'b'\nsource = 'serial'\nprotocol = 'imu_line'",
+            ["imu[1].port", "missing", "tcp://HOST:PORT"],
+        ),
+        (SERIAL.replace("vectornav", "vectonav"), ["imu[1].protocol", "'vectonav'", '"vectornav", "imu_line"']),
+        (SERIAL.replace("own", "fc"), ["imu[1].name", "found 'fc'", "imu[0]", "a name of its own"]),
+        (SERIAL + "mounting = 'ROTATION_YAW_91'", ["imu[1].mounting", "ROTATION_YAW_91", "did you mean"]),
+        (SERIAL + "mounting = [1, 2]", ["imu[1].mounting", "found [1, 2]", "[number, number, number]"]),
+        (SERIAL + "mounting = [1, 2, inf]", ["imu[1].mounting", "inf", "finite"]),
+        (SERIAL + SERIAL.replace("own", "other"), ["imu[2].port", "/dev/ttyUSB0", "imu[1].port", "a port of its own"]),
+        (SERIAL + "autopilot_instance = 1", ["imu[1]", "autopilot IMU 1 a second time"]),
+        ("[[imu]]\nname = 'b'\nsource = 'autopilot'\nport = '/dev/x'\ninstance = 2", ["imu[1].port", "only with"]),
+        ("[[imu]]\nname = 'b'\nsource = 'autopilot'\ninstance = 4", ["imu[1].instance", "found 4", "from 1 to 3"]),
+        ("[gradienter]\nport = '/dev/x'\nprotocol = 'inclinometer_xy'", ["gradienter.law", "missing", '"slope"']),
+        (
+            "[gradienter]\nport = 3\nprotocol = 'inclinometer_xy'\nlaw = 'axis'",
+            ["gradienter.port", "found 3", "a text"],
+        ),
+        ("[compass]\nport = 'COM3'\nprotocol = 'hmr3300'", ["compass.port", "'COM3'", "tcp://HOST:PORT"]),
+        (
+            "[gradienter]\nport = '/dev/x'\nprotocol = 'inclinometer_xy'\nlaw = 'axis'\nmounting = 'ROTATION_ROLL_180'",
+            ["gradienter.mounting", "ROTATION_ROLL_180", "upside down", "upright"],
+        ),
+        ("[mqtt]\nhost = ''", ["mqtt.host", "found ''", "not empty"]),
+        ("[vehicle]\nlatitude_deg = 3 4", ["not valid TOML", "line 8"]),
+    ],
+)
+def test_a_mistake_is_one_line_that_says_it_all(text: str, words: list[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(GOOD + text, "the.toml")
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in ("the.toml", *words):
+        assert word in message
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", ["mavlink", "missing"]),
+        ("[mavlink]\nurl = 'x:1'\n[[imu]]\nname='a'\nsource='autopilot'", ["mavlink.url", "'x:1'", "udpin:HOST:PORT"]),
+        ("[mavlink]\nurl = 'udpin:a:1'", ["imu", "missing", "[[imu]]"]),
+        ("imu = []\n[mavlink]\nurl = 'udpin:a:1'", ["imu", "not empty"]),
+        ("imu = 3\n[mavlink]\nurl = 'udpin:a:1'", ["imu", "found 3"]),
+        ("[mavlink]\ncomponent_id = 3", ["mavlink.url", "missing"]),
+    ],
+)
+def test_what_every_file_needs(text: str, words: list[str]) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(text, "the.toml")
+    for word in ("the.toml", *words):
+        assert word in str(caught.value)
+
+
+def test_a_missing_or_unreadable_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.toml: no such file"):
+        load(tmp_path / "none.toml")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load(tmp_path)
+    (tmp_path / "latin.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load(tmp_path / "latin.toml")
+
+
+def test_systemds_folders_are_the_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", "/run/here")
+    monkeypatch.setenv("STATE_DIRECTORY", "/state/here")
+    config = parse(GOOD, "x.toml")
+    assert str(config.control.path) == "/run/here/control.sock"
+    assert str(config.storage.path) == "/state/here"

@@ -1,0 +1,119 @@
+"""The control socket: who may use it, what happens to a stale one, and clients that misbehave."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import stat
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from companion.daemon.control import ControlServer, Object, ask
+from companion.errors import CalibrationRefusedError, DaemonUnreachableError, LinkError
+
+
+async def _echo(request: Object) -> AsyncIterator[Object]:
+    if request.get("command") == "refuse":
+        raise CalibrationRefusedError("moved")
+    if request.get("command") == "break":
+        raise ZeroDivisionError
+    yield {"kind": "progress", "n": 1}
+    yield {"kind": "result", "request": request}
+
+
+async def _all(path: Path, request: Object) -> list[Object]:
+    return [reply async for reply in ask(path, request)]
+
+
+def test_request_progress_result_and_errors(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "control.sock"
+
+    async def main() -> None:
+        async with ControlServer(path, _echo):
+            assert stat.S_IMODE(path.stat().st_mode) == 0o600
+            replies = await _all(path, {"command": "x", "long": "y" * 5000})
+            assert [reply["kind"] for reply in replies] == ["progress", "result"]
+            assert replies[-1]["request"]["long"] == "y" * 5000
+            assert await _all(path, {"command": "refuse"}) == [{"kind": "error", "reason": "moved"}]
+            (broken,) = await _all(path, {"command": "break"})
+            assert "internal error" in broken["reason"]
+        assert not path.exists()
+
+    asyncio.run(main())
+
+
+def test_a_stale_socket_is_replaced_and_a_live_one_refused(tmp_path: Path) -> None:
+    path = tmp_path / "control.sock"
+    stale = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    stale.bind(str(path))
+    stale.close()  # what kill -9 leaves
+
+    async def main() -> None:
+        async with ControlServer(path, _echo):
+            assert (await _all(path, {"command": "x"}))[-1]["kind"] == "result"
+            with pytest.raises(LinkError, match="another companion is running"):
+                async with ControlServer(path, _echo):
+                    pass
+            assert (await _all(path, {"command": "x"}))[-1]["kind"] == "result"
+
+    asyncio.run(main())
+
+
+def test_a_file_in_the_way_is_not_removed(tmp_path: Path) -> None:
+    path = tmp_path / "control.sock"
+    path.write_text("precious")
+
+    async def main() -> None:
+        with pytest.raises(LinkError, match="not a socket"):
+            async with ControlServer(path, _echo):
+                pass
+
+    asyncio.run(main())
+    assert path.read_text() == "precious"
+
+
+@pytest.mark.parametrize("line", [b"\n", b"{\n", b"[1]\n", b"\xff\xfe\n", b"x" * 70000 + b"\n"])
+def test_garbage_is_answered_with_one_error_line(tmp_path: Path, line: bytes) -> None:
+    path = tmp_path / "control.sock"
+
+    async def main() -> bytes:
+        async with ControlServer(path, _echo):
+            reader, writer = await asyncio.open_unix_connection(str(path))
+            writer.write(line)
+            answer = await reader.read()
+            writer.close()
+            return answer
+
+    assert b"request not understood" in asyncio.run(main())
+
+
+def test_no_daemon_is_said_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(DaemonUnreachableError, match=r"no daemon answers at .*companion run"):
+        asyncio.run(_all(tmp_path / "none.sock", {"command": "status"}))
+
+
+def test_a_client_that_leaves_in_the_middle_disturbs_nobody(tmp_path: Path) -> None:
+    path = tmp_path / "control.sock"
+    started = asyncio.Event()
+
+    async def endless(request: Object) -> AsyncIterator[Object]:
+        if request.get("command") == "status":
+            yield {"kind": "result"}
+            return
+        while True:
+            started.set()
+            yield {"kind": "progress", "pad": "x" * 1000}
+
+    async def main() -> None:
+        async with ControlServer(path, endless):
+            _, writer = await asyncio.open_unix_connection(str(path))
+            writer.write(b'{"command": "monitor"}\n')
+            await started.wait()
+            writer.close()
+            assert await _all(path, {"command": "status"}) == [{"kind": "result"}]
+
+    asyncio.run(main())
+    assert not os.path.exists(path)

@@ -1,0 +1,123 @@
+"""The project's own $IMU line."""
+
+from __future__ import annotations
+
+import pytest
+
+from companion.protocols.imu_line import ImuLineDecoder
+from companion.samples import ImuSample, Sample
+from tests.support.frames import imu_line, sentence
+
+LINE = imu_line(7, 1_234_567)
+
+
+def feed(data: bytes) -> tuple[list[Sample], dict[str, int]]:
+    decoder = ImuLineDecoder()
+    return decoder.feed(data, 1.0), dict(decoder.rejected)
+
+
+def test_a_line_written_out_by_hand() -> None:
+    # The checksum was computed in a shell, from od's bytes.
+    line = b"$IMU,1,2000000,0.01,-0.02,0.03,0.1,0.2,-9.8,25.0*55\r\n"
+    assert feed(line) == ([ImuSample(1.0, (0.01, -0.02, 0.03), (0.1, 0.2, -9.8), 25.0, 1, 2.0)], {})
+
+
+def test_the_counters_reach_their_last_values() -> None:
+    samples, _ = feed(imu_line(65535, 4294967295))
+    assert [(s.sequence, s.t_device_s) for s in samples if isinstance(s, ImuSample)] == [(65535, 4294.967295)]
+
+
+def test_the_temperature_may_be_empty() -> None:
+    samples, rejected = feed(imu_line(1, 1, temperature=""))
+    assert [s.temperature_degc for s in samples if isinstance(s, ImuSample)] == [None]
+    assert not rejected
+
+
+@pytest.mark.parametrize("end", [b"\r\n", b"\n", b"\r", b"\n\r", b"\r\r\n"])
+def test_any_line_end_will_do(end: bytes) -> None:
+    samples, rejected = feed(3 * (LINE.rstrip() + end))
+    assert len(samples) == 3
+    assert not rejected
+
+
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        ("IMU,1,2,0,0,0,0,0,-9.8", "field count"),
+        ("IMU,1,2,0,0,0,0,0,-9.8,25,1", "field count"),
+        ("IMU,1,2,0,0,0,0,0,,25", "not a number"),
+        ("IMU,1,2,0,0,0,0,0,-9.8,warm", "not a number"),
+        ("IMU,1.5,2,0,0,0,0,0,-9.8,25", "not a number"),
+        ("IMU,65536,2,0,0,0,0,0,-9.8,25", "out of range"),
+        ("IMU,-1,2,0,0,0,0,0,-9.8,25", "out of range"),
+        ("IMU,1,4294967296,0,0,0,0,0,-9.8,25", "out of range"),
+        ("IMU,1,2,101,0,0,0,0,-9.8,25", "out of range"),
+        ("IMU,1,2,0,0,0,0,0,-2001,25", "out of range"),
+        ("IMU,1,2,0,0,0,0,0,-9.8,900", "out of range"),
+        ("IMU,1,2,nan,0,0,0,0,-9.8,25", "non-finite"),
+        ("IMU,1,2,0,0,inf,0,0,-inf,25", "non-finite"),
+        ("IMU,1,2,0,0,0,0,0,-9.8,nan", "non-finite"),
+        ("IMV,1,2,0,0,0,0,0,-9.8,25", "unknown sentence"),
+    ],
+)
+def test_a_right_checksum_alone_is_not_enough(body: str, reason: str) -> None:
+    assert feed(sentence(body)) == ([], {reason: 1})
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (LINE.replace(b"*", b"*0"), "no checksum"),
+        (LINE[:-4] + b"zz\r\n", "no checksum"),
+        (LINE[: LINE.index(b"*")] + b"\r\n", "no checksum"),
+        (LINE[:10] + b"9" + LINE[11:], "checksum"),
+        (LINE[:30], ""),
+        (LINE[:30] + b"$", "cut short"),
+        (b"$" + b"x" * 200, "too long"),
+    ],
+)
+def test_damage_is_counted_by_reason(data: bytes, reason: str) -> None:
+    samples, rejected = feed(data)
+    assert samples == []
+    assert rejected == ({reason: 1} if reason else {})
+
+
+@pytest.mark.parametrize("before", [b"$IMU,1,2,", b"$$$", b"\x00\xff\n\n", b"$" + b"x" * 500, b"rst:0x1 (POWERON)"])
+def test_a_line_that_begins_inside_a_rejected_one_is_not_lost(before: bytes) -> None:
+    samples, _ = feed(before + LINE)
+    assert len(samples) == 1
+
+
+def test_bytes_outside_of_lines_are_counted() -> None:
+    decoder = ImuLineDecoder()
+    decoder.feed(b"boot\r\n" + LINE + b"???", 1.0)
+    assert decoder.skipped == 7
+    decoder.feed(b"$IMU,1$" + b"x" * 161, 1.0)  # a start that is cut short, and one that is two bytes too long
+    assert decoder.rejected == {"cut short": 1, "too long": 1}
+    assert decoder.skipped == 7 + 2
+
+
+def test_an_interruption_forgets_the_line_under_way() -> None:
+    decoder = ImuLineDecoder()
+    decoder.feed(LINE[:20], 1.0)
+    decoder.interrupted()
+    assert decoder.feed(LINE[20:] + LINE, 2.0) != []
+    assert decoder.accepted == 1
+    assert decoder.rejected == {"cut short": 1}
+
+
+def test_every_single_damaged_bit_is_seen() -> None:
+    """One flipped bit gives no sample, or the very same one (a hexadecimal digit in the other case)."""
+    (right,), _ = feed(LINE)
+    for at in range(len(LINE) * 8):
+        damaged = bytearray(LINE)
+        damaged[at // 8] ^= 1 << at % 8
+        samples, _ = feed(bytes(damaged) + b"\r\n")
+        assert samples in ([], [right]), damaged
+
+
+def test_times_are_those_of_the_line_ends() -> None:
+    decoder = ImuLineDecoder(seconds_per_byte=0.001)
+    samples = decoder.feed(LINE + LINE, 10.0)
+    # The line ends with its "\r": the "\n" and the second line came after it.
+    assert [s.t_s for s in samples] == pytest.approx([10.0 - 0.001 * (len(LINE) + 1), 10.0 - 0.001])

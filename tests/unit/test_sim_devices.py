@@ -1,0 +1,242 @@
+"""Bytes of every device, taken apart by hand."""
+
+from __future__ import annotations
+
+import binascii
+import math
+import re
+import struct
+from collections.abc import Sequence
+from functools import reduce
+from operator import xor
+
+import numpy as np
+import pytest
+
+from sim.aircraft import Pose, Site, VirtualAircraft
+from sim.devices import HMR3300, Frame, Gradienter, ImuLine, SerialDevice, VectorNavAscii, VectorNavBinary
+from sim.imu_model import ImuModel
+from sim.motions import Knock, Turn
+
+POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
+
+
+def joined(frames: Sequence[Frame]) -> bytes:
+    return b"".join(frame.data for frame in frames)
+
+
+def checked(line: str) -> list[str]:
+    """Fields of an NMEA-like line whose XOR is right."""
+    match = re.fullmatch(r"\$([^*]*)\*([0-9A-F]{2})\r\n", line)
+    assert match, line
+    assert reduce(xor, match[1].encode(), 0) == int(match[2], 16)
+    return match[1].split(",")
+
+
+def test_hmr3300_lines_are_magnetic_heading_pitch_roll_at_8_hz() -> None:
+    aircraft = VirtualAircraft(POSE, Site(40.0, 116.0, 50.0, declination_deg=-7.5))
+    compass = HMR3300(aircraft, heading_error_deg=1.0, heading_noise_deg=0.0)
+    assert re.fullmatch(rb"HMR3300 [^\r\n]*\r\n", compass.power_on(0.0))
+    frames = compass.frames_until(10.0)
+    assert len(frames) == 81
+    assert [frame.sampled_s for frame in frames[:3]] == [0.0, 0.125, 0.25]
+    assert {frame.data for frame in frames} == {b"48.5, 5.0, -3.0\r\n"}
+    assert frames[0].complete_s == pytest.approx(17 * 10 / 19200)
+
+
+def test_hmr3300_heading_wraps_before_360_and_zero_has_no_minus() -> None:
+    for heading, text in ((359.96, "0.0"), (359.94, "359.9"), (-0.04, "0.0"), (0.04, "0.0")):
+        compass = HMR3300(VirtualAircraft(Pose(-0.04, 0.0, heading)), heading_noise_deg=0.0)
+        assert compass.frames_until(0.0)[0].data == f"{text}, 0.0, 0.0\r\n".encode()
+
+
+def test_hmr3300_tilt_is_fooled_by_acceleration() -> None:
+    aircraft = VirtualAircraft(motions=[Knock(start_s=0.9, peak_deg_s=0.0, peak_m_s2=3.0)])
+    compass = HMR3300(aircraft, heading_noise_deg=0.0)
+    pitches = [float(frame.data.split(b",")[1]) for frame in compass.frames_until(2.0)]
+    assert pitches[0] == 0.0
+    assert max(map(abs, pitches)) > 3.0
+
+
+def test_hmr3300_commands() -> None:
+    compass = HMR3300(VirtualAircraft(POSE), heading_noise_deg=0.0)
+    assert compass.frames_until(0.5)
+    assert compass.command(b"*Q\r\n", 0.5) == b""  # only while stopped
+    assert compass.command(b"*S\r", 0.5) == b""
+    assert compass.frames_until(1.0) == []
+    assert compass.command(b"*", 1.0) + compass.command(b"Q\r\n", 1.0) == b"40.0, 5.0, -3.0\r\n"
+    assert compass.command(b"*M\r\n*Q\r\n", 1.0).count(b".") == 0
+    assert compass.command(b"rubbish\r\n", 1.0) == b"#I\r\n"
+    assert compass.command(b"\x00\xff" * 5000, 1.0) == b""
+    compass.command(b"\r\n*S\r\n", 1.0)
+    assert re.fullmatch(rb"(-?\d+, -?\d+, -?\d+\r\n)+", joined(compass.frames_until(2.0)))
+
+
+def test_gradienter_pairs_at_10_hz() -> None:
+    gradienter = Gradienter(VirtualAircraft(POSE), offset_deg=(0.01, -0.02), noise_deg=0.0)
+    frames = gradienter.frames_until(1.0)
+    assert len(frames) == 11
+    x = math.degrees(math.asin(math.sin(math.radians(-3.0)) * math.cos(math.radians(5.0)))) + 0.01
+    assert {frame.data for frame in frames} == {f"X={x:+07.3f}\r\nY=+04.980\r\n".encode()}
+    assert frames[0].complete_s == pytest.approx(22 * 10 / 9600)
+    assert Gradienter(VirtualAircraft(), parity="even").frames_until(0.0)[0].complete_s == pytest.approx(22 * 11 / 9600)
+
+
+@pytest.mark.parametrize(
+    ("law", "x_deg", "y_deg"),
+    # theta = 20, gamma = 30: an axis-elevation device reads 28.0 in x, a liquid surface 30.0; y = atan(tan t / cos g).
+    [("axis", 28.024, 20.0), ("slope", 30.0, 22.796), ("euler", 30.0, 20.0)],
+)
+def test_gradienter_laws(law: str, x_deg: float, y_deg: float) -> None:
+    gradienter = Gradienter(VirtualAircraft(Pose(20.0, 30.0, 77.0)), law=law, noise_deg=0.0, range_deg=45.0)  # type: ignore[arg-type]
+    match = re.fullmatch(rb"X=([+-]\d\d\.\d{3})\r\nY=([+-]\d\d\.\d{3})\r\n", gradienter.frames_until(0.0)[0].data)
+    assert match
+    assert (float(match[1]), float(match[2])) == pytest.approx((x_deg, y_deg), abs=6e-4)
+
+
+def test_gradienter_beyond_its_range_says_signs() -> None:
+    gradienter = Gradienter(VirtualAircraft(Pose(-40.0, 35.0, 0.0)), law="euler")
+    assert gradienter.frames_until(0.0)[0].data == b"X=+++++++\r\nY=-------\r\n"
+
+
+def test_gradienter_fluid_follows_with_one_decade_a_second() -> None:
+    aircraft = VirtualAircraft(Pose(5.0, 0.0, 0.0), motions=[Turn(start_s=1.0, duration_s=0.001, pitch_deg=-5.0)])
+    gradienter = Gradienter(aircraft, noise_deg=0.0)
+    y = {round(f.sampled_s, 1): float(f.data.split(b"Y=")[1]) for f in gradienter.frames_until(4.5)}
+    assert y[0.9] == 5.0
+    assert y[2.0] == pytest.approx(0.5, rel=0.05)
+    assert y[3.0] == pytest.approx(0.05, rel=0.1)
+    assert y[4.0] == pytest.approx(0.005, abs=0.001)
+
+
+def test_gradienter_takes_acceleration_for_tilt_and_its_mounting_into_account() -> None:
+    shaken = VirtualAircraft(motions=[Knock(start_s=0.0, duration_s=1.0, peak_deg_s=0.0, peak_m_s2=2.0)])
+    tilts = Gradienter(shaken).tilt_deg(np.linspace(0.0, 1.0, 51))
+    assert np.abs(tilts).max() > 4.0
+    turned = Gradienter(VirtualAircraft(POSE), mounting_deg=(0.0, 0.0, 90.0), law="axis")
+    # Its forward axis is the vehicle's right one, which is up by asin(sin 3 cos 5); its right axis points backwards.
+    x, y = turned.tilt_deg(np.array([0.0]))[0]
+    assert x == pytest.approx(5.0)
+    assert y == pytest.approx(2.98859, abs=1e-4)
+
+
+def test_gradienter_commands() -> None:
+    gradienter = Gradienter(VirtualAircraft(POSE), noise_deg=0.0)
+    assert gradienter.command(b"s", 0.0) == b"s"
+    assert gradienter.frames_until(1.0) == []
+    assert gradienter.command(b"R", 1.0) == b"X=-02.989\r\nY=+05.000\r\n"
+    assert gradienter.command(b"V", 1.0).startswith(b"DPL2 V1.8.0")
+    assert gradienter.command(b"fima\x00\xff", 1.0) == b""
+    assert gradienter.command(b"S", 1.0) == b""
+    assert len(gradienter.frames_until(2.0)) == 10
+
+
+def still_imu() -> tuple[VirtualAircraft, ImuModel]:
+    aircraft = VirtualAircraft(POSE, temperature_degc=31.25)
+    return aircraft, ImuModel(
+        aircraft, "perfect", gyro_bias_rad_s=(0.01, -0.02, 0.03), accel_bias_m_s2=(0.1, -0.2, 0.3)
+    )
+
+
+def test_vectornav_binary_packets_at_200_hz() -> None:
+    aircraft, imu = still_imu()
+    device = VectorNavBinary(imu)
+    frames = device.frames_until(0.995)
+    assert len(frames) == 200
+    assert {len(frame.data) for frame in frames} == {44}
+    rate, force = aircraft.truth_at(0.0)
+    for number, frame in enumerate(frames):
+        data = frame.data
+        sync, groups, common, inertial = struct.unpack("<BBHH", data[:6])
+        assert (sync, groups, common, inertial) == (0xFA, 0x05, 0x0121, 0x0010)
+        assert binascii.crc_hqx(data[1:], 0) == 0  # CRC over everything after the sync byte, CRC included
+        (startup_ns,) = struct.unpack("<Q", data[6:14])
+        assert startup_ns == number * 5_000_000
+        values = struct.unpack("<7f", data[14:42])
+        assert values[:3] == pytest.approx(np.add(rate, [0.01, -0.02, 0.03]), abs=1e-8)
+        assert values[3:6] == pytest.approx(np.add(force, [0.1, -0.2, 0.3]), abs=1e-6)
+        assert values[6] == 31.25
+    assert frames[7].complete_s - frames[7].sampled_s == pytest.approx(44 * 10 / 115200)
+
+
+NUMBER = {
+    "yaw": r"[+-]\d{3}\.\d{3}", "mag": r"[+-]\d{2}\.\d{4}", "accel": r"[+-]\d{2}\.\d{3}", "gyro": r"[+-]\d{2}\.\d{6}",
+}  # fmt: skip
+
+
+def test_vectornav_ymr_has_the_shape_of_the_documented_line() -> None:
+    _, imu = still_imu()
+    documented = "$VNYMR,+100.949,-007.330,+000.715,-00.0049,-00.2449,+00.5397,-01.258,-00.100,-09.701,-00.000018,+00.001122,-00.000551*69\r\n"  # noqa: E501
+    pattern = ",".join([NUMBER["yaw"]] * 3 + [NUMBER["mag"]] * 3 + [NUMBER["accel"]] * 3 + [NUMBER["gyro"]] * 3)
+    assert re.fullmatch(rf"\$VNYMR,{pattern}\*[0-9A-F]{{2}}\r\n", documented)
+    frames = VectorNavAscii(imu).frames_until(1.0)
+    assert len(frames) == 41
+    line = frames[0].data.decode()
+    assert re.fullmatch(rf"\$VNYMR,{pattern}\*[0-9A-F]{{2}}\r\n", line)
+    assert len(line) == len(documented) == 122
+    fields = [float(field) for field in checked(line)[1:]]
+    assert fields[:3] == pytest.approx([40.0, 5.0, -3.0], abs=5e-4)
+    assert fields[6:9] == pytest.approx([0.954, 0.311, -9.451], abs=6e-4)
+    assert fields[9] == pytest.approx(0.01 + 4.67e-5, abs=1e-6)
+
+
+def test_vectornav_imu_line() -> None:
+    _, imu = still_imu()
+    device = VectorNavAscii(imu, message="VNIMU", rate_hz=200.0)
+    frames = device.frames_until(1.0)
+    assert len(frames) == 201
+    fields = checked(frames[0].data.decode())
+    assert fields[0] == "VNIMU"
+    assert len(fields) == 12
+    assert float(fields[10]) == pytest.approx(31.2, abs=0.051)
+    assert device.line_time_s(len(frames[0].data)) < 1.0 / 200.0
+
+
+def test_imu_line_counts_wrap() -> None:
+    aircraft, imu = still_imu()
+    device = ImuLine(imu)
+    lines = joined(device.frames_until(0.1)).decode().splitlines(keepends=True)
+    assert len(lines) == 21
+    for number, line in enumerate(lines):
+        fields = checked(line)
+        assert fields[0] == "IMU"
+        assert int(fields[1]) == number
+        assert int(fields[2]) == number * 5000
+        assert [float(field) for field in fields[3:6]] == pytest.approx(
+            np.add(aircraft.truth_at(0.0).rate_rad_s, [0.01, -0.02, 0.03]), abs=6e-8
+        )
+        assert float(fields[9]) == 31.25
+        assert len(fields) == 10
+    assert device.line_time_s(len(lines[0])) < 1.0 / 200.0
+    wrapped = checked(device.encode(np.array([0.0]), 65536 * 15)[0].decode())
+    assert int(wrapped[1]) == 0
+    assert int(wrapped[2]) == 65536 * 15 * 5000 % 2**32
+
+
+def devices() -> list[SerialDevice]:
+    aircraft = VirtualAircraft(POSE)
+    return [
+        HMR3300(aircraft, seed=1),
+        Gradienter(aircraft, seed=1),
+        VectorNavBinary(ImuModel(aircraft, seed=1)),
+        VectorNavAscii(ImuModel(aircraft, seed=1)),
+        ImuLine(ImuModel(aircraft, seed=1)),
+    ]
+
+
+@pytest.mark.parametrize("number", range(5))
+def test_the_same_seed_gives_the_same_bytes_however_they_are_fetched(number: int) -> None:
+    once, piecewise = devices()[number], devices()[number]
+    whole = joined(once.frames_until(3.0))
+    parts = [piecewise.frames_until(t_s) for t_s in (0.2, 0.2, 1.7, 1.71, 3.0)]
+    assert b"".join(joined(part) for part in parts) == whole
+    assert len(whole) > 200
+
+
+def test_a_fast_clock_makes_more_frames_and_is_in_the_device_time() -> None:
+    aircraft = VirtualAircraft()
+    device = VectorNavBinary(ImuModel(aircraft, "perfect"), clock_ppm=1000.0)
+    frames = device.frames_until(100.0)
+    assert len(frames) == 20021
+    (startup_ns,) = struct.unpack("<Q", frames[-1].data[6:14])
+    assert startup_ns == pytest.approx(100.1e9, abs=1e6)

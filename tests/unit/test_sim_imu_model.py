@@ -1,0 +1,124 @@
+"""The IMU model's statistics against theory, and its bias against itself in other words."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sim.aircraft import Pose, VirtualAircraft
+from sim.earth import Array
+from sim.imu_model import DEG_H, MG, PARTS, AxisNoise, ImuModel, ImuSpec
+
+
+def allan_deviation(values: Array, count: int) -> float:
+    """Non-overlapping, over groups of `count` readings."""
+    groups = values[: len(values) // count * count].reshape(-1, count).mean(axis=1)
+    return math.sqrt(0.5 * float(np.mean(np.diff(groups) ** 2)))
+
+
+def expected_allan(noise: AxisNoise, tau_s: float) -> float:
+    """White noise, the flat part of flicker, and random walk (IEEE 952)."""
+    return math.sqrt(noise.white**2 / tau_s + (0.664 * noise.flicker) ** 2 + noise.walk**2 * tau_s / 3.0)
+
+
+@pytest.mark.parametrize("part", ["icm42688p", "bmi088", "adis16470", "adis16405"])
+def test_allan_deviation_of_named_parts(part: str) -> None:
+    # Without rounding: at 4 readings a second it is too coarse to be dithered, which is another matter.
+    spec = replace(PARTS[part], gyro=replace(PARTS[part].gyro, step=0.0), accel=replace(PARTS[part].accel, step=0.0))
+    interval_s = 0.25
+    times = np.arange(0.0, 3600.0, interval_s)
+    readings = [ImuModel(VirtualAircraft(), spec, seed=seed).read(times, interval_s) for seed in range(4)]
+    for axes, noise in (((0, 1, 2), spec.gyro), ((3, 4, 5), spec.accel)):
+        for tau_s, tolerance in ((1.0, 0.03), (10.0, 0.05), (60.0, 0.10), (200.0, 0.20)):
+            count = round(tau_s / interval_s)
+            variances = [allan_deviation(one[:, axis], count) ** 2 for one in readings for axis in axes]
+            found = math.sqrt(float(np.mean(variances)))
+            assert found == pytest.approx(expected_allan(noise, tau_s), rel=tolerance), (part, axes, tau_s)
+
+
+def test_white_noise_has_the_density_at_any_rate() -> None:
+    for rate_hz in (10.0, 200.0):
+        imu = ImuModel(VirtualAircraft(), "white_only", seed=5)
+        readings = imu.read(np.arange(40_000) / rate_hz, 1.0 / rate_hz)
+        found = readings.std(axis=0) / math.sqrt(rate_hz)
+        assert found == pytest.approx(imu.white, rel=0.02)
+
+
+def test_bias_starts_at_what_was_ordered_and_wanders_by_its_seed() -> None:
+    imus = [ImuModel(VirtualAircraft(), "icm42688p", seed=s, gyro_bias_rad_s=(1e-3, 0.0, 0.0)) for s in (1, 1, 2)]
+    assert imus[0].true_bias(0.0).gyro_rad_s == pytest.approx([1e-3, 0.0, 0.0])
+    later = [imu.true_bias(600.0).gyro_rad_s for imu in imus]
+    assert later[0] == pytest.approx(later[1], abs=0.0)
+    assert np.abs(later[0] - later[2]).max() > 0.1 * DEG_H
+    assert 0.5 * DEG_H < np.abs(later[0] - [1e-3, 0.0, 0.0]).max() < 60.0 * DEG_H
+
+
+def test_the_bias_does_not_depend_on_who_asks_when_and_how() -> None:
+    asked_late, read_before = (ImuModel(VirtualAircraft(), "adis16405", seed=9) for _ in range(2))
+    far = asked_late.true_bias(400.0)
+    read_before.read(np.arange(0.0, 350.0, 0.37), 0.37)
+    read_before.true_bias(3.3)
+    assert read_before.true_bias(400.0).gyro_rad_s == pytest.approx(far.gyro_rad_s, abs=0.0)
+    block = asked_late.expected_block(np.array([51.13, 51.27, 102.44]))
+    for row, t_s in zip(block, (51.13, 51.27, 102.44), strict=True):  # around the seams of the stored blocks too
+        assert row == pytest.approx(asked_late.expected(t_s), abs=1e-15)
+
+
+def test_readings_average_to_truth_plus_bias() -> None:
+    aircraft = VirtualAircraft(Pose(5.0, -3.0, 40.0))
+    imu = ImuModel(
+        aircraft, "icm42688p", seed=3, gyro_bias_rad_s=(5e-4, -3e-4, 8e-4), accel_bias_m_s2=(0.01, -0.02, 0.03)
+    )
+    times = np.arange(0.0, 60.0, 0.005)
+    mean = imu.read(times, 0.005).mean(axis=0)
+    truth, bias = aircraft.truth_at(0.0), imu.mean_bias(0.0, 60.0)
+    assert mean[:3] == pytest.approx(truth.rate_rad_s + bias.gyro_rad_s, abs=4.0 * imu.white[0] / math.sqrt(60.0))
+    assert mean[3:] == pytest.approx(truth.force_m_s2 + bias.accel_m_s2, abs=4.0 * imu.white[3] / math.sqrt(60.0))
+
+
+def test_temperature_moves_the_bias_from_its_reference() -> None:
+    imu = ImuModel(VirtualAircraft(temperature_degc=lambda t_s: 25.0 + t_s / 100.0), "white_only")
+    assert imu.true_bias(500.0).gyro_rad_s == pytest.approx([0.0, 0.0, 0.0])
+    spec = ImuSpec(
+        name="warm",
+        gyro=AxisNoise(white=0.0, per_kelvin=18.0 * DEG_H),
+        accel=AxisNoise(white=0.0, per_kelvin=0.15 * MG),
+        reference_degc=20.0,
+    )
+    warm = ImuModel(VirtualAircraft(temperature_degc=lambda t_s: 25.0 + t_s / 100.0), spec)
+    assert warm.true_bias(500.0).gyro_rad_s == pytest.approx([180.0 * DEG_H] * 3)
+    assert warm.expected_block(np.array([0.0, 500.0]))[1, 3] == pytest.approx(1.5 * MG)
+
+
+def test_rounding_and_saturation() -> None:
+    spec = ImuSpec(
+        name="coarse",
+        gyro=AxisNoise(white=0.0, step=0.01, limit=0.02),
+        accel=AxisNoise(white=0.0, step=0.5, limit=9.0),
+    )
+    imu = ImuModel(VirtualAircraft(), spec, gyro_bias_rad_s=(0.0149, 0.0151, 5.0), accel_bias_m_s2=(0.26, -0.26, 0.0))
+    assert imu.read(np.array([0.0]), 0.01)[0] == pytest.approx([0.01, 0.02, 0.02, 0.5, -0.5, -9.0])
+
+
+def test_scale_misalignment_and_mounting_in_the_right_frames() -> None:
+    aircraft = VirtualAircraft(Pose(0.0, 0.0, 0.0))
+    gravity = aircraft.site.gravity_m_s2
+    scaled = ImuModel(aircraft, "perfect", accel_scale=(0.0, 0.0, 0.01))
+    assert scaled.error_in_vehicle(0.0).accel_m_s2 == pytest.approx([0.0, 0.0, -0.01 * gravity])
+    turned = ImuModel(aircraft, "perfect", accel_misalignment_rad=(0.0, 0.001, 0.0))
+    # A triad turned by +1 mrad about y has its x axis towards -z: it sees part of the upward force as positive.
+    assert turned.error_in_vehicle(0.0).accel_m_s2[0] == pytest.approx(0.001 * gravity, rel=1e-6)
+    mounted = ImuModel(aircraft, "perfect", mounting_deg=(0.0, 0.0, 90.0), accel_bias_m_s2=(0.1, 0.0, 0.0))
+    assert mounted.expected(0.0)[3:] == pytest.approx([0.1, 0.0, -gravity])
+    assert mounted.true_bias_in_vehicle(0.0).accel_m_s2 == pytest.approx([0.0, 0.1, 0.0], abs=1e-15)
+    assert mounted.error_in_vehicle(0.0).accel_m_s2 == pytest.approx([0.0, 0.1, 0.0], abs=1e-12)
+
+
+def test_a_bias_too_far_back_is_refused_not_invented() -> None:
+    imu = ImuModel(VirtualAircraft(), "icm42688p", seed=1)
+    imu.true_bias(6.0 * 3600.0)
+    with pytest.raises(ValueError, match="no longer kept"):
+        imu.true_bias(1.0)

@@ -1,0 +1,177 @@
+"""Devices on pseudo-terminals, in real time and briefly."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import struct
+import termios
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from sim.aircraft import Pose, VirtualAircraft
+from sim.devices import HMR3300, Gradienter, VectorNavBinary
+from sim.imu_model import ImuModel
+from sim.pty_device import PtyDevice
+
+
+class Port:
+    """A reader that does as a serial program does."""
+
+    def __init__(self, path: Path) -> None:
+        self.descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        self.data = b""
+
+    def read(self) -> bytes:
+        try:
+            self.data += os.read(self.descriptor, 65536)
+        except BlockingIOError:
+            pass
+        return self.data
+
+    async def wait_for(self, size: int) -> bytes:
+        async with asyncio.timeout(5.0):
+            while len(self.read()) < size:  # noqa: ASYNC110 - a port has no event
+                await asyncio.sleep(0.005)
+        return self.data
+
+    def close(self) -> None:
+        os.close(self.descriptor)
+
+
+def hung_up(descriptor: int) -> bool:
+    """What a dead port says after what was left in it: an error, or an empty read."""
+    try:
+        while os.read(descriptor, 65536):
+            pass
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def test_a_reader_gets_200_frames_a_second_unchanged(tmp_path: Path) -> None:
+    async def main() -> None:
+        device = VectorNavBinary(ImuModel(VirtualAircraft(Pose(5.0, -3.0, 40.0)), seed=1))
+        async with PtyDevice(device, tmp_path / "imu"):
+            port = Port(tmp_path / "imu")
+            loop = asyncio.get_running_loop()
+            await port.wait_for(44)
+            begun_s, begun = loop.time(), len(port.data)
+            data = await port.wait_for(begun + 44 * 100)
+            taken_s = loop.time() - begun_s
+            port.close()
+        assert taken_s == pytest.approx(0.5, abs=0.15)
+        stamps = []
+        for start in range(0, len(data) - 43, 44):
+            assert data[start] == 0xFA
+            stamps.append(struct.unpack("<Q", data[start + 6 : start + 14])[0])
+        steps = {after - before for before, after in pairwise(stamps)}
+        assert steps == {5_000_000}
+
+    asyncio.run(main())
+
+
+def test_the_path_is_raw_and_says_its_banner_to_the_first_reader(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with PtyDevice(
+            HMR3300(VirtualAircraft(Pose(0.0, 0.0, 123.4)), heading_noise_deg=0.0), tmp_path / "c"
+        ) as pty:
+            opened = [pty.opened]
+            port = Port(tmp_path / "c")
+            opened.append(pty.opened)
+            local = termios.tcgetattr(port.descriptor)[3]
+            assert not local & (termios.ICANON | termios.ECHO)
+            data = await port.wait_for(30)
+            port.close()
+        assert opened == [False, True]
+        assert data.split(b"\r\n")[0].startswith(b"HMR3300")
+        assert data.split(b"\r\n")[1] == b"123.4, 0.0, 0.0"
+        assert not (tmp_path / "c").is_symlink()
+
+    asyncio.run(main())
+
+
+def test_what_was_said_while_nobody_listened_is_lost(tmp_path: Path) -> None:
+    async def main() -> None:
+        device = VectorNavBinary(ImuModel(VirtualAircraft(), seed=1))
+        async with PtyDevice(device, tmp_path / "imu") as pty:
+            await asyncio.sleep(0.2)
+            assert pty.bytes_dropped > 0
+            port = Port(tmp_path / "imu")
+            first = (await port.wait_for(44))[:44]
+            port.close()
+            assert struct.unpack("<Q", first[6:14])[0] >= 0.15e9
+
+    asyncio.run(main())
+
+
+def test_a_reader_that_does_not_read_loses_bytes_and_stops_nobody(tmp_path: Path) -> None:
+    async def main() -> None:
+        device = VectorNavBinary(ImuModel(VirtualAircraft(), seed=1), rate_hz=2000.0)
+        device.baud = 4_000_000
+        async with PtyDevice(device, tmp_path / "imu") as pty:
+            port = Port(tmp_path / "imu")
+            async with asyncio.timeout(5.0):
+                while pty.bytes_dropped == 0:  # noqa: ASYNC110 - as above
+                    await asyncio.sleep(0.02)
+            sent = pty.frames_sent
+            await asyncio.sleep(0.05)
+            assert pty.frames_sent > sent
+            port.close()
+
+    asyncio.run(main())
+
+
+def test_unplugging_hangs_up_and_replugging_brings_the_path_back(tmp_path: Path) -> None:
+    async def main() -> None:
+        path = tmp_path / "gradienter"
+        async with PtyDevice(Gradienter(VirtualAircraft(), noise_deg=0.0), path) as pty:
+            port = Port(path)
+            await port.wait_for(44)
+            pty.unplug()
+            assert not path.exists()
+            assert hung_up(port.descriptor)
+            port.close()
+            await asyncio.sleep(0.05)
+            pty.replug()
+            port = Port(path)
+            assert (await port.wait_for(22))[:22] == b"X=+00.000\r\nY=+00.000\r\n"
+            port.close()
+
+    asyncio.run(main())
+
+
+def test_commands_reach_the_device_and_a_muted_one_is_silent(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with PtyDevice(Gradienter(VirtualAircraft(), noise_deg=0.0), tmp_path / "g") as pty:
+            port = Port(tmp_path / "g")
+            await port.wait_for(22)
+            os.write(port.descriptor, b"sV")
+            async with asyncio.timeout(5.0):
+                while b"DPL2" not in port.read():  # noqa: ASYNC110 - as above
+                    await asyncio.sleep(0.01)
+            os.write(port.descriptor, b"S")
+            await port.wait_for(len(port.data) + 22)
+            pty.muted = True
+            await asyncio.sleep(0.05)
+            before = len(port.read())
+            await asyncio.sleep(0.25)
+            assert len(port.read()) == before
+            port.close()
+
+    asyncio.run(main())
+
+
+def test_a_file_in_the_way_is_not_overwritten(tmp_path: Path) -> None:
+    async def main() -> None:
+        (tmp_path / "imu").write_text("precious")
+        with pytest.raises(FileExistsError, match="no symlink"):
+            async with PtyDevice(Gradienter(VirtualAircraft()), tmp_path / "imu"):
+                pass
+        assert (tmp_path / "imu").read_text() == "precious"
+
+    asyncio.run(main())

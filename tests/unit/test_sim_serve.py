@@ -1,0 +1,157 @@
+"""The simulator's command line, UDP, and its independence."""
+
+from __future__ import annotations
+
+import ast
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion import config
+from sim.__main__ import main
+from sim.autopilot import ArduPilotDouble
+from sim.imu_model import DEG_H, MG
+from sim.scenario import demo, site_at
+from sim.serve import configuration, describe, serve
+from sim.station import Station
+from sim.udp import open_udp
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_simulator_takes_nothing_from_the_science_it_judges() -> None:
+    for path in sorted((ROOT / "sim").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
+                names = [node.module or ""]
+            for name in names:
+                foreign = name.split(".")[0] == "companion" and name != "companion.links.mavlink"
+                # the lead's demonstration shows the whole chain, so it may use all of it
+                assert not foreign or path.name == "demo.py", f"{path}: {name}"
+
+
+def test_the_printed_configuration_is_one_the_companion_takes(tmp_path: Path) -> None:
+    scenario = demo()
+    both = config.parse(configuration(scenario, directory=tmp_path, udp=("127.0.0.1", 14650)), "both")
+    assert both.mavlink.url == "udpin:127.0.0.1:14650"
+    assert [(imu.name, imu.source) for imu in both.imu] == [("fc", "autopilot"), ("own", "serial")]
+    assert both.gradienter is not None
+    assert both.gradienter.port == str(tmp_path / "gradienter")
+    assert both.compass is not None
+    assert both.compass.protocol == "hmr3300"
+    devices = config.parse(configuration(scenario, directory=tmp_path, udp=None), "devices")
+    assert devices.vehicle.latitude_deg == 40.0
+    autopilot = config.parse(configuration(scenario, directory=None, udp=("127.0.0.1", 14650)), "autopilot")
+    assert autopilot.gradienter is None
+
+
+def test_the_demo_is_the_documented_place_and_size() -> None:
+    scenario = demo(seed=3)
+    assert scenario.aircraft.site.gravity_m_s2 == pytest.approx(9.801543, abs=1e-6)
+    assert scenario.aircraft.site.declination_deg == pytest.approx(-7.5, abs=0.2)  # about -7.5 near Beijing
+    first, second = (model.true_bias(0.0) for model in scenario.flight_controller_imus)
+    assert first.gyro_rad_s / DEG_H == pytest.approx([162.234, 169.563, 98.289])
+    assert first.accel_m_s2 / MG == pytest.approx([2.4125, 2.1596, 0.89809])
+    assert abs(second.gyro_rad_s - first.gyro_rad_s).max() > 50.0 * DEG_H
+    assert site_at(80.0, 0.0, 0.0, 1_735_689_600.0).declination_deg == pytest.approx(
+        1.28, abs=0.01
+    )  # WMM2025 test value
+    words = describe(scenario, devices=True, autopilot=True)
+    assert "162.2, 169.6, 98.3 deg/h" in words
+    assert "serial IMU (adis16470)" in words
+
+
+def test_the_double_answers_over_udp_to_its_target_and_to_whoever_speaks() -> None:
+    async def scene(*, listening: bool) -> None:
+        double: ArduPilotDouble = demo().autopilot
+        station = Station(1, 191)
+        if listening:
+            server = await open_udp(double, listen=("127.0.0.1", 0))
+            client = await open_udp(station, target=server.local)
+        else:
+            client = await open_udp(station, listen=("127.0.0.1", 0))
+            server = await open_udp(double, target=client.local)
+        running = asyncio.create_task(double.run())
+        try:
+            if listening:
+                station.heartbeat()
+            async with asyncio.timeout(5.0):
+                while not station.all(mavlink.MAVLink_heartbeat_message):  # noqa: ASYNC110 - a socket has no event
+                    await asyncio.sleep(0.01)
+            assert await station.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 105, 10_000) == 0
+            async with asyncio.timeout(5.0):
+                while len(station.all(mavlink.MAVLink_highres_imu_message)) < 20:  # noqa: ASYNC110
+                    await asyncio.sleep(0.01)
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+            server.close()
+            client.close()
+            await asyncio.sleep(0)
+
+    asyncio.run(scene(listening=True))
+    asyncio.run(scene(listening=False))
+
+
+def test_udp_wants_one_of_target_and_listen() -> None:
+    async def scene() -> None:
+        with pytest.raises(ValueError, match="either"):
+            await open_udp(demo().autopilot)
+
+    asyncio.run(scene())
+
+
+def test_serving_everything_makes_the_ports_and_takes_them_away(tmp_path: Path) -> None:
+    async def scene() -> None:
+        station = Station()
+        client = await open_udp(station, listen=("127.0.0.1", 0))
+        started = asyncio.Event()
+        serving = asyncio.create_task(serve(demo(), directory=tmp_path / "ports", udp=client.local, started=started))
+        await asyncio.wait_for(started.wait(), 5.0)
+        assert sorted(path.name for path in (tmp_path / "ports").iterdir()) == ["compass", "gradienter", "imu"]
+        async with asyncio.timeout(5.0):
+            while not station.all(mavlink.MAVLink_heartbeat_message):  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+        serving.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await serving
+        assert list((tmp_path / "ports").iterdir()) == []
+        client.close()
+        await asyncio.sleep(0)
+
+    asyncio.run(scene())
+
+
+def test_the_command_line_runs_says_how_to_connect_and_ends_cleanly(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "sim", "devices", "--dir", str(tmp_path / "ports"), "--pose", "1", "2", "3"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        lines = []
+        for line in process.stdout:
+            lines.append(line)
+            if line.startswith("height_m"):
+                break
+        text = "".join(lines)
+        assert "pitch 1, roll 2, heading 3 deg" in text
+        assert os.path.islink(tmp_path / "ports" / "imu")
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=5.0) == 0
+    assert config.parse(text, "printed").compass is not None
+    assert list((tmp_path / "ports").iterdir()) == []
+
+
+def test_mistakes_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for wrong in (["nonsense"], ["autopilot", "--udp", "localhost"], ["devices", "--pose", "1"]):
+        with pytest.raises(SystemExit) as error:
+            main(wrong)
+        assert error.value.code == 2
+    (tmp_path / "imu").write_text("in the way")
+    assert main(["devices", "--dir", str(tmp_path)]) == 1
+    assert "no symlink" in capsys.readouterr().err
