@@ -213,12 +213,14 @@ class Vehicle:
         """
         heard = self._boot_time_heard
         heard.clear()
-        self.commands.request_message(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
+        request = self.commands.request_message(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
         try:
             async with asyncio.timeout(timeout_s):
                 await heard.wait()
         except TimeoutError:
             return False
+        finally:
+            request.cancel()
         return True
 
     async def wait_found(self) -> None:
@@ -232,14 +234,15 @@ class Vehicle:
         """
         heard = asyncio.Event()
         self._heartbeat_waiters.append(heard)
+        heartbeat_id: int = mavlink.MAVLINK_MSG_ID_HEARTBEAT
+        request = self.commands.request_message(heartbeat_id)
         try:
-            heartbeat_id: int = mavlink.MAVLINK_MSG_ID_HEARTBEAT
-            self.commands.request_message(heartbeat_id)
             async with asyncio.timeout(within_s):
                 await heard.wait()
         except TimeoutError:
             return False
         finally:
+            request.cancel()  # or unanswered ones would queue up before the next
             self._heartbeat_waiters.remove(heard)
         return True
 

@@ -146,3 +146,11 @@ def test_false_alarms_are_rare_and_unused_values_are_found() -> None:
         misses += judge(observation(expected, (unused[0], unused[1], unused[2]))).ok
     assert false_alarms <= 4
     assert misses == 0
+
+
+def test_a_step_made_by_a_turned_board_is_seen_in_its_own_axis() -> None:
+    step = YAW_90 @ np.array([0.005, -0.002, 0.001])
+    vector = (float(step[0]), float(step[1]), float(step[2]))
+    verdict = judge(dataclasses.replace(observation(vector, vector), orientation=YAW_90))
+    assert words(verdict) == ["seen"] * 3
+    assert [axis.made for axis in verdict.axes] == pytest.approx([0.005, -0.002, 0.001])
