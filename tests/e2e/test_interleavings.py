@@ -161,7 +161,8 @@ async def _one(folder: Path, seed: int) -> tuple[int, int, int]:
         max_s=3.0,
         duplicate=chance.choice((0.0, 0.0, 0.1, 0.5)),
         imu_rate_hz=10.0,
-        feed_s=0.2,
+        device_rate_hz=5.0,
+        feed_s=0.4,
         version=chance.choice(("4.8", "4.8", "4.5")),
     )
     witness = Witness(rig)
@@ -176,10 +177,10 @@ async def _one(folder: Path, seed: int) -> tuple[int, int, int]:
         faults.arm_after_writes = faults.reboot_after_writes = None
         rig.wire.cut, rig.wire.loss = False, 0.0
         double.disarm()
+        await asyncio.sleep(2.0)  # what is still on the wire, and the autopilot's reboot, if it is in one
         await rig.until(
             lambda: (conductor.job is None or conductor.job.finished.done()) and not rig.service.mender.pending, 240.0
         )
-        await asyncio.sleep(2.0)
         records = rig.service.store.history()[::-1]
         now = {name: rig.double.parameter(name) for name in FC_PARAMETERS}
     assert witness.faults == [], f"seed {seed}"
@@ -200,5 +201,5 @@ def test_interleavings(tmp_path: Path, first: int, monkeypatch: pytest.MonkeyPat
         writes, answered, done = writes + w, answered + a, done + d
     # The dice must really have been thrown: requests answered, parameters written, some calibrations done.
     assert answered > CASES_A_TEST
-    assert writes > 3 * CASES_A_TEST
+    assert writes > CASES_A_TEST
     assert done > CASES_A_TEST // 10

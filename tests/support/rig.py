@@ -86,6 +86,7 @@ class Rig:
         loss: float = 0.0,
         duplicate: float = 0.0,
         imu_rate_hz: float = 100.0,
+        device_rate_hz: float | None = None,
         feed_s: float = 0.05,
         **autopilot: Any,
     ) -> None:
@@ -120,8 +121,8 @@ class Rig:
         self.config = parse(text, "rig.toml")
         self.link = MavlinkLink()
         self.devices: dict[str, SerialDevice] = {
-            "gradienter": Gradienter(self.aircraft, seed=seed, law=law),
-            "compass": HMR3300(self.aircraft, seed=seed),
+            "gradienter": Gradienter(self.aircraft, seed=seed, law=law, rate_hz=device_rate_hz),
+            "compass": HMR3300(self.aircraft, seed=seed, rate_hz=device_rate_hz),
         }
         if own_imu:
             self.own_model = ImuModel(
