@@ -34,7 +34,7 @@ demo: $(VENV)/.run
 	@$(BIN)/python -m sim demo
 
 test: $(VENV)/.dev
-	@$(BIN)/python -m pytest -q -n $(JOBS)
+	@$(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal
 
 check: $(VENV)/.dev
 	@$(BIN)/ruff format --check .

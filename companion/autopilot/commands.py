@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import Final
@@ -19,6 +20,7 @@ from companion.links.mavlink import MavlinkLink
 
 logger = logging.getLogger(__name__)
 
+_COPY_S: Final = 0.5
 MAX_WAITING: Final = 16
 """Commands of one kind that may wait; beyond that the newest is dropped, counted, and answered None at once."""
 
@@ -53,6 +55,7 @@ class Commands:
         self._queues: dict[int, deque[_Request]] = {}
         self._in_flight: dict[int, _Request] = {}
         self._timers: dict[int, asyncio.TimerHandle] = {}
+        self._last_ack = (0, 0, 0, -math.inf)
         self._unsubscribe = link.subscribe(mavlink.MAVLink_command_ack_message, self._on_ack)
 
     def send(self, command: int, *parameters: float, timeout_s: float = 0.5) -> asyncio.Future[int | None]:
@@ -119,7 +122,7 @@ class Commands:
         request.settle(result)
         self._next(command)
 
-    def _on_ack(self, message: mavlink.MAVLink_command_ack_message, _t_s: float) -> None:
+    def _on_ack(self, message: mavlink.MAVLink_command_ack_message, t_s: float) -> None:
         request = self._in_flight.get(message.command)
         if request is None or (message.get_srcSystem(), message.get_srcComponent()) != self._target():
             return
@@ -128,6 +131,11 @@ class Commands:
             return
         if message.target_component not in (0, self._link.component_id):
             return
+        # Two routes bring a packet twice; the second must not answer the next request of the same command.
+        copy = (message.command, message.get_seq(), message.result)
+        if copy == self._last_ack[:3] and t_s - self._last_ack[3] < _COPY_S:
+            return
+        self._last_ack = (*copy, t_s)
         if message.result == mavlink.MAV_RESULT_IN_PROGRESS:
             self._arm_timer(message.command, request)
         else:

@@ -34,7 +34,7 @@ class Sides:
     accel_residual: Array | None
 
 
-def verdicts(
+def judge_vectors(
     sides: Sides, calibration: ImuCalibration, changes: list[Change], kind: StreamKind | None, profile: str | None
 ) -> list[Verdict]:
     """Judge the vectors that were written: accelerometers, gyros, or both."""
@@ -83,6 +83,12 @@ def verdicts(
             )
         )
     return result
+
+
+def nearly_visible(verdict: Verdict) -> bool:
+    """Whether a step that could not be seen might be with a longer look: at least 3 of the 8 sigmas it needs."""
+    sigma = verdict.fraction_sigma
+    return verdict.ok and bool(verdict.warnings) and sigma is not None and sigma < 1 / 3
 
 
 def _drift_sigma(profile: NoiseProfile, triad: str, span_s: tuple[float, float], *, known: bool) -> float:

@@ -15,13 +15,14 @@ from companion.autopilot.ardupilot import ImuCalibration, changes_for, read_cali
 from companion.autopilot.imu_stream import StreamKind
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.vehicle import ArmState, Vehicle
+from companion.autopilot.verify import Verdict
 from companion.autopilot.writer import Change, ParameterWriter, WriteFailedError
 from companion.calibration.record import Outcome, WrittenParameter
 from companion.calibration.rolling import RollingCollector, Window
 from companion.calibration.solve import ImuSolution, Solution
 from companion.config import Config
 from companion.daemon.autopilot_imu import AutopilotImu
-from companion.daemon.effect import Sides, verdicts
+from companion.daemon.effect import Sides, judge_vectors, nearly_visible
 from companion.daemon.ledger import Ledger
 from companion.daemon.report import Draft
 from companion.errors import AutopilotError, CalibrationRefusedError, NotDisarmedError
@@ -35,6 +36,8 @@ SETTLE_S: Final = 1.0
 """ArduPilot's telemetry shows a new offset within 60 ms (its 20 Hz filter); a second covers slower links."""
 VERIFY_MAX_S: Final = 60.0
 """So long the aircraft may move after the write before its effect counts as not seen."""
+LOOK_LONGER_S: Final = 30.0
+"""So long at most for a change that a few seconds do not show; beyond it flicker hides more than averaging shows."""
 DISARMED_WITHIN_S: Final = 10.0
 """A heartbeat lost just before the write is waited for so long."""
 POLL_S: Final = 0.2
@@ -58,6 +61,8 @@ class Plan:
     """What is to be changed."""
 
     targets: tuple[Target, ...]
+    boots: int
+    """How often the autopilot had rebooted when this was made."""
 
     @property
     def changes(self) -> tuple[Change, ...]:
@@ -116,7 +121,7 @@ class Pusher:
             if self.enabled:
                 kind = imu.stream.kind if imu is not None else None
                 targets.append(Target(found.name, calibration, tuple(changes), found, kind, watched=imu is not None))
-        return Plan(tuple(targets))
+        return Plan(tuple(targets), self._vehicle.boots)
 
     async def write(self, plan: Plan, draft: Draft) -> None:
         """Write and read back; on failure the old values are put back.
@@ -146,15 +151,15 @@ class Pusher:
             AutopilotError: the autopilot does not use what it stored; the old values are back, or it is said which
                 are not.
         """
-        after, why_not = await self._measure_after(plan, go_on)
-        problems: list[str] = []
+        verdicts, why_not = await self._look(plan, before, go_on)
+        problems = [] if verdicts is not None or self._vehicle.boots == plan.boots else [why_not]
         for target in plan.targets:
             if not target.watched:
                 draft.warn(target.name, "effect of the written offsets not seen: this IMU is not in the telemetry")
-            elif after is None:
+            elif verdicts is None:
                 draft.warn(target.name, f"effect of the written offsets not seen: {why_not}")
             else:
-                problems += self._judge(target, before, after, draft)
+                problems += self._note_verdicts(target, verdicts[target.name], draft)
         if problems:
             await self.roll_back(plan, draft, "; ".join(problems))
         await self._ledger.commit(self._change_set(plan))
@@ -228,54 +233,64 @@ class Pusher:
         if self._vehicle.arm_state is ArmState.UNKNOWN:
             raise NotDisarmedError("no heartbeat, so nobody knows whether the aircraft is armed; nothing was written")
 
-    async def _measure_after(self, plan: Plan, go_on: Callable[[str], None]) -> tuple[Window | None, str]:
-        """A still stretch after the write, or why there was none to be had."""
-        if not any(target.watched for target in plan.targets):
+    async def _look(
+        self, plan: Plan, before: Window, go_on: Callable[[str], None]
+    ) -> tuple[dict[str, list[Verdict]] | None, str]:
+        """Verdicts by IMU from a still stretch after the write, or why there was none to be had.
+
+        A step that only just cannot be seen is looked at for longer.
+        """
+        watched = [target for target in plan.targets if target.watched]
+        if not watched:
             return None, "no autopilot IMU is in the telemetry"
         loop = asyncio.get_running_loop()
         since_s = loop.time() + SETTLE_S
-        deadline_s = since_s + VERIFY_MAX_S
-        boots = self._vehicle.boots
-        words = ""
-        while loop.time() < deadline_s:
+        verdicts: dict[str, list[Verdict]] | None = None
+        words = "waiting for the telemetry"
+        while loop.time() < since_s + VERIFY_MAX_S:
             go_on(words)
             if self._vehicle.arm_state is ArmState.ARMED:
-                return None, "armed right after the write"
-            if self._vehicle.boots != boots:
+                return verdicts, "armed right after the write"
+            if self._vehicle.boots != plan.boots:
                 return None, "the autopilot rebooted right after the write"
-            status = self._collector.status(loop.time())
-            if status.waiting_for is None:
+            words = self._collector.status(loop.time()).waiting_for or ""
+            if not words:
                 try:
-                    return self._collector.window(loop.time(), since_s=since_s), ""
+                    after = self._collector.window(loop.time(), since_s=since_s)
                 except CalibrationRefusedError as error:
                     words = str(error)
-            else:
-                words = status.waiting_for
+                else:
+                    verdicts = {target.name: self._judge(target, before, after) for target in watched}
+                    hidden = any(nearly_visible(verdict) for each in verdicts.values() for verdict in each)
+                    if not hidden or loop.time() > since_s + LOOK_LONGER_S:
+                        return verdicts, ""
+                    words = "the change is small: looking longer"
             await asyncio.sleep(POLL_S)
-        return None, f"not still within {VERIFY_MAX_S:.0f} s after the write ({words})"
+        return verdicts, f"not still within {VERIFY_MAX_S:.0f} s after the write ({words})"
 
-    def _judge(self, target: Target, before: Window, after: Window, draft: Draft) -> list[str]:
-        """Set the outcomes of one IMU's parameters; returns what is wrong, in words."""
-        by_name = {window.name: window for window in after.imus}
+    def _judge(self, target: Target, before: Window, after: Window) -> list[Verdict]:
         sides = Sides(
             before=next(imu for imu in before.imus if imu.name == target.name),
-            after=by_name[target.name],
+            after=next(imu for imu in after.imus if imu.name == target.name),
             gyro_residual=target.solution.gyro_rad_s,
             accel_residual=target.solution.accel_m_s2,
         )
-        problems: list[str] = []
         profile = self._sources[target.name].profile
-        for verdict in verdicts(sides, target.calibration, list(target.changes), target.kind, profile):
-            problems += verdict.problems
+        return judge_vectors(sides, target.calibration, list(target.changes), target.kind, profile)
+
+    def _note_verdicts(self, target: Target, verdicts: list[Verdict], draft: Draft) -> list[str]:
+        """Set the outcomes of one IMU's parameters; returns what is wrong, in words."""
+        problems: list[str] = []
+        for verdict in verdicts:
+            problems += [f"imu {target.name}: {problem}" for problem in verdict.problems]
             for warning in verdict.warnings:
                 draft.warn(target.name, warning)
             for axis in verdict.axes:
                 # A vector whose step as a whole was seen is in use; an axis that hardly changed cannot show more.
-                outcome: Outcome = (
-                    "verified" if verdict.ok and not verdict.warnings else verdict.outcome(axis.parameter)
-                )
-                self._mark(Plan((target,)), draft, [axis.parameter], outcome)
-        return [f"imu {target.name}: {problem}" for problem in problems]
+                seen = verdict.ok and not verdict.warnings
+                outcome: Outcome = "verified" if seen else verdict.outcome(axis.parameter)
+                self._mark(Plan((target,), 0), draft, [axis.parameter], outcome)
+        return problems
 
 
 def _whole(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:

@@ -153,6 +153,7 @@ def test_a_day_at_the_flight_line(tmp_path: Path) -> None:
             assert undone.code == DONE, undone
             assert undone.json["written"]["INS_GYROFFS_X"]["outcome"] == "rolled_back"
 
+            autopilot.write_as_another_station("INS_GYROFFS_X", 0.004)  # something worth correcting
             autopilot.faults.echo_without_effect = True
             broken = await companion("-c", config, "calibrate", "--wait", "--json")
             assert broken.code == FAILED
