@@ -21,7 +21,7 @@ from companion.autopilot.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.calibration.machine import Event, Machine, State
 from companion.calibration.record import Record
 from companion.calibration.request import What
-from companion.calibration.rolling import RollingCollector, Window
+from companion.calibration.rolling import RollingCollector, Settings, Window
 from companion.calibration.site import local_earth
 from companion.calibration.solve import Solution, solve
 from companion.component.service import JobResult, Refusal
@@ -78,6 +78,7 @@ class Conductor:
         self.settings = models.settings(config)
         self.at_arm = config.calibration.at_arm
         self.on_result: Callable[[Record], None] = lambda record: None
+        self._done_s: float | None = None
         self._unsubscribe = vehicle.watch(self._on_event)
 
     # --- what others ask of it (component.service.CalibrationService)
@@ -131,7 +132,8 @@ class Conductor:
         self.settings = msgspec.structs.replace(
             self.settings, **{key: value for key, value in changes.items() if value is not None}
         )
-        self._collector.retarget(self.settings)
+        if self.job is None or self.job.finished.done():
+            self._collector.retarget(self.settings)
 
     @property
     def push_parameters(self) -> bool:
@@ -182,11 +184,10 @@ class Conductor:
             self._machine.on(event)
         self.reason = result.reason
         severity = {"done": Severity.NOTICE, "failed": Severity.ERROR, "cancelled": Severity.NOTICE}[result.outcome]
-        logger.log(
-            logging.ERROR if result.outcome == "failed" else logging.INFO,
-            "%s %s: %s", job.kind, result.outcome, result.reason,
-        )  # fmt: skip
-        self._say(severity, f"{job.kind.capitalize()} {result.outcome}: {result.reason}", Weight.RESULT)
+        told = result.reason.startswith(result.outcome)
+        words = f"{job.kind.capitalize()} {result.reason if told else f'{result.outcome}: {result.reason}'}"
+        logger.log(logging.ERROR if result.outcome == "failed" else logging.INFO, "%s", words)
+        self._say(severity, words, Weight.RESULT)
         job.finish(result)
 
     def _on_event(self, event: VehicleEvent) -> None:
@@ -198,12 +199,10 @@ class Conductor:
             self._collector.reset("just disarmed")
 
     def _in_force(self) -> str:
-        if self.last is None or self.last.state != "done":
+        """How fresh the calibration is; one of an earlier power-up says nothing about these biases."""
+        if self._done_s is None:
             return "not calibrated since the companion started"
-        age_s = (
-            datetime.datetime.now(tz=datetime.UTC) - datetime.datetime.fromisoformat(self.last.started_at)
-        ).total_seconds()
-        return f"calibrated {max(0.0, age_s) / 60:.0f} min ago"
+        return f"calibrated {(asyncio.get_running_loop().time() - self._done_s) / 60:.0f} min ago"
 
     # --- a calibration
 
@@ -224,7 +223,9 @@ class Conductor:
             outcome, reason, event = "failed", f"internal error: {error!r}; the log has the details", Event.FAULT
         else:
             outcome, reason, event = "done", _in_words(draft.solution), None
+            self._done_s = loop.time()
         record = draft.record(outcome, reason, loop.time() - started_s)
+        self._collector.retarget(self.settings)
         job.record = self.last = record
         self.on_result(record)
         try:
@@ -236,6 +237,7 @@ class Conductor:
 
     async def _measure_and_push(self, job: Job, draft: Draft) -> None:
         self._say(Severity.NOTICE, "Calibration started: keep the aircraft still", Weight.NEWS)
+        self._collector.retarget(self._wanted(job.what))
         while True:
             window = await self._measure(job)
             if await self._pusher.offsets_still_hold():
@@ -277,6 +279,14 @@ class Conductor:
             except CompanionError as said:
                 raise JobCancelledError(str(said)) from None
         self._machine.on(Event.VERIFIED)
+
+    def _wanted(self, what: What) -> Settings:
+        """The targets of what was asked for; the rest may be as bad as it likes."""
+        return msgspec.structs.replace(
+            self.settings,
+            target_gyro_sigma_rad_s=self.settings.target_gyro_sigma_rad_s if what.gyros else math.inf,
+            target_accel_sigma_m_s2=self.settings.target_accel_sigma_m_s2 if what.accelerometers else math.inf,
+        )
 
     async def _measure(self, job: Job) -> Window:
         """Wait for stillness and for enough of it; returns the averages.
@@ -344,14 +354,14 @@ class Conductor:
 
 
 def _in_words(solution: Solution | None) -> str:
-    """The figures of a result in one line: largest sigma over axes and IMUs."""
+    """The figures of a result: the largest sigma over axes and IMUs; short enough for one STATUSTEXT."""
     if solution is None:
         return "nothing measured"
-    parts = []
+    parts: list[str] = []
     gyros = [imu.gyro_sigma_use_rad_s for imu in solution.imus if imu.gyro_rad_s is not None]
     accels = [imu.accel_sigma_use_m_s2 for imu in solution.imus if imu.accel_m_s2 is not None]
     if gyros:
-        parts.append(f"gyro +-{np.max(gyros) / DEG_H:.1f} deg/h")
+        parts.append(f"{np.max(gyros) / DEG_H:.1f} deg/h")
     if accels:
-        parts.append(f"accel +-{np.max(accels) / MG:.2f} mg")
-    return ", ".join(parts)
+        parts.append(f"{np.max(accels) / MG:.2f} mg")
+    return f"sigma {', '.join(parts)}"

@@ -22,7 +22,7 @@ from companion.calibration.rolling import RollingCollector, Window
 from companion.calibration.solve import ImuSolution, Solution
 from companion.config import Config
 from companion.daemon.autopilot_imu import AutopilotImu
-from companion.daemon.effect import Sides, judge_vectors, nearly_visible
+from companion.daemon.effect import Sides, in_short, judge_vectors, nearly_visible
 from companion.daemon.ledger import Ledger
 from companion.daemon.report import Draft
 from companion.errors import AutopilotError, CalibrationRefusedError, NotDisarmedError
@@ -282,9 +282,10 @@ class Pusher:
         """Set the outcomes of one IMU's parameters; returns what is wrong, in words."""
         problems: list[str] = []
         for verdict in verdicts:
-            problems += [f"imu {target.name}: {problem}" for problem in verdict.problems]
-            for warning in verdict.warnings:
-                draft.warn(target.name, warning)
+            if not verdict.ok:
+                problems.append(f"imu {target.name}: {in_short(verdict)}")
+            for words in (*verdict.problems, *verdict.warnings):
+                draft.warn(target.name, words)
             for axis in verdict.axes:
                 # A vector whose step as a whole was seen is in use; an axis that hardly changed cannot show more.
                 seen = verdict.ok and not verdict.warnings

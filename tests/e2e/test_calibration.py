@@ -90,7 +90,7 @@ def test_a_ground_station_calibrates_and_undoes(tmp_path: Path) -> None:
             assert {name: rig.double.parameter(name) for name in FC_PARAMETERS} != before
             texts = " | ".join(rig.ground.texts())
             assert "Calibration started" in texts
-            assert "Calibration done: gyro" in texts
+            assert "Calibration done: sigma" in texts
             rig.ground.command(UNDO)
             await rig.until(lambda: rig.ground.finals(UNDO) == [ACCEPTED], 30.0)
             assert {name: rig.double.parameter(name) for name in FC_PARAMETERS} == before
