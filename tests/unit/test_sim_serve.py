@@ -65,7 +65,7 @@ def test_the_demo_is_the_documented_place_and_size() -> None:
     )  # WMM2025 test value
     words = describe(scenario, devices=True, autopilot=True)
     assert "162.2, 169.6, 98.3 deg/h" in words
-    assert "serial IMU (adis16470)" in words
+    assert "serial IMU (bmi088)" in words
 
 
 def test_the_double_answers_over_udp_to_its_target_and_to_whoever_speaks() -> None:
