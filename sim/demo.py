@@ -111,7 +111,6 @@ async def _serve(scenario: Scenario, folder: Path, stack: contextlib.AsyncExitSt
     stack.callback(air.close)
     station.heartbeat()
     text = configuration(scenario, directory=folder, udp=link.local).replace("udpin:", "udpout:")
-    text += f'\n[control]\nsocket = "{folder / "control.sock"}"\n\n[storage]\ndirectory = "{folder / "state"}"\n'
     # The stop rule would stop by itself at some 40 s; the bound keeps the demonstration below 90 s on any day.
     text += f"\n[calibration]\nmax_s = {MEASURE_MAX_S}\n"
     (folder / "companion.toml").write_text(text, encoding="utf-8")

@@ -97,6 +97,9 @@ def configuration(scenario: Scenario, *, directory: Path | None, udp: tuple[str,
     lines += [f'protocol = "{scenario.gradienter.protocol}"', f'law = "{scenario.gradienter_law}"']
     lines += ["sigma_deg = 0.005", "", "[compass]", f'port = "{directory / "compass"}"']
     lines += [f'protocol = "{scenario.compass.protocol}"', 'reference = "magnetic"', "sigma_deg = 1.0"]
+    # Beside the ports, so that no root is needed to try.
+    lines += ["", "[control]", f'socket = "{directory / "control.sock"}"']
+    lines += ["", "[storage]", f'directory = "{directory / "state"}"']
     if udp is None:
         site = scenario.aircraft.site
         lines += ["", "[vehicle]", f"latitude_deg = {site.latitude_deg}", f"longitude_deg = {site.longitude_deg}"]

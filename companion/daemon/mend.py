@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Final
 
 from companion.autopilot.float32 import same_float32
@@ -26,7 +27,7 @@ POLL_S: Final = 0.2
 
 
 class Mender:
-    """Puts values back, guarded like every write."""
+    """Puts values back, guarded like every write; `changing` tells the IMUs that it is us who change them."""
 
     def __init__(
         self,
@@ -35,10 +36,10 @@ class Mender:
         writer: ParameterWriter,
         ledger: Ledger,
         say: Say,
+        changing: Callable[[], AbstractContextManager[None]],
     ) -> None:
-        self._vehicle, self._parameters, self._writer, self._ledger, self._say = (
-            vehicle, parameters, writer, ledger, say,
-        )  # fmt: skip
+        self._vehicle, self._parameters, self._writer = vehicle, parameters, writer
+        self._ledger, self._say, self._changing = ledger, say, changing
 
     @property
     def fault(self) -> str | None:
@@ -86,7 +87,8 @@ class Mender:
             await asyncio.sleep(POLL_S)
         ours, foreign = await self._sort(open_set)
         if ours:
-            await self._writer.restore(ours)
+            with self._changing():
+                await self._writer.restore(ours)
         await self._ledger.abandon()
         words = f"Interrupted write: {len(ours)} old values put back" + (
             f"; changed by others, left alone: {', '.join(foreign)}" if foreign else ""
@@ -108,7 +110,8 @@ class Mender:
             raise AutopilotError(why or "nothing to undo")
         await self._ledger.begin(undoable)
         try:
-            written = await self._writer.undo([_change(changed) for changed in undoable.changes])
+            with self._changing():
+                written = await self._writer.undo([_change(changed) for changed in undoable.changes])
         except WriteFailedError as error:
             # In force is what was before the undo, unless something could not be put back: then the mender looks.
             if error.left_changed:

@@ -40,6 +40,20 @@ def check_profiles(config: Config) -> None:
             raise ConfigError(f"'imu[{index}].profile': found {imu.profile!r}: {error}") from None
 
 
+def not_in_this_version(config: Config) -> list[str]:
+    """What the configuration may ask for that this version does not do: said at start, never silently ignored."""
+    asked = (
+        (
+            config.calibration.at_arm == "gate",
+            'calibration.at_arm = "gate": arming is not gated yet, only warned about',
+        ),
+        (config.push.attitude != "off", f'push.attitude = "{config.push.attitude}": attitude is not pushed yet'),
+        (config.mqtt is not None, "[mqtt]: MQTT is not spoken yet"),
+        (config.web is not None, "[web]: there is no page yet"),
+    )
+    return [words for is_asked, words in asked if is_asked]
+
+
 def imu_input(imu: Imu, kind: StreamKind | None) -> ImuInput:
     """One IMU as the collector takes it; an autopilot's telemetry is in the vehicle's axes already."""
     return ImuInput(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import signal
 from collections.abc import AsyncIterator, Iterator
@@ -81,7 +82,7 @@ class Service:
         self.ledger = Ledger(ChangeLog(config.storage.path), offload)
         writer = ParameterWriter(self.parameters, self.vehicle)
         pusher = Pusher(config, self.vehicle, self.parameters, self.imus, self.collector, writer, self.ledger)
-        self.mender = Mender(self.vehicle, self.parameters, writer, self.ledger, self._say)
+        self.mender = Mender(self.vehicle, self.parameters, writer, self.ledger, self._say, self._changing)
         self.conductor = Conductor(
             config, self.vehicle, self.collector, self.imus, pusher, self.mender, self.store, self._say, offload
         )
@@ -90,6 +91,13 @@ class Service:
 
     def _say(self, *what: Any) -> object:
         return self.component.say(*what)
+
+    @contextlib.contextmanager
+    def _changing(self) -> Iterator[None]:
+        with contextlib.ExitStack() as stack:
+            for imu in self.imus.values():
+                stack.enter_context(imu.changing())
+            yield
 
     def _autopilot_imu(self, imu: Imu) -> AutopilotImu:
         def kind_changed(kind: StreamKind | None) -> None:
@@ -163,6 +171,8 @@ class Service:
         Raises:
             CompanionError: it cannot start (another daemon runs, the storage cannot be read).
         """
+        for words in models.not_in_this_version(self.config):
+            logger.warning("%s", words)
         async with ControlServer(self.config.control.path, self.answer):
             logger.info("ready: %s", self.config.control.path)
             await self.serve()

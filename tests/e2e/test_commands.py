@@ -64,7 +64,6 @@ async def flight_line(folder: Path, *, daemon: bool = True) -> AsyncIterator[Fli
         autopilot = asyncio.create_task(scenario.autopilot.run())
         stack.callback(autopilot.cancel)
         text = configuration(scenario, directory=folder, udp=link.local).replace("udpin:", "udpout:")
-        text += f'[control]\nsocket = "{folder}/control.sock"\n[storage]\ndirectory = "{folder}/state"\n'
         text += "[calibration]\nmin_still_s = 3\nmax_s = 4\n"
         config = folder / "companion.toml"
         config.write_text(text)
