@@ -28,6 +28,8 @@ class Component:
     def __init__(self, link: MavlinkLink, vehicle: VehicleView, service: CalibrationService) -> None:
         self._link, self._vehicle, self._service = link, vehicle, service
         self._woken = asyncio.Event()
+        self._known_as = link.system_id
+        """The system id under which we were heard last."""
         self._next_heartbeat_s = -math.inf
         self.texts = StatusText(link, self._woken.set)
         self.parameters = OwnParameters(link, self.texts.say, self._woken.set)
@@ -79,10 +81,10 @@ class Component:
     def _follow_vehicle(self) -> None:
         """Take over the vehicle's system id, and be heard under it at once."""
         system_id = self._vehicle.system_id
-        if system_id is not None and system_id != self._link.system_id:
-            self._link.system_id = system_id
+        if system_id is not None and system_id != self._known_as:
+            self._known_as = self._link.system_id = system_id
             self._next_heartbeat_s = -math.inf
 
     def _on_heartbeat(self, _message: mavlink.MAVLink_heartbeat_message, _t_s: float) -> None:
-        if self._vehicle.system_id not in (None, self._link.system_id):
+        if self._vehicle.system_id not in (None, self._known_as):
             self._woken.set()

@@ -6,6 +6,7 @@ import asyncio
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from companion.calibration.record import Record
 from companion.calibration.request import What
@@ -79,19 +80,22 @@ def test_both_imus_are_calibrated_at_once_and_the_autopilot_is_right_afterwards(
     run_virtual(main())
 
 
-def test_a_ground_station_calibrates_and_undoes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("system_id", [1, 7])
+def test_a_ground_station_calibrates_and_undoes(tmp_path: Path, system_id: int) -> None:
+    vehicle = (system_id, 191)
+
     async def main() -> None:
-        async with Rig(tmp_path).running() as rig:
+        async with Rig(tmp_path, system_id=system_id).running() as rig:
             await rig.ready()
             before = {name: rig.double.parameter(name) for name in FC_PARAMETERS}
             await rig.until(lambda: rig.double.hears(191), 5.0)
-            rig.ground.command(CALIBRATE, 0.0)
+            rig.ground.command(CALIBRATE, 0.0, target=vehicle)
             await rig.until(lambda: rig.ground.finals(CALIBRATE) == [ACCEPTED], 90.0)
             assert {name: rig.double.parameter(name) for name in FC_PARAMETERS} != before
             texts = " | ".join(rig.ground.texts())
             assert "Calibration started" in texts
             assert "Calibration done: sigma" in texts
-            rig.ground.command(UNDO)
+            rig.ground.command(UNDO, target=vehicle)
             await rig.until(lambda: rig.ground.finals(UNDO) == [ACCEPTED], 30.0)
             assert {name: rig.double.parameter(name) for name in FC_PARAMETERS} == before
             await asyncio.sleep(2.0)
