@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -100,5 +101,91 @@ def test_a_ground_station_calibrates_and_undoes(tmp_path: Path, system_id: int) 
             assert {name: rig.double.parameter(name) for name in FC_PARAMETERS} == before
             await asyncio.sleep(2.0)
             assert rig.ground.finals() == [ACCEPTED, ACCEPTED]
+
+    run_virtual(main())
+
+
+def test_after_a_minute_of_rest_the_result_is_there_at_once_and_nothing_is_written_unless_wanted(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, more="[push]\nparameters = false\n").running() as rig:
+            await rig.ready()
+            await asyncio.sleep(60.0)
+            result, record = await calibrated(rig)
+            assert result.outcome == "done"
+            assert record.duration_s < 1.0
+            assert record.imus[0].samples > 2000
+            assert record.imus[0].written == {}
+            assert rig.double.writes == []
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("what", [What.GYROS, What.ACCELEROMETERS])
+def test_only_what_was_asked_for_is_written(tmp_path: Path, what: What) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            result, record = await calibrated(rig, what)
+            assert result.outcome == "done"
+            kind = "GYR" if what is What.GYROS else "ACC"
+            assert {write.name for write in rig.double.writes} == {name for name in FC_PARAMETERS if kind in name}
+            imu = record.imus[0]
+            assert (imu.gyro_bias_rad_s is None) == (what is What.ACCELEROMETERS)
+            assert (imu.accel_bias_m_s2 is None) == (what is What.GYROS)
+            assert imu.covariance is not None
+            assert (imu.covariance[0][0] is None) == (what is What.ACCELEROMETERS)
+            assert (imu.covariance[5][5] is None) == (what is What.GYROS)
+
+    run_virtual(main())
+
+
+def test_without_gradienter_and_compass_the_gyros_are_calibrated_with_a_wider_sigma(tmp_path: Path) -> None:
+    async def main() -> None:
+        rig = Rig(tmp_path)
+        rig.config = msgspec.structs.replace(rig.config, gradienter=None, compass=None)
+        rig.devices.clear()
+        async with rig.running():
+            await rig.ready()
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            imu = record.imus[0]
+            assert imu.accel_bias_m_s2 is None
+            assert imu.gyro_bias_rad_s is not None
+            assert imu.gyro_sigma_use_rad_s is not None
+            true = rig.model.true_bias(rig.aircraft.time_at(rig.now_s))
+            off = np.abs(np.subtract(imu.gyro_bias_rad_s, true.gyro_rad_s)) / imu.gyro_sigma_use_rad_s
+            assert off.max() < 3.5
+            # 15.04 deg/h cos 40 deg over sqrt 2 is what an unknown heading leaves.
+            assert max(imu.gyro_sigma_use_rad_s) > 8 * DEG_H
+            assert any("gyros only" in warning for warning in record.warnings)
+            assert any("compass" in warning for warning in record.warnings)
+            assert record.pose is not None
+            assert record.pose.psi_deg is None
+            assert {write.name for write in rig.double.writes} == set(FC_PARAMETERS[3:])
+
+    run_virtual(main())
+
+
+def test_a_serial_imu_that_the_autopilot_consumes_gets_its_offsets_there_and_they_count_as_stored(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        rig = Rig(tmp_path, own_imu=True)
+        own = msgspec.structs.replace(rig.config.imu[1], autopilot_instance=2)
+        rig.config = msgspec.structs.replace(rig.config, imu=[rig.config.imu[0], own])
+        async with rig.running():
+            await rig.ready()
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            own_record = record.imus[1]
+            assert set(own_record.written) == {*offset_names(2, "accel"), *offset_names(2, "gyro")}
+            assert {written.outcome for written in own_record.written.values()} == {"stored"}
+            assert any("not seen" in warning for warning in own_record.warnings)
+            assert own_record.gyro_bias_rad_s is not None
+            written = [rig.double.parameter(name) for name in offset_names(2, "gyro")]
+            np.testing.assert_allclose(written, own_record.gyro_bias_rad_s, atol=1e-9)
+            assert {w.outcome for w in record.imus[0].written.values()} == {"verified"}
 
     run_virtual(main())

@@ -347,3 +347,32 @@ def test_refusals_before_anything_starts(tmp_path: Path) -> None:
             assert busy.kind == "busy"
 
     run_virtual(main())
+
+
+@pytest.mark.parametrize("version", ["4.8", "4.5"])
+def test_a_board_with_integer_messages_only_has_a_sigma_that_says_so(tmp_path: Path, version: str) -> None:
+    async def main() -> None:
+        rig = Rig(tmp_path, max_s=12.0, version=version)
+        rig.double.faults.int_only = True
+        async with rig.running():
+            await rig.until(lambda: rig.service.imus["fc"].calibration is not None, 15.0)
+            await rig.until(lambda: rig.service.imus["fc"].stream.samples > 0, 30.0)
+            _, record = await calibrated(rig, timeout_s=120.0)
+            assert record.imus, record.reason
+            imu = record.imus[0]
+            assert imu.gyro_bias_rad_s is not None
+            assert imu.accel_bias_m_s2 is not None
+            assert imu.gyro_sigma_use_rad_s is not None
+            assert imu.accel_sigma_use_m_s2 is not None
+            # The last digit is 206 deg/h and 1 mg, cut off: half of it is the least that is uncertain.
+            assert min(imu.gyro_sigma_use_rad_s) > 100 * DEG_H
+            assert min(imu.accel_sigma_use_m_s2) > 0.4 * MG
+            true = rig.model.true_bias(rig.aircraft.time_at(rig.now_s))
+            assert np.all(
+                np.abs(np.subtract(imu.gyro_bias_rad_s, true.gyro_rad_s)) < 3 * np.array(imu.gyro_sigma_use_rad_s)
+            )
+            assert np.all(
+                np.abs(np.subtract(imu.accel_bias_m_s2, true.accel_m_s2)) < 3 * np.array(imu.accel_sigma_use_m_s2)
+            )
+
+    run_virtual(main())
