@@ -33,7 +33,7 @@ def test_the_simulator_takes_nothing_from_the_science_it_judges() -> None:
                 names = [node.module or ""]
             for name in names:
                 foreign = name.split(".")[0] == "companion" and name != "companion.links.mavlink"
-                # the lead's demonstration shows the whole chain, so it may use all of it
+                # the demonstration shows the whole chain, so it may use all of it
                 assert not foreign or path.name == "demo.py", f"{path}: {name}"
 
 
