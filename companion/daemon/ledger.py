@@ -29,7 +29,11 @@ class Ledger:
         self.orphaned = asyncio.Event()
 
     def load(self) -> None:
-        """Read both files at start."""
+        """Read both files at start, and find out whether they can be written."""
+        try:
+            self._log.check_writable()
+        except StorageError as error:
+            self.fault = f"{error}; nothing can be kept, so nothing is written; mend it and restart the companion"
         try:
             self.open = self._log.journal.read()
             self.undoable = self._log.undo.read()

@@ -185,8 +185,11 @@ class Service:
             ports: open the serial ports (else somebody hands their bytes to `sensors`).
         """
         self.ledger.load()
-        history = self.store.history(limit=1)
-        self.conductor.last = history[0] if history else None
+        if self.ledger.fault is not None:
+            # Stay and say so: a daemon that is gone is harder to understand from the field.
+            logger.error("%s", self.ledger.fault)
+        else:
+            self.conductor.last = next(iter(self.store.history(limit=1)), None)
         try:
             async with asyncio.TaskGroup() as group:
                 try:

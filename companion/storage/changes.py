@@ -69,5 +69,15 @@ class ChangeLog:
     """The two change files of one storage folder."""
 
     def __init__(self, directory: Path) -> None:
+        self._probe = directory / "probe"
         self.journal = ChangeFile(directory / "journal.json")
         self.undo = ChangeFile(directory / "undo.json")
+
+    def check_writable(self) -> None:
+        """Find out now, not at the first write, whether anything can be kept here.
+
+        Raises:
+            StorageError: it cannot.
+        """
+        write_atomically(self._probe, b"")
+        remove_durably(self._probe)

@@ -376,3 +376,17 @@ def test_a_board_with_integer_messages_only_has_a_sigma_that_says_so(tmp_path: P
             )
 
     run_virtual(main())
+
+
+def test_a_storage_that_cannot_be_written_refuses_with_the_reason_before_anything_is_measured(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+
+    async def main() -> None:
+        async with Rig(tmp_path / "file").running() as rig:
+            await rig.until(lambda: rig.service.vehicle.alive, 10.0)
+            refusal = rig.service.conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(refusal, Refusal)
+            assert "cannot be written" in refusal.reason
+            assert rig.service.conductor.mav_state == 5  # MAV_STATE_CRITICAL
+
+    run_virtual(main())

@@ -160,3 +160,11 @@ def test_removing_what_cannot_be_removed_is_said(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     with pytest.raises(StorageError, match="cannot be removed"):
         remove_durably(tmp_path / "folder")
+
+
+def test_a_folder_that_cannot_be_written_is_found_out_before_it_matters(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="cannot be written"):
+        ChangeLog(tmp_path / "file").check_writable()
+    ChangeLog(tmp_path / "new").check_writable()
+    assert list((tmp_path / "new").iterdir()) == []
