@@ -34,6 +34,7 @@ class Ledger:
             self._log.check_writable()
         except StorageError as error:
             self.fault = f"{error}; nothing can be kept, so nothing is written; mend it and restart the companion"
+            return
         try:
             self.open = self._log.journal.read()
             self.undoable = self._log.undo.read()
