@@ -25,7 +25,7 @@ from companion.daemon.autopilot_imu import AutopilotImu
 from companion.daemon.effect import Sides, in_short, judge_vectors, nearly_visible
 from companion.daemon.ledger import Ledger
 from companion.daemon.report import Draft
-from companion.errors import AutopilotError, CalibrationRefusedError, NotDisarmedError
+from companion.errors import AutopilotError, CalibrationRefusedError, NotDisarmedError, StorageError
 from companion.physics.frames import Array
 from companion.samples import Vector
 from companion.storage.changes import Changed, ChangeSet
@@ -150,6 +150,7 @@ class Pusher:
         Raises:
             AutopilotError: the autopilot does not use what it stored; the old values are back, or it is said which
                 are not.
+            StorageError: the values for undo cannot be kept; the old values are being put back.
         """
         verdicts, why_not = await self._look(plan, before, go_on)
         problems = [] if verdicts is not None or self._vehicle.boots == plan.boots else [why_not]
@@ -162,7 +163,12 @@ class Pusher:
                 problems += self._note_verdicts(target, verdicts[target.name], draft)
         if problems:
             await self.roll_back(plan, draft, "; ".join(problems))
-        await self._ledger.commit(self._change_set(plan))
+        try:
+            await self._ledger.commit(self._change_set(plan))
+        except StorageError:
+            # What cannot be undone later must not stay: the journal still has the old values.
+            self._ledger.orphaned.set()
+            raise
 
     async def roll_back(self, plan: Plan, draft: Draft, reason: str) -> None:
         """Put the old values back and say so.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -388,5 +389,28 @@ def test_a_storage_that_cannot_be_written_refuses_with_the_reason_before_anythin
             assert isinstance(refusal, Refusal)
             assert "cannot be written" in refusal.reason
             assert rig.service.conductor.mav_state == 5  # MAV_STATE_CRITICAL
+
+    run_virtual(main())
+
+
+def test_a_disk_that_fills_up_during_the_calibration_leaves_the_old_values(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            before = values(rig.double)
+            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.conductor.state is State.VERIFYING, 60.0)
+            assert values(rig.double) != before
+
+            def full(*_: object) -> None:
+                raise OSError(28, "No space left on device")
+
+            monkeypatch.setattr(os, "replace", full)
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "No space left on device" in result.reason
+            await rig.until(lambda: values(rig.double) == before and not rig.service.mender.pending, 30.0)
 
     run_virtual(main())
