@@ -23,7 +23,7 @@ from tests.support.virtual_time import run_virtual
 
 CASES = 1000
 CASES_A_TEST = 25
-ACTS_S = 14.0
+ACTS_S = 10.0
 COMMANDS = (CALIBRATE, CANCEL, UNDO)
 
 
