@@ -111,7 +111,7 @@ def describe(scenario: Scenario, *, devices: bool, autopilot: bool) -> str:
     """The truth in a few lines: what a calibration should find."""
     pose = scenario.aircraft.pose
     angles = f"pitch {pose.pitch_deg:g}, roll {pose.roll_deg:g}, heading {pose.heading_deg:g} deg"
-    lines = [f"# The truth: {angles}; declination {scenario.aircraft.site.declination_deg:.2f} deg"]
+    lines = [f"# The truth at the start: {angles}; declination {scenario.aircraft.site.declination_deg:.2f} deg"]
     models: list[tuple[str, ImuModel]] = []
     if autopilot:
         models += [(f"autopilot IMU {n}", model) for n, model in enumerate(scenario.flight_controller_imus, 1)]

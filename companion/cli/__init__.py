@@ -12,7 +12,7 @@ import json
 import sys
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 from companion import __version__, config
 from companion.errors import CompanionError, ConfigError, DaemonUnreachableError
@@ -64,15 +64,21 @@ def load_config(options: argparse.Namespace) -> config.Config:
     return config.load(path)
 
 
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """Say a usage error in one line."""
+        self.exit(USAGE, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
 def _parser() -> argparse.ArgumentParser:
     from companion.cli import client, local
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
-    common = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
+    common = _Parser(add_help=False, argument_default=argparse.SUPPRESS)
     common.add_argument("-c", "--config", type=Path, metavar="FILE", help=f"default: {config.DEFAULT_PATH}")
     common.add_argument("--json", action="store_true", help="print one JSON object on stdout")
 
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="companion", parents=[common], description="Field self-calibration of gyro and accelerometer biases."
     )
     parser.add_argument("--version", action="version", version=f"companion {__version__}")
@@ -106,14 +112,17 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _seconds(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
     if not 0 < value < 1e6:
         raise argparse.ArgumentTypeError(f"{text!r} is not a time in seconds above 0")
     return value
 
 
 def _count(text: str) -> int:
-    value = int(text)
+    value = int(text) if text.isdecimal() else 0
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
     return value

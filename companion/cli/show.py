@@ -67,6 +67,10 @@ def _number(value: float | None, form: str) -> str:
 def status_lines(status: Object) -> list[str]:
     """The daemon's state as a person reads it."""
     lines = [f"state: {status['state']}" + (f" - {status['reason']}" if status["reason"] else "")]
+    if status["fault"] is not None:
+        lines.append(f"FAULT: {status['fault']}")
+    if status["putting_back"]:
+        lines.append("an interrupted write is being put back (needs the autopilot, disarmed)")
     vehicle = status["vehicle"]
     lines.append(f"autopilot: {vehicle['summary']}")
     lines += [f"{device['name']}: {device['summary']}" for device in status["devices"]]

@@ -12,6 +12,7 @@ from companion.errors import ConfigError
 from companion.rotations import ROTATIONS_DEG
 
 UPRIGHT_COSINE = 0.5
+LAST_PORT = 65535
 PORT_WORDS = "a device path (/dev/...) or tcp://HOST:PORT"
 
 
@@ -33,7 +34,7 @@ def check_together(config: Config, name: str) -> None:
         seen[imu.name] = index
         _check_imu(imu, here, name)
         _check_mounting(imu.mounting, f"{here}.mounting", name)
-        target = imu.instance if imu.source == "autopilot" else imu.autopilot_instance
+        target = (imu.instance or 1) if imu.source == "autopilot" else imu.autopilot_instance
         if target is not None and target in autopilot_instances:
             raise ConfigError(
                 f"{name}: '{here}': found autopilot IMU {target} a second time (imu"
@@ -67,7 +68,17 @@ def _check_imu(imu: Imu, here: str, name: str) -> None:
                 what = PORT_WORDS if key == "port" else allowed(f"imu.{key}")
                 raise ConfigError(f"{name}: '{here}.{key}' is missing; allowed: {what} (needed by source = \"serial\")")
         _check_port(imu.port or "", f"{here}.port", name)
+        if imu.instance is not None:
+            raise ConfigError(
+                f"{name}: '{here}.instance': found {imu.instance}; allowed: only with source = \"autopilot\""
+                " (autopilot_instance names the autopilot's IMU that this one is)"
+            )
         return
+    if imu.mounting != "ROTATION_NONE":
+        raise ConfigError(
+            f"{name}: '{here}.mounting': found {imu.mounting!r}; allowed: only with source = \"serial\" (the"
+            " autopilot's telemetry is in the vehicle's axes already)"
+        )
     for key in ("port", "baud", "protocol", "autopilot_instance"):
         if getattr(imu, key) is not None:
             raise ConfigError(
@@ -77,7 +88,10 @@ def _check_imu(imu: Imu, here: str, name: str) -> None:
 
 
 def _check_port(port: str, here: str, name: str) -> None:
-    if port.startswith("/") or re.fullmatch(r"tcp://\S+:\d{1,5}", port):
+    if port.startswith("/"):
+        return
+    address = re.fullmatch(r"tcp://\S+:(\d{1,5})", port)
+    if address and 1 <= int(address[1]) <= LAST_PORT:
         return
     raise ConfigError(f"{name}: {here!r}: found {port!r}; allowed: {PORT_WORDS}")
 
@@ -88,7 +102,7 @@ def _check_ports_differ(config: Config, name: str) -> None:
     ports += [(f"{section}.port", device.port) for section in ("gradienter", "compass")
               if (device := getattr(config, section)) is not None]  # fmt: skip
     if config.mavlink.url.startswith("serial:"):
-        ports.append(("mavlink.url", config.mavlink.url.split(":")[1]))
+        ports.append(("mavlink.url", config.mavlink.url.removeprefix("serial:").rpartition(":")[0]))
     for here, port in ports:
         if port is not None and port in used:
             raise ConfigError(
@@ -98,19 +112,24 @@ def _check_ports_differ(config: Config, name: str) -> None:
             used[port] = here
 
 
-_MAVLINK_URL = re.compile(r"(udpin|udpout|tcp):[^:\s]+:\d{1,5}|serial:[^:\s]+:\d{3,7}")
+_MAVLINK_URL = re.compile(r"(udpin|udpout|tcp):[^:\s]+:(?P<port>\d{1,5})|serial:/\S+:\d{3,7}")
 
 
 def _check_mavlink_url(url: str, name: str) -> None:
-    if not _MAVLINK_URL.fullmatch(url):
+    match = _MAVLINK_URL.fullmatch(url)
+    if match is None or (match["port"] and not 1 <= int(match["port"]) <= LAST_PORT):
         raise ConfigError(
             f"{name}: 'mavlink.url': found {url!r}; allowed: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT"
-            " or serial:PATH:BAUD"
+            " or serial:PATH:BAUD, with ports from 1 to 65535"
         )
 
 
 def _check_mounting(mounting: Mounting, here: str, name: str) -> None:
-    if not isinstance(mounting, str) or mounting in ROTATIONS_DEG:
+    if not isinstance(mounting, str):
+        if max(map(abs, mounting)) > 360.0:
+            raise ConfigError(f"{name}: {here!r}: found {list(mounting)}; allowed: angles within 360 degrees")
+        return
+    if mounting in ROTATIONS_DEG:
         return
     near = difflib.get_close_matches(mounting, ROTATIONS_DEG, n=1)
     hint = f" (did you mean {near[0]}?)" if near else ""

@@ -10,6 +10,7 @@ import msgspec
 from msgspec import Meta
 
 ImuProtocol = Literal["vectornav", "imu_line"]
+Profile = Literal["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
 GradienterProtocol = Literal["inclinometer_xy"]
 CompassProtocol = Literal["hmr3300"]
 Law = Literal["axis", "slope", "euler"]
@@ -52,13 +53,14 @@ class Imu(Section, frozen=True):
 
     name: NonEmpty
     source: Literal["autopilot", "serial"]
-    instance: Annotated[int, Meta(ge=1, le=3)] = 1
+    instance: Annotated[int, Meta(ge=1, le=3)] | None = None
+    """Of the autopilot; 1 where it is not said."""
     port: NonEmpty | None = None
     baud: Baud | None = None
     protocol: ImuProtocol | None = None
     mounting: Mounting = "ROTATION_NONE"
     autopilot_instance: Annotated[int, Meta(ge=1, le=3)] | None = None
-    profile: NonEmpty | None = None
+    profile: Profile | None = None
 
 
 class Gradienter(Section, frozen=True):

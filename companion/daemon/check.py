@@ -38,7 +38,8 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
         async for reply in ask(config.control.path, {"command": "status"}):
             status = reply.get("status")
     if status is not None:
-        findings.append(Finding("daemon", good=True, words=f"running, {status['state']}"))
+        fault = status["fault"]
+        findings.append(Finding("daemon", good=fault is None, words=fault or f"running, {status['state']}"))
     else:
         findings.append(Finding("daemon", good=True, words="not running: ports opened by this check"))
         findings.append(_storage(config.storage.path))

@@ -77,8 +77,12 @@ class Conductor:
         """What the present state means, in words."""
         self.settings = models.settings(config)
         self.at_arm = config.calibration.at_arm
+        self.only_listening: str | None = None
+        """Why nothing may be started although requests arrive: a check listens and must change nothing."""
         self.on_result: Callable[[Record], None] = lambda record: None
         self._done_s: float | None = None
+        self._undone = False
+        mender.on_mended = self._mended
         self._unsubscribe = vehicle.watch(self._on_event)
 
     # --- what others ask of it (component.service.CalibrationService)
@@ -154,22 +158,21 @@ class Conductor:
     # --- starting and ending
 
     def _refusal(self) -> Refusal | None:
+        if self.only_listening is not None:
+            return Refusal("other", self.only_listening)
         if self.job is not None and not self.job.finished.done():
             return Refusal("busy", f"a {self.job.kind} is running ({self.job.words or self.state.value})")
         if self._vehicle.arm_state is ArmState.ARMED:
-            return Refusal("armed", "the aircraft is armed: disarm first")
+            return Refusal("armed", "armed: disarm first")
         if self._vehicle.arm_state is ArmState.UNKNOWN:
             age_s = self._vehicle.heartbeat_age_s
             return Refusal(
-                "unknown",
-                "no autopilot heard yet: not known whether it is armed"
-                if age_s is None
-                else f"no heartbeat for {age_s:.0f} s: not known whether it is armed",
+                "unknown", "no autopilot heard yet" if age_s is None else f"no heartbeat for {age_s:.0f} s: armed?"
             )
         if self._mender.fault is not None:
             return Refusal("other", self._mender.fault)
         if self._mender.pending:
-            return Refusal("busy", "values of an interrupted write are being put back first")
+            return Refusal("busy", "putting old values back first")
         return None
 
     def _start(self, job: Job, event: Event, work: Coroutine[None, None, None]) -> Job:
@@ -198,8 +201,16 @@ class Conductor:
         elif event == "disarmed":
             self._collector.reset("just disarmed")
 
+    def _mended(self, words: str) -> None:
+        """What the mender has put in order is what `status` says last."""
+        self.reason = words
+
     def _in_force(self) -> str:
         """How fresh the calibration is; one of an earlier power-up says nothing about these biases."""
+        if self._machine.state in (State.WRITING, State.VERIFYING):
+            return "in the middle of writing new offsets"
+        if self._undone:
+            return "the last calibration was undone"
         if self._done_s is None:
             return "not calibrated since the companion started"
         return f"calibrated {(asyncio.get_running_loop().time() - self._done_s) / 60:.0f} min ago"
@@ -223,7 +234,7 @@ class Conductor:
             outcome, reason, event = "failed", f"internal error: {error!r}; the log has the details", Event.FAULT
         else:
             outcome, reason, event = "done", _in_words(draft.solution), None
-            self._done_s = loop.time()
+            self._done_s, self._undone = loop.time(), False
         record = draft.record(outcome, reason, loop.time() - started_s)
         self._collector.retarget(self.settings)
         job.record = self.last = record
@@ -278,6 +289,9 @@ class Conductor:
                 await self._pusher.roll_back(plan, draft, str(cancelled))
             except CompanionError as said:
                 raise JobCancelledError(str(said)) from None
+        except BaseException:
+            self._pusher.leave_to_mender()
+            raise
         self._machine.on(Event.VERIFIED)
 
     def _wanted(self, what: What) -> Settings:
@@ -349,8 +363,8 @@ class Conductor:
             logger.exception("the undo met a fault of the program")
             self._end(job, Event.FAULT, JobResult("failed", f"internal error: {error!r}; the log has the details"))
         else:
-            names = ", ".join(job.written)
-            self._end(job, Event.RESTORED, JobResult("done", f"old values back in {names}"))
+            self._undone = True
+            self._end(job, Event.RESTORED, JobResult("done", f"{len(job.written)} old values back"))
 
 
 def _in_words(solution: Solution | None) -> str:

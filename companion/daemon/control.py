@@ -66,6 +66,7 @@ class ControlServer:
 
     def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if len(self._clients) >= MAX_CLIENTS:
+            writer.write(b'{"kind": "error", "reason": "the daemon has too many clients at once; try again"}\n')
             writer.close()
             return
         client = asyncio.get_running_loop().create_task(self._serve(reader, writer), name="control client")
@@ -103,7 +104,7 @@ class ControlServer:
 
 
 async def _write(writer: asyncio.StreamWriter, reply: Object) -> None:
-    writer.write(json.dumps(reply).encode() + b"\n")
+    writer.write(msgspec.json.encode(reply) + b"\n")
     await writer.drain()
 
 

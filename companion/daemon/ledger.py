@@ -7,6 +7,7 @@ put back) and somebody has to bring it to an end. Undoable: the last finished wr
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -34,12 +35,13 @@ class Ledger:
             self._log.check_writable()
         except StorageError as error:
             self.fault = f"{error}; nothing can be kept, so nothing is written; mend it and restart the companion"
-            return
         try:
             self.open = self._log.journal.read()
             self.undoable = self._log.undo.read()
         except StorageError as error:
-            self.fault = f"{error}; compare the autopilot's parameters with your notes, then remove the file"
+            self.fault = self.fault or (
+                f"{error}; compare the autopilot's parameters with your notes, then remove the file"
+            )
         if self.open is not None:
             self.orphaned.set()
 
@@ -59,8 +61,15 @@ class Ledger:
             StorageError: the disk refuses; the write stays open.
         """
         await self._offload(self._log.undo.write, changes)
+        try:
+            await self.abandon()
+        except StorageError:
+            # The write will be put back, so there will be nothing to undo.
+            self.undoable = None
+            with contextlib.suppress(StorageError):
+                await self._offload(self._log.undo.clear)
+            raise
         self.undoable = changes
-        await self.abandon()
 
     async def abandon(self) -> None:
         """The old values are in force again: nothing is open any more.

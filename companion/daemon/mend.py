@@ -41,6 +41,8 @@ class Mender:
         self._vehicle, self._parameters, self._writer = vehicle, parameters, writer
         self._ledger, self._say, self._changing = ledger, say, changing
 
+        self.on_mended: Callable[[str], None] = lambda words: None
+
     @property
     def fault(self) -> str | None:
         """Why nothing may be written at all, for people."""
@@ -55,9 +57,9 @@ class Mender:
         """Why there is nothing to undo, or None when there is."""
         undoable = self._ledger.undoable
         if undoable is None:
-            return "nothing to undo: no calibration has written since the last undo"
+            return "nothing to undo"
         if undoable.system_id != self._vehicle.system_id:
-            return f"nothing to undo here: the last write was to system {undoable.system_id}"
+            return f"nothing to undo here, only on system {undoable.system_id}"
         return None
 
     async def run(self) -> None:
@@ -89,11 +91,14 @@ class Mender:
         if ours:
             with self._changing():
                 await self._writer.restore(ours)
+        if self._ledger.undoable == open_set:
+            await self._ledger.forget_undo()  # it was an undo that was interrupted, and now it is done
         await self._ledger.abandon()
         words = f"Interrupted write: {len(ours)} old values put back" + (
             f"; changed by others, left alone: {', '.join(foreign)}" if foreign else ""
         )
         logger.warning("%s", words)
+        self.on_mended(words)
         self._say(Severity.WARNING, words, Weight.RESULT)
 
     async def undo(self) -> dict[str, WrittenParameter]:
@@ -122,8 +127,12 @@ class Mender:
         except BaseException:
             self._ledger.orphaned.set()
             raise
-        await self._ledger.forget_undo()
-        await self._ledger.abandon()
+        try:
+            await self._ledger.forget_undo()
+            await self._ledger.abandon()
+        except BaseException:
+            self._ledger.orphaned.set()
+            raise
         return written
 
     async def _sort(self, changes: ChangeSet) -> tuple[Sequence[Change], Sequence[str]]:

@@ -11,7 +11,6 @@ from companion.calibration.rolling import ImuInput, Settings
 from companion.calibration.site import Whereabouts
 from companion.calibration.solve import CompassModel, GradienterModel
 from companion.config import Compass, Config, Gradienter, Imu
-from companion.errors import ConfigError
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H, MG
 
@@ -25,19 +24,6 @@ def settings(config: Config) -> Settings:
         target_gyro_sigma_rad_s=wanted.target_gyro_sigma_deg_h * DEG_H,
         target_accel_sigma_m_s2=wanted.target_accel_sigma_mg * MG,
     )
-
-
-def check_profiles(config: Config) -> None:
-    """Refuse noise profiles that do not exist before anything is opened.
-
-    Raises:
-        ConfigError: names the key, what was found and what is allowed.
-    """
-    for index, imu in enumerate(config.imu):
-        try:
-            noise_profile(imu.profile)
-        except ConfigError as error:
-            raise ConfigError(f"'imu[{index}].profile': found {imu.profile!r}: {error}") from None
 
 
 def not_in_this_version(config: Config) -> list[str]:
@@ -58,7 +44,7 @@ def imu_input(imu: Imu, kind: StreamKind | None) -> ImuInput:
     """One IMU as the collector takes it; an autopilot's telemetry is in the vehicle's axes already."""
     return ImuInput(
         name=imu.name,
-        rotation=rotation_matrix(imu.mounting),
+        rotation=rotation_matrix(imu.mounting if imu.source == "serial" else "ROTATION_NONE"),
         profile=noise_profile(imu.profile),
         gyro_step_rad_s=kind.gyro_step_rad_s if kind else 0.0,
         accel_step_m_s2=kind.accel_step_m_s2 if kind else 0.0,

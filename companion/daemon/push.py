@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from companion.autopilot.ardupilot import ImuCalibration, changes_for, read_calibration, whole_bias
+from companion.autopilot.float32 import same_float32
 from companion.autopilot.imu_stream import StreamKind
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.vehicle import ArmState, Vehicle
@@ -150,25 +151,26 @@ class Pusher:
         Raises:
             AutopilotError: the autopilot does not use what it stored; the old values are back, or it is said which
                 are not.
-            StorageError: the values for undo cannot be kept; the old values are being put back.
         """
         verdicts, why_not = await self._look(plan, before, go_on)
-        problems = [] if verdicts is not None or self._vehicle.boots == plan.boots else [why_not]
+        # What somebody has changed meanwhile explains what the telemetry shows, so it comes first.
+        problems = await self._no_longer_in_force(plan)
+        if verdicts is None and self._vehicle.boots != plan.boots:
+            problems.append(why_not)
         for target in plan.targets:
             if not target.watched:
                 draft.warn(target.name, "effect of the written offsets not seen: this IMU is not in the telemetry")
             elif verdicts is None:
                 draft.warn(target.name, f"effect of the written offsets not seen: {why_not}")
-            else:
+            elif not problems:
                 problems += self._note_verdicts(target, verdicts[target.name], draft)
         if problems:
             await self.roll_back(plan, draft, "; ".join(problems))
         try:
             await self._ledger.commit(self._change_set(plan))
-        except StorageError:
-            # What cannot be undone later must not stay: the journal still has the old values.
-            self._ledger.orphaned.set()
-            raise
+        except StorageError as error:
+            # What cannot be undone later must not stay.
+            await self.roll_back(plan, draft, str(error))
 
     async def roll_back(self, plan: Plan, draft: Draft, reason: str) -> None:
         """Put the old values back and say so.
@@ -177,6 +179,9 @@ class Pusher:
             AutopilotError: always; `reason`, and what became of the old values.
         """
         left: Sequence[str]
+        end = "will be once disarmed"
+        with contextlib.suppress(NotDisarmedError):
+            await self._wait_disarmed()  # after a restart the first heartbeat is still to come
         with self._changing(plan):
             try:
                 self._note(plan, draft, await self._writer.restore(plan.changes))
@@ -184,12 +189,14 @@ class Pusher:
             except WriteFailedError as error:
                 self._note(plan, draft, error.written)
                 left = error.left_changed
+                if error.kind == "changed by someone else":
+                    end = "somebody else changed them"
             except NotDisarmedError:
                 left = [change.parameter for change in plan.changes]
                 self._mark(plan, draft, left, "failed")
         await self._settle(left)
         if left:
-            raise AutopilotError(f"{reason}; old values NOT yet back in {', '.join(left)}: will be once disarmed")
+            raise AutopilotError(f"{reason}; old values NOT back in {', '.join(left)}: {end}")
         raise AutopilotError(f"{reason}; old values put back")
 
     async def _settle(self, left: Sequence[str]) -> None:
@@ -197,7 +204,27 @@ class Pusher:
         if left:
             self._ledger.orphaned.set()
         else:
-            await self._ledger.abandon()
+            try:
+                await self._ledger.abandon()
+            except StorageError:
+                self._ledger.orphaned.set()
+
+    def leave_to_mender(self) -> None:
+        """Whatever is open and has not been brought to an end is the mender's now."""
+        if self._ledger.open is not None:
+            self._ledger.orphaned.set()
+
+    async def _no_longer_in_force(self, plan: Plan) -> list[str]:
+        """What somebody has changed while we looked at the telemetry."""
+        changed: list[str] = []
+        try:
+            for change in plan.changes:
+                now = await self._parameters.read(change.parameter)
+                if not same_float32(now, change.after):
+                    changed.append(f"{change.parameter} is {now:.6g}, somebody changed it right after the write")
+        except AutopilotError as error:
+            changed.append(str(error))
+        return changed
 
     @contextlib.contextmanager
     def _changing(self, plan: Plan) -> Iterator[None]:

@@ -62,7 +62,6 @@ class Service:
         offload: Offload = asyncio.to_thread,
         imu_rate_hz: float = 100.0,
     ) -> None:
-        models.check_profiles(config)
         self.config = config
         self.link = link or MavlinkLink(
             system_id=config.vehicle.system_id or 1, component_id=config.mavlink.component_id
@@ -75,7 +74,7 @@ class Service:
             gradienter=config.gradienter is not None,
             compass=config.compass is not None,
         )
-        self._imu_rate_hz = imu_rate_hz
+        self._imu_rate_hz, self._offload = imu_rate_hz, offload
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
         self.sensors = self._serial_sensors()
         self.store = RecordStore(config.storage.path)
@@ -111,7 +110,7 @@ class Service:
 
         return AutopilotImu(
             imu.name,
-            imu.instance,
+            imu.instance or 1,
             self.link,
             self.vehicle,
             self.parameters,
@@ -210,6 +209,7 @@ class Service:
 
     async def listen(self, seconds: float) -> Object:
         """Open everything, listen, and tell what `status` would; for `companion check`, writes nothing."""
+        self.conductor.only_listening = "only a check is running: start companion run"
         running = [self.component.run(), run_transport(self.link, self.config.mavlink.url)]
         running += [imu.run() for imu in self.imus.values()]
         running += [sensor.run() for sensor in self.sensors]
@@ -245,14 +245,18 @@ class Service:
             yield {"kind": "result", "state": result.outcome, "reason": result.reason, "written": written}
         elif command == "history":
             limit = request.get("limit")
-            records = self.store.history(limit if isinstance(limit, int) and limit > 0 else None)
-            yield {"kind": "result", "records": [_plain(record) for record in records]}
+            number = limit if isinstance(limit, int) and limit > 0 else None
+            # A thousand records take longer to read than a ground station waits for an answer.
+            yield {"kind": "result", "records": await self._offload(self._history, number)}
         elif command == "monitor":
             while True:
                 yield {"kind": "progress", "status": self.status()}
                 await asyncio.sleep(MONITOR_EVERY_S)
         else:
             yield {"kind": "error", "reason": f"unknown command {command!r}"}
+
+    def _history(self, limit: int | None) -> list[Object]:
+        return [_plain(record) for record in self.store.history(limit)]
 
     async def _answer_calibrate(self, request: Object) -> AsyncIterator[Object]:
         try:
@@ -295,6 +299,8 @@ class Service:
                 if self.vehicle.system_id is not None
                 else f"not heard yet on {self.config.mavlink.url}",
             },
+            "fault": self.mender.fault,
+            "putting_back": self.mender.pending,
             "devices": [
                 *(imu.status() for imu in self.imus.values()),
                 *(sensor.status() for sensor in self.sensors),

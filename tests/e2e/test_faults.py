@@ -411,6 +411,62 @@ def test_a_disk_that_fills_up_during_the_calibration_leaves_the_old_values(
             result = await job.finished
             assert result.outcome == "failed"
             assert "No space left on device" in result.reason
+            assert job.record is not None
+            assert outcomes(job.record) == {"rolled_back"}
             await rig.until(lambda: values(rig.double) == before and not rig.service.mender.pending, 30.0)
+
+    run_virtual(main())
+
+
+def test_a_foreign_write_during_the_verification_is_never_called_verified(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            before = values(rig.double)
+            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.conductor.state is State.VERIFYING, 60.0)
+            await asyncio.sleep(1.5)
+            foreign = rig.double.parameter("INS_GYROFFS_X") + 6e-5
+            rig.double.write_as_another_station("INS_GYROFFS_X", foreign)
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "somebody" in result.reason
+            assert "INS_GYROFFS_X" in result.reason
+            now = values(rig.double)
+            assert now.pop("INS_GYROFFS_X") == pytest.approx(foreign)
+            before.pop("INS_GYROFFS_X")
+            assert now == before
+
+    run_virtual(main())
+
+
+def test_an_undo_that_a_power_cut_interrupted_is_finished_and_is_not_there_to_undo_again(tmp_path: Path) -> None:
+    names = offset_names(1, "gyro")
+    changes = ChangeSet(1, tuple(Changed(name, before=0.0, after=0.0078125) for name in names))
+    ChangeLog(tmp_path).journal.write(changes)
+    ChangeLog(tmp_path).undo.write(changes)
+
+    async def main() -> None:
+        async with Rig(tmp_path, parameters={names[0]: 0.0, names[1]: 0.0078125, names[2]: 0.0078125}).running() as rig:
+            await rig.until(lambda: not rig.service.mender.pending, 20.0)
+            assert [rig.double.parameter(name) for name in names] == [0.0, 0.0, 0.0]
+            refusal = rig.service.conductor.start_undo("test")
+            assert isinstance(refusal, Refusal)
+            assert refusal.kind == "nothing_to_undo"
+
+    run_virtual(main())
+
+
+def test_a_check_that_only_listens_starts_nothing(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            rig.service.conductor.only_listening = "only a check is running"
+            for answer in (
+                rig.service.conductor.start_calibration(What.BOTH, "test"),
+                rig.service.conductor.start_undo("test"),
+            ):
+                assert isinstance(answer, Refusal)
+                assert "check" in answer.reason
 
     run_virtual(main())

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from companion.calibration.allan import PROFILES
 from companion.config import Config, load, parse
+from companion.config.sections import Profile
 from companion.errors import ConfigError
 
 GOOD = """
@@ -23,7 +26,7 @@ def test_the_smallest_file_and_its_defaults() -> None:
     config = parse(GOOD, "x.toml")
     assert isinstance(config, Config)
     assert config.mavlink.component_id == 191
-    assert config.imu[0].instance == 1
+    assert config.imu[0].instance is None
     assert config.calibration.min_still_s == 10
     assert config.calibration.max_s == 60
     assert config.calibration.at_arm == "warn"
@@ -114,6 +117,17 @@ bind = "127.0.0.1:8080"
             ["gradienter.mounting", "ROTATION_ROLL_180", "upside down", "upright"],
         ),
         ("[mqtt]\nhost = ''", ["mqtt.host", "found ''", "not empty"]),
+        (
+            "[[imu]]\nname = 'b'\nsource = 'autopilot'\ninstance = 2\nprofile = 'xyz'",
+            ["imu[1].profile", "'xyz'", "bmi088"],
+        ),
+        (SERIAL + "instance = 2", ["imu[1].instance", "found 2", "only with source"]),
+        (SERIAL + "mounting = [1e300, 0, 0]", ["imu[1].mounting", "360 degrees"]),
+        (
+            "[[imu]]\nname = 'b'\nsource = 'autopilot'\ninstance = 2\nmounting = 'ROTATION_YAW_90'",
+            ["imu[1].mounting", "ROTATION_YAW_90", "only with source"],
+        ),
+        ("[compass]\nport = 'tcp://h:99999'\nprotocol = 'hmr3300'", ["compass.port", "tcp://h:99999", "allowed"]),
         ("[vehicle]\nlatitude_deg = 3 4", ["not valid TOML", "line 8"]),
     ],
 )
@@ -124,6 +138,31 @@ def test_a_mistake_is_one_line_that_says_it_all(text: str, words: list[str]) -> 
     assert "\n" not in message
     for word in ("the.toml", *words):
         assert word in message
+
+
+@pytest.mark.parametrize(
+    ("url", "good"),
+    [
+        ("serial:/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0:57600", True),
+        ("udpin:0.0.0.0:14550", True),
+        ("tcp:autopilot.local:5760", True),
+        ("udpin:127.0.0.1:99999", False),
+        ("udpout:127.0.0.1:0", False),
+        ("serial:ttyUSB0:57600", False),
+        ("serial:/dev/ttyUSB0", False),
+    ],
+)
+def test_mavlink_urls(url: str, good: bool) -> None:
+    text = GOOD.replace("udpout:127.0.0.1:14550", url)
+    if good:
+        assert parse(text, "x.toml").mavlink.url == url
+        return
+    with pytest.raises(ConfigError, match=r"x\.toml: 'mavlink\.url': found .*allowed: udpin:HOST:PORT"):
+        parse(text, "x.toml")
+
+
+def test_the_profiles_that_may_be_named_are_those_that_exist() -> None:
+    assert set(get_args(Profile)) == set(PROFILES)
 
 
 @pytest.mark.parametrize(
