@@ -94,9 +94,9 @@ class Mender:
         if self._ledger.undoable == open_set:
             await self._ledger.forget_undo()  # it was an undo that was interrupted, and now it is done
         await self._ledger.abandon()
-        words = f"Interrupted write: {len(ours)} old values put back" + (
-            f"; changed by others, left alone: {', '.join(foreign)}" if foreign else ""
-        )
+        words = f"Interrupted write: {f'{len(ours)} old values put back' if ours else 'nothing of ours was in force'}"
+        if foreign:
+            words += f"; changed by others, left alone: {', '.join(foreign)}"
         logger.warning("%s", words)
         self.on_mended(words)
         self._say(Severity.WARNING, words, Weight.RESULT)

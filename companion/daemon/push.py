@@ -157,12 +157,13 @@ class Pusher:
         problems = await self._no_longer_in_force(plan)
         if verdicts is None and self._vehicle.boots != plan.boots:
             problems.append(why_not)
+        explained = bool(problems)
         for target in plan.targets:
             if not target.watched:
                 draft.warn(target.name, "effect of the written offsets not seen: this IMU is not in the telemetry")
             elif verdicts is None:
                 draft.warn(target.name, f"effect of the written offsets not seen: {why_not}")
-            elif not problems:
+            elif not explained:
                 problems += self._note_verdicts(target, verdicts[target.name], draft)
         if problems:
             await self.roll_back(plan, draft, "; ".join(problems))

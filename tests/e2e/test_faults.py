@@ -470,3 +470,19 @@ def test_a_check_that_only_listens_starts_nothing(tmp_path: Path) -> None:
                 assert "check" in answer.reason
 
     run_virtual(main())
+
+
+def test_every_imu_that_does_not_take_its_offsets_is_named(tmp_path: Path) -> None:
+    async def main() -> None:
+        second = '[[imu]]\nname = "fc2"\nsource = "autopilot"\ninstance = 2\nprofile = "icm42688p"\n'
+        rig = Rig(tmp_path, max_s=12.0, more=second, parameters={"INS_ACC2OFFS_X": 0.1})
+        async with rig.running():
+            await rig.ready()
+            rig.double.faults.echo_without_effect = True
+            result, record = await calibrated(rig)
+            assert result.outcome == "failed"
+            assert "imu fc: the autopilot stored" in result.reason
+            assert "imu fc2: the autopilot stored INS_ACC2OFFS_X but does not use it" in result.reason
+            assert {w.outcome for imu in record.imus for w in imu.written.values()} == {"rolled_back"}
+
+    run_virtual(main())
