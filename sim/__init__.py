@@ -6,6 +6,8 @@ On the command line:
                                UDP, and a configuration for the companion that fits
     python -m sim devices      the devices alone
     python -m sim autopilot    the autopilot alone
+    python -m sim ardupilot    a real ArduPilot SITL binary on the same aircraft, and the devices; `px4`: a real PX4
+    python -m sim residuals    what each calibration leaves in a real autopilot, beside the truth
 
 In a test, on any event loop, also one whose clock jumps:
 
@@ -20,8 +22,9 @@ In a test, on any event loop, also one whose clock jumps:
 
     aircraft, motions    where and how it stands, what happens to it         earth       frames, gravity, Earth rate
     imu_model            noise and bias of named parts, true bias at hand    devices     frames of serial devices
-    pty_device           a device as a path that can be unplugged            autopilot   the ArduPilot double
+    pty_device           a device as a path that can be unplugged            autopilot, px4   the doubles
     scenario             ready-made worlds                                   station     a bare MAVLink peer
+    sitl                 physics for real firmware binaries
 
 Nothing here uses the companion's physics, protocols or calibration: the simulator would only repeat their mistakes.
 """

@@ -1,4 +1,4 @@
-"""`python -m sim devices | autopilot | all | demo`."""
+"""`python -m sim devices | autopilot | all | demo | ardupilot | px4 | residuals`."""
 
 from __future__ import annotations
 
@@ -19,8 +19,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             print("python -m sim demo: not part of this copy; try `python -m sim all`", file=sys.stderr)
             return 1
         return int(demo.main(arguments[1:]) or 0)
+    from sim.serve import FIRMWARE_COMMANDS
     from sim.serve import main as serve
 
+    if arguments[:1] and arguments[0] in FIRMWARE_COMMANDS:
+        from sim.sitl.cli import main as firmware
+
+        return firmware(arguments)
     return serve(arguments)
 
 

@@ -6,9 +6,7 @@ reference of this project, sections 1, 2, 3, 5.4, 7.5, 9.1 and 9.3.1); the class
 
 from __future__ import annotations
 
-import asyncio
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -16,27 +14,30 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
 from sim.ardupilot.calibrations import Calibrations
-from sim.ardupilot.channel import Channel, Message
-from sim.ardupilot.commands import CommandServer, command_of
+from sim.ardupilot.channel import ArduPilotChannel
+from sim.ardupilot.commands import CommandServer
 from sim.ardupilot.estimator import CoarseEstimator
-from sim.ardupilot.faults import Faults
 from sim.ardupilot.inertial import InertialPath
 from sim.ardupilot.messages import BUILDERS
-from sim.ardupilot.parameter_server import ParameterServer, Write
-from sim.ardupilot.parameters import ParameterStore, Version, default_parameters, device_id, float32, offset_names
+from sim.ardupilot.parameter_server import ParameterServer
+from sim.ardupilot.parameters import ParameterStore, default_parameters, device_id, offset_names
 from sim.ardupilot.routing import Router
+from sim.ardupilot.versions import NEWEST, Version, since
 from sim.earth import Array
+from sim.firmware.channel import Channel, Message
+from sim.firmware.command import command_of
+from sim.firmware.double import HEARTBEAT, AutopilotDouble
+from sim.firmware.faults import Faults
+from sim.firmware.numbers import float32
+from sim.firmware.writes import Write
 from sim.imu_model import Bias, ImuModel
 
 __all__ = ["ArduPilotDouble", "Faults", "Write", "float32", "offset_names"]
 
-HEARTBEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT
-FIELD_MILLIGAUSS = (280.0, 450.0)
-"""Horizontal and vertical part of the magnetic field."""
 LOOP_RATE_HZ = {"copter": 400.0, "plane": 50.0}
 
 
-class ArduPilotDouble:
+class ArduPilotDouble(AutopilotDouble):
     """An autopilot with up to three IMUs on a virtual aircraft.
 
     It is an `End` (attach, receive) on which the companion is plugged in; `ground` is a second one for a ground
@@ -49,11 +50,11 @@ class ArduPilotDouble:
         aircraft: the truth.
         imus: one to three models; the first is IMU 1. Their `mounting_deg` is how the board is really turned, which
             AHRS_ORIENTATION (default none) is meant to undo.
-        version: "4.8": PARAM_ERROR, too fast rates DENIED, HIGHRES_IMU. "4.5": silence for unknown parameters, too fast
-            rates silently capped, no HIGHRES_IMU, SYSID_THISMAV instead of MAV_SYSID.
+        version: "4.3" to "4.8"; `sim.ardupilot.versions` says how they differ.
         vehicle: "copter" (loop 400 Hz) or "plane" (50 Hz: nothing above 40 Hz).
         parameters: values that differ from the defaults, such as {"INS_GYR_CAL": 0}; set before the first boot.
         up_s: how long it has been running when the simulation begins.
+        auxiliary: whether the board has parameters of IMU 4 and 5, and a gyro behind 4 that no message shows.
         has_position: whether it has a GNSS fix, and so a position and a date.
         clock_ppm: how much faster its clock runs.
     """
@@ -64,71 +65,30 @@ class ArduPilotDouble:
         imus: Sequence[ImuModel],
         *,
         system_id: int = 1,
-        version: Version = "4.8",
+        version: Version = NEWEST,
         vehicle: Literal["copter", "plane"] = "copter",
         parameters: Mapping[str, float] | None = None,
         up_s: float = 30.0,
+        auxiliary: bool = False,
         has_position: bool = True,
         clock_ppm: float = 0.0,
         seed: int = 0,
     ) -> None:
         if not 1 <= len(imus) <= 3:
             raise ValueError(f"imus: found {len(imus)}; allowed: 1 to 3")
-        self.aircraft, self.imus = aircraft, tuple(imus)
+        channels = (ArduPilotChannel(system_id, self._handle), ArduPilotChannel(system_id, self._handle))
+        super().__init__(aircraft, imus, channels, up_s=up_s, has_position=has_position, clock_ppm=clock_ppm, seed=seed)
         self.system_id, self.version, self.vehicle = system_id, version, vehicle
-        self.has_position, self.clock_ppm = has_position, clock_ppm
-        self.faults = Faults()
-        self.armed = False
-        self.calibrating = False
-        self.boots = 0
-        declination = math.radians(aircraft.site.declination_deg)
-        north, down = FIELD_MILLIGAUSS
-        self.field_ned = np.array([north * math.cos(declination), north * math.sin(declination), down])
-        """Magnetic field at the site in milligauss."""
+        self._auxiliary = auxiliary
         self.parameters = self._new_store(parameters or {})
         self.estimator = CoarseEstimator()
-        self.ground = Channel(system_id, self._handle)
-        """The second port."""
-        self._port = Channel(system_id, self._handle)
-        self.channels = (self._port, self.ground)
         self._router = Router(system_id, self.channels)
-        self._random = np.random.default_rng([seed, 4])
         self._paths = [InertialPath(model, number + 1, self.parameters, seed=seed) for number, model in enumerate(imus)]
-        self.calibrations = Calibrations(self._paths, self.parameters, self._random)
+        self.calibrations = Calibrations(self._paths, self.parameters, self.random)
         self._parameter_server = ParameterServer(self)
         self._commands = CommandServer(self)
         self._frozen: dict[int, Array] = {}
-        self._up_s = up_s
-        self._booted_s: float | None = None
-        self._down = False
-        self._generation = 0
-        self._last_later_s = 0.0
-        self._failed: asyncio.Future[None] | None = None
-        self._timer: asyncio.TimerHandle | None = None
         self._boot_gyros(0.0)
-
-    # The outside: two ends, and the loop.
-
-    def attach(self, transmit: Callable[[bytes], None] | None) -> None:
-        """Plug the companion's wire in (None: out)."""
-        self._port.attach(transmit)
-
-    def receive(self, data: bytes, t_s: float) -> None:
-        """Bytes from the companion's wire; never raises."""
-        self._port.receive(data, t_s)
-
-    async def run(self) -> None:
-        """Send heartbeats and streams until cancelled."""
-        loop = asyncio.get_running_loop()
-        self._failed = loop.create_future()
-        self._begin(loop.time())
-        self._tick()
-        try:
-            await self._failed
-        finally:
-            self._failed = None
-            if self._timer is not None:
-                self._timer.cancel()
 
     # What tests and people do to it.
 
@@ -164,15 +124,6 @@ class ArduPilotDouble:
             self.armed = False
             self.say(mavlink.MAV_SEVERITY_INFO, "Disarming motors")
 
-    def reboot(self, down_s: float = 1.5) -> None:
-        """Restart: silence for `down_s`, then time from zero, streams and routes forgotten, parameters kept."""
-        self._down = True
-        self._generation += 1
-        generation = self._generation
-        self.armed = self.calibrating = False
-        loop = asyncio.get_running_loop()
-        loop.call_later(down_s, lambda: self._boot(loop.time()) if generation == self._generation else None)
-
     def residual(self, instance: int, loop_s: float) -> Bias:
         """What is left in the output of IMU `instance` (1..3) after offsets and scales: output minus truth, FRD."""
         t_s = self.aircraft.time_at(loop_s)
@@ -185,7 +136,7 @@ class ArduPilotDouble:
 
     def prearm_failures(self, loop_s: float) -> list[str]:
         """Why it would not arm, in the firmware's words without the prefix."""
-        failures = []
+        failures = [] if self.calibrations.gyros_ok else ["Gyros not calibrated"]
         values = self.parameters.values
         outputs = [path.corrected(self.aircraft.time_at(loop_s)) for path in self._paths]
         for path in self._paths:
@@ -209,25 +160,12 @@ class ArduPilotDouble:
     @property
     def has_highres_imu(self) -> bool:
         """4.6 and later, on boards with more than 1 MB of flash."""
-        return self.version != "4.5" and not self.faults.int_only
+        return since(self.version, "4.6") and not self.faults.int_only
 
     @property
     def fastest_interval_ms(self) -> int:
         """Whole milliseconds of 1.25 loop periods."""
         return int(1.25 * 1000.0 / LOOP_RATE_HZ[self.vehicle])
-
-    def boot_us(self, loop_s: float) -> int:
-        """Microseconds since boot on its own clock."""
-        assert self._booted_s is not None
-        return int((loop_s - self._booted_s) * (1.0 + self.clock_ppm * 1e-6) * 1e6)
-
-    def boot_ms(self, loop_s: float) -> int:
-        """Milliseconds since boot."""
-        return self.boot_us(loop_s) // 1000
-
-    def unix_s(self, loop_s: float) -> float:
-        """The date it knows."""
-        return self.aircraft.unix_s + self.aircraft.time_at(loop_s)
 
     def imu_output(self, index: int, loop_s: float) -> Array:
         """Filtered rates and specific forces (6) of IMU index 0..2 in vehicle FRD."""
@@ -248,57 +186,49 @@ class ArduPilotDouble:
         roll, pitch, yaw = self.aircraft.angles_rad(self.aircraft.time_at(loop_s))
         roll_error, pitch_error = map(float, self.estimator.tilt_error_rad)
         trim = self.parameters.effective
-        yaw = (yaw + np.pi) % (2.0 * np.pi) - np.pi
+        yaw = (yaw + self.estimator.yaw_error_rad + np.pi) % (2.0 * np.pi) - np.pi
         return roll + roll_error - trim["AHRS_TRIM_X"], pitch + pitch_error - trim["AHRS_TRIM_Y"], float(yaw)
-
-    def now_s(self) -> float:
-        """The loop's clock."""
-        return asyncio.get_running_loop().time()
 
     def answer_delay_s(self) -> float:
         """Time to a PARAM_VALUE: 2 to 6 ms, on Plane 17 to 23 ms."""
         low, high = (0.002, 0.006) if self.vehicle == "copter" else (0.017, 0.023)
-        return float(self._random.uniform(low, high))
+        return float(self.random.uniform(low, high))
 
-    def later(self, delay_s: float, action: Callable[[], None]) -> None:
-        """Do something after a delay, unless a reboot comes first; short delays keep their order."""
-        loop = asyncio.get_running_loop()
-        at_s = loop.time() + delay_s
-        if delay_s < 0.1:
-            at_s = max(at_s, self._last_later_s + 1e-6)
-            self._last_later_s = at_s
-        generation = self._generation
-        loop.call_at(at_s, lambda: action() if generation == self._generation else None)
+    def read_delay_s(self) -> float:
+        """Time to the answer to a read, which waits for the next turn of a slow thread: 5 to 95 ms."""
+        return float(self.random.uniform(0.005, 0.095))
 
-    def answer(self, channel: Channel, message: Message) -> None:
-        """Send an answer, unless it answers nothing."""
-        if not self._down and not self.faults.silent:
-            channel.send(message)
+    def coin(self) -> bool:
+        """Heads or tails."""
+        return bool(self.random.integers(2))
+
+    def announce(self, names: Iterable[str]) -> None:
+        """PARAM_VALUE on every port for what the autopilot itself has changed and saved."""
+        for name in names:
+            self._parameter_server.announce(name)
 
     def say(self, severity: int, text: str) -> None:
         """STATUSTEXT on every port, cut at 50 characters a chunk."""
         data = text.encode()
         chunks = [data[start : start + 50] for start in range(0, len(data), 50)]
-        text_id = int(self._random.integers(1, 65536)) if len(chunks) > 1 else 0
+        text_id = int(self.random.integers(1, 65536)) if len(chunks) > 1 else 0
         for channel in self.channels:
             for number, chunk in enumerate(chunks):
                 self.answer(channel, mavlink.MAVLink_statustext_message(severity, chunk, text_id, number))
 
-    def wake(self) -> None:
-        """Tell `run` that something is due earlier than it thought."""
-        if self._failed is not None:
-            asyncio.get_running_loop().call_soon(self._tick)
-
     def erase_parameters(self) -> None:
         """PREFLIGHT_STORAGE 2 or 4: everything is gone, at the next boot the defaults are there."""
-        for name, (value, _) in default_parameters(self.version, len(self.imus)).items():
+        for name, (value, _) in self._table().items():
             self.parameters.set(name, value, takes_effect=False)
 
     # The inside.
 
+    def _table(self) -> dict[str, tuple[float, int]]:
+        return default_parameters(self.version, len(self.imus), auxiliary=self._auxiliary)
+
     def _new_store(self, overrides: Mapping[str, float]) -> ParameterStore:
-        table = default_parameters(self.version, len(self.imus))
-        own = "SYSID_THISMAV" if self.version == "4.5" else "MAV_SYSID"
+        table = self._table()
+        own = "MAV_SYSID" if since(self.version, "4.7") else "SYSID_THISMAV"
         table[own] = (float(self.system_id), table[own][1])
         table["SCHED_LOOP_RATE"] = (LOOP_RATE_HZ[self.vehicle], table["SCHED_LOOP_RATE"][1])
         store = ParameterStore(table)
@@ -306,19 +236,15 @@ class ArduPilotDouble:
             store.set(name, value)
         return store
 
-    def _begin(self, loop_s: float) -> None:
-        """The first instant on a loop: it has been up for a while."""
-        if self._booted_s is None:
-            self.aircraft.begin(loop_s)
-            self._booted_s = loop_s - self._up_s
-            self.boots = 1
-            self.estimator.reset(self.aircraft.time_at(loop_s) - self._up_s)
-            self._start_heartbeats(loop_s)
+    def build(self, message_id: int, loop_s: float) -> Message:
+        """A message of `BUILDERS`."""
+        return BUILDERS[message_id](self, loop_s)
 
-    def _boot(self, loop_s: float) -> None:
-        self._down = False
-        self._booted_s = loop_s
-        self.boots += 1
+    def _started(self, loop_s: float) -> None:
+        self.estimator.reset(self.aircraft.time_at(loop_s) - self._up_s)
+        self._start_heartbeats(loop_s)
+
+    def _restarted(self, loop_s: float) -> None:
         self.parameters.set("STAT_BOOTCNT", self.parameters.values["STAT_BOOTCNT"] + 1)
         self.parameters.reload()
         self._router.forget()
@@ -327,14 +253,11 @@ class ArduPilotDouble:
         for path in self._paths:
             path.reset()
         self.estimator.reset(self.aircraft.time_at(loop_s))
-        for channel in self.channels:
-            channel.streams.clear()
-            channel.listing = False
         self._start_heartbeats(loop_s)
-        self.wake()
 
     def _boot_gyros(self, t_s: float) -> None:
         """INS_GYR_CAL = 1: every boot measures the gyro offsets anew and throws the stored ones away."""
+        self.calibrations.gyros_ok = True
         if self.parameters.values["INS_GYR_CAL"] == 1:
             self.calibrations.gyros(t_s)
 
@@ -343,40 +266,11 @@ class ArduPilotDouble:
             channel.set_stream(HEARTBEAT, 1.0, loop_s)
             channel.streams[HEARTBEAT].next_s = loop_s
 
-    def _tick(self) -> None:
-        """Send what is due and come back for what is next: plain callbacks, cheaper than a task."""
-        if self._failed is None or self._failed.done():
-            return
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
-        loop = asyncio.get_running_loop()
-        try:
-            self._send_due(loop.time())
-        except Exception as error:  # noqa: BLE001 - handed to whoever awaits run()
-            self._failed.set_exception(error)
-            return
-        due = [at for channel in self.channels if (at := channel.next_due_s()) is not None]
-        if due and not self._down:
-            self._timer = loop.call_at(min(due), self._tick)
+    def _holds_back(self, message_id: int) -> bool:
+        # While it calibrates, the real one's delay loop sends heartbeats and parameters only.
+        return super()._holds_back(message_id) or (self.calibrating and message_id != HEARTBEAT)
 
-    def _send_due(self, loop_s: float) -> None:
-        if self._down:
-            return
-        for channel in self.channels:
-            for message_id in channel.due(loop_s):
-                if message_id == HEARTBEAT:
-                    if self.faults.heartbeat_off:
-                        continue
-                elif self.faults.telemetry_off or self.calibrating:
-                    continue  # while it calibrates, the real one's delay loop sends heartbeats and parameters only
-                if channel.attached:
-                    channel.send(BUILDERS[message_id](self, loop_s))
-
-    def _handle(self, channel: Channel, message: Message, loop_s: float) -> None:
-        if self._down:
-            return
-        self._begin(loop_s)
+    def _receive_message(self, channel: Channel, message: Message, loop_s: float) -> None:
         if not self._router.route(channel, message):
             return
         if isinstance(message, mavlink.MAVLink_param_set_message):

@@ -11,18 +11,18 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import json
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.ardupilot.parameters import offset_names
+from sim.companion_process import CompanionProcess, Record
 from sim.earth import Array
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.pty_device import PtyDevice
@@ -40,10 +40,7 @@ SEED: Final = 70
 the 10 deg/h that are asked below, between the calibration and the look afterwards, and no calibration can know that."""
 OBSERVE_HZ: Final = 100.0
 MEASURE_MAX_S: Final = 45
-READY_WITHIN_S: Final = 20.0
 CALIBRATE_WITHIN_S: Final = 150.0
-
-Record = dict[str, Any]
 
 
 def main(argv: Sequence[str]) -> int:
@@ -70,11 +67,10 @@ async def _run(folder: Path, seed: int) -> int:
         station = await _serve(scenario, folder, stack)
         print(describe(scenario, devices=True, autopilot=True).replace("# ", ""), end="")
         print("\nStarting the daemon: companion run", flush=True)
-        daemon = await _start_daemon(folder)
-        stack.push_async_callback(_stop_daemon, daemon)
-        await _wait_ready(folder, daemon)
+        daemon = await stack.enter_async_context(CompanionProcess(folder))
+        await daemon.ready()
         print("Calibrating both IMUs at once: companion calibrate --wait\n", flush=True)
-        record = await _calibrate(folder)
+        record = await daemon.calibrate(CALIBRATE_WITHIN_S)
         if record["state"] != "done":
             print(f"\nThe calibration {record['state']}: {record['reason']}", file=sys.stderr)
             return 1
@@ -117,57 +113,9 @@ async def _serve(scenario: Scenario, folder: Path, stack: contextlib.AsyncExitSt
     return station
 
 
-def _command(folder: Path, *words: str) -> list[str]:
-    return [sys.executable, "-m", "companion", "-c", str(folder / "companion.toml"), *words]
-
-
-async def _start_daemon(folder: Path) -> asyncio.subprocess.Process:
-    with (folder / "daemon.log").open("wb") as log:
-        return await asyncio.create_subprocess_exec(*_command(folder, "run"), stderr=log)
-
-
-async def _stop_daemon(daemon: asyncio.subprocess.Process) -> None:
-    if daemon.returncode is None:
-        daemon.terminate()
-    await daemon.wait()
-
-
 async def _cancel(task: asyncio.Task[None]) -> None:
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
-
-
-async def _wait_ready(folder: Path, daemon: asyncio.subprocess.Process) -> None:
-    """Wait until the daemon answers and knows that the aircraft is disarmed.
-
-    Raises:
-        RuntimeError: it ended; its log is in the message.
-        TimeoutError: it did not become ready.
-    """
-    deadline_s = time.monotonic() + READY_WITHIN_S
-    while time.monotonic() < deadline_s:
-        if daemon.returncode is not None:
-            raise RuntimeError(f"the daemon ended:\n{(folder / 'daemon.log').read_text()}")
-        status = await asyncio.create_subprocess_exec(
-            *_command(folder, "status", "--json"),
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.DEVNULL,
-        )
-        output, _ = await status.communicate()
-        if status.returncode == 0 and json.loads(output)["vehicle"]["armed"] == "disarmed":
-            return
-    raise TimeoutError(f"the daemon is not ready after {READY_WITHIN_S:g} s:\n{(folder / 'daemon.log').read_text()}")
-
-
-async def _calibrate(folder: Path) -> Record:
-    """Run `companion calibrate --wait`, its progress on our stderr, and return the record."""
-    words = ("calibrate", "--wait", "--timeout", str(CALIBRATE_WITHIN_S), "--json")
-    process = await asyncio.create_subprocess_exec(*_command(folder, *words), stdout=asyncio.subprocess.PIPE)
-    output, _ = await process.communicate()
-    if not output.strip():
-        raise RuntimeError(f"companion calibrate printed no record (exit code {process.returncode})")
-    record: Record = json.loads(output)
-    return record
 
 
 async def _observe(station: Station) -> Array:

@@ -5,16 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Literal
 
 from pygeomag.geomag import GeoMag
 
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.autopilot import ArduPilotDouble
 from sim.devices import HMR3300, Gradienter, Law, VectorNavBinary
+from sim.firmware.double import AutopilotDouble
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.motions import Motion
+from sim.px4.double import PX4Double
+
+Firmware = Literal["ardupilot", "px4"]
 
 DEMO_POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
+FIRST_GYRO_DEG_H = (162.234, 169.563, 98.289)
+FIRST_ACCEL_MG = (2.4125, 2.1596, 0.89809)
+GRADIENTER_OFFSET_DEG = (0.003, -0.002)
 DEMO_UNIX_S = 1_795_219_200.0
 """21 November 2026, 00:00 UTC."""
 
@@ -35,7 +43,7 @@ class Scenario:
     aircraft: VirtualAircraft
     flight_controller_imus: tuple[ImuModel, ...]
     serial_imu: ImuModel
-    autopilot: ArduPilotDouble
+    autopilot: AutopilotDouble
     imu: VectorNavBinary
     gradienter: Gradienter
     compass: HMR3300
@@ -50,6 +58,11 @@ def demo(
     motions: Sequence[Motion] = (),
     law: Law = "axis",
     gyr_cal_at_boot: bool = False,
+    firmware: Firmware = "ardupilot",
+    part: str = "icm42688p",
+    gyro_deg_h: Sequence[float] = FIRST_GYRO_DEG_H,
+    accel_mg: Sequence[float] = FIRST_ACCEL_MG,
+    gradienter_offset_deg: tuple[float, float] = GRADIENTER_OFFSET_DEG,
 ) -> Scenario:
     """A small aircraft on uneven ground near Beijing, 40 N, 116 E, 50 m: pitch 5, roll -3, heading 40 degrees.
 
@@ -65,32 +78,41 @@ def demo(
         law: of the gradienter.
         gyr_cal_at_boot: the autopilot's default INS_GYR_CAL = 1, with which it has already found most of the gyro bias
             (and has swallowed the Earth's rotation). The demonstration starts without, to have something to show.
+        firmware: whose manners the autopilot has.
+        part: what the flight controller's IMUs are.
+        gyro_deg_h: gyro biases of its first IMU.
+        accel_mg: likewise of the accelerometers.
+        gradienter_offset_deg: what the gradienter shows too much, x and y.
     """
     aircraft = VirtualAircraft(pose, site_at(40.0, 116.0, 50.0, unix_s), motions=motions, unix_s=unix_s)
 
-    def imu(number: int, gyro_deg_h: tuple[float, ...], accel_mg: tuple[float, ...], part: str) -> ImuModel:
+    def imu(number: int, rates_deg_h: Sequence[float], forces_mg: Sequence[float], name: str) -> ImuModel:
         return ImuModel(
             aircraft,
-            part,
+            name,
             seed=seed * 10 + number,
-            gyro_bias_rad_s=[value * DEG_H for value in gyro_deg_h],
-            accel_bias_m_s2=[value * MG for value in accel_mg],
+            gyro_bias_rad_s=[value * DEG_H for value in rates_deg_h],
+            accel_bias_m_s2=[value * MG for value in forces_mg],
         )
 
     flight_controller = (
-        imu(1, (162.234, 169.563, 98.289), (2.4125, 2.1596, 0.89809), "icm42688p"),
-        imu(2, (-89.532, -98.564, -72.196), (-0.55739, -1.0068, 0.34809), "icm42688p"),
+        imu(1, gyro_deg_h, accel_mg, part),
+        imu(2, (-89.532, -98.564, -72.196), (-0.55739, -1.0068, 0.34809), part),
     )
+    autopilot: AutopilotDouble
+    if firmware == "px4":
+        autopilot = PX4Double(aircraft, flight_controller, parameters={"MAV_1_FORWARD": 1}, seed=seed)
+    else:
+        parameters = {"INS_GYR_CAL": float(gyr_cal_at_boot)}
+        autopilot = ArduPilotDouble(aircraft, flight_controller, parameters=parameters, seed=seed)
     serial = imu(3, (60.294, 124.657, 108.289), (0.21593, -2.2118, 1.2953), "bmi088")
     return Scenario(
         aircraft=aircraft,
         flight_controller_imus=flight_controller,
         serial_imu=serial,
-        autopilot=ArduPilotDouble(
-            aircraft, flight_controller, parameters={"INS_GYR_CAL": float(gyr_cal_at_boot)}, seed=seed
-        ),
+        autopilot=autopilot,
         imu=VectorNavBinary(serial),
-        gradienter=Gradienter(aircraft, seed=seed, law=law, offset_deg=(0.003, -0.002)),
+        gradienter=Gradienter(aircraft, seed=seed, law=law, offset_deg=gradienter_offset_deg),
         compass=HMR3300(aircraft, seed=seed, heading_error_deg=0.8),
         gradienter_law=law,
     )

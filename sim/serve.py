@@ -10,7 +10,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
 
 from sim.aircraft import Pose
@@ -20,6 +20,14 @@ from sim.scenario import DEMO_POSE, Scenario, demo
 from sim.udp import open_udp
 
 DEFAULT_UDP = "127.0.0.1:14550"
+_PROFILES = {"white_only": "icm42688p", "perfect": "icm42688p"}
+"""Parts that only simulators have, and what the companion is told instead."""
+FIRMWARE_COMMANDS = {
+    "ardupilot": "a real ArduPilot SITL binary on this aircraft, and the devices",
+    "px4": "a real PX4 SITL binary on this aircraft, and the devices",
+    "residuals": "what each calibration leaves in a real autopilot, as a table",
+}
+"""Of `sim.sitl.cli`."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -28,28 +36,14 @@ def parser() -> argparse.ArgumentParser:
         prog="python -m sim",
         description="A virtual aircraft that stands still somewhere near Beijing: its sensors and its autopilot.",
     )
-    commands = top.add_subparsers(dest="command", required=True, metavar="devices | autopilot | all | demo")
+    commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in (
         ("devices", "serial IMU, gradienter and compass on pseudo-terminals"),
-        ("autopilot", "an ArduPilot double on UDP"),
+        ("autopilot", "an ArduPilot or PX4 double on UDP"),
         ("all", "both, on one aircraft"),
     ):
         command = commands.add_parser(name, help=text, description=text)
-        command.add_argument(
-            "--pose",
-            type=float,
-            nargs=3,
-            metavar=("PITCH", "ROLL", "HEADING"),
-            default=(DEMO_POSE.pitch_deg, DEMO_POSE.roll_deg, DEMO_POSE.heading_deg),
-            help="degrees: nose up +, right side down +, clockwise from true north (default 5 -3 40)",
-        )
-        command.add_argument("--seed", type=int, default=0, help="the same seed gives the same noise (default 0)")
-        command.add_argument(
-            "--law",
-            choices=("axis", "slope", "euler"),
-            default="axis",
-            help="what the gradienter's two readings mean (default axis)",
-        )
+        add_world_options(command)
         if name != "autopilot":
             command.add_argument("--dir", type=Path, help="folder for the ports (default: a new one)")
         if name != "devices":
@@ -61,10 +55,35 @@ def parser() -> argparse.ArgumentParser:
                 "--ground", type=address, metavar="HOST:PORT", help="second port, for a ground station"
             )  # fmt: skip
             command.add_argument(
-                "--gyr-cal", action="store_true", help="INS_GYR_CAL = 1: the autopilot calibrates its gyros at boot"
+                "--firmware", choices=("ardupilot", "px4"), default="ardupilot",
+                help="whose manners the autopilot has (default ardupilot)",
+            )  # fmt: skip
+            command.add_argument(
+                "--gyr-cal", action="store_true", help="INS_GYR_CAL = 1: ArduPilot calibrates its gyros at boot"
             )
     commands.add_parser("demo", help="the whole chain, with a result to look at")
+    for name, text in FIRMWARE_COMMANDS.items():
+        commands.add_parser(name, help=text)
     return top
+
+
+def add_world_options(command: argparse.ArgumentParser) -> None:
+    """--pose, --seed and --law."""
+    command.add_argument(
+        "--pose",
+        type=float,
+        nargs=3,
+        metavar=("PITCH", "ROLL", "HEADING"),
+        default=(DEMO_POSE.pitch_deg, DEMO_POSE.roll_deg, DEMO_POSE.heading_deg),
+        help="degrees: nose up +, right side down +, clockwise from true north (default 5 -3 40)",
+    )
+    command.add_argument("--seed", type=int, default=0, help="the same seed gives the same noise (default 0)")
+    command.add_argument(
+        "--law",
+        choices=("axis", "slope", "euler"),
+        default="axis",
+        help="what the gradienter's two readings mean (default axis)",
+    )
 
 
 def address(text: str) -> tuple[str, int]:
@@ -85,14 +104,14 @@ def configuration(scenario: Scenario, *, directory: Path | None, udp: tuple[str,
         for number, model in enumerate(scenario.flight_controller_imus, 1):
             if number == 1:
                 lines += ["", "[[imu]]", 'name = "fc"', 'source = "autopilot"', f"instance = {number}"]
-                lines.append(f'profile = "{model.spec.name}"')
+                lines.append(f'profile = "{_PROFILES.get(model.spec.name, model.spec.name)}"')
     if directory is None:
         site = scenario.aircraft.site
         lines += ["", f"# no gradienter, no compass; the site is {site.latitude_deg} {site.longitude_deg}"]
         return "\n".join(lines) + "\n"
     lines += ["", "[[imu]]", 'name = "own"', 'source = "serial"', f'port = "{directory / "imu"}"']
     lines += [f"baud = {scenario.imu.baud}", f'protocol = "{scenario.imu.protocol}"']
-    lines.append(f'profile = "{scenario.serial_imu.spec.name}"')
+    lines.append(f'profile = "{_PROFILES.get(scenario.serial_imu.spec.name, scenario.serial_imu.spec.name)}"')
     lines += ["", "[gradienter]", f'port = "{directory / "gradienter"}"']
     lines += [f'protocol = "{scenario.gradienter.protocol}"', f'law = "{scenario.gradienter_law}"']
     lines += ["sigma_deg = 0.005", "", "[compass]", f'port = "{directory / "compass"}"']
@@ -173,6 +192,7 @@ def main(argv: Sequence[str]) -> int:
         unix_s=time.time(),
         law=arguments.law,
         gyr_cal_at_boot=autopilot and arguments.gyr_cal,
+        firmware=arguments.firmware if autopilot else "ardupilot",
     )
     directory: Path | None = None
     made_here = devices and arguments.dir is None
@@ -182,8 +202,12 @@ def main(argv: Sequence[str]) -> int:
     text = describe(scenario, devices=devices, autopilot=autopilot)
     text += configuration(scenario, directory=directory, udp=udp)
     try:
+        ground = arguments.ground if autopilot else None
         return asyncio.run(
-            _serve_until_stopped(scenario, text, directory, udp, arguments.ground if autopilot else None)
+            run_until_stopped(
+                lambda started: serve(scenario, directory=directory, udp=udp, ground=ground, started=started),
+                lambda: text,
+            )
         )
     except OSError as error:
         print(f"python -m sim: {error}", file=sys.stderr)
@@ -194,26 +218,28 @@ def main(argv: Sequence[str]) -> int:
                 os.rmdir(directory)
 
 
-async def _serve_until_stopped(
-    scenario: Scenario,
-    text: str,
-    directory: Path | None,
-    udp: tuple[str, int] | None,
-    ground: tuple[str, int] | None,
+async def run_until_stopped(
+    serve: Callable[[asyncio.Event], Coroutine[None, None, None]], text: Callable[[], str]
 ) -> int:
+    """Serve until Ctrl-C or SIGTERM, and print how to use it once it is up; returns the exit code.
+
+    Args:
+        serve: serves until cancelled, and sets the event when everything is up. What it raises is raised here.
+        text: truth and configuration, asked for when everything is up.
+    """
     loop = asyncio.get_running_loop()
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
     started = asyncio.Event()
-    serving = asyncio.create_task(serve(scenario, directory=directory, udp=udp, ground=ground, started=started))
+    serving = asyncio.create_task(serve(started))
     waiting = asyncio.create_task(stop.wait())
     ready = asyncio.create_task(started.wait())
-    await asyncio.wait({serving, ready}, return_when=asyncio.FIRST_COMPLETED)
+    await asyncio.wait({serving, ready, waiting}, return_when=asyncio.FIRST_COMPLETED)
     if started.is_set():
         print("# Ready. Save these lines as companion.toml and run: companion run -c companion.toml")
         print("# Ctrl-C ends the simulation.")
-        print(text, flush=True)
+        print(text(), flush=True)
     await asyncio.wait({serving, waiting}, return_when=asyncio.FIRST_COMPLETED)
     failed = serving.done()
     for task in (serving, waiting, ready):

@@ -48,12 +48,10 @@ class Station:
         """STATUSTEXT, chunk by chunk."""
         return [message.text for message in self.all(mavlink.MAVLink_statustext_message)]
 
-    def heartbeat(self) -> None:
-        """Show that we are here, as an onboard controller or ground station."""
+    def heartbeat(self, kind: int = mavlink.MAV_TYPE_ONBOARD_CONTROLLER) -> None:
+        """Show that we are here, as an onboard controller or (MAV_TYPE_GCS) a ground station."""
         self.send(
-            mavlink.MAVLink_heartbeat_message(
-                mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
-            )
+            mavlink.MAVLink_heartbeat_message(kind, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3)
         )
 
     async def command(self, number: int, *params: float, target: tuple[int, int] = (1, 1), wait_s: float = 2.0) -> int:
@@ -70,10 +68,17 @@ class Station:
             await asyncio.sleep(0.002)
         return -1
 
-    async def set_parameter(self, name: str, value: float, *, target: tuple[int, int] = (1, 1)) -> list[float]:
-        """PARAM_SET; returns the values of that name that come back within 0.1 s."""
+    async def set_parameter(
+        self,
+        name: str,
+        value: float,
+        *,
+        target: tuple[int, int] = (1, 1),
+        kind: int = mavlink.MAV_PARAM_TYPE_REAL32,
+    ) -> list[float]:
+        """PARAM_SET; returns the values of that name that come back within 0.1 s, as they are in the message."""
         begun = len(self.heard)
-        self.send(mavlink.MAVLink_param_set_message(*target, name.encode(), value, mavlink.MAV_PARAM_TYPE_REAL32))
+        self.send(mavlink.MAVLink_param_set_message(*target, name.encode(), value, kind))
         await asyncio.sleep(0.1)
         return self._values(name, begun)
 

@@ -6,13 +6,16 @@ ratio says the same on every machine; a microsecond does not. Read a ratio again
 
 from __future__ import annotations
 
+import asyncio
 import binascii
+import contextlib
 import struct
 import tempfile
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -20,10 +23,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.calibration.allan import noise_profile
 from companion.calibration.request import What
 from companion.calibration.rolling import ImuInput, RollingCollector, Settings
+from companion.component.arm_authorisation import ArmAuthoriser
 from companion.daemon.job import Job
 from companion.links.mavlink import MavlinkLink
 from companion.protocols.registry import make_decoder
 from companion.samples import ImuSample
+from tests.support.component import FakeVehicle, ScriptedGate
 from tests.support.frames import imu_line, vectornav_imu
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
@@ -94,6 +99,76 @@ async def _one_calibration(folder: Path) -> float:
         return (time.process_time() - start_s) / (rig.now_s - virtual_s)
 
 
+class Stalls:
+    """The longest that each of the daemon's tasks has held the loop, in processor time, while calibrating.
+
+    What the daemon gives to a thread is not counted, though on virtual time it runs on the spot.
+    """
+
+    def __init__(self) -> None:
+        self.longest_s: dict[str, float] = {}
+        self._elsewhere_s = 0.0
+
+    async def offload(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        start_s = time.process_time()
+        try:
+            return function(*arguments)
+        finally:
+            self._elsewhere_s += time.process_time() - start_s
+
+    @contextlib.contextmanager
+    def watching(self) -> Iterator[None]:
+        inner = asyncio.Handle._run
+
+        def run(handle: asyncio.Handle) -> None:
+            task = getattr(getattr(handle, "_callback", None), "__self__", None)
+            start_s, elsewhere_s = time.process_time(), self._elsewhere_s
+            inner(handle)
+            spent_s = time.process_time() - start_s - (self._elsewhere_s - elsewhere_s)
+            if isinstance(task, asyncio.Task) and not task.get_name().startswith("Task-"):
+                name = task.get_name()
+                self.longest_s[name] = max(self.longest_s.get(name, 0.0), spent_s)
+
+        asyncio.Handle._run = run  # type: ignore[assignment, method-assign]
+        try:
+            yield
+        finally:
+            asyncio.Handle._run = inner  # type: ignore[method-assign]
+
+
+async def _longest_stalls(folder: Path) -> dict[str, float]:
+    """Over a calibration by itself, its record, an arming, and half a minute of keeping the verdict fresh."""
+    stalls, rig = Stalls(), Rig(folder, own_imu=True, at_arm="gate")
+    rig.offload = stalls.offload
+    with stalls.watching():
+        async with rig.running():
+            await rig.until(lambda: rig.service.readiness.answer().verdict == "accept", 100.0)
+            rig.double.arm()
+            await asyncio.sleep(2.0)
+            rig.double.disarm()
+            await asyncio.sleep(30.0)
+    return stalls.longest_s
+
+
+def arm_request() -> Callable[[], object]:
+    """MAV_CMD_ARM_AUTHORIZATION_REQUEST received, judged from the cache, and the COMMAND_ACK packed."""
+    sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    frame = mavlink.MAVLink_command_long_message(1, 0, 3001, 0, 0, 0, 0, 0, 0, 0, 0).pack(sender)
+    link, answers = MavlinkLink(), deque[bytes](maxlen=1)
+    link.attach(answers.append)
+    ArmAuthoriser(link, FakeVehicle(1), ScriptedGate(), lambda severity, text, weight: None)
+
+    def work() -> None:
+        link.receive(frame, 1.0)
+        answers.pop()
+
+    return work
+
+
+async def _answering() -> float:
+    return seconds_a_call(arm_request())
+
+
 def main() -> None:
     base_s = seconds_a_call(reference())
     print(f"{'one':44} {'x reference':>12}")
@@ -105,8 +180,13 @@ def main() -> None:
         ("IMU sample into the rolling collector", collector_sample()),
     ):
         print(f"{words:44} {seconds_a_call(work) / base_s:12.1f}")
+    print(f"{'arm authorisation, from request to answer':44} {asyncio.run(_answering()) / base_s:12.1f}")
     with tempfile.TemporaryDirectory() as folder:
         share = run_virtual(_one_calibration(Path(folder)))
+        longest_s = run_virtual(_longest_stalls(Path(folder) / "stalls"))
+    print("\nlongest hold of the loop by one task, calibrating by itself (ms; x reference):")
+    for name, held_s in sorted(longest_s.items(), key=lambda item: -item[1])[:6]:
+        print(f"  {name:42} {1e3 * held_s:6.2f} {held_s / base_s:8.0f}")
     print(f"\na calibration with simulator and daemon in one process: {share:.1%} of a core (100 Hz FC, 200 Hz serial)")
 
 

@@ -9,6 +9,8 @@ _BACK_S: Final = 0.5
 
 _GAP_S: Final = 2.0
 _CONFIRM_S: Final = 0.5
+_CLOCKS: Final = 1.01
+"""More than two quartz clocks ever differ by."""
 _WRAP_S: Final = 2**32 * 1e-3
 """time_boot_ms is a 32 bit number: it starts again after 49.7 days."""
 
@@ -17,15 +19,22 @@ class BootClock:
     """Watches the time since boot that many messages carry; all of them count from the same boot.
 
     A restart shows in one of two ways. The time goes back. Or, after a silence, it has advanced by less than half
-    of what the host's clock has: a restart while the link was lost, of which the time since boot has meanwhile
-    overtaken the old one. (Half, since a simulator may run slower than real time. And the first messages after a
-    silence of our own making are old ones from a buffer, so this second way must hold for another half second.)
+    of what the host's clock has, and is not longer than the silence: a restart while the link was lost, of which the
+    time since boot has meanwhile overtaken the old one. (Half, since a simulator may run slower than real time; on a
+    busy machine slower than that, but an autopilot that was up for longer than we heard nothing has not restarted
+    meanwhile. And the first messages after a silence of our own making are old ones from a buffer, so this second way
+    must hold for another half second.)
     """
 
     def __init__(self) -> None:
         self._last: tuple[float, float] | None = None
         self._before_gap: tuple[float, float] | None = None
         self._suspected_s = 0.0
+
+    @property
+    def latest_s(self) -> float | None:
+        """The time since boot that was heard last."""
+        return None if self._last is None else self._last[0]
 
     def rebooted(self, boot_s: float, t_s: float) -> bool:
         """Take one message's time since boot, received at `t_s`; True when a restart lies between it and the last."""
@@ -53,4 +62,5 @@ class BootClock:
 def _too_slow(boot_s: float, t_s: float, since: tuple[float, float]) -> bool:
     silence_s = t_s - since[1]
     advance_s = (boot_s - since[0]) % _WRAP_S
-    return silence_s > _GAP_S and advance_s < 0.5 * silence_s - 0.5
+    fits_in_silence = boot_s <= silence_s * _CLOCKS + _BACK_S
+    return silence_s > _GAP_S and fits_in_silence and advance_s < 0.5 * silence_s - 0.5

@@ -1,4 +1,4 @@
-"""Single parameters over MAVLink: read by name, write one REAL32, watch what anybody writes.
+"""Single parameters over MAVLink: read by name, write one, watch what anybody writes.
 
 Every write is guarded: immediately before each PARAM_SET that leaves, the first as well as every repetition, the
 aircraft must be disarmed. Neither autopilot refuses a PARAM_SET while armed (autopilots 1.3, 4.4), so nobody else
@@ -13,12 +13,13 @@ import contextlib
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.float32 import float32, same_float32
+from companion.autopilot.parameter_encoding import REAL32, decode, encode, is_integer
 from companion.autopilot.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.errors import (
     AutopilotRebootedError,
@@ -46,6 +47,11 @@ _ERROR_WORDS: Final = {
 """MAV_PARAM_ERROR in words; the generated dialect knows only the first five."""
 
 _INBOX: Final = 64
+_REMEMBERED_TYPES: Final = 4096
+"""More parameters than any firmware has; what is not remembered is asked for."""
+
+_AT_ONCE: Final = 6
+"""Requests in flight: ArduPilot queues some twenty and answers one every few milliseconds."""
 
 
 class _Inbox:
@@ -111,6 +117,10 @@ class ParameterClient:
         self._inboxes: list[_Inbox] = []
         self._watchers: list[Callable[[str, float], None]] = []
         self._answering: str | None = None
+        self._absent: set[str] = set()
+        """Names that this boot of the autopilot has shown not to have: told by silence, that takes seconds to learn."""
+        self._types: dict[str, int] = {}
+        """MAV_PARAM_TYPE by name, as heard since the last restart."""
         self._unsubscribe = [
             link.subscribe(mavlink.MAVLink_param_value_message, self._on_value),
             link.subscribe(mavlink.MAVLink_param_error_message, self._on_error),
@@ -141,13 +151,17 @@ class ParameterClient:
 
         Firmware from ArduPilot 4.7 and PX4 1.17 on says so (PARAM_ERROR); older ones are silent. Silence means that
         it does not exist only while heartbeats come and the autopilot answers for another parameter right after;
-        otherwise requests do not reach it.
+        otherwise requests do not reach it. ArduPilot 4.8 is often silent too: its PARAM_ERROR to a read may leave by
+        another of its links. So what is absent is remembered until it restarts or announces the name.
 
         Raises:
             ParameterTimeoutError: no answer to anything.
             ParameterRefusedError: PARAM_ERROR other than that it does not exist.
             AutopilotRebootedError: the autopilot restarted meanwhile.
         """
+        if name in self._absent:
+            return None
+        boots = self.vehicle.boots
         with self._exchange(name) as inbox:
             for _ in range(self._tries):
                 answer = await self._ask(inbox, name, -1)
@@ -155,17 +169,44 @@ class ParameterClient:
                     return answer
                 if isinstance(answer, _Refusal):
                     if answer.code == _DOES_NOT_EXIST:
+                        self._absent.add(name)
                         return None
                     raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.words}")
         if not self.vehicle.alive or not await self._answers_at_all():
             raise ParameterTimeoutError(f"{self.vehicle.name} answers neither for {name} nor for anything else")
+        if self.vehicle.boots == boots:
+            self._absent.add(name)
         return None
 
-    async def write(self, name: str, value: float) -> float:
-        """Set a parameter (REAL32, rounded to float32) and wait for the autopilot to confirm that very value.
+    async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]:
+        """Read several by name, a few requests at a time.
 
-        Another value in between may be an answer to somebody else's write, so the wait goes on; if nothing else
-        comes it is what the autopilot made of ours.
+        Args:
+            names: which.
+            optional: names that do not exist are left out, instead of an error.
+
+        Raises:
+            ParameterTimeoutError, ParameterRefusedError, AutopilotRebootedError: as `read` and `read_optional`.
+        """
+        wanted = list(names)
+        read = self.read_optional if optional else self.read
+        found: dict[str, float] = {}
+        for start in range(0, len(wanted), _AT_ONCE):
+            some = wanted[start : start + _AT_ONCE]
+            answers = await asyncio.gather(*map(read, some), return_exceptions=True)
+            for name, answer in zip(some, answers, strict=True):
+                if isinstance(answer, BaseException):
+                    raise answer
+                if answer is not None:
+                    found[name] = answer
+        return found
+
+    async def write(self, name: str, value: float) -> float:
+        """Set a parameter and wait for the autopilot to confirm that very value.
+
+        It is sent as the type that the autopilot has told of it; a REAL32 is rounded to float32. Another value in
+        between may be an answer to somebody else's write, so the wait goes on; if nothing else comes it is what the
+        autopilot made of ours.
 
         Returns:
             The confirmed value, within 1 ulp of what was asked.
@@ -178,22 +219,26 @@ class ParameterClient:
             ParameterRefusedError: PARAM_ERROR, or the value is not a finite number.
             AutopilotRebootedError: the autopilot restarted meanwhile; it may have had its effect.
         """
-        wanted = float32(value)
-        if not math.isfinite(wanted):
-            raise ParameterRefusedError(f"{name}: {value} is not a number that may be written")
+        kind = await self._type_of(name)
+        whole = is_integer(kind)
+        wanted = value if whole else float32(value)
+        carried = encode(wanted, kind, bytewise=self.vehicle.integers_bytewise)
+        if not math.isfinite(wanted) or carried is None:
+            what = "a whole number" if whole else "a number"
+            raise ParameterRefusedError(f"{name}: {value} is not {what} that may be written")
         other: float | None = None
         # The last heartbeat may be older than an arming; one that was asked for just now is not.
         await self.vehicle.fresh_heartbeat()
         with self._exchange(name) as inbox:
             for _ in range(self._tries):
                 self._require_disarmed(name)
-                deadline_s = self._send(self._set_message(name, wanted), inbox)
+                deadline_s = self._send(self._set_message(name, carried, kind), inbox)
                 while (answer := await self._next(inbox, deadline_s)) is not None:
                     if isinstance(answer, _Refusal):
                         raise ParameterRefusedError(
                             f"{self.vehicle.name} refuses {name} = {wanted:.9g}: {answer.words}"
                         )
-                    if same_float32(answer, wanted):
+                    if answer == wanted if whole else same_float32(answer, wanted):
                         return answer
                     other = answer
                 await self.vehicle.fresh_heartbeat()
@@ -202,6 +247,11 @@ class ParameterClient:
         raise ParameterTimeoutError(
             f"{self.vehicle.name} does not answer to setting {name} ({self._tries} times, {self._timeout_s:g} s each)"
         )
+
+    @property
+    def answering(self) -> bool:
+        """Whether the autopilot has answered a request since it started."""
+        return self._answering is not None
 
     def watch(self, callback: Callable[[str, float], None]) -> Unsubscribe:
         """Be told of every PARAM_VALUE of the autopilot, whoever caused it; returns how to stop that."""
@@ -264,6 +314,14 @@ class ParameterClient:
                     return True
         return False
 
+    async def _type_of(self, name: str) -> int:
+        """The type to write a parameter as; only firmware that carries integers byte by byte minds."""
+        if not self.vehicle.integers_bytewise:
+            return REAL32
+        if name not in self._types:
+            await self.read(name)
+        return self._types.get(name, REAL32)
+
     def _target(self) -> tuple[int, int]:
         if self.vehicle.system_id is None:
             raise ParameterTimeoutError("no autopilot has been heard yet")
@@ -272,14 +330,16 @@ class ParameterClient:
     def _read_message(self, name: str, index: int) -> mavlink.MAVLink_param_request_read_message:
         return mavlink.MAVLink_param_request_read_message(*self._target(), _wire_name(name), index)
 
-    def _set_message(self, name: str, value: float) -> mavlink.MAVLink_param_set_message:
-        kind: int = mavlink.MAV_PARAM_TYPE_REAL32
-        return mavlink.MAVLink_param_set_message(*self._target(), _wire_name(name), value, kind)
+    def _set_message(self, name: str, carried: float, kind: int) -> mavlink.MAVLink_param_set_message:
+        return mavlink.MAVLink_param_set_message(*self._target(), _wire_name(name), carried, kind)
 
     def _on_value(self, message: mavlink.MAVLink_param_value_message, _t_s: float) -> None:
         if not self.vehicle.sent(message):
             return
-        name, value = message.param_id, float(message.param_value)
+        name, value = message.param_id, decode(message, bytewise=self.vehicle.integers_bytewise)
+        self._absent.discard(name)
+        if len(self._types) < _REMEMBERED_TYPES or name in self._types:
+            self._types[name] = message.param_type
         for inbox in self._inboxes:
             if inbox.name == name or (inbox.name == "" and message.param_index == 0):
                 inbox.put(value)
@@ -303,6 +363,8 @@ class ParameterClient:
     def _on_event(self, event: VehicleEvent) -> None:
         if event == "rebooted":
             self._answering = None
+            self._absent.clear()
+            self._types.clear()
             for inbox in self._inboxes:
                 inbox.put(_Reboot())
 

@@ -18,6 +18,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.boot_clock import BootClock
 from companion.autopilot.commands import Commands
+from companion.autopilot.latch import Latch, is_aircraft
+from companion.autopilot.standing_requests import StandingRequests
 from companion.links.mavlink import MavlinkLink, Message, Unsubscribe
 
 logger = logging.getLogger(__name__)
@@ -31,39 +33,25 @@ HEARTBEAT_RATE_HZ: Final = 5.0
 FRESH_WITHIN_S: Final = 0.3
 """An autopilot that sends heartbeats on request does so within 20 ms of it; slow radios need more."""
 
+_OVERDUE_S: Final = 1.1
 _TICK_S: Final = 0.5
 _STALL_S: Final = 1.0
-_ADOPT_OTHER_COMPONENT_S: Final = 2.0
+_CONFLICT_S: Final = 5.0
+"""So long after the last sign of a second autopilot under our vehicle's ids nothing is believed of either."""
+_RESTARTS_S: Final = 1.0
+"""No autopilot restarts twice in that time: two whose times since boot alternate do."""
 _EARLIEST_UNIX_TIME_S: Final = 1577836800.0  # 2020: a clock before that has not been set
-
-_NOT_AIRCRAFT: Final = frozenset(
-    {
-        mavlink.MAV_TYPE_ANTENNA_TRACKER,
-        mavlink.MAV_TYPE_GCS,
-        mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
-        mavlink.MAV_TYPE_GIMBAL,
-        mavlink.MAV_TYPE_ADSB,
-        mavlink.MAV_TYPE_CAMERA,
-        mavlink.MAV_TYPE_CHARGING_STATION,
-        mavlink.MAV_TYPE_FLARM,
-        mavlink.MAV_TYPE_SERVO,
-        mavlink.MAV_TYPE_ODID,
-        mavlink.MAV_TYPE_BATTERY,
-        mavlink.MAV_TYPE_PARACHUTE,
-        mavlink.MAV_TYPE_LOG,
-        mavlink.MAV_TYPE_OSD,
-        mavlink.MAV_TYPE_IMU,
-        mavlink.MAV_TYPE_GPS,
-        mavlink.MAV_TYPE_WINCH,
-        mavlink.MAV_TYPE_ILLUMINATOR,
-        mavlink.MAV_TYPE_GRIPPER,
-    }
-)
 
 Firmware = Literal["ardupilot", "px4", "other"]
 VehicleEvent = Literal["armed", "disarmed", "lost", "found", "rebooted"]
 """What `Vehicle.watch` tells. "found": latched, or heard again after "lost". "armed" and "disarmed": the heartbeat
 says so and the one before, if any, said otherwise; so the first heartbeat of all brings "found" and one of them."""
+
+
+_FIRMWARES: Final[dict[int, Firmware]] = {
+    mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot",
+    mavlink.MAV_AUTOPILOT_PX4: "px4",
+}
 
 
 class ArmState(enum.Enum):
@@ -84,17 +72,6 @@ class Position:
     source: str
 
 
-@dataclasses.dataclass(slots=True)
-class _Wanted:
-    """A message that is asked for again whenever it stays away."""
-
-    message: type[Message]
-    rate_hz: float
-    heard_s: float = -math.inf
-    asked_s: float = -math.inf
-    pause_s: float = 3.0
-
-
 class Vehicle:
     """The one autopilot that is calibrated.
 
@@ -113,6 +90,8 @@ class Vehicle:
         self.firmware: Firmware | None = None
         self.version: str | None = None
         """Such as "4.6.1" or "4.8.0-dev"; None until AUTOPILOT_VERSION has come."""
+        self.capabilities: int | None = None
+        """MAV_PROTOCOL_CAPABILITY bits; None until AUTOPILOT_VERSION has come."""
         self.system_status: int | None = None
         """MAV_STATE of the last heartbeat."""
         self.boots = 0
@@ -120,19 +99,19 @@ class Vehicle:
         self.position: Position | None = None
         self.commands = Commands(link, self._target)
         self._link = link
-        self._configured_system_id = system_id
+        self._latch = Latch(system_id)
         self._heartbeat_s: float | None = None
         self._armed: bool | None = None
+        self._conflict_s = self._restarted_s = -math.inf
         self._lost = True
         self._trusted_from_s = -math.inf
-        self._candidates: dict[tuple[int, int], float] = {}
         self._boot_clock = BootClock()
         self._unix_minus_loop_s: float | None = None
         self._watchers: list[Callable[[VehicleEvent], None]] = []
         self._found = asyncio.Event()
         self._heartbeat_waiters: list[asyncio.Event] = []
         self._boot_time_heard = asyncio.Event()
-        self._wanted: list[_Wanted] = []
+        self._wanted = StandingRequests(self.commands)
         self._version_asked_s, self._version_pause_s = -math.inf, 2.0
         self._lost_timer: asyncio.TimerHandle | None = None
         self._tick_timer: asyncio.TimerHandle | None = None
@@ -155,7 +134,7 @@ class Vehicle:
     @property
     def arm_state(self) -> ArmState:
         """ARMED or DISARMED by a heartbeat of the latched autopilot younger than 2 s, else UNKNOWN."""
-        if self._lost or self._armed is None or self._heartbeat_s is None:
+        if self._lost or self._armed is None or self._heartbeat_s is None or self.conflict is not None:
             return ArmState.UNKNOWN
         now_s = asyncio.get_running_loop().time()
         # After a stall of our own loop the next heartbeats read are old ones that waited in a buffer.
@@ -163,6 +142,13 @@ class Vehicle:
         if stalled or now_s - self._heartbeat_s >= HEARTBEAT_TIMEOUT_S:
             return ArmState.UNKNOWN
         return ArmState.ARMED if self._armed else ArmState.DISARMED
+
+    @property
+    def conflict(self) -> str | None:
+        """What is wrong when two autopilots speak under the ids of one; then the arm state is UNKNOWN."""
+        if asyncio.get_running_loop().time() - self._conflict_s >= _CONFLICT_S:
+            return None
+        return f"two autopilots have system id {self.system_id}"
 
     @property
     def alive(self) -> bool:
@@ -192,6 +178,19 @@ class Vehicle:
         words = {"ardupilot": "ArduPilot", "px4": "PX4"}.get(self.firmware or "", "autopilot")
         return f"{words}{' ' + self.version if self.version else ''}, system {self.system_id}"
 
+    @property
+    def integers_bytewise(self) -> bool:
+        """Whether integer parameters travel as the bytes of an int32 in the float field, not as a number.
+
+        By the capability bit; else by who it is: older PX4 and ArduPilot set neither bit (autopilots 7.5).
+        """
+        if self.capabilities is not None:
+            if self.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE:
+                return True
+            if self.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST:
+                return False
+        return self.firmware == "px4"
+
     def sent(self, message: Message) -> bool:
         """Whether a message came from the latched autopilot."""
         return self._target() == (message.get_srcSystem(), message.get_srcComponent())
@@ -205,6 +204,11 @@ class Vehicle:
                 self._watchers.remove(callback)
 
         return unsubscribe
+
+    @property
+    def boot_s(self) -> float | None:
+        """Its time since boot as it was heard last."""
+        return self._boot_clock.latest_s
 
     async def hear_boot_time(self, timeout_s: float = 1.0) -> bool:
         """Ask for the time since boot and wait for it; afterwards `boots` counts every restart until now.
@@ -272,11 +276,11 @@ class Vehicle:
     # --- heartbeats
 
     def _on_heartbeat(self, message: mavlink.MAVLink_heartbeat_message, t_s: float) -> None:
-        if message.type in _NOT_AIRCRAFT or message.autopilot == mavlink.MAV_AUTOPILOT_INVALID:
+        if not is_aircraft(message):
             return
-        if self.system_id is None and self._may_latch(message, t_s):
-            self._latch(message)
-        if not self.sent(message):
+        if self.system_id is None and self._latch.takes(message, t_s):
+            self._take(message)
+        if not self.sent(message) or not self._is_ours(message):
             return
         was_lost, was_armed = self._lost, self._armed
         self._heartbeat_s = asyncio.get_running_loop().time()
@@ -293,30 +297,34 @@ class Vehicle:
         if self._armed != was_armed:
             self._tell("armed" if self._armed else "disarmed")
 
-    def _may_latch(self, message: mavlink.MAVLink_heartbeat_message, t_s: float) -> bool:
-        system, component = message.get_srcSystem(), message.get_srcComponent()
-        if self._configured_system_id not in (None, system) or system == 0:
-            return False
-        if component == mavlink.MAV_COMP_ID_AUTOPILOT1:
+    def _is_ours(self, message: mavlink.MAVLink_heartbeat_message) -> bool:
+        """Whether a heartbeat under our ids is our vehicle's; ArduPilot and PX4 both are system 1 out of the box."""
+        firmware = _FIRMWARES.get(message.autopilot, "other")
+        if firmware == self.firmware:
             return True
-        if message.autopilot not in (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4):
+        if firmware == "other":
+            return False  # some device that pretends; whether it is armed means nothing
+        if not self._lost:
+            self._notice_conflict()
             return False
-        first_s = self._candidates.setdefault((system, component), t_s)
-        return t_s - first_s >= _ADOPT_OTHER_COMPONENT_S
+        # Another firmware has been flashed while we heard nothing.
+        self.firmware = firmware
+        self._boot_clock = BootClock()
+        self._restarted()
+        return True
 
-    def _latch(self, message: mavlink.MAVLink_heartbeat_message) -> None:
+    def _notice_conflict(self) -> None:
+        now_s = asyncio.get_running_loop().time()
+        if now_s - self._conflict_s > _CONFLICT_S:
+            logger.error("%s: two autopilots have this system id; nothing is written to either", self.name)
+        self._conflict_s = now_s
+
+    def _take(self, message: mavlink.MAVLink_heartbeat_message) -> None:
         self.system_id = self._link.system_id = message.get_srcSystem()
         self.component_id = message.get_srcComponent()
-        firmwares: dict[int, Firmware] = {
-            mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot",
-            mavlink.MAV_AUTOPILOT_PX4: "px4",
-        }
-        self.firmware = firmwares.get(message.autopilot, "other")
-        self._candidates.clear()
-        self._wanted = [
-            _Wanted(mavlink.MAVLink_system_time_message, 1.0),
-            _Wanted(mavlink.MAVLink_global_position_int_message, 1.0),
-        ]
+        self.firmware = _FIRMWARES.get(message.autopilot, "other")
+        self._wanted.add(mavlink.MAVLink_system_time_message, 1.0)
+        self._wanted.add(mavlink.MAVLink_global_position_int_message, 1.0)
         self._tick()
 
     def _watch_for_loss(self) -> None:
@@ -347,43 +355,43 @@ class Vehicle:
 
     def _ask_soon(self) -> None:
         # What was streamed before a loss is gone if the autopilot restarted meanwhile.
-        for wanted in self._wanted:
-            wanted.asked_s, wanted.pause_s = -math.inf, 3.0
+        self._wanted.forget_asking()
         if self.firmware == "ardupilot":
             heartbeat_id: int = mavlink.MAVLINK_MSG_ID_HEARTBEAT
             self.commands.request_message_interval(heartbeat_id, HEARTBEAT_RATE_HZ)
         self._ask_for_missing(asyncio.get_running_loop().time())
 
     def _ask_for_missing(self, now_s: float) -> None:
-        for wanted in self._wanted:
-            silent = now_s - wanted.heard_s > 2.5 / wanted.rate_hz
-            if silent and now_s - wanted.asked_s > wanted.pause_s:
-                if wanted.asked_s > -math.inf:
-                    wanted.pause_s = min(2 * wanted.pause_s, 30.0)
-                wanted.asked_s = now_s
-                self.commands.request_message_interval(wanted.message.id, wanted.rate_hz)
+        overdue = self._heartbeat_s is not None and now_s - self._heartbeat_s > _OVERDUE_S
+        if overdue and self.firmware == "px4":
+            # Its heartbeat cannot be had faster than once a second, so that after a single one that is lost nobody
+            # would know whether it is armed.
+            heartbeat_id: int = mavlink.MAVLINK_MSG_ID_HEARTBEAT
+            self.commands.request_message(heartbeat_id)
+        self._wanted.ask_for_missing(now_s)
         if self.version is None and now_s - self._version_asked_s > self._version_pause_s:
             self._version_asked_s = now_s
             self._version_pause_s = min(2 * self._version_pause_s, 60.0)
             self.commands.request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
-
-    def _heard(self, message: Message, t_s: float) -> None:
-        for wanted in self._wanted:
-            if wanted.message.msgname == message.get_type():
-                wanted.heard_s, wanted.pause_s = t_s, 3.0
 
     # --- what the other messages tell
 
     def _boot_time(self, boot_s: float, t_s: float) -> None:
         restarted = self._boot_clock.rebooted(boot_s, t_s)
         self._boot_time_heard.set()
-        if not restarted:
-            return
+        if restarted:
+            now_s = asyncio.get_running_loop().time()
+            if now_s - self._restarted_s < _RESTARTS_S:
+                self._notice_conflict()
+            self._restarted_s = now_s
+            self._restarted()
+
+    def _restarted(self) -> None:
         self.boots += 1
         self._armed = None  # the last heartbeat was of the time before
         self.position = None
         self._unix_minus_loop_s = None
-        self.version = None
+        self.version = self.capabilities = None
         self._version_asked_s, self._version_pause_s = -math.inf, 2.0
         self._ask_soon()
         self._tell("rebooted")
@@ -409,7 +417,7 @@ class Vehicle:
     def _on_system_time(self, message: mavlink.MAVLink_system_time_message, t_s: float) -> None:
         if not self.sent(message):
             return
-        self._heard(message, t_s)
+        self._wanted.heard(message, t_s)
         self._boot_time(message.time_boot_ms * 1e-3, t_s)
         unix_s = message.time_unix_usec * 1e-6
         self._unix_minus_loop_s = unix_s - t_s if unix_s > _EARLIEST_UNIX_TIME_S else None
@@ -417,11 +425,12 @@ class Vehicle:
     def _on_version(self, message: mavlink.MAVLink_autopilot_version_message, _t_s: float) -> None:
         if self.sent(message):
             self.version = _version_text(message.flight_sw_version)
+            self.capabilities = message.capabilities
 
     def _on_global_position(self, message: mavlink.MAVLink_global_position_int_message, t_s: float) -> None:
         if not self.sent(message):
             return
-        self._heard(message, t_s)
+        self._wanted.heard(message, t_s)
         self._boot_time(message.time_boot_ms * 1e-3, t_s)
         position = _position(message.lat, message.lon, message.alt, "autopilot GLOBAL_POSITION_INT")
         if position is not None:

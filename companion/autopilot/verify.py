@@ -49,7 +49,7 @@ class Observation:
     after: Vector
     after_sigma: Vector
     expected_step: Vector
-    """What the output had to move by (`ardupilot.output_step`)."""
+    """What the output had to move by (`imu_calibration.output_step`)."""
     truth: Vector
     """What the sensor had to read."""
     tolerance: float

@@ -11,12 +11,14 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import logging
-from collections.abc import Sequence
-from typing import Final, Literal
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.float32 import float32, same_float32
+from companion.autopilot.change import Change, FailureKind, RebootedWhileWritingError, WriteFailedError
+from companion.autopilot.float32 import same_float32
+from companion.autopilot.pace import let_pass, moment
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.vehicle import ArmState, Vehicle
 from companion.calibration.record import Outcome, WrittenParameter
@@ -28,7 +30,13 @@ from companion.errors import (
     ParameterRefusedError,
 )
 
+__all__ = ["Change", "ParameterWriter", "RebootedWhileWritingError", "WriteFailedError"]
+
 logger = logging.getLogger(__name__)
+
+HOLD_S: Final = 2.5
+"""So long a value on the way (`Change.via`) stays: PX4 looks at its parameters at most once a second (autopilots 9.2),
+and 2.5 s is what a real one was tried with (9.3.2)."""
 
 _LATE_ECHO_S: Final = 0.3
 """Let answers to earlier writes pass before reading back: ArduPilot answers to X with Y and Z, old ones, as well."""
@@ -45,60 +53,6 @@ _TELL_REBOOT_S: Final = 2.0
 _ROUNDS: Final = 2
 """How often putting back is tried; a late echo may have passed for a confirmation the first time."""
 
-FailureKind = Literal[
-    "refused",
-    "no answer",
-    "answered another value",
-    "armed in the middle",
-    "rebooted in the middle",
-    "arm state unknown",
-    "changed by someone else",
-    "cancelled",
-]
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Change:
-    """One parameter: the value it has, and the value it shall get. Both are rounded to float32."""
-
-    parameter: str
-    before: float
-    after: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "before", float32(self.before))
-        object.__setattr__(self, "after", float32(self.after))
-
-
-class WriteFailedError(AutopilotError):
-    """Why a set of parameters is not in force as a whole, and what is in force instead.
-
-    Attributes:
-        kind: the cause in a word.
-        written: every parameter of the set with its outcome: "rolled_back" (the old value is in force again),
-            "failed" (never written, or not put back: then it is in `left_changed` too, and `read_back` says what
-            is in force, None when that cannot be known).
-        left_changed: the parameters of which the old value is not, or not surely, in force.
-    """
-
-    def __init__(
-        self, kind: FailureKind, reason: str, written: dict[str, WrittenParameter], left_changed: tuple[str, ...]
-    ) -> None:
-        words = f"{kind}: {reason}"
-        if left_changed:
-            words += f"; NOT put back: {', '.join(left_changed)}"
-        elif any(parameter.outcome == "rolled_back" for parameter in written.values()):
-            words += "; the old values are back"
-        super().__init__(words)
-        self.kind: FailureKind = kind
-        self.reason = reason
-        self.written = written
-        self.left_changed = left_changed
-
-
-class RebootedWhileWritingError(WriteFailedError, AutopilotRebootedError):
-    """A WriteFailedError of kind "rebooted in the middle": what persisted was read again afterwards."""
-
 
 @dataclasses.dataclass(slots=True)
 class _Item:
@@ -106,6 +60,8 @@ class _Item:
 
     change: Change
     sent: bool = False
+    confirmed: bool = False
+    """The autopilot has answered with a value of ours: another one found later is somebody else's."""
     read_back: float | None = None
     outcome: Outcome = "failed"
     left: bool = False
@@ -135,8 +91,15 @@ class ParameterWriter:
         self._boots = 0
         self._give_up_s = self._deadline_s = 0.0
 
-    async def apply(self, changes: Sequence[Change]) -> dict[str, WrittenParameter]:
+    async def apply(
+        self, changes: Sequence[Change], on_the_way: Callable[[], Awaitable[str | None]] | None = None
+    ) -> dict[str, WrittenParameter]:
         """Write all changes or none; a parameter that already has its new value is not written again.
+
+        Args:
+            changes: the whole set.
+            on_the_way: called while the values on the way (`Change.via`) are in force, of which it may look at the
+                effect; what it returns is a reason to put everything back.
 
         Returns:
             Every parameter as "stored": read back afresh, its effect not yet looked at.
@@ -151,8 +114,10 @@ class ParameterWriter:
             items = self._begin(changes)
             try:
                 await self._check_before(items)
+                await self._write_on_the_way(items, on_the_way)
                 for item in items:
-                    await self._write(item)
+                    if item.change.before != item.change.after or item.sent:
+                        await self._write(item, item.change.after)
                 await self._read_back(items)
                 await self._check_end()
             except _Failure as failure:
@@ -199,7 +164,7 @@ class ParameterWriter:
             NotDisarmedError, WriteFailedError, asyncio.CancelledError: as `apply`; "rolled_back" in the
                 error then means that the value from before the undo is in force.
         """
-        swapped = [Change(change.parameter, change.after, change.before) for change in reversed(changes)]
+        swapped = [dataclasses.replace(c, before=c.after, after=c.before) for c in reversed(changes)]
         done = await self.apply(swapped)
         self.written = {
             change.parameter: WrittenParameter(
@@ -239,18 +204,32 @@ class ParameterWriter:
                     f"{name} is {_words(now)} now but was {_words(before)} when it was measured; nothing was written",
                 )
 
-    async def _write(self, item: _Item) -> None:
-        change = item.change
-        if change.before == change.after:
+    async def _write_on_the_way(
+        self, items: list[_Item], on_the_way: Callable[[], Awaitable[str | None]] | None
+    ) -> None:
+        indirect = [(item, item.change.via) for item in items if item.change.via is not None]
+        for item, via in indirect:
+            await self._write(item, via)
+        if not indirect:
             return
+        written = moment(self._vehicle)
+        wrong = None if on_the_way is None else await on_the_way()
+        await let_pass(self._vehicle, written, HOLD_S)
+        await self._check_end()
+        if wrong is not None:
+            raise _Failure("not as believed", wrong)
+
+    async def _write(self, item: _Item, value: float) -> None:
+        name = item.change.parameter
         sent_before = self._parameters.writes
         try:
-            await self._parameters.write(change.parameter, change.after)
+            await self._parameters.write(name, value)
+            item.confirmed = True
         except AutopilotError as error:
             raise self._failure(error) from error
         finally:
-            item.sent = self._parameters.writes > sent_before
-        self._check_boot(f"after {change.parameter} was written")
+            item.sent |= self._parameters.writes > sent_before
+        self._check_boot(f"after {name} was written")
 
     async def _read_back(self, items: list[_Item]) -> None:
         await asyncio.sleep(_LATE_ECHO_S)
@@ -261,9 +240,8 @@ class ParameterWriter:
                 await asyncio.sleep(_LATE_ECHO_S)
                 item.read_back = await self._read(name)
             if not same_float32(item.read_back, wanted):
-                raise _Failure(
-                    "answered another value", f"{name} was set to {_words(wanted)} and reads {_words(item.read_back)}"
-                )
+                kind: FailureKind = "changed by someone else" if item.confirmed else "answered another value"
+                raise _Failure(kind, f"{name} was set to {_words(wanted)} and reads {_words(item.read_back)}")
 
     async def _check_end(self) -> None:
         await self._vehicle.hear_boot_time()
@@ -310,6 +288,11 @@ class ParameterWriter:
             self._give_up_s = asyncio.get_running_loop().time() + _RECOVERY_S
             if await self._wait_disarmed():
                 await self._vehicle.hear_boot_time(_TELL_REBOOT_S)
+        elif kind in ("answered another value", "changed by someone else", "no answer") and any(
+            item.sent for item in items
+        ):
+            # Another value may be that of a start-up calibration, which is not ours to overwrite.
+            await self._vehicle.hear_boot_time()
         if self._vehicle.boots != self._boots and kind != "rebooted in the middle":
             kind, reason = "rebooted in the middle", f"{self._vehicle.name} restarted ({reason})"
         await self._put_back(items, leave_foreign=kind == "rebooted in the middle")
@@ -327,8 +310,14 @@ class ParameterWriter:
                 remaining = [item for item in touched if item.left]
                 if not remaining:
                     break
+                foreign = leave_foreign or self._vehicle.boots != self._boots
+                indirect = [(item, item.change.via) for item in remaining if item.change.via is not None]
+                for item, via in indirect:
+                    await self._put_back_one(item, via, leave_foreign=foreign)
+                if indirect and self._vehicle.alive and not self._late():
+                    await asyncio.sleep(HOLD_S)
                 for item in remaining:
-                    await self._put_one_back(item, leave_foreign=leave_foreign or self._vehicle.boots != self._boots)
+                    await self._put_back_one(item, item.change.before, leave_foreign=foreign)
                 await asyncio.sleep(_LATE_ECHO_S)
                 for item in touched:
                     item.read_back = await self._look(item.change.parameter)
@@ -337,17 +326,19 @@ class ParameterWriter:
         finally:
             self._publish(items)
 
-    async def _put_one_back(self, item: _Item, *, leave_foreign: bool) -> None:
+    async def _put_back_one(self, item: _Item, value: float, *, leave_foreign: bool) -> None:
+        """Set one parameter to its old value, or to the one on the way to it."""
         change = item.change
         if not await self._wait_disarmed() or self._late():
             return
-        if leave_foreign:
-            # What is neither ours nor the old value came from a start-up calibration or another ground station.
+        if leave_foreign or item.confirmed:
+            # What is neither ours nor the old value came from a start-up calibration or another ground station. Of a
+            # value that was never confirmed nobody knows: it may be what the autopilot has made of ours.
             now = await self._look(change.parameter)
-            if not _same(now, change.after):
+            if not any(_same(now, ours) for ours in change.ours) and (leave_foreign or now is not None):
                 return
         try:
-            await self._parameters.write(change.parameter, change.before)
+            await self._parameters.write(change.parameter, value)
         except AutopilotError as error:
             logger.warning("%s is not put back yet: %s", change.parameter, error)
 
@@ -383,7 +374,7 @@ class ParameterWriter:
             return "arm state unknown"
         if any(item.left and item.read_back is None for item in items):
             return "no answer"
-        foreign = any(item.left and not _same(item.read_back, item.change.after) for item in items)
+        foreign = any(item.left and not any(_same(item.read_back, own) for own in item.change.ours) for item in items)
         return "changed by someone else" if foreign else "answered another value"
 
     def _publish(self, items: list[_Item]) -> dict[str, WrittenParameter]:

@@ -166,3 +166,15 @@ def student_ratio(freedom: float) -> float:
     if freedom <= 0.0:
         return 3.0
     return min(1.0 + 1.210 / freedom + 1.441 / freedom**2, 3.0)
+
+
+def white_noise(slots: NDArray[np.int64], values: Floats) -> Floats:
+    """N of every column from the Allan deviation between neighbouring seconds, widened for few degrees of freedom.
+
+    Falls back on the scatter of the means where no two seconds are neighbours (a gradienter slower than 1 Hz).
+    """
+    variance, freedom = allan_variance(slots, values, 1)
+    if freedom == 0.0:
+        freedom = float(len(values) - 1)
+        variance = values.var(axis=0, ddof=1) if len(values) > 1 else np.zeros(values.shape[1])
+    return np.asarray(np.sqrt(variance) * student_ratio(freedom))

@@ -20,12 +20,25 @@ Floats = NDArray[np.float64]
 MAX_SAMPLES: Final = 4096
 """Kept of one slot; what comes beyond is dropped and counted. Ten times the fastest stream."""
 
+MAX_LEVELS: Final = 1024
+"""Integers between the lowest and the highest of one second that are counted one by one; at rest it is a tenth."""
+
 _MAX_TIME_S: Final = 1e12
 _BACKWARD_SAMPLES: Final = 20
 """So many samples in a row from the past mean that the clock went back, not that some were late."""
 _BACKWARD_S: Final = 2.0
 _PINNED_SAMPLES: Final = 5
 _PINNED_DISTINCT: Final = 8
+_PINNED_SIGMAS: Final = 4.0
+
+
+class Counts(msgspec.Struct, frozen=True):
+    """How often every integer came in one second."""
+
+    lowest: NDArray[np.int64]
+    """(c,) integer of the first row, in steps of the stream."""
+    table: NDArray[np.int32]
+    """(k, c), k at most `MAX_LEVELS`."""
 
 
 class Batch(msgspec.Struct, frozen=True):
@@ -50,6 +63,8 @@ class Batch(msgspec.Struct, frozen=True):
     missing: int | None
     """By the device's sequence counter or clock; None where it has neither."""
     temperature_degc: float | None
+    counts: Counts | None = None
+    """Of a stream of integers; None for floats, and for a second that spans more than `MAX_LEVELS`."""
 
 
 class BatchSource:
@@ -60,6 +75,9 @@ class BatchSource:
         keep: how many batches are kept; the oldest go first.
         circle: the single channel is an angle in degrees on [0, 360); means are taken on the circle.
     """
+
+    steps: NDArray[np.float64] | None = None
+    """(c,) of a stream of integers, of which every second keeps how often each one came; None for floats."""
 
     def __init__(self, limits: tuple[float, ...], keep: int, *, circle: bool = False) -> None:
         self.dropped: Counter[str] = Counter()
@@ -206,7 +224,20 @@ class BatchSource:
             largest_gap_s=float(gaps.max()),
             missing=_missing(stamps),
             temperature_degc=self._temperature_sum / self._temperature_count if self._temperature_count else None,
+            counts=None if self.steps is None else _counts(rows, self.steps),
         )
+
+
+def _counts(rows: Floats, steps: Floats) -> Counts | None:
+    integers = np.rint(rows / steps).astype(np.int64)
+    lowest = integers.min(axis=0)
+    place = integers - lowest
+    levels = int(place.max()) + 1
+    if levels > MAX_LEVELS:
+        return None
+    width = rows.shape[1]
+    flat = np.bincount((place * width + np.arange(width)).ravel(), minlength=levels * width)
+    return Counts(lowest, flat.reshape(levels, width).astype(np.int32))
 
 
 def _unrolled(rows: Floats) -> Floats:
@@ -246,10 +277,11 @@ def _missing(stamps: Floats | None) -> int | None:
 
 
 def _clipped(ordered: Floats, distinct: NDArray[np.int64]) -> bool:
-    """Whether some channel's commonest value is its lowest or its highest.
+    """Whether some channel's lowest or highest value is by far its commonest.
 
     Noise thins out towards its ends; a pile at an end is the end of the range. Few distinct values prove nothing:
-    a quantised stream of a still sensor looks like that.
+    a quantised stream of a still sensor looks like that. And of 50 integers the lowest is the commonest by chance now
+    and then, so that it must be so by four standard deviations of such counts.
     """
     if len(ordered) <= _PINNED_SAMPLES:
         return False
@@ -260,5 +292,7 @@ def _clipped(ordered: Floats, distinct: NDArray[np.int64]) -> bool:
     for channel in suspects:
         _, counts = np.unique(ordered[:, channel], return_counts=True)
         if counts.argmax() in {0, len(counts) - 1}:
-            return True
+            pile, next_most = np.sort(counts)[[-1, -2]]
+            if pile > next_most + _PINNED_SIGMAS * math.sqrt(next_most):
+                return True
     return False

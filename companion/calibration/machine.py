@@ -40,6 +40,7 @@ class Event(enum.Enum):
     WRITE = "biases to write"
     NOTHING_TO_WRITE = "nothing to write"
     WRITTEN = "read back"
+    AGAIN = "not the right IMU"
     VERIFIED = "seen in the telemetry"
     RESTORED = "old values back"
     FAULT = "fault"
@@ -59,6 +60,8 @@ TRANSITIONS: Final[dict[tuple[State, Event], State]] = {
     (State.SOLVING, Event.WRITE): State.WRITING,
     (State.SOLVING, Event.NOTHING_TO_WRITE): State.DONE,
     (State.WRITING, Event.WRITTEN): State.VERIFYING,
+    # What was written acts on another IMU than believed; it is put back, and now it is known.
+    (State.WRITING, Event.AGAIN): State.WAITING,
     (State.WRITING, Event.RESTORED): State.DONE,
     (State.VERIFYING, Event.VERIFIED): State.DONE,
     **{(state, Event.FAULT): State.FAILED for state in State if state not in RESTING},

@@ -76,6 +76,29 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     written: dict[str, WrittenParameter] = {}
 
 
+class Arming(msgspec.Struct, frozen=True, kw_only=True):
+    """What was in force when the aircraft armed.
+
+    "calibrated": by the calibration that began at `calibration`. "checked": offsets of unknown origin, measured to be
+    right. "uncalibrated": neither; `reason` says why.
+    """
+
+    armed_at: str
+    """UTC, ISO 8601; the host's clock."""
+    state: Literal["calibrated", "checked", "uncalibrated"]
+    reason: str
+    """As it was said to the ground station."""
+    at_arm: Literal["gate", "warn", "off"]
+    calibration: str | None
+    """`started_at` of the record that was in force, wholly or in part."""
+    calibrated_ago_s: float | None
+    confirmed_ago_s: float | None
+    """Since a still window last agreed with the offsets in force."""
+    gyro_sigma_use_rad_s: float | None
+    """The largest of all axes in force."""
+    accel_sigma_use_m_s2: float | None
+
+
 class Record(msgspec.Struct, frozen=True, kw_only=True):
     """One calibration, finished in whatever way."""
 
@@ -89,6 +112,12 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     pose: Pose | None
     site: Site | None
     imus: tuple[ImuRecord, ...]
+    system_id: int | None = None
+    """MAVLink system of the vehicle; None while it had not been heard."""
+    undone_at: str | None = None
+    """UTC, ISO 8601: when what this calibration has written was put back on request."""
+    armings: tuple[Arming, ...] = ()
+    """Armings while this calibration was in force; empty in the file, filled in by the history."""
 
 
 def to_json(record: Record) -> bytes:

@@ -32,28 +32,30 @@ def _scale(residual: Floats) -> Floats:
     return np.asarray(np.where(mad > _EQUAL * mean, mad, mean))
 
 
-def _weights(residual: Floats, scale: Floats) -> Floats:
-    limit = HUBER_C * scale
+def _weights(residual: Floats, scale: Floats, c: Floats | float) -> Floats:
+    limit = c * scale
     size = np.abs(residual)
     # A column of equal values has scale zero: every weight is one.
     return np.asarray(limit / np.where(size > limit, size, np.where(limit > 0.0, limit, 1.0)) + (limit == 0.0))
 
 
-def huber_mean(values: Floats) -> Floats:
+def huber_mean(values: Floats, c: Floats | float = HUBER_C, least: Floats | float = 0.0) -> Floats:
     """Huber's location of every column.
 
     Args:
         values: (m, c), m >= 1.
+        c: one or (c,), scales beyond which a value counts less.
+        least: one or (c,), the scale is at least this.
 
     Returns:
         (c,) in the unit of the values.
     """
     centre = np.median(values, axis=0)
-    scale = _scale(values - centre)
+    scale = np.maximum(_scale(values - centre), least)
     scale = np.where(scale > 0.0, scale, 1.0)
     for _ in range(_ROUNDS):
         residual = values - centre
-        weight = _weights(residual, scale)
+        weight = _weights(residual, scale, c)
         step = (weight * residual).sum(axis=0) / weight.sum(axis=0)
         centre = centre + step
         if bool(np.all(np.abs(step) <= _CONVERGED * scale)):
@@ -76,13 +78,17 @@ class Line(msgspec.Struct, frozen=True):
     """(c,) variance of `end` over the variance of one value: about 4/m, against 1/m for a mean."""
 
 
-def huber_line(times_s: Floats, values: Floats, end_s: float) -> Line:
+def huber_line(
+    times_s: Floats, values: Floats, end_s: float, c: Floats | float = HUBER_C, least: Floats | float = 0.0
+) -> Line:
     """Huber's line through every column, evaluated at the window's end and not a second later.
 
     Args:
         times_s: (m,) ascending, m >= 3.
         values: (m, c).
         end_s: where the line is evaluated.
+        c: as for `huber_mean`.
+        least: as for `huber_mean`.
     """
     count = values.shape[0]
     time = (times_s - times_s.mean())[:, None]
@@ -92,10 +98,10 @@ def huber_line(times_s: Floats, values: Floats, end_s: float) -> Line:
     half = count // 2
     slope = np.median((values[-half:] - values[:half]) / (times_s[-half:] - times_s[:half])[:, None], axis=0)
     level = np.median(values - slope * time, axis=0)
-    scale = _scale(values - level - slope * time)
+    scale = np.maximum(_scale(values - level - slope * time), least)
     for _ in range(_ROUNDS):
         residual = values - level - slope * time
-        weight = _weights(residual, scale)
+        weight = _weights(residual, scale, c)
         total = weight.sum(axis=0)
         centre = (weight * time).sum(axis=0) / total
         spread = (weight * np.square(time - centre)).sum(axis=0)

@@ -14,25 +14,17 @@ import msgspec
 import numpy as np
 
 from companion.calibration.batches import Batch
+from companion.calibration.pose_windows import HeadingWindow, TiltWindow, heading_window, tilt_window
 from companion.calibration.sources import Source, SourceStatus, compass_source, gradienter_source, imu_source
 from companion.calibration.stillness import ImuGate, Verdict
 from companion.calibration.stop import Settings, expected_s, is_enough
 from companion.calibration.stretch import Stretch
-from companion.calibration.windows import (
-    HeadingWindow,
-    ImuEstimate,
-    ImuInput,
-    ImuWindow,
-    TiltWindow,
-    Window,
-    heading_window,
-    imu_estimates,
-    tilt_window,
-)
+from companion.calibration.windows import ImuEstimate, ImuInput, ImuWindow, Window, imu_estimates, integer_steps
 from companion.errors import CalibrationRefusedError
 from companion.samples import CompassSample, ImuSample, TiltSample
 
 __all__ = [
+    "Glance",
     "HeadingWindow",
     "ImuInput",
     "ImuWindow",
@@ -67,6 +59,19 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     sources: tuple[SourceStatus, ...]
     restarted_because: str
     """Argument of the last reset; empty before any."""
+
+
+class Glance(msgspec.Struct, frozen=True, kw_only=True):
+    """What can be said of the stillness at once, without looking at the readings themselves."""
+
+    obstacle: str | None
+    """What is in the way at this moment, however long it has been still: it moves, or a source is silent or stuck."""
+    moving: bool
+    """Whether the obstacle is a movement, which a hand can end, and no fault."""
+    still_s: float
+    """As in `Status`."""
+    steady_s: float
+    """Good seconds without a bad one until now."""
 
 
 class RollingCollector:
@@ -144,11 +149,13 @@ class RollingCollector:
         gate = ImuGate(imu.name, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2), prior)
         known = self._imus.get(imu.name)
         if known is None:
-            self._imus[imu.name] = imu_source(imu.name, gate, self._keep)
+            known = self._imus[imu.name] = imu_source(imu.name, gate, self._keep)
+            known.batches.steps = integer_steps(imu)
             # It has no share in the seconds so far.
             self._break()
         else:
             known.gate = gate
+            known.batches.steps = integer_steps(imu)
             self.reset("another stream", imu.name)
 
     def retarget(self, settings: Settings) -> None:
@@ -184,6 +191,16 @@ class RollingCollector:
         self._break()
 
     # ------------------------------------------------------------------------------------------------- what is known
+
+    def glance(self, now_s: float) -> Glance:
+        """How still it is at `now_s`; costs a small part of what `status` does."""
+        self._advance(now_s)
+        return Glance(
+            obstacle=self._obstacle(now_s),
+            moving=self._moving(now_s),
+            still_s=float(self._stretch.good),
+            steady_s=float(self._stretch.steady),
+        )
 
     def status(self, now_s: float) -> Status:
         """Where it stands at `now_s` (the samples' clock); closes seconds that are over."""
@@ -331,6 +348,14 @@ class RollingCollector:
             if words := source.verdict.words:
                 return words if source.verdict.fault else f"waiting for still: {words}"
         return f"hold still {self._min_good} s"
+
+    def _moving(self, now_s: float) -> bool:
+        """Whether nothing but a movement is in the way right now."""
+        sources = self._sources()
+        faulty = any(
+            source.silence(now_s) is not None or (source.verdict.fault and source.verdict.words) for source in sources
+        )
+        return not faulty and not self._stretch.good_now
 
     def _waiting_for(self, now_s: float) -> str | None:
         obstacle = self._obstacle(now_s)

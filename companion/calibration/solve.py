@@ -18,7 +18,7 @@ from companion.calibration.bias import accelerometer_bias, attitude_error_jacobi
 from companion.calibration.record import Pose, PoseSigma, Site
 from companion.calibration.request import What
 from companion.calibration.rolling import HeadingWindow, ImuWindow, TiltWindow, Window
-from companion.calibration.site import LocalEarth
+from companion.calibration.site import LocalEarth, Whereabouts, local_earth
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
 from companion.physics.gradienter import Law, up_in_sensor, up_jacobian
@@ -50,7 +50,7 @@ class CompassModel:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class ImuSolution:
-    """What is left in one IMU's output: mean minus truth, in vehicle FRD, shape (3,); None where not asked for.
+    """What is left in one IMU's output: mean minus truth, in vehicle FRD, shape (3,); None: not asked for or unknown.
 
     `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of the estimate as a prediction of the next
     minutes: sigma_use is the root of its diagonal.
@@ -65,6 +65,8 @@ class ImuSolution:
     accel_sigma_stat_m_s2: Array
     covariance: Matrix
     warnings: tuple[str, ...]
+    dithered: bool = False
+    """The telemetry was seen to follow this IMU's offsets step by step."""
 
     @property
     def gyro_sigma_use_rad_s(self) -> Array:
@@ -104,6 +106,8 @@ class Solution:
     site: Site
     imus: tuple[ImuSolution, ...]
     warnings: tuple[str, ...]
+    unknown: tuple[str, ...] = ()
+    """What was asked for and its readings do not tell, such as "gyro fc"; the IMU's warnings say why."""
 
 
 def solve(
@@ -132,14 +136,31 @@ def solve(
     if compass is None or window.heading is None:
         warnings.append("no compass: the horizontal part of the Earth's rate is unknown, gyro sigma widened")
     truth = _truth(window, gradienter if tilted is not None else None, compass, local, warnings)
-    return Solution(
-        pose=_pose(truth),
-        site=local.site,
-        imus=tuple(
-            _estimate(imu, truth, local, gyros=what.gyros, accelerometers=accelerometers) for imu in window.imus
-        ),
-        warnings=tuple(warnings),
-    )
+    imus = tuple(_estimate(imu, truth, local, gyros=what.gyros, accelerometers=accelerometers) for imu in window.imus)
+    if all(imu.gyro_rad_s is None and imu.accel_m_s2 is None for imu in imus):
+        refusals = [
+            words for imu in window.imus for words in _hidden(imu, gyros=what.gyros, accelerometers=accelerometers)
+        ]
+        if refusals:
+            raise CalibrationRefusedError("; ".join(refusals))
+    unknown = [f"gyro {imu.name}" for imu in window.imus if what.gyros and imu.refused("gyro")]
+    unknown += [f"accel {imu.name}" for imu in window.imus if accelerometers and imu.refused("accel")]
+    return Solution(pose=_pose(truth), site=local.site, imus=imus, warnings=tuple(warnings), unknown=tuple(unknown))
+
+
+def solve_at(
+    window: Window,
+    where: Whereabouts,
+    gradienter: GradienterModel | None,
+    compass: CompassModel | None,
+    what: What,
+) -> Solution:
+    """`solve`, with all that the place is needed for (the magnetic model takes the longest), in one call for a thread.
+
+    Raises:
+        CalibrationRefusedError: as `solve`.
+    """
+    return solve(window, local_earth(where), gradienter, compass, what)
 
 
 def _truth(
@@ -233,12 +254,19 @@ def _estimate(imu: ImuWindow, truth: Truth, local: LocalEarth, *, gyros: bool, a
         name=imu.name,
         samples=imu.samples,
         temperature_degc=imu.temperature_degc,
-        gyro_rad_s=gyro_bias(np.array(imu.gyro_rad_s), rate.mean) if gyros else None,
+        gyro_rad_s=gyro_bias(np.array(imu.gyro_rad_s), rate.mean) if gyros and imu.refused("gyro") is None else None,
         accel_m_s2=accelerometer_bias(np.array(imu.accel_m_s2), truth.up, local.gravity_m_s2)
-        if accelerometers
+        if accelerometers and imu.refused("accel") is None
         else None,
         gyro_sigma_stat_rad_s=np.array(imu.gyro_sigma_stat_rad_s),
         accel_sigma_stat_m_s2=np.array(imu.accel_sigma_stat_m_s2),
         covariance=covariance,
-        warnings=imu.warnings,
+        warnings=(*imu.warnings, *_hidden(imu, gyros=gyros, accelerometers=accelerometers)),
+        dithered=imu.dithered,
     )
+
+
+def _hidden(imu: ImuWindow, *, gyros: bool, accelerometers: bool) -> list[str]:
+    """What this IMU's readings do not tell, or not well, of what is asked for."""
+    asked = {"gyro": gyros, "accel": accelerometers}
+    return [hidden.words for part, hidden in imu.hidden.items() if asked[part]]

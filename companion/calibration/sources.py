@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Final, Literal
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from companion.calibration.batches import Batch, BatchSource
 from companion.calibration.stillness import ImuGate, PoseGate, Verdict, compass_gate, gradienter_gate
@@ -94,6 +96,13 @@ class Source:
 def imu_source(name: str, gate: ImuGate, keep: int) -> Source:
     """A source of six channels: gyro in rad/s, accelerometer in m/s^2."""
     return Source("imu", name, BatchSource(_LIMITS_IMU, keep), gate)
+
+
+def integer_batches(steps: NDArray[np.float64], keep: int) -> BatchSource:
+    """Seconds of an IMU's stream of truncated integers, (6,) steps in SI units, outside of a collector."""
+    batches = BatchSource(_LIMITS_IMU, keep)
+    batches.steps = steps
+    return batches
 
 
 def gradienter_source(keep: int) -> Source:

@@ -21,6 +21,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     target_gyro_sigma_rad_s: float
     target_accel_sigma_m_s2: float
     horizon_s: float = 180.0
+    dither: bool = False
+    """Integers that do not tell are measured in another way afterwards: more seconds of them are not waited for."""
 
     @property
     def min_slots(self) -> int:
@@ -36,7 +38,7 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
 def is_enough(settings: Settings, estimates: Sequence[ImuEstimate]) -> bool:
     """Whether every axis meets its target, or its white part is below 30 % of what averaging cannot remove."""
     return all(
-        bool(_done(triad.white_variance, triad.use_variance, np.asarray(target)).all())
+        bool(_done(triad.white_variance, triad.use_variance, np.asarray(target), _waited_for(settings, triad)).all())
         for triad, target in _triads(settings, estimates)
     )
 
@@ -54,7 +56,8 @@ def expected_s(settings: Settings, estimates: Sequence[ImuEstimate]) -> int:
         seconds,
         settings.horizon_s,
     )
-    done = _done(white, white + floor, np.repeat([target for _, target in triads], 3)).all(axis=1)
+    undecided = np.concatenate([_waited_for(settings, triad) for triad, _ in triads])
+    done = _done(white, white + floor, np.repeat([target for _, target in triads], 3), undecided).all(axis=1)
     return settings.min_slots + int(done.argmax()) if done.any() else settings.max_slots
 
 
@@ -63,5 +66,12 @@ def _triads(settings: Settings, estimates: Sequence[ImuEstimate]) -> list[tuple[
     return gyros + [(item.accel, settings.target_accel_sigma_m_s2) for item in estimates]
 
 
-def _done(white: NDArray[np.float64], use: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return np.asarray((use <= np.square(target)) | (white < WHITE_SHARE * (use - white)))
+def _waited_for(settings: Settings, triad: Estimate) -> NDArray[np.bool_]:
+    return triad.undecided & (not settings.dither)
+
+
+def _done(
+    white: NDArray[np.float64], use: NDArray[np.float64], target: NDArray[np.float64], undecided: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    enough = (white < WHITE_SHARE * (use - white)) & ~undecided
+    return np.asarray(np.where(undecided, np.isinf(target), use <= np.square(target)) | enough)

@@ -50,6 +50,11 @@ class Stretch:
         return True
 
     @property
+    def steady(self) -> int:
+        """Good seconds in a row until now."""
+        return next((k for k, good in enumerate(reversed(self.flags)) if not good), len(self.flags))
+
+    @property
     def good_now(self) -> bool:
         """Whether the latest second was good."""
         return bool(self.flags) and self.flags[-1]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, Literal
 
 import msgspec
 import numpy as np
@@ -19,9 +19,12 @@ from companion.calibration.allan import (
     NoiseProfile,
     allan_variance,
     floor_variance,
-    student_ratio,
+    white_noise,
 )
 from companion.calibration.batches import Batch
+from companion.calibration.integers import integer_columns
+from companion.calibration.pose_windows import HeadingWindow, TiltWindow
+from companion.calibration.quantised import EDGE_RMS
 from companion.calibration.robust import huber_line, huber_mean
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG_H, MG
@@ -42,7 +45,6 @@ _LOST_REFUSAL: Final = 0.5
 _USUAL_SHARE: Final = 0.95
 """A second that holds fewer samples than this share of the usual lost some; what is above is the grid's phase."""
 _TEMPERATURE_WARNING_K: Final = 3.0
-_MAX_DECIMALS: Final = 4
 _AXIS: Final = "xyz"
 
 
@@ -58,8 +60,34 @@ class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
     accel_step_m_s2: float = 0.0
     truncates: bool = False
     """Whether the stream truncates toward zero instead of rounding."""
+    gyro_grid_rad_s: float = 0.0
+    """Steps of its own that the sensor's readings had before they became integers of the stream; 0: much finer."""
+    accel_grid_m_s2: float = 0.0
     gyro_prior_rad_s: Axes | None = None
     """Bias known from before, in the sensor's axes and of this very stream; gates a steady turn at start."""
+
+
+def integer_steps(imu: ImuInput) -> Floats | None:
+    """(6,) steps of a stream of truncated integers, whose seconds must keep their counts; None for others."""
+    if not imu.truncates or imu.gyro_step_rad_s == imu.accel_step_m_s2 == 0.0:
+        return None
+    steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
+    return np.where(steps > 0.0, steps, 1.0)
+
+
+def _edges(imu: ImuInput) -> tuple[float, float]:
+    """Rms displacement of the integers' edges, in steps, by a grid below; each lies anywhere between two lines."""
+    pairs = ((imu.gyro_grid_rad_s, imu.gyro_step_rad_s), (imu.accel_grid_m_s2, imu.accel_step_m_s2))
+    gyro, accel = (grid / step / math.sqrt(12.0) if step > 0.0 else 0.0 for grid, step in pairs)
+    return gyro, accel
+
+
+class Hidden(msgspec.Struct, frozen=True):
+    """What the integer readings of one triad do not tell."""
+
+    words: str
+    useless: bool
+    """It is no measurement; else good to half a step."""
 
 
 class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
@@ -78,25 +106,16 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     accel_sigma_use_m_s2: Axes
     temperature_degc: float | None
     warnings: tuple[str, ...]
+    hidden: dict[Literal["gyro", "accel"], Hidden] = {}
+    """By triad, where the noise spreads the integers too little for a mean."""
 
+    dithered: bool = False
+    """Its means come from a dither, in which the telemetry followed every step of the offsets."""
 
-class TiltWindow(msgspec.Struct, frozen=True, kw_only=True):
-    """Means of the gradienter in its own axes; sigmas are statistical."""
-
-    samples: int
-    x_deg: float
-    y_deg: float
-    x_sigma_deg: float
-    y_sigma_deg: float
-    temperature_degc: float | None
-
-
-class HeadingWindow(msgspec.Struct, frozen=True, kw_only=True):
-    """Mean on the circle of the compass' heading in [0, 360); sigma is statistical."""
-
-    samples: int
-    heading_deg: float
-    sigma_deg: float
+    def refused(self, part: Literal["gyro", "accel"]) -> str | None:
+        """Why a triad's means are no measurement although they have a figure; None when they are one."""
+        found = self.hidden.get(part)
+        return found.words if found is not None and found.useless else None
 
 
 class Window(msgspec.Struct, frozen=True, kw_only=True):
@@ -124,6 +143,13 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     ramp_per_s: Floats
     """Zero where no ramp is significant."""
     half_step: NDArray[np.bool_]
+    """Fewer than 3 distinct readings; of a stream of integers, too few outside the two commonest."""
+    undecided: NDArray[np.bool_]
+    """Integers whose mean is unknown yet: more seconds may bring the rare reading that tells."""
+    useless: NDArray[np.bool_]
+    """Integers around zero whose mean is unknown: it says no more than that it is less than a step."""
+    edge_rms: Floats
+    """Of integers: displacement of their edges, in steps, for which sigma allows (`quantised.shape_variance`)."""
 
 
 class ImuEstimate(msgspec.Struct, frozen=True, kw_only=True):
@@ -132,18 +158,6 @@ class ImuEstimate(msgspec.Struct, frozen=True, kw_only=True):
     gyro: Estimate
     accel: Estimate
     window: ImuWindow
-
-
-def white_noise(slots: NDArray[np.int64], values: Floats) -> Floats:
-    """N of every column from the Allan deviation between neighbouring seconds, widened for few degrees of freedom.
-
-    Falls back on the scatter of the means where no two seconds are neighbours (a gradienter slower than 1 Hz).
-    """
-    variance, freedom = allan_variance(slots, values, 1)
-    if freedom == 0.0:
-        freedom = float(len(values) - 1)
-        variance = values.var(axis=0, ddof=1) if len(values) > 1 else np.zeros(values.shape[1])
-    return np.asarray(np.sqrt(variance) * student_ratio(freedom))
 
 
 def estimates(
@@ -163,27 +177,31 @@ def estimates(
     slots = np.array([batch.slot for batch in batches[0]], dtype=np.int64)
     values = _columns([[batch.mean for batch in item] for item in batches])
     seconds = float(len(slots))
-    mean = huber_mean(values)
+    steps = _per_axis([imu.gyro_step_rad_s for imu in imus], [imu.accel_step_m_s2 for imu in imus])
+    edges = np.repeat([_edges(imu) for imu in imus], 3)
+    whole = integer_columns(batches, steps, np.repeat([imu.truncates for imu in imus], 6), edges)
+    values = np.where(whole.of, whole.values, values)
+    mean = huber_mean(values, whole.huber_c, whole.least)
     leverage = np.full(values.shape[1], 1.0 / seconds)
     slope = np.zeros(values.shape[1])
     level: Floats = values
     if len(values) >= RAMP_BATCHES:
         times = slots.astype(np.float64) + 0.5
-        line = huber_line(times, values, end_s)
+        line = huber_line(times, values, end_s, whole.huber_c, whole.least)
         ramps = np.abs(line.t_statistic) > RAMP_T
         mean = np.where(ramps, line.end, mean)
         leverage = np.where(ramps, line.end_leverage, leverage)
         slope = np.where(ramps, line.slope, 0.0)
         level = values - slope * (times - times.mean())[:, None]
-    measured = white_noise(slots, level)
+    measured = np.maximum(white_noise(slots, level), whole.least)
     white = np.maximum(measured, _per_axis([m.white for m in gyros], [m.white for m in accels]))
     flicker = _flicker(slots, level, measured, _per_axis([m.flicker for m in gyros], [m.flicker for m in accels]))
     walk = _per_axis([m.walk for m in gyros], [m.walk for m in accels])
     quantum, half_step = _quantisation(
         batches,
-        _per_axis([imu.gyro_step_rad_s for imu in imus], [imu.accel_step_m_s2 for imu in imus]),
-        np.repeat([imu.truncates for imu in imus], 6),
+        steps,
     )
+    quantum, half_step = np.where(whole.of, whole.hidden, quantum), np.where(whole.of, whole.unknown, half_step)
     # Where a ramp is seen, the next H seconds lie between "it ends now" and "it goes on": the mean over them is off
     # by anything from nothing to slope * H / 2.
     going_on = np.square(slope * horizon_s / 2.0) / 3.0
@@ -202,6 +220,9 @@ def estimates(
             walk=walk[part],
             ramp_per_s=slope[part],
             half_step=half_step[part],
+            undecided=whole.unknown[part],
+            useless=whole.useless[part],
+            edge_rms=whole.edge_rms[part],
         )
 
     return [(triad(slice(at, at + 3)), triad(slice(at + 3, at + 6))) for at in range(0, 6 * len(imus), 6)]
@@ -229,13 +250,11 @@ def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: F
     return np.maximum(np.sqrt(more) / FLOOR_OF_FLICKER, profile)
 
 
-def _quantisation(
-    batches: Sequence[Sequence[Batch]], steps: Floats, truncates: NDArray[np.bool_]
-) -> tuple[Floats, NDArray[np.bool_]]:
-    """What the reading's steps may hide, as one sigma a column, and where there are fewer than 3 distinct values.
+def _quantisation(batches: Sequence[Sequence[Batch]], steps: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """What a rounded reading's steps may hide, as one sigma a column, and where there are fewer than 3 distinct values.
 
-    Half a step for truncation and for fewer than 3 distinct values; else, for rounding, the bound that noise of
-    sigma leaves, (q / pi) exp(-2 pi^2 sigma^2 / q^2) (method sections 2.2 and 2.5).
+    Half a step for fewer than 3 distinct values; else the bound that noise of sigma leaves, (q / pi) exp(-2 pi^2
+    sigma^2 / q^2) (method sections 2.2 and 2.5).
     """
     low = _columns([[batch.low for batch in item] for item in batches]).min(axis=0)
     high = _columns([[batch.high for batch in item] for item in batches]).max(axis=0)
@@ -247,7 +266,7 @@ def _quantisation(
     variance = _columns([[batch.variance for batch in item] for item in batches]).mean(axis=0)
     divisor = np.where(known, steps, 1.0)
     bound = steps / math.pi * np.exp(-2.0 * math.pi**2 * variance / np.square(divisor))
-    return np.where(few | (truncates & known), half, bound), few
+    return np.where(few, half, bound), few
 
 
 def imu_estimates(
@@ -286,6 +305,7 @@ def _imu_estimate(
         accel_sigma_use_m_s2=_turned(rotation, accel.use_variance),
         temperature_degc=float(np.mean(temperatures)) if temperatures else None,
         warnings=tuple(_warnings(imu, batches, gyro, accel, temperatures, rejected)),
+        hidden=_hidden(imu, gyro, accel),
     )
     return ImuEstimate(gyro=gyro, accel=accel, window=window)
 
@@ -326,6 +346,32 @@ def _lost(batches: Sequence[Batch]) -> float:
     return missing / (missing + came)
 
 
+def _hidden(imu: ImuInput, gyro: Estimate, accel: Estimate) -> dict[Literal["gyro", "accel"], Hidden]:
+    found: dict[Literal["gyro", "accel"], Hidden] = {}
+    part: Literal["gyro", "accel"]
+    for part, triad, size, grid, finer in (
+        ("gyro", gyro, f"{imu.gyro_step_rad_s / DEG_H:.0f} deg/h", imu.gyro_grid_rad_s, imu.gyro_grid_rad_s / DEG_H),
+        ("accel", accel, f"{imu.accel_step_m_s2 / MG:.1f} mg", imu.accel_grid_m_s2, imu.accel_grid_m_s2 / MG),
+    ):
+        if not triad.undecided.any():
+            if grid > 0.0 and (triad.edge_rms > EDGE_RMS).any():
+                found[part] = Hidden(
+                    f"{part} {imu.name}: the sensor has coarse steps of its own ({finer:.3g} {size.split()[1]}) below"
+                    " the integers, sigma widened; push.dither = true takes them away",
+                    useless=False,
+                )
+            continue
+        useless = bool(triad.useless.any())
+        axes = "".join(_AXIS[axis] for axis in range(3) if (triad.useless if useless else triad.undecided)[axis])
+        what = "around 0 the mean is not known" if useless else "up to half a step may be hidden, sigma widened"
+        found[part] = Hidden(
+            f"{part} {imu.name} {axes}: integer steps of {size} and too little noise for them, {what}; set"
+            " push.dither = true (or use IMU 1 where it sends HIGHRES_IMU)",
+            useless,
+        )
+    return found
+
+
 def _warnings(
     imu: ImuInput,
     batches: Sequence[Batch],
@@ -342,11 +388,13 @@ def _warnings(
         rate = float(np.abs(accel.ramp_per_s).max()) / MG * 60.0
         found.append(f"warm-up: accel {imu.name} drifts {rate:.2f} mg per minute")
     for part, triad in (("gyro", gyro), ("accel", accel)):
-        axes = "".join(_AXIS[axis] for axis in range(3) if triad.half_step[axis])
+        axes = "".join(_AXIS[axis] for axis in range(3) if triad.half_step[axis] and not triad.undecided[axis])
         if axes:
             found.append(f"{part} {imu.name} {axes}: fewer than 3 distinct readings, half a step may be hidden")
-    if imu.truncates:
-        found.append(f"imu {imu.name} sends truncated integers: half a step added to its sigmas")
+        axes = "".join(_AXIS[axis] for axis in range(3) if triad.edge_rms[axis] > EDGE_RMS)
+        if axes and not (imu.gyro_grid_rad_s if part == "gyro" else imu.accel_grid_m_s2):
+            why = "a coarser step inside the sensor?"
+            found.append(f"{part} {imu.name} {axes}: integers not spread like noise ({why}), sigma widened")
     if (lost := _lost(batches)) > _LOST_WARNING:
         found.append(f"imu {imu.name} lost {lost:.0%} of its samples")
     if rejected:
@@ -354,47 +402,3 @@ def _warnings(
     if temperatures and (span := max(temperatures) - min(temperatures)) > _TEMPERATURE_WARNING_K:
         found.append(f"temperature of imu {imu.name} moved by {span:.1f} K")
     return found
-
-
-def tilt_window(batches: Sequence[Batch]) -> TiltWindow:
-    """The gradienter's window from its good batches, at least one."""
-    mean, sigma = _pose_mean(batches, np.array([batch.mean for batch in batches]))
-    temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
-    return TiltWindow(
-        samples=sum(batch.n for batch in batches),
-        x_deg=float(mean[0]),
-        y_deg=float(mean[1]),
-        x_sigma_deg=float(sigma[0]),
-        y_sigma_deg=float(sigma[1]),
-        temperature_degc=float(np.mean(temperatures)) if temperatures else None,
-    )
-
-
-def heading_window(batches: Sequence[Batch]) -> HeadingWindow:
-    """The compass' window from its good batches, at least one."""
-    first = batches[0].mean
-    turned = np.array([np.mod(batch.mean - first + 180.0, 360.0) - 180.0 for batch in batches])
-    mean, sigma = _pose_mean(batches, turned)
-    return HeadingWindow(
-        samples=sum(batch.n for batch in batches),
-        heading_deg=float(np.mod(mean[0] + first[0], 360.0)),
-        sigma_deg=float(sigma[0]),
-    )
-
-
-def _pose_mean(batches: Sequence[Batch], values: Floats) -> tuple[Floats, Floats]:
-    slots = np.array([batch.slot for batch in batches], dtype=np.int64)
-    variance = np.square(white_noise(slots, values)) / len(values) + np.square(_resolution(batches)) / 12.0
-    return huber_mean(values), np.asarray(np.sqrt(variance))
-
-
-def _resolution(batches: Sequence[Batch]) -> Floats:
-    """Step of a reading that shows fewer than 3 values: their distance, or that of the last decimal it prints."""
-    low = np.min([batch.low for batch in batches], axis=0)
-    high = np.max([batch.high for batch in batches], axis=0)
-    few = np.max([batch.distinct for batch in batches], axis=0) < 3
-    decimal = np.full(len(low), 10.0**-_MAX_DECIMALS)
-    for digits in range(_MAX_DECIMALS - 1, -1, -1):
-        prints = (np.abs(low - np.round(low, digits)) < 1e-9) & (np.abs(high - np.round(high, digits)) < 1e-9)
-        decimal = np.where(prints, 10.0**-digits, decimal)
-    return np.where(few, np.where(high > low, high - low, decimal), 0.0)

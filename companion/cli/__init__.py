@@ -94,6 +94,11 @@ def _parser() -> argparse.ArgumentParser:
     check = add("check", local.check, "check configuration, ports, sensors and autopilot; say what is wrong")
     check.add_argument("--seconds", type=_seconds, default=3.0, metavar="S", help="how long to listen (default 3)")
     add("ports", local.ports, "list serial ports with their stable names")
+    add(
+        "lua",
+        local.lua,
+        "print the arming script for ArduPilot (> APM/scripts/companion_arming.lua), and how to install it",
+    )
     add("status", client.status, "what the daemon is doing")
     calibrate = add("calibrate", client.calibrate, "calibrate now (the aircraft must be disarmed and still)")
     what = calibrate.add_mutually_exclusive_group()
@@ -103,8 +108,14 @@ def _parser() -> argparse.ArgumentParser:
     calibrate.add_argument(
         "--timeout", type=_seconds, metavar="S", help="cancel when it has not finished by then (default: no limit)"
     )
+    calibrate.add_argument(
+        "--reboot", action="store_true", help="restart the autopilot afterwards (PX4's attitude needs it)"
+    )
     add("cancel", client.cancel, "cancel a running calibration")
-    add("undo", client.undo, "put the autopilot's values from before the last calibration back")
+    undo = add("undo", client.undo, "put the autopilot's values from before the last calibration back")
+    undo.add_argument(
+        "--force", action="store_true", help="leave what somebody else has changed since, and put the rest back"
+    )
     history = add("history", client.history, "list past calibrations")
     history.add_argument("-n", "--limit", type=_count, default=20, metavar="N", help="the latest N (default 20)")
     add("monitor", client.monitor, "watch the daemon until Ctrl-C")

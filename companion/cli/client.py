@@ -46,7 +46,13 @@ async def status(options: argparse.Namespace) -> int:
 async def calibrate(options: argparse.Namespace) -> int:
     """`companion calibrate`."""
     what = "gyros" if options.gyros else "accelerometers" if options.accelerometers else "both"
-    request = {"command": "calibrate", "what": what, "wait": options.wait, "timeout_s": options.timeout}
+    request = {
+        "command": "calibrate",
+        "what": what,
+        "wait": options.wait,
+        "timeout_s": options.timeout,
+        "reboot": options.reboot,
+    }
     reply = await _request(options, request)
     if "record" in reply:
         record = reply["record"]
@@ -64,7 +70,7 @@ async def cancel(options: argparse.Namespace) -> int:
 
 async def undo(options: argparse.Namespace) -> int:
     """`companion undo`."""
-    reply = await _request(options, {"command": "undo"})
+    reply = await _request(options, {"command": "undo", "force": options.force})
     answer = {key: reply.get(key) for key in ("state", "reason", "written")}
     return _finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=answer["state"] == "done")
 
@@ -73,7 +79,9 @@ async def history(options: argparse.Namespace) -> int:
     """`companion history`."""
     reply = await _request(options, {"command": "history", "limit": options.limit})
     records = reply.get("records", [])
-    return _finish(options, reply, {"records": records}, show.history_lines(records), good=True)
+    armings = reply.get("armings", [])
+    answer = {"records": records, "armings": armings}
+    return _finish(options, reply, answer, show.history_lines(records, armings), good=True)
 
 
 async def monitor(options: argparse.Namespace) -> int:

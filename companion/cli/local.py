@@ -41,6 +41,20 @@ async def ports(options: argparse.Namespace) -> int:
     return DONE
 
 
+async def lua(options: argparse.Namespace) -> int:
+    """`companion lua`: the script on stdout, the steps on stderr."""
+    from companion.lua import ARMING_SCRIPT, INSTALLATION
+
+    script = ARMING_SCRIPT.read_text(encoding="utf-8")
+    if getattr(options, "json", False):
+        print_json({"name": ARMING_SCRIPT.name, "script": script, "installation": list(INSTALLATION)})
+        return DONE
+    print(script, end="")
+    for number, step in enumerate(INSTALLATION, 1):
+        print(f"{number}. {step}", file=sys.stderr)
+    return DONE
+
+
 async def check(options: argparse.Namespace) -> int:
     """`companion check`."""
     from companion.daemon.check import run_check

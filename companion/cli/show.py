@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 Object = dict[str, Any]
 
+_VERDICTS = {"accept": "ready", "wait": "not yet", "refuse": "NOT ready"}
+
 
 def record_lines(record: Object) -> list[str]:
     """A record as a person reads it: outcome first, then pose, then one block an IMU."""
@@ -74,6 +76,15 @@ def status_lines(status: Object) -> list[str]:
     vehicle = status["vehicle"]
     lines.append(f"autopilot: {vehicle['summary']}")
     lines += [f"{device['name']}: {device['summary']}" for device in status["devices"]]
+    lines += [f"warning: {warning}" for warning in status["warnings"]]
+    if not status["ground_stations"]["good"]:
+        lines.append(f"ground stations: {status['ground_stations']['summary']}")
+    arming = status["arming"]
+    lines.append(
+        f"at arming ({arming['at_arm']}): {_VERDICTS[arming['verdict']]}"
+        + (f", {arming['words']}" if arming["verdict"] != "accept" else "")
+    )
+    lines.append(f"in force: {arming['in_force']}")
     last = status["last"]
     lines.append(
         "last calibration: "
@@ -82,16 +93,33 @@ def status_lines(status: Object) -> list[str]:
     return lines
 
 
-def history_lines(records: Sequence[Object]) -> list[str]:
-    """Past calibrations, one line each, newest first."""
+def history_lines(records: Sequence[Object], armings: Sequence[Object]) -> list[str]:
+    """Past calibrations and the latest armings, one line each, newest first."""
     if not records:
         return ["no calibrations yet"]
-    lines = [f"{'started (UTC)':20} {'state':10} {'took':>6}  what came of it"]
+    lines = [f"{'started (UTC)':20} {'vehicle':>7} {'state':10} {'took':>6}  what came of it"]
     lines += [
-        f"{record['started_at'][:19]:20} {record['state']:10} {record['duration_s']:5.0f}s  {record['reason']}"
+        f"{record['started_at'][:19]:20} {record.get('system_id') or '?':>7} {record['state']:10}"
+        f" {record['duration_s']:5.0f}s  {record['reason']}{_what_became(record)}"
         for record in records
     ]
+    if armings:
+        lines.append(f"{'armed (UTC)':20} in force")
+        lines += [
+            f"{arming['armed_at'][:19]:20} {'' if arming['state'] != 'uncalibrated' else 'UNCALIBRATED: '}"
+            f"{arming['reason']}"
+            for arming in armings
+        ]
     return lines
+
+
+def _what_became(record: Object) -> str:
+    """What a calibration has written, and whether that was taken back."""
+    written = sum(len(imu["written"]) for imu in record.get("imus", ()))
+    if not written or record["state"] != "done":
+        return ""
+    undone = record.get("undone_at")
+    return f"; {written} parameters written" + (f", undone {undone[:19]}" if undone else "")
 
 
 def port_lines(ports: Sequence[SerialPort]) -> list[str]:

@@ -188,7 +188,7 @@ class CommandServer:
             if isinstance(request, requests.Undo):
                 job = self._service.start_undo(requester)
             else:
-                job = self._service.start_calibration(request.what, requester)
+                job = self._service.start_calibration(request.what, requester, reboot=request.reboot)
         except Exception:
             logger.exception("starting %s failed", name.lower())
             self._refuse(key, mavlink.MAV_RESULT_FAILED, f"{name} failed: internal error, see the log", now_s)

@@ -7,10 +7,12 @@ import math
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.component.arm_authorisation import ArmAuthoriser
+from companion.component.arming_script import ArmingScript
 from companion.component.commands import CommandServer
 from companion.component.identity import heartbeat
 from companion.component.own_parameters import OwnParameters
-from companion.component.service import CalibrationService, VehicleView
+from companion.component.service import ArmGate, CalibrationService, VehicleView
 from companion.component.statustext import Severity, StatusText, Weight
 from companion.links.mavlink import MavlinkLink
 
@@ -22,10 +24,12 @@ class Component:
     """The companion on the MAVLink network.
 
     Everything is sent from `run`: when that loop stalls, so does the heartbeat, and the network can see it. Define
-    `parameters` before `run` starts.
+    `parameters` before `run` starts. Without a `gate` questions about arming are left unanswered.
     """
 
-    def __init__(self, link: MavlinkLink, vehicle: VehicleView, service: CalibrationService) -> None:
+    def __init__(
+        self, link: MavlinkLink, vehicle: VehicleView, service: CalibrationService, gate: ArmGate | None = None
+    ) -> None:
         self._link, self._vehicle, self._service = link, vehicle, service
         self._woken = asyncio.Event()
         self._known_as = link.system_id
@@ -34,6 +38,8 @@ class Component:
         self.texts = StatusText(link, self._woken.set)
         self.parameters = OwnParameters(link, self.texts.say, self._woken.set)
         self._commands = CommandServer(link, service, self.texts.say, self._woken.set)
+        self._authoriser = ArmAuthoriser(link, vehicle, gate, self.texts.say) if gate is not None else None
+        self._script = ArmingScript(link, vehicle, gate) if gate is not None else None
         self._unsubscribe = link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
 
     def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
@@ -54,6 +60,8 @@ class Component:
                     timer.cancel()
         finally:
             self._unsubscribe()
+            if self._authoriser is not None:
+                self._authoriser.close()
             self.parameters.close()
             self._commands.close(loop.time())
             self.texts.step(loop.time())
@@ -73,6 +81,7 @@ class Component:
                 self._next_heartbeat_s = now_s + _RETRY_S
         return min(
             self._next_heartbeat_s,
+            self._script.step(now_s) if self._script is not None else math.inf,
             self._commands.step(now_s),
             self.parameters.step(now_s),
             self.texts.step(now_s),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -31,9 +32,10 @@ class Command(NamedTuple):
 
 
 class Calibrate(NamedTuple):
-    """Measure and write biases."""
+    """Measure and write biases, and restart the autopilot afterwards if asked to."""
 
     what: What
+    reboot: bool = False
 
 
 class Undo(NamedTuple):
@@ -73,7 +75,7 @@ def judge(command: Command) -> Request | Refused:
     """What is asked for. Parameters count exactly: NaN, 0.5 and 3 are refused where 0, 1 and 2 are allowed."""
     match command.key.command:
         case mavlink.MAV_CMD_USER_1:
-            return _calibrate(command.parameters[0])
+            return _calibrate(command.parameters[0], command.parameters[1])
         case mavlink.MAV_CMD_USER_2:
             return Cancel()
         case mavlink.MAV_CMD_USER_3:
@@ -88,18 +90,25 @@ def judge(command: Command) -> Request | Refused:
             return Refused(mavlink.MAV_RESULT_UNSUPPORTED, f"Command {other} is not supported by the companion")
 
 
-def _calibrate(which: float) -> Calibrate | Refused:
+def _calibrate(which: float, reboot: float) -> Calibrate | Refused:
+    # NaN stands for "not given" with some ground stations.
+    if reboot not in (0.0, 1.0) and not math.isnan(reboot):
+        return _denied(f"Calibration refused: param2 {reboot:g}, allowed 0, 1")
     for what in What:
         if which == what.value:
-            return Calibrate(what)
+            return Calibrate(what, reboot == 1.0)
     return _denied(f"Calibration refused: param1 {which:g}, allowed 0, 1, 2")
 
 
 def _preflight_calibration(parameters: tuple[float, ...]) -> Calibrate | Refused:
-    """MAV_CMD_PREFLIGHT_CALIBRATION: param1 gyros, param5 accelerometers; we have nothing else to calibrate."""
+    """MAV_CMD_PREFLIGHT_CALIBRATION: param1 gyros, param5 accelerometers; we have nothing else to calibrate.
+
+    Mission Planner's button also ticks param3, ground pressure, by habit: beside gyros or accelerometers that is let
+    pass, for nobody who presses it means our barometer.
+    """
     for number, value in enumerate(parameters, start=1):
-        if value != 0 and not (number in (1, 5) and value == 1):
-            allowed = "0 or 1" if number in (1, 5) else "0"
+        if value != 0 and not (number in (1, 3, 5) and value == 1):
+            allowed = "0 or 1" if number in (1, 3, 5) else "0"
             return _denied(f"Calibration refused: param{number} {value:g}, allowed {allowed}")
     match (parameters[0] == 1, parameters[4] == 1):
         case (True, True):

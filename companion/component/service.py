@@ -47,8 +47,8 @@ class CalibrationService(Protocol):
     asked for by others than MAVLink too. The component says refusals, which only it can tell.
     """
 
-    def start_calibration(self, what: What, requester: str) -> Job | Refusal:
-        """Start measuring, or say why not."""
+    def start_calibration(self, what: What, requester: str, *, reboot: bool = False) -> Job | Refusal:
+        """Start measuring, and restart the autopilot when the result is stored if asked to; or say why not."""
 
     def start_undo(self, requester: str) -> Job | Refusal:
         """Start putting the previous values back, or say why not."""
@@ -59,6 +59,32 @@ class CalibrationService(Protocol):
     @property
     def mav_state(self) -> int:
         """MAV_STATE_* for the heartbeat: CALIBRATING while busy, ACTIVE or STANDBY when idle, CRITICAL on a fault."""
+
+
+class ArmAnswer(msgspec.Struct, frozen=True):
+    """Whether the aircraft may arm at this moment.
+
+    "accept": yes. "wait": not now, but soon, by itself or by holding still. "refuse": not without somebody doing
+    something. `words` say why and what to do, in at most 41 characters where possible (what ArduPilot shows).
+    """
+
+    verdict: Literal["accept", "wait", "refuse"]
+    words: str
+
+
+class ArmGate(Protocol):
+    """Who knows whether the aircraft may arm. Both return at once, whatever else goes on."""
+
+    @property
+    def at_arm(self) -> Literal["gate", "warn", "off"]:
+        """What is to happen at arming."""
+
+    @property
+    def asks_script(self) -> bool:
+        """Whether a script on the autopilot may be waiting for the answer, as on ArduPilot."""
+
+    def answer(self) -> ArmAnswer:
+        """The answer, ready made."""
 
 
 class VehicleView(Protocol):

@@ -97,14 +97,22 @@ class Calibration(Section, frozen=True):
     target_gyro_sigma_deg_h: PositiveFloat = 5.0
     target_accel_sigma_mg: PositiveFloat = 0.2
     at_arm: AtArm = "warn"
+    max_age_min: PositiveFloat = 30.0
+    """So long after it was last seen to be right a calibration counts as fresh (method section 3, item 8)."""
+    max_temperature_change_degc: PositiveFloat = 3.0
+    """So far from the temperature at which it was seen to be right (the same)."""
 
 
 class Push(Section, frozen=True):
     """What is sent to the autopilot."""
 
     parameters: bool = True
+    dither: bool = False
+    """Whether offsets may be stepped for a minute, and put back, where an IMU's integers tell nothing otherwise."""
     attitude: Literal["off", "yaw", "full"] = "off"
     attitude_rate_hz: Annotated[float, Meta(gt=0, le=50)] = 30.0
+    stop_rivals: bool = False
+    """Whether to switch off what in the autopilot overwrites our biases; an undo switches it on again."""
 
 
 class Mqtt(Section, frozen=True):

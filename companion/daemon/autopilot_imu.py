@@ -14,10 +14,12 @@ from typing import Final
 
 import numpy as np
 
-from companion.autopilot.ardupilot import ImuCalibration, read_calibration
-from companion.autopilot.float32 import same_float32
+from companion.autopilot.firmwares import read_calibration
+from companion.autopilot.imu_calibration import ImuCalibration
 from companion.autopilot.imu_stream import ImuStream, StreamKind
 from companion.autopilot.parameters import ParameterClient
+from companion.autopilot.px4_slots import SlotMemory
+from companion.autopilot.rivals import rivals_of
 from companion.autopilot.vehicle import Vehicle, VehicleEvent
 from companion.errors import AutopilotError
 from companion.links.mavlink import MavlinkLink
@@ -36,8 +38,10 @@ class AutopilotImu:
         instance: 1 to 3.
         take: gets every sample that counts.
         void: called with a reason when everything taken so far is no longer valid.
-        kind_changed: called when the telemetry changes its message or resolution.
+        kind_changed: called when the telemetry changes its message or resolution, and when the sensor's own steps
+            behind it (rad/s, m/s^2; 0 where they do not matter) turn out to be other ones.
         rate_hz: asked of the autopilot.
+        memory: what is known about PX4's slots.
     """
 
     def __init__(
@@ -50,8 +54,9 @@ class AutopilotImu:
         *,
         take: Callable[[ImuSample], None],
         void: Callable[[str], None],
-        kind_changed: Callable[[StreamKind | None], None],
+        kind_changed: Callable[[StreamKind | None, tuple[float, float]], None],
         rate_hz: float,
+        memory: SlotMemory | None = None,
     ) -> None:
         self.name, self.instance = name, instance
         self.calibration: ImuCalibration | None = None
@@ -60,12 +65,27 @@ class AutopilotImu:
         """Why the offsets are not known, in one line."""
         self.failures = 0
         """How often reading the offsets has failed in a row."""
+        self.tap: Callable[[ImuSample], None] | None = None
+        """Gets every sample, whatever the offsets behind it."""
         self._vehicle, self._parameters = vehicle, parameters
+        self._memory = memory or SlotMemory()
         self._take, self._void = take, void
+        self.on_read: Callable[[ImuCalibration | None, ImuCalibration], None] = lambda before, after: None
+        """Told of every reading: what was read before, unless we have written since, and what is in force now."""
+        self._known: ImuCalibration | None = None
+        """What was read last, unless we have written since."""
         self._ours = 0
         self._stale = asyncio.Event()
         self._stale.set()
-        self.stream = ImuStream(link, vehicle, instance, self._on_sample, rate_hz=rate_hz, on_kind_change=kind_changed)
+        self._kind_changed, self._grid = kind_changed, (0.0, 0.0)
+        self.stream = ImuStream(
+            link,
+            vehicle,
+            instance,
+            self._on_sample,
+            rate_hz=rate_hz,
+            on_kind_change=lambda k: kind_changed(k, self._grid),
+        )
         self._unsubscribe = (parameters.watch(self._on_parameter), vehicle.watch(self._on_event))
 
     async def run(self) -> None:
@@ -82,7 +102,7 @@ class AutopilotImu:
     def changing(self) -> Iterator[None]:
         """While we write its offsets ourselves: no samples count, and nobody reads in between."""
         self._ours += 1
-        self.calibration = None
+        self.calibration = self._known = None
         try:
             yield
         finally:
@@ -106,14 +126,26 @@ class AutopilotImu:
         Raises:
             AutopilotError: they cannot be read, or this IMU cannot be calibrated.
         """
-        assumed, fresh = self.calibration, await read_calibration(self._parameters, self.instance)
+        assumed, fresh = self.calibration, await self._read()
+        if self._ours:
+            return False  # we have begun to write meanwhile: nobody knows which of them this still is
+        known, self._known = self._known, fresh
         self.calibration, self.problem, self.failures = fresh, "", 0
+        if self._grid != (grid := (fresh.gyro_grid_rad_s, fresh.accel_grid_m_s2)):
+            self._grid = grid
+            self._kind_changed(self.stream.kind, grid)
+        self.on_read(known, fresh)
         if assumed is None or not _same(assumed, fresh):
             self._void("the autopilot's offsets were read anew")
             return False
         return True
 
+    async def _read(self) -> ImuCalibration:
+        return await read_calibration(self._parameters, self.instance, self._memory)
+
     def _on_sample(self, sample: ImuSample) -> None:
+        if self.tap is not None:
+            self.tap(sample)
         if self.calibration is not None:
             self._take(sample)
 
@@ -124,9 +156,15 @@ class AutopilotImu:
         self._stale.set()
 
     def _on_parameter(self, name: str, value: float) -> None:
-        if self.calibration is not None and not self._ours and _contradicts(self.calibration, name, value):
+        if self.calibration is not None and not self._ours and self.calibration.contradicts({name: value}):
             logger.warning("%s: somebody set %s to %.6g; measuring afresh", self.name, name, value)
             self._invalidate(f"{name} was changed")
+        elif self.calibration is not None and self._rival_changed(self.calibration, name, value):
+            self._stale.set()  # what is in force is the same, but not what will become of it
+
+    def _rival_changed(self, calibration: ImuCalibration, name: str, value: float) -> bool:
+        known = {rival.parameter: rival.value for rival in calibration.rivals}
+        return name in rivals_of(self._vehicle.firmware) and known.get(name, 0) != value
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event == "rebooted":
@@ -164,25 +202,10 @@ class AutopilotImu:
         }
 
 
-def _corrections(calibration: ImuCalibration) -> dict[str, float]:
-    """By parameter: everything that acts on this IMU's output, as far as single parameters tell."""
-    names = calibration.parameters
-    return {
-        **dict(zip(names.gyro_offset, calibration.gyro_offset_rad_s, strict=True)),
-        **dict(zip(names.accel_offset, calibration.accel_offset_m_s2, strict=True)),
-        **dict(zip(names.accel_scale, calibration.accel_scale, strict=True)),
-    }
-
-
 def _same(one: ImuCalibration, other: ImuCalibration) -> bool:
     return (
-        _corrections(one) == _corrections(other)
+        one.corrections == other.corrections
         and one.tcal_enable == other.tcal_enable
         and (one.gyro_id, one.accel_id) == (other.gyro_id, other.accel_id)
         and np.array_equal(one.orientation, other.orientation)
     )
-
-
-def _contradicts(calibration: ImuCalibration, name: str, value: float) -> bool:
-    known = _corrections(calibration)
-    return name in known and not same_float32(known[name], value)

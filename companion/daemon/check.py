@@ -48,11 +48,26 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
     vehicle = status["vehicle"]
     findings.append(Finding("autopilot", good=vehicle["system_id"] is not None, words=vehicle["summary"]))
     findings += [Finding(device["name"], device["good"], device["summary"]) for device in status["devices"]]
+    findings += [Finding("warning", good=True, words=words) for words in status["warnings"]]
+    ground = status["ground_stations"]
+    findings.append(Finding("ground stations", good=ground["good"], words=ground["summary"]))
+    if config.calibration.at_arm == "gate":
+        findings.append(_gate(config, status["arming"]["setup"]))
     for kind in ("gradienter", "compass"):
         if getattr(config, kind) is None:
             without = {"gradienter": "gyros only", "compass": "gyro sigma widened by the Earth's rate"}[kind]
             findings.append(Finding(kind, good=True, words=f"not configured: {without}"))
     return findings
+
+
+def _gate(config: Config, setup: Object) -> Finding:
+    """Whether anybody asks before arming."""
+    if not config.push.parameters:
+        return Finding("arming", good=False, words="at_arm = gate with push.parameters = false never opens")
+    if not setup["known"]:
+        return Finding("arming", good=False, words="not known whether the autopilot asks before it arms: try again")
+    problem = setup["problem"]
+    return Finding("arming", good=problem is None, words=problem or "the autopilot asks before it arms")
 
 
 async def _listen(config: Config, seconds: float) -> Object:

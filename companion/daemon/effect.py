@@ -1,20 +1,26 @@
-"""Did the autopilot take the new offsets? Its telemetry before and after the write, against what must have changed."""
+"""Did the autopilot take the new offsets? Its telemetry before and after the write, against what must have changed.
+
+What the last digit of integer telemetry hides is in the windows' sigmas; only the short look at far values on the way
+is of plain means.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.autopilot.ardupilot import ImuCalibration, output_step
+from companion.autopilot.imu_calibration import ImuCalibration, output_step
 from companion.autopilot.imu_stream import StreamKind
+from companion.autopilot.px4_slots import Sensor
 from companion.autopilot.verify import Observation, Verdict, judge
 from companion.autopilot.writer import Change
 from companion.calibration.allan import AllanModel, floor_variance, noise_profile
 from companion.calibration.rolling import ImuWindow
+from companion.daemon.far_step import FarMean
 from companion.physics.frames import Array
 from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
@@ -36,6 +42,15 @@ class Sides:
     accel_residual: Array | None
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class OnTheWay:
+    """What was seen between: the output while far values were in force, and the step from there to the new ones."""
+
+    far: Mapping[Sensor, FarMean]
+    gyro_step: Vector
+    accel_step: Vector
+
+
 class _Triad(NamedTuple):
     """Gyros or accelerometers of one window."""
 
@@ -53,9 +68,18 @@ def _accelerometers(window: ImuWindow) -> _Triad:
 
 
 def judge_vectors(
-    sides: Sides, calibration: ImuCalibration, changes: list[Change], kind: StreamKind | None, profile: str | None
+    sides: Sides,
+    calibration: ImuCalibration,
+    changes: list[Change],
+    kind: StreamKind | None,
+    profile: str | None,
+    on_the_way: OnTheWay | None = None,
 ) -> list[Verdict]:
-    """Judge the vectors that were written: accelerometers, gyros, or both."""
+    """Judge the vectors that were written: accelerometers, gyros, or both.
+
+    Where the output was seen to follow a far value and then to leave it as it had to, the new one is in use, however
+    small the change as a whole.
+    """
     gyro_step, accel_step = output_step(calibration, changes)
     names, noise = calibration.parameters, noise_profile(profile)
     spans_s = (sides.before.duration_s, sides.after.duration_s)
@@ -63,29 +87,39 @@ def judge_vectors(
 
     def observe(triad: Callable[[ImuWindow], _Triad], residual: Array, drift: float, rest: _Rest) -> Verdict:
         before, after = triad(sides.before), triad(sides.after)
+        observation = Observation(
+            parameters=rest.parameters,
+            unit=rest.unit,
+            before=before.mean,
+            before_sigma=before.sigma_stat,
+            after=after.mean,
+            after_sigma=_hypot(after.sigma_stat, drift),
+            expected_step=rest.step,
+            truth=_minus(before.mean, residual),
+            tolerance=TOLERANCE_SIGMAS * max(before.sigma_use),
+            orientation=calibration.orientation,
+        )
+        verdict = judge(observation)
+        far = on_the_way.far.get(rest.sensor) if on_the_way is not None else None
+        if not verdict.ok or on_the_way is None or far is None:
+            return verdict
         return judge(
-            Observation(
-                parameters=rest.parameters,
-                unit=rest.unit,
-                before=before.mean,
-                before_sigma=before.sigma_stat,
-                after=after.mean,
-                after_sigma=_hypot(after.sigma_stat, drift),
-                expected_step=rest.step,
-                truth=_minus(before.mean, residual),
-                tolerance=TOLERANCE_SIGMAS * max(before.sigma_use),
-                orientation=calibration.orientation,
+            dataclasses.replace(
+                observation,
+                before=_vector(far.mean),
+                before_sigma=_vector(far.sigma),
+                expected_step=on_the_way.gyro_step if rest.sensor == "gyro" else on_the_way.accel_step,
                 resolution=rest.resolution,
             )
         )
 
     result = []
     if sides.accel_residual is not None:
-        rest = _Rest(names.accel_offset, "m/s^2", accel_step, kind.accel_step_m_s2 if kind else 0.0)
+        rest = _Rest("accel", names.accel_offset, "m/s^2", accel_step, kind.accel_step_m_s2 if kind else 0.0)
         drift = _drift_sigma(noise.accel, ordinary[1], spans_s)
         result.append(observe(_accelerometers, sides.accel_residual, drift, rest))
     if sides.gyro_residual is not None:
-        rest = _Rest(names.gyro_offset, "rad/s", gyro_step, kind.gyro_step_rad_s if kind else 0.0)
+        rest = _Rest("gyro", names.gyro_offset, "rad/s", gyro_step, kind.gyro_step_rad_s if kind else 0.0)
         drift = _drift_sigma(noise.gyro, ordinary[0], spans_s)
         result.append(observe(_gyros, sides.gyro_residual, drift, rest))
     return result
@@ -94,6 +128,7 @@ def judge_vectors(
 class _Rest(NamedTuple):
     """What else an observation needs."""
 
+    sensor: Sensor
     parameters: tuple[str, str, str]
     unit: str
     step: Vector
@@ -124,6 +159,11 @@ def _drift_sigma(model: AllanModel, most_flicker: float, spans_s: tuple[float, f
 
 def _hypot(sigmas: Vector, drift: float) -> Vector:
     x, y, z = (float(np.hypot(sigma, drift)) for sigma in sigmas)
+    return x, y, z
+
+
+def _vector(values: Array) -> Vector:
+    x, y, z = (float(value) for value in values)
     return x, y, z
 
 

@@ -16,8 +16,14 @@ class JobCancelledError(Exception):
 class Job:
     """A calibration or an undo; `finished` is done exactly once."""
 
-    def __init__(self, kind: str, what: What, requester: str, deadline_s: float | None) -> None:
+    def __init__(
+        self, kind: str, what: What, requester: str, deadline_s: float | None, *, reboot: bool = False
+    ) -> None:
         self.kind, self.what, self.requester = kind, what, requester
+        self.reboot = reboot
+        """Whether the autopilot is to be restarted once the result is stored."""
+        self.automatic = False
+        """Whether nobody asked for it."""
         self.deadline_s = deadline_s
         """Loop time until which measuring may take; None: no limit."""
         self.finished: asyncio.Future[JobResult] = asyncio.get_running_loop().create_future()
@@ -38,6 +44,15 @@ class Job:
         """Say how far it is and what is going on."""
         self._percent = max(self._percent, min(99, int(percent)))
         self.words = words
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether somebody has asked it to stop."""
+        return self._cancelled_by is not None
+
+    def adopt(self, requester: str, deadline_s: float | None) -> None:
+        """Somebody asks for what already runs by itself: from now on it is theirs."""
+        self.kind, self.requester, self.deadline_s, self.automatic = "calibration", requester, deadline_s, False
 
     def cancel(self, by: str) -> None:
         """Ask it to stop at the next safe point."""

@@ -1,7 +1,7 @@
 """What was changed in the autopilot, in memory and on disk at once.
 
 Open: a write is under way. Orphaned: a write was interrupted (the daemon died, or the old values could not all be
-put back) and somebody has to bring it to an end. Undoable: the last finished write.
+put back) and somebody has to bring it to an end. Undoable: the last finished write on each vehicle.
 """
 
 from __future__ import annotations
@@ -26,18 +26,19 @@ class Ledger:
         self.fault: str | None = None
         """Why nothing may be written at all, for people; None while all is well."""
         self.open: ChangeSet | None = None
-        self.undoable: ChangeSet | None = None
+        self.undoable: dict[int, ChangeSet] = {}
+        """By vehicle's system id."""
         self.orphaned = asyncio.Event()
 
     def load(self) -> None:
-        """Read both files at start, and find out whether they can be written."""
+        """Read the files at start, and find out whether they can be written."""
         try:
             self._log.check_writable()
         except StorageError as error:
             self.fault = f"{error}; nothing can be kept, so nothing is written; mend it and restart the companion"
         try:
             self.open = self._log.journal.read()
-            self.undoable = self._log.undo.read()
+            self.undoable = self._log.undos()
         except StorageError as error:
             self.fault = self.fault or (
                 f"{error}; compare the autopilot's parameters with your notes, then remove the file"
@@ -60,16 +61,17 @@ class Ledger:
         Raises:
             StorageError: the disk refuses; the write stays open.
         """
-        await self._offload(self._log.undo.write, changes)
+        kept = self._log.undo_of(changes.system_id)
+        await self._offload(kept.write, changes)
         try:
             await self.abandon()
         except StorageError:
             # The write will be put back, so there will be nothing to undo.
-            self.undoable = None
+            self.undoable.pop(changes.system_id, None)
             with contextlib.suppress(StorageError):
-                await self._offload(self._log.undo.clear)
+                await self._offload(kept.clear)
             raise
-        self.undoable = changes
+        self.undoable[changes.system_id] = changes
 
     async def abandon(self) -> None:
         """The old values are in force again: nothing is open any more.
@@ -81,11 +83,11 @@ class Ledger:
         self.open = None
         self.orphaned.clear()
 
-    async def forget_undo(self) -> None:
-        """What could be undone has been.
+    async def forget_undo(self, system_id: int) -> None:
+        """What could be undone on a vehicle has been.
 
         Raises:
             StorageError: the disk refuses.
         """
-        await self._offload(self._log.undo.clear)
-        self.undoable = None
+        await self._offload(self._log.undo_of(system_id).clear)
+        self.undoable.pop(system_id, None)

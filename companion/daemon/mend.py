@@ -56,10 +56,10 @@ class Mender:
     def why_no_undo(self) -> str | None:
         """Why there is nothing to undo, or None when there is."""
         undoable = self._ledger.undoable
-        if undoable is None:
+        if not undoable:
             return "nothing to undo"
-        if undoable.system_id != self._vehicle.system_id:
-            return f"nothing to undo here, only on system {undoable.system_id}"
+        if self._vehicle.system_id not in undoable:
+            return f"nothing to undo here, only on system {', '.join(map(str, sorted(undoable)))}"
         return None
 
     async def run(self) -> None:
@@ -91,8 +91,10 @@ class Mender:
         if ours:
             with self._changing():
                 await self._writer.restore(ours)
-        if self._ledger.undoable == open_set:
-            await self._ledger.forget_undo()  # it was an undo that was interrupted, and now it is done
+        if self._ledger.undoable.get(open_set.system_id) == open_set:
+            await self._ledger.forget_undo(
+                open_set.system_id
+            )  # it was an undo that was interrupted, and now it is done
         await self._ledger.abandon()
         words = f"Interrupted write: {f'{len(ours)} old values put back' if ours else 'nothing of ours was in force'}"
         if foreign:
@@ -101,22 +103,35 @@ class Mender:
         self.on_mended(words)
         self._say(Severity.WARNING, words, Weight.RESULT)
 
-    async def undo(self) -> dict[str, WrittenParameter]:
+    async def undo(self, *, force: bool = False) -> dict[str, WrittenParameter]:
         """Put back the values from before the last calibration, all or none; returns what was done.
 
+        Args:
+            force: leave what somebody else has changed since as it is, and put the rest back; without it, nothing is
+                written then.
+
         Raises:
-            AutopilotError: somebody else has changed one of them since (named; nothing is written), or the writing
-                failed (what could not be put back will be, as soon as the aircraft is disarmed).
+            AutopilotError: somebody else has changed some of them since (each named, with their value, ours and the
+                one before), or the writing failed (what could not be put back will be, as soon as the aircraft is
+                disarmed).
             StorageError: the disk refuses.
         """
-        undoable = self._ledger.undoable
+        undoable = self._ledger.undoable.get(self._vehicle.system_id or 0)
         why = self.why_no_undo()
         if undoable is None or why is not None:
             raise AutopilotError(why or "nothing to undo")
+        ours, foreign = await self._sort(undoable)
+        if foreign and not force:
+            raise AutopilotError(
+                f"changed by somebody else or by a boot since, so nothing was put back: {'; '.join(foreign)}."
+                " companion undo --force puts the others back"
+            )
+        if foreign:
+            logger.warning("changed by somebody else since, left alone: %s", "; ".join(foreign))
         await self._ledger.begin(undoable)
         try:
             with self._changing():
-                written = await self._writer.undo([_change(changed) for changed in undoable.changes])
+                written = await self._writer.undo(ours)
         except WriteFailedError as error:
             # In force is what was before the undo, unless something could not be put back: then the mender looks.
             if error.left_changed:
@@ -128,7 +143,7 @@ class Mender:
             self._ledger.orphaned.set()
             raise
         try:
-            await self._ledger.forget_undo()
+            await self._ledger.forget_undo(undoable.system_id)
             await self._ledger.abandon()
         except BaseException:
             self._ledger.orphaned.set()
@@ -139,14 +154,23 @@ class Mender:
         """Which changes are still as we made them, and what others have put in their place."""
         ours: list[Change] = []
         foreign: list[str] = []
+        found = await self._parameters.read_many(changed.parameter for changed in changes.changes)
         for changed in changes.changes:
-            now = await self._parameters.read(changed.parameter)
-            if same_float32(now, changed.after):
-                ours.append(_change(changed))
+            now, change = found[changed.parameter], _change(changed)
+            if changed.after is None:
+                if not same_float32(now, changed.before):
+                    ours.append(Change(changed.parameter, changed.before, now))
+            elif any(same_float32(now, own) for own in change.ours):
+                ours.append(change)
+            elif any(same_float32(now, own) for own in changed.also):
+                ours.append(Change(changed.parameter, changed.before, now, changed.via))
             elif not same_float32(now, changed.before):
-                foreign.append(f"{changed.parameter} is {now:.6g}, we had set {changed.after:.6g}")
+                foreign.append(
+                    f"{changed.parameter} is {now:.6g}, we had set {changed.after:.6g} (before: {changed.before:.6g})"
+                )
         return ours, foreign
 
 
 def _change(changed: Changed) -> Change:
-    return Change(changed.parameter, changed.before, changed.after)
+    after = changed.before if changed.after is None else changed.after
+    return Change(changed.parameter, changed.before, after, changed.via)

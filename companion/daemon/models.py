@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+from typing import Final
 
 from companion.autopilot.imu_stream import StreamKind
 from companion.autopilot.vehicle import Vehicle
@@ -14,6 +15,17 @@ from companion.config import Compass, Config, Gradienter, Imu
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H, MG
 
+IMU_RATE_HZ: Final = 100.0
+"""Asked of the autopilot for each IMU where the connection does not limit it; its own filters pass 20 Hz."""
+LEAST_IMU_RATE_HZ: Final = 10.0
+LINE_SHARE: Final = 0.5
+BITS_PER_BYTE: Final = 10.0
+"""8N1: a start bit, eight bits of data, a stop bit."""
+HIGHRES_BYTES: Final = 75.0
+"""HIGHRES_IMU in MAVLink 2: 63 bytes and 12 around them."""
+SCALED_BYTES: Final = 36.0
+"""SCALED_IMU2 or 3 likewise: 24 and 12."""
+
 
 def settings(config: Config) -> Settings:
     """How long and how good."""
@@ -23,16 +35,29 @@ def settings(config: Config) -> Settings:
         max_s=wanted.max_s,
         target_gyro_sigma_rad_s=wanted.target_gyro_sigma_deg_h * DEG_H,
         target_accel_sigma_m_s2=wanted.target_accel_sigma_mg * MG,
+        dither=config.push.dither and config.push.parameters,
     )
+
+
+def imu_rate_hz(config: Config) -> float:
+    """How often each autopilot IMU may send without filling a serial line: half of it stays free for everything else.
+
+    An autopilot whose line is full drops what does not fit, and answers late (57600 baud: 38 Hz for one IMU).
+    """
+    kind, _, rest = config.mavlink.url.partition(":")
+    if kind != "serial":
+        return IMU_RATE_HZ
+    bytes_per_s = int(rest.rpartition(":")[2]) / BITS_PER_BYTE
+    instances = [imu.instance or 1 for imu in config.imu if imu.source == "autopilot"]
+    each_time = sum(HIGHRES_BYTES if instance == 1 else SCALED_BYTES for instance in instances)
+    if not each_time:
+        return IMU_RATE_HZ
+    return max(LEAST_IMU_RATE_HZ, min(IMU_RATE_HZ, LINE_SHARE * bytes_per_s / each_time))
 
 
 def not_in_this_version(config: Config) -> list[str]:
     """What the configuration may ask for that this version does not do: said at start, never silently ignored."""
     asked = (
-        (
-            config.calibration.at_arm == "gate",
-            'calibration.at_arm = "gate": arming is not gated yet, only warned about',
-        ),
         (config.push.attitude != "off", f'push.attitude = "{config.push.attitude}": attitude is not pushed yet'),
         (config.mqtt is not None, "[mqtt]: MQTT is not spoken yet"),
         (config.web is not None, "[web]: there is no page yet"),
@@ -40,15 +65,24 @@ def not_in_this_version(config: Config) -> list[str]:
     return [words for is_asked, words in asked if is_asked]
 
 
-def imu_input(imu: Imu, kind: StreamKind | None) -> ImuInput:
-    """One IMU as the collector takes it; an autopilot's telemetry is in the vehicle's axes already."""
+def imu_input(imu: Imu, kind: StreamKind | None, grid: tuple[float, float] = (0.0, 0.0)) -> ImuInput:
+    """One IMU as the collector takes it; an autopilot's telemetry is in the vehicle's axes already.
+
+    Args:
+        imu: its configuration.
+        kind: of an autopilot's telemetry.
+        grid: the sensor's own steps behind that, rad/s and m/s^2, where they are known to be coarse.
+    """
+    integers = kind is not None and kind.truncates
     return ImuInput(
         name=imu.name,
         rotation=rotation_matrix(imu.mounting if imu.source == "serial" else "ROTATION_NONE"),
         profile=noise_profile(imu.profile),
         gyro_step_rad_s=kind.gyro_step_rad_s if kind else 0.0,
         accel_step_m_s2=kind.accel_step_m_s2 if kind else 0.0,
-        truncates=kind.truncates if kind else False,
+        truncates=integers,
+        gyro_grid_rad_s=grid[0] if integers else 0.0,
+        accel_grid_m_s2=grid[1] if integers else 0.0,
     )
 
 

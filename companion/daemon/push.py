@@ -1,4 +1,4 @@
-"""Biases into the autopilot: plan, write, look in the telemetry, and put back what did not work."""
+"""Biases into the autopilot: write, look in the telemetry, and put back what did not work."""
 
 from __future__ import annotations
 
@@ -6,69 +6,42 @@ import asyncio
 import contextlib
 import dataclasses
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
-import numpy as np
-
-from companion.autopilot.ardupilot import ImuCalibration, changes_for, read_calibration, whole_bias
+from companion.autopilot.firmwares import settle_s
 from companion.autopilot.float32 import same_float32
-from companion.autopilot.imu_stream import StreamKind
+from companion.autopilot.pace import has_passed, moment
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.vehicle import ArmState, Vehicle
 from companion.autopilot.verify import Verdict
-from companion.autopilot.writer import Change, ParameterWriter, WriteFailedError
+from companion.autopilot.writer import ParameterWriter, WriteFailedError
 from companion.calibration.record import Outcome, WrittenParameter
 from companion.calibration.rolling import RollingCollector, Window
-from companion.calibration.solve import ImuSolution, Solution
+from companion.calibration.solve import Solution
 from companion.config import Config
 from companion.daemon.autopilot_imu import AutopilotImu
-from companion.daemon.effect import Sides, in_short, judge_vectors, nearly_visible
+from companion.daemon.effect import OnTheWay, Sides, in_short, judge_vectors, nearly_visible
+from companion.daemon.firmware_calibration import FirmwareCalibration, settles_within_s
 from companion.daemon.ledger import Ledger
+from companion.daemon.plan import Plan, Planner, Target
+from companion.daemon.px4_writes import Px4Writes, change_set, step_from_far
 from companion.daemon.report import Draft
 from companion.errors import AutopilotError, CalibrationRefusedError, NotDisarmedError, StorageError
-from companion.physics.frames import Array
-from companion.samples import Vector
-from companion.storage.changes import Changed, ChangeSet
 
 logger = logging.getLogger(__name__)
 
-SETTLE_S: Final = 1.0
-"""ArduPilot's telemetry shows a new offset within 60 ms (its 20 Hz filter); a second covers slower links."""
 VERIFY_MAX_S: Final = 60.0
 """So long the aircraft may move after the write before its effect counts as not seen."""
+LOOK_S: Final = 10.0
+"""Seconds that show a step, where a calibration must be still for longer."""
 LOOK_LONGER_S: Final = 30.0
 """So long at most for a change that a few seconds do not show; beyond it flicker hides more than averaging shows."""
 DISARMED_WITHIN_S: Final = 10.0
 """A heartbeat lost just before the write is waited for so long."""
+TELEMETRY_S: Final = 2.0
+"""So long after a write the telemetry may seem to be missing."""
 POLL_S: Final = 0.2
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Target:
-    """One autopilot IMU that gets new offsets."""
-
-    name: str
-    calibration: ImuCalibration
-    changes: tuple[Change, ...]
-    solution: ImuSolution
-    kind: StreamKind | None
-    watched: bool
-    """Whether its output is in the telemetry that we collect."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Plan:
-    """What is to be changed."""
-
-    targets: tuple[Target, ...]
-    boots: int
-    """How often the autopilot had rebooted when this was made."""
-
-    @property
-    def changes(self) -> tuple[Change, ...]:
-        """All of it, in the order of writing."""
-        return tuple(change for target in self.targets for change in target.changes)
 
 
 class Pusher:
@@ -83,59 +56,63 @@ class Pusher:
         collector: RollingCollector,
         writer: ParameterWriter,
         ledger: Ledger,
+        px4: Px4Writes,
+        planner: Planner,
+        firmware: FirmwareCalibration,
     ) -> None:
+        self._px4, self._planner, self._firmware = px4, planner, firmware
         self._vehicle, self._parameters = vehicle, parameters
         self._imus, self._collector = imus, collector
         self._writer, self._ledger = writer, ledger
         self._sources = {imu.name: imu for imu in config.imu}
         self.enabled = config.push.parameters
+        self._look_s = min(LOOK_S, config.calibration.min_still_s)
 
     async def offsets_still_hold(self) -> bool:
-        """Read the offsets afresh; False when they were not those under which was measured."""
+        """Read the offsets afresh; False when they were not, or not surely, those under which was measured.
+
+        Raises:
+            AutopilotError: they cannot be read; or what was unsure could not be made sure.
+            StorageError: the old values could not be kept.
+        """
         held = True
         for imu in self._imus.values():
             held &= await imu.refresh()
-        return held
+        return held and not (self.enabled and await self._px4.make_sure(list(self._imus.values())))
 
     async def plan(self, solution: Solution, draft: Draft) -> Plan:
-        """Work out which parameter gets which value; fills the draft's whole biases and warnings.
+        """As `Planner.plan`; nothing to write where results are not pushed."""
+        return await self._planner.plan(solution, draft, push=self.enabled)
 
-        Raises:
-            AutopilotError: a parameter cannot be read, or the autopilot cannot be calibrated as it is.
-            CalibrationRefusedError: what was found is no bias.
-        """
-        targets: list[Target] = []
-        for found in solution.imus:
-            imu, source = self._imus.get(found.name), self._sources[found.name]
-            if imu is not None:
-                calibration = imu.in_force
-                draft.whole[found.name] = _whole(calibration, found)
-                gyro, accel = found.gyro_rad_s, found.accel_m_s2
-            elif source.autopilot_instance is not None:
-                calibration = await read_calibration(self._parameters, source.autopilot_instance)
-                gyro, accel = _residual_of_consumer(calibration, found)
-            else:
-                continue
-            for warning in calibration.warnings:
-                draft.warn(found.name, warning)
-            changes = changes_for(calibration, _vector(gyro), _vector(accel))
-            if self.enabled:
-                kind = imu.stream.kind if imu is not None else None
-                targets.append(Target(found.name, calibration, tuple(changes), found, kind, watched=imu is not None))
-        return Plan(tuple(targets), self._vehicle.boots)
-
-    async def write(self, plan: Plan, draft: Draft) -> None:
+    async def write(self, plan: Plan, draft: Draft, go_on: Callable[[str], None]) -> Plan:
         """Write and read back; on failure the old values are put back.
+
+        Args:
+            plan: what to write.
+            draft: filled with what was.
+            go_on: told what takes longer.
+
+        Returns:
+            The plan, and what the firmware has changed besides.
 
         Raises:
             AutopilotError: what went wrong, and which parameters could not be put back, if any.
             StorageError: the old values could not be kept, so nothing was written.
         """
         await self._wait_disarmed()
-        await self._ledger.begin(self._change_set(plan))
-        with self._changing(plan):
+        before = await self._firmware.prepare(plan.gyros, draft.warnings.append)
+        if before is None:
+            await self._ledger.begin(change_set(self._vehicle, plan.everything))
+        with self._changing(plan, everything=before is not None):
             try:
-                self._note(plan, draft, await self._writer.apply(plan.changes))
+                if before is None:
+                    async with self._px4.standing_by([(t.calibration, t.changes) for t in plan.targets]) as look:
+                        self._note(plan, draft, await self._writer.apply(plan.changes, look))
+                    return plan
+                done = await self._firmware.write(plan.changes, plan.gyros, before, go_on)
+                self._note(plan, draft, done.written)
+                draft.warnings += done.warnings
+                return dataclasses.replace(plan, collateral=done.collateral, firmware=done.outcome)
             except WriteFailedError as error:
                 self._note(plan, draft, error.written)
                 await self._settle(error.left_changed)
@@ -168,10 +145,25 @@ class Pusher:
         if problems:
             await self.roll_back(plan, draft, "; ".join(problems))
         try:
-            await self._ledger.commit(self._change_set(plan))
+            await self._ledger.commit(change_set(self._vehicle, plan.everything))
         except StorageError as error:
             # What cannot be undone later must not stay.
             await self.roll_back(plan, draft, str(error))
+
+    async def look_again(self, plan: Plan, before: Window, go_on: Callable[[str], None]) -> tuple[list[str], str]:
+        """After a restart: what the telemetry shows to be wrong; and why it could not be looked at, if so."""
+        verdicts, why_not = await self._look(dataclasses.replace(plan, boots=self._vehicle.boots), before, go_on)
+        found = verdicts or {}
+        return [f"imu {name}: {in_short(v)}" for name, each in found.items() for v in each if not v.ok], why_not
+
+    @staticmethod
+    def settles_within_s(plan: Plan) -> float:
+        """So long at most `settle` waits."""
+        return settles_within_s(plan.firmware)
+
+    async def settle(self, plan: Plan, go_on: Callable[[str], None]) -> str | None:
+        """Wait until the autopilot's EKF agrees with the new gyro offsets; what a pilot should know, if it does not."""
+        return await self._firmware.settle(plan.gyros, plan.firmware, go_on)
 
     async def roll_back(self, plan: Plan, draft: Draft, reason: str) -> None:
         """Put the old values back and say so.
@@ -183,9 +175,9 @@ class Pusher:
         end = "will be once disarmed"
         with contextlib.suppress(NotDisarmedError):
             await self._wait_disarmed()  # after a restart the first heartbeat is still to come
-        with self._changing(plan):
+        with self._changing(plan, everything=bool(plan.collateral)):
             try:
-                self._note(plan, draft, await self._writer.restore(plan.changes))
+                self._note(plan, draft, await self._writer.restore(plan.everything))
                 left = ()
             except WriteFailedError as error:
                 self._note(plan, draft, error.written)
@@ -193,12 +185,17 @@ class Pusher:
                 if error.kind == "changed by someone else":
                     end = "somebody else changed them"
             except NotDisarmedError:
-                left = [change.parameter for change in plan.changes]
+                left = [change.parameter for change in plan.everything]
                 self._mark(plan, draft, left, "failed")
         await self._settle(left)
         if left:
             raise AutopilotError(f"{reason}; old values NOT back in {', '.join(left)}: {end}")
         raise AutopilotError(f"{reason}; old values put back")
+
+    def mark_lost(self, plan: Plan, draft: Draft, parameters: Iterable[str]) -> None:
+        """These have been written and seen, and are no longer there."""
+        for target in plan.targets:
+            self._mark(Plan((target,), plan.boots), draft, list(parameters), "failed")
 
     async def _settle(self, left: Sequence[str]) -> None:
         """After a write that failed: nothing is open any more, or the mender has to end it."""
@@ -228,18 +225,14 @@ class Pusher:
         return changed
 
     @contextlib.contextmanager
-    def _changing(self, plan: Plan) -> Iterator[None]:
+    def _changing(self, plan: Plan, *, everything: bool) -> Iterator[None]:
+        """While offsets change: those of the plan's IMUs, or of all."""
+        ours = {target.name for target in plan.targets}
         with contextlib.ExitStack() as stack:
-            for target in plan.targets:
-                if target.watched:
-                    stack.enter_context(self._imus[target.name].changing())
+            for name, imu in self._imus.items():
+                if everything or name in ours:
+                    stack.enter_context(imu.changing())
             yield
-
-    def _change_set(self, plan: Plan) -> ChangeSet:
-        return ChangeSet(
-            system_id=self._vehicle.system_id or 0,
-            changes=tuple(Changed(change.parameter, change.before, change.after) for change in plan.changes),
-        )
 
     @staticmethod
     def _note(plan: Plan, draft: Draft, written: Mapping[str, WrittenParameter]) -> None:
@@ -278,7 +271,11 @@ class Pusher:
         if not watched:
             return None, "no autopilot IMU is in the telemetry"
         loop = asyncio.get_running_loop()
-        since_s = loop.time() + SETTLE_S
+        written = moment(self._vehicle)
+        while not has_passed(self._vehicle, written, settle_s(self._vehicle.firmware)):
+            go_on("waiting for the telemetry")
+            await asyncio.sleep(POLL_S)
+        since_s = loop.time()
         verdicts: dict[str, list[Verdict]] | None = None
         words = "waiting for the telemetry"
         while loop.time() < since_s + VERIFY_MAX_S:
@@ -287,8 +284,18 @@ class Pusher:
                 return verdicts, "armed right after the write"
             if self._vehicle.boots != plan.boots:
                 return None, "the autopilot rebooted right after the write"
-            words = self._collector.status(loop.time()).waiting_for or ""
-            if not words:
+            status = self._collector.status(loop.time())
+            words = status.waiting_for or ""
+            if words and status.still_s > 0.0:
+                # How long a calibration must be still says nothing about how long a step takes to show.
+                words = self._collector.glance(loop.time()).obstacle or ""
+                if not words and status.still_s < self._look_s:
+                    words = f"hold still {self._look_s - status.still_s:.0f} s more"
+            if words and loop.time() < since_s + TELEMETRY_S:
+                words = "waiting for the telemetry"  # which was not taken during the write
+            elif words:
+                words = f"checking the new offsets: {words}"
+            else:
                 try:
                     after = self._collector.window(loop.time(), since_s=since_s)
                 except CalibrationRefusedError as error:
@@ -310,7 +317,10 @@ class Pusher:
             accel_residual=target.solution.accel_m_s2,
         )
         profile = self._sources[target.name].profile
-        return judge_vectors(sides, target.calibration, list(target.changes), target.kind, profile)
+        on_the_way = OnTheWay(
+            self._px4.seen_far(target.calibration), *step_from_far(target.calibration, target.changes)
+        )
+        return judge_vectors(sides, target.calibration, list(target.changes), target.kind, profile, on_the_way)
 
     def _note_verdicts(self, target: Target, verdicts: list[Verdict], draft: Draft) -> list[str]:
         """Set the outcomes of one IMU's parameters; returns what is wrong, in words."""
@@ -322,37 +332,8 @@ class Pusher:
                 draft.warn(target.name, words)
             for axis in verdict.axes:
                 # A vector whose step as a whole was seen is in use; an axis that hardly changed cannot show more.
-                seen = verdict.ok and not verdict.warnings
+                # Where the integers show no step at all, the dither has shown that they follow these parameters.
+                seen = verdict.ok and (not verdict.warnings or target.solution.dithered)
                 outcome: Outcome = "verified" if seen else verdict.outcome(axis.parameter)
                 self._mark(Plan((target,), 0), draft, [axis.parameter], outcome)
         return problems
-
-
-def _whole(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:
-    gyro, accel = whole_bias(calibration, _vector(found.gyro_rad_s) or _ZERO, _vector(found.accel_m_s2) or _ZERO)
-    return (
-        np.array(gyro) if found.gyro_rad_s is not None else None,
-        np.array(accel) if found.accel_m_s2 is not None else None,
-    )
-
-
-def _residual_of_consumer(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:
-    """What is left in the output of an autopilot that consumes our own IMU, from the IMU's whole bias."""
-    rotation, scale = calibration.orientation, np.asarray(calibration.accel_scale)
-    gyro = accel = None
-    if found.gyro_rad_s is not None:
-        gyro = found.gyro_rad_s - rotation @ np.asarray(calibration.gyro_offset_rad_s)
-    if found.accel_m_s2 is not None:
-        board = rotation.T @ found.accel_m_s2
-        accel = rotation @ (scale * (board - np.asarray(calibration.accel_offset_m_s2)))
-    return gyro, accel
-
-
-_ZERO: Final[Vector] = (0.0, 0.0, 0.0)
-
-
-def _vector(values: Array | None) -> Vector | None:
-    if values is None:
-        return None
-    x, y, z = (float(value) for value in values)
-    return x, y, z

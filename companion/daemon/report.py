@@ -18,12 +18,15 @@ class Draft:
     """A record in the making: filled as the calibration proceeds, so that a failure keeps what was known."""
 
     started_at: datetime.datetime
+    system_id: int | None = None
     solution: Solution | None = None
     whole: dict[str, tuple[Array | None, Array | None]] = dataclasses.field(default_factory=dict)
     """By IMU: whole gyro and accelerometer bias, where the owner of the IMU subtracts offsets already."""
     written: dict[str, dict[str, WrittenParameter]] = dataclasses.field(default_factory=dict)
     """By IMU: parameters."""
     warnings: list[str] = dataclasses.field(default_factory=list)
+    notes: list[str] = dataclasses.field(default_factory=list)
+    """What belongs into the reason besides the figures."""
     imu_warnings: dict[str, list[str]] = dataclasses.field(default_factory=dict)
 
     def warn(self, imu: str, words: str) -> None:
@@ -31,6 +34,14 @@ class Draft:
         warnings = self.imu_warnings.setdefault(imu, [])
         if words not in warnings:
             warnings.append(words)
+
+    def begin_again(self, why: str) -> None:
+        """Forget what was found and written, but not why."""
+        self.solution = None
+        self.whole.clear()
+        self.written.clear()
+        self.imu_warnings.clear()
+        self.warnings.append(why)
 
     def record(self, state: Literal["done", "failed", "cancelled"], reason: str, duration_s: float) -> Record:
         """The finished record."""
@@ -43,6 +54,7 @@ class Draft:
             duration_s=round(duration_s, 3),
             pose=solution.pose if solution else None,
             site=solution.site if solution else None,
+            system_id=self.system_id,
             imus=tuple(self._imu(estimate) for estimate in solution.imus) if solution else (),
         )
 

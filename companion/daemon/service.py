@@ -6,32 +6,45 @@ import asyncio
 import contextlib
 import logging
 import signal
-from collections.abc import AsyncIterator, Iterator
-from typing import Any, Final
+from collections.abc import Iterator
+from typing import Any
 
-import msgspec
-
+from companion.autopilot.ekf import EkfWatch
 from companion.autopilot.imu_stream import StreamKind
 from companion.autopilot.parameters import ParameterClient
+from companion.autopilot.px4_slots import SlotMemory
 from companion.autopilot.vehicle import Vehicle
 from companion.autopilot.writer import ParameterWriter
-from companion.calibration.record import Record
-from companion.calibration.request import What
 from companion.calibration.rolling import RollingCollector
 from companion.component.component import Component
-from companion.component.service import Refusal
+from companion.component.service import JobResult
 from companion.config import Config, Imu
 from companion.daemon import models
+from companion.daemon.answers import Answers
+from companion.daemon.armings import Armings
+from companion.daemon.automatic import Automatic
 from companion.daemon.autopilot_imu import AutopilotImu
 from companion.daemon.conductor import Conductor
 from companion.daemon.control import ControlServer, Object
+from companion.daemon.course import Course
+from companion.daemon.dither import Ditherer
+from companion.daemon.far_step import FarStepWatch
+from companion.daemon.firmware_calibration import FirmwareCalibration
 from companion.daemon.flight_line import define_parameters
+from companion.daemon.gate_setup import GateSetup
+from companion.daemon.in_force import InForce
 from companion.daemon.job import Job
 from companion.daemon.ledger import Ledger, Offload
 from companion.daemon.mend import Mender
+from companion.daemon.plan import Planner
 from companion.daemon.push import Pusher
+from companion.daemon.px4_writes import Px4Writes
+from companion.daemon.reach import Reach
+from companion.daemon.readiness import Readiness
+from companion.daemon.reboot import Reboot
+from companion.daemon.rivalry import Rivalry
 from companion.daemon.sensors import SerialSensor
-from companion.errors import CalibrationRefusedError, CompanionError
+from companion.errors import CompanionError
 from companion.links.mavlink import MavlinkLink
 from companion.links.mavlink_transport import run_transport
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
@@ -39,9 +52,6 @@ from companion.storage.changes import ChangeLog
 from companion.storage.records import RecordStore
 
 logger = logging.getLogger(__name__)
-
-MONITOR_EVERY_S: Final = 0.5
-PROGRESS_EVERY_S: Final = 0.2
 
 
 class Service:
@@ -51,7 +61,7 @@ class Service:
         config: what to run.
         link: the MAVLink connection; a test may have put it on a wire of its own.
         offload: runs a blocking call elsewhere.
-        imu_rate_hz: asked of the autopilot for each IMU; it may grant less.
+        imu_rate_hz: asked of the autopilot for each IMU, which may grant less; None: what the connection can carry.
     """
 
     def __init__(
@@ -60,7 +70,7 @@ class Service:
         *,
         link: MavlinkLink | None = None,
         offload: Offload = asyncio.to_thread,
-        imu_rate_hz: float = 100.0,
+        imu_rate_hz: float | None = None,
     ) -> None:
         self.config = config
         self.link = link or MavlinkLink(
@@ -74,19 +84,83 @@ class Service:
             gradienter=config.gradienter is not None,
             compass=config.compass is not None,
         )
-        self._imu_rate_hz, self._offload = imu_rate_hz, offload
+        self.slots = SlotMemory()
+        self._imu_rate_hz = models.imu_rate_hz(config) if imu_rate_hz is None else imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
         self.sensors = self._serial_sensors()
         self.store = RecordStore(config.storage.path)
         self.ledger = Ledger(ChangeLog(config.storage.path), offload)
         writer = ParameterWriter(self.parameters, self.vehicle)
-        pusher = Pusher(config, self.vehicle, self.parameters, self.imus, self.collector, writer, self.ledger)
-        self.mender = Mender(self.vehicle, self.parameters, writer, self.ledger, self._say, self._changing)
-        self.conductor = Conductor(
-            config, self.vehicle, self.collector, self.imus, pusher, self.mender, self.store, self._say, offload
+        far = FarStepWatch(self.link, self.vehicle, self.slots)
+        px4 = Px4Writes(self.vehicle, writer, self.ledger, far, self.slots, self._say)
+        self.rivalry = Rivalry(self.vehicle, self.imus, self._say, stop_rivals=config.push.stop_rivals)
+        ekf = EkfWatch(self.link, self.vehicle)
+        pusher = Pusher(
+            config,
+            self.vehicle,
+            self.parameters,
+            self.imus,
+            self.collector,
+            writer,
+            self.ledger,
+            px4,
+            Planner(config, self.vehicle, self.parameters, self.imus, self.slots, self.rivalry),
+            FirmwareCalibration(self.vehicle, self.parameters, writer, self.ledger, ekf),
         )
-        self.component = Component(self.link, self.vehicle, self.conductor)
+        self.mender = Mender(self.vehicle, self.parameters, writer, self.ledger, self._say, self._changing)
+        course = Course(
+            config,
+            self.vehicle,
+            self.collector,
+            self.imus,
+            pusher,
+            self._say,
+            offload,
+            Reboot(self.vehicle, self.parameters, pusher, self._say),
+            Ditherer(config, self.vehicle, self.parameters, self.imus, self.collector, writer, self.ledger),
+        )
+        self.conductor = Conductor(
+            config, self.vehicle, self.collector, course, pusher, self.mender, self.store, self._say, offload
+        )
+        self.reach = Reach(self.link, self.vehicle, self.parameters)
+        self.in_force = InForce(config, self.vehicle, self.collector, self.imus, offload)
+        self.readiness = Readiness(self.vehicle, self.collector, self.conductor, self.mender, self.in_force)
+        self.automatic = Automatic(
+            self.vehicle,
+            self.collector,
+            self.conductor,
+            self.imus,
+            self.in_force,
+            config.storage.path,
+            self._say,
+            offload,
+        )
+        self.conductor.on_ended = self._on_ended
+        self.readiness.why_not_by_itself = self.automatic.why_not
+        self.armings = Armings(self.vehicle, self.readiness, config.storage.path, self._say, offload)
+        self.gate_setup = GateSetup(self.vehicle, self.parameters, self.readiness, self._say)
+        self.component = Component(self.link, self.vehicle, self.conductor, self.readiness)
         define_parameters(self.component.parameters, config, self.conductor)
+        self.answers = Answers(
+            self.conductor,
+            self.vehicle,
+            self.collector,
+            [*self.imus.values(), *self.sensors],
+            self.store,
+            offload,
+            mavlink_url=config.mavlink.url,
+            rivalry=self.rivalry,
+            reach=self.reach,
+            mender=self.mender,
+            readiness=self.readiness,
+            armings=self.armings,
+            gate_setup=self.gate_setup,
+            automatic=self.automatic,
+        )
+
+    def _on_ended(self, job: Job, result: JobResult) -> None:
+        self.in_force.on_ended(job, result)
+        self.automatic.on_ended(job, result)
 
     def _say(self, *what: Any) -> object:
         return self.component.say(*what)
@@ -99,8 +173,8 @@ class Service:
             yield
 
     def _autopilot_imu(self, imu: Imu) -> AutopilotImu:
-        def kind_changed(kind: StreamKind | None) -> None:
-            self.collector.set_imu(models.imu_input(imu, kind))
+        def kind_changed(kind: StreamKind | None, grid: tuple[float, float]) -> None:
+            self.collector.set_imu(models.imu_input(imu, kind, grid))
 
         def take(sample: ImuSample) -> None:
             self.collector.add_imu(imu.name, sample)
@@ -118,6 +192,7 @@ class Service:
             void=void,
             kind_changed=kind_changed,
             rate_hz=self._imu_rate_hz,
+            memory=self.slots,
         )
 
     def _serial_sensors(self) -> list[SerialSensor]:
@@ -172,7 +247,7 @@ class Service:
         """
         for words in models.not_in_this_version(self.config):
             logger.warning("%s", words)
-        async with ControlServer(self.config.control.path, self.answer):
+        async with ControlServer(self.config.control.path, self.answers.answer):
             logger.info("ready: %s", self.config.control.path)
             await self.serve()
 
@@ -196,6 +271,11 @@ class Service:
                     if mavlink:
                         group.create_task(run_transport(self.link, self.config.mavlink.url), name="mavlink")
                     group.create_task(self.mender.run(), name="mender")
+                    group.create_task(self.reach.run(), name="reach")
+                    group.create_task(self.readiness.run(), name="readiness")
+                    group.create_task(self.armings.run(), name="armings")
+                    group.create_task(self.automatic.run(), name="automatic")
+                    group.create_task(self.gate_setup.run(), name="gate setup")
                     for imu in self.imus.values():
                         group.create_task(imu.run(), name=imu.name)
                     for sensor in self.sensors if ports else ():
@@ -205,13 +285,14 @@ class Service:
                     # Before the links go: a write under way needs them to come to its end.
                     await self.conductor.close()
         finally:
+            self.rivalry.close()
             self.vehicle.close()
 
     async def listen(self, seconds: float) -> Object:
         """Open everything, listen, and tell what `status` would; for `companion check`, writes nothing."""
         self.conductor.only_listening = "only a check is running: start companion run"
         running = [self.component.run(), run_transport(self.link, self.config.mavlink.url)]
-        running += [imu.run() for imu in self.imus.values()]
+        running += [self.reach.run(), self.gate_setup.run(), *(imu.run() for imu in self.imus.values())]
         running += [sensor.run() for sensor in self.sensors]
         tasks = [asyncio.get_running_loop().create_task(one) for one in running]
         try:
@@ -222,107 +303,9 @@ class Service:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    # --- the control socket
-
-    async def answer(self, request: Object) -> AsyncIterator[Object]:
-        """Answer one request of the control socket."""
-        command = request.get("command")
-        if command == "status":
-            yield {"kind": "result", "status": self.status()}
-        elif command == "calibrate":
-            async for reply in self._answer_calibrate(request):
-                yield reply
-        elif command == "cancel":
-            running = self.conductor.cancel("companion cancel")
-            if running and self.conductor.job is not None:
-                await asyncio.shield(self.conductor.job.finished)
-            reason = self.conductor.reason if running else "nothing was running"
-            yield {"kind": "result", "state": self.conductor.state.value, "reason": reason}
-        elif command == "undo":
-            job = _accepted(self.conductor.start_undo("companion undo"))
-            result = await asyncio.shield(job.finished)
-            written = {name: _plain(what) for name, what in job.written.items()}
-            yield {"kind": "result", "state": result.outcome, "reason": result.reason, "written": written}
-        elif command == "history":
-            limit = request.get("limit")
-            number = limit if isinstance(limit, int) and limit > 0 else None
-            # A thousand records take longer to read than a ground station waits for an answer.
-            yield {"kind": "result", "records": await self._offload(self._history, number)}
-        elif command == "monitor":
-            while True:
-                yield {"kind": "progress", "status": self.status()}
-                await asyncio.sleep(MONITOR_EVERY_S)
-        else:
-            yield {"kind": "error", "reason": f"unknown command {command!r}"}
-
-    def _history(self, limit: int | None) -> list[Object]:
-        return [_plain(record) for record in self.store.history(limit)]
-
-    async def _answer_calibrate(self, request: Object) -> AsyncIterator[Object]:
-        try:
-            what = What[str(request.get("what", "both")).upper()]
-            timeout_s = request.get("timeout_s")
-            timeout_s = None if timeout_s is None else float(timeout_s)
-        except (KeyError, TypeError, ValueError) as error:
-            raise CalibrationRefusedError(f"calibrate: {error} is not understood") from None
-        job = _accepted(self.conductor.start_calibration(what, "companion calibrate", timeout_s))
-        if not request.get("wait"):
-            yield {"kind": "result", "state": self.conductor.state.value, "reason": "calibration started"}
-            return
-        while not job.finished.done():
-            yield {
-                "kind": "progress",
-                "state": self.conductor.state.value,
-                "percent": job.progress_percent,
-                "text": job.words,
-            }
-            await asyncio.wait([job.finished], timeout=PROGRESS_EVERY_S)
-        yield {"kind": "result", "record": _plain(job.record)}
-
     def status(self) -> Object:
         """What the daemon is doing, as JSON can hold it."""
-        conductor, job = self.conductor, self.conductor.job
-        busy = job is not None and not job.finished.done()
-        now_s = asyncio.get_running_loop().time()
-        still = self.collector.status(now_s)
-        return {
-            "state": conductor.state.value,
-            "reason": job.words if busy and job is not None else conductor.reason,
-            "progress": job.progress_percent if busy and job is not None else None,
-            "still_s": round(still.still_s, 1),
-            "waiting_for": still.waiting_for,
-            "vehicle": {
-                "system_id": self.vehicle.system_id,
-                "firmware": self.vehicle.firmware,
-                "armed": self.vehicle.arm_state.value,
-                "summary": f"{self.vehicle.name}, {self.vehicle.arm_state.value}"
-                if self.vehicle.system_id is not None
-                else f"not heard yet on {self.config.mavlink.url}",
-            },
-            "fault": self.mender.fault,
-            "putting_back": self.mender.pending,
-            "devices": [
-                *(imu.status() for imu in self.imus.values()),
-                *(sensor.status() for sensor in self.sensors),
-            ],
-            "last": _summary(conductor.last),
-        }
-
-
-def _accepted(answer: Job | Refusal) -> Job:
-    if isinstance(answer, Refusal):
-        raise CalibrationRefusedError(answer.reason)
-    return answer
-
-
-def _plain(value: object) -> Any:
-    return msgspec.to_builtins(value)
-
-
-def _summary(record: Record | None) -> Object | None:
-    if record is None:
-        return None
-    return {"state": record.state, "started_at": record.started_at, "reason": record.reason}
+        return self.answers.status()
 
 
 async def run(config: Config) -> None:

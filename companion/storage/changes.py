@@ -1,7 +1,7 @@
 """What we changed in an autopilot: kept before the first write, so that it can be put back after any interruption.
 
-Two files a folder: `journal.json` exists only while a write is under way (found at start, it means that the daemon
-died in the middle), `undo.json` holds the values before the last finished write.
+`journal.json` exists only while a write is under way (found at start, it means that the daemon died in the middle);
+`undo-N.json` holds the values before the last finished write on the vehicle with system id N.
 """
 
 from __future__ import annotations
@@ -15,11 +15,16 @@ from companion.storage.atomic import remove_durably, write_atomically
 
 
 class Changed(msgspec.Struct, frozen=True):
-    """One parameter: the value before, and the one we set."""
+    """One parameter: the value before, the one we set, and the one that is set on the way between them, if any."""
 
     parameter: str
     before: float
-    after: float
+    after: float | None
+    """None: not known in advance, and whatever is found is of our doing (the firmware's own gyro calibration that we
+    have started)."""
+    via: float | None = None
+    also: tuple[float, ...] = ()
+    """Other values that may stand there by our doing, while several are set one after the other."""
 
 
 class ChangeSet(msgspec.Struct, frozen=True):
@@ -66,12 +71,29 @@ class ChangeFile:
 
 
 class ChangeLog:
-    """The two change files of one storage folder."""
+    """The change files of one storage folder."""
 
     def __init__(self, directory: Path) -> None:
+        self._directory = directory
         self._probe = directory / "probe"
         self.journal = ChangeFile(directory / "journal.json")
-        self.undo = ChangeFile(directory / "undo.json")
+
+    def undo_of(self, system_id: int) -> ChangeFile:
+        """The values from before the last finished write on one vehicle."""
+        return ChangeFile(self._directory / f"undo-{system_id}.json")
+
+    def undos(self) -> dict[int, ChangeSet]:
+        """By system id, what can be undone.
+
+        Raises:
+            StorageError: a file is there and cannot be understood.
+        """
+        found: dict[int, ChangeSet] = {}
+        for path in sorted(self._directory.glob("undo-*.json")):
+            kept = ChangeFile(path).read()
+            if kept is not None:
+                found[kept.system_id] = kept
+        return found
 
     def check_writable(self) -> None:
         """Find out now, not at the first write, whether anything can be kept here.

@@ -52,6 +52,23 @@ class RecordStore:
                 logger.warning("%s: not a readable record, passed over: %s", path, error)
         return records
 
+    def mark_undone(self, system_id: int, undone_at: str) -> None:
+        """Note in the latest record that has written to this vehicle that it was put back.
+
+        Raises:
+            StorageError: it could not be written.
+        """
+        for number in reversed(self._numbers()):
+            path = self._folder / f"{number:06d}.json"
+            try:
+                record = from_json(path.read_bytes())
+            except (OSError, msgspec.MsgspecError):
+                continue
+            wrote = record.state == "done" and any(imu.written for imu in record.imus)
+            if wrote and record.system_id == system_id:
+                write_atomically(path, to_json(msgspec.structs.replace(record, undone_at=undone_at)) + b"\n")
+                return
+
     def _numbers(self) -> list[int]:
         try:
             names = [entry.name for entry in self._folder.iterdir()]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sim.ardupilot.inertial import InertialPath
-from sim.ardupilot.parameters import ParameterStore, device_id, offset_names
+from sim.ardupilot.parameters import ParameterStore, caltemp_name, device_id, gyro_id_name, offset_names
 from sim.earth import STANDARD_GRAVITY_M_S2, Array
 
 GYRO_TIME_S = 0.55
@@ -26,6 +26,8 @@ class Calibrations:
     store: ParameterStore
     random: np.random.Generator
     last_accel_s: float = field(default=-math.inf)
+    gyros_ok: bool = True
+    """Whether the last gyro calibration converged; if not, it does not arm."""
 
     def _mean(self, path: InertialPath, t_s: float) -> Array:
         """The sensor's mean over the averaging time that ends now, with its white noise."""
@@ -39,13 +41,30 @@ class Calibrations:
             for name in offset_names(path.instance, "gyro"):
                 self.store.set(name, 0.0)
 
-    def gyros(self, t_s: float) -> None:
-        """Mean rate becomes the offset: the Earth's rotation goes into it."""
+    def gyros(self, t_s: float, *, converged: bool = True) -> tuple[str, ...]:
+        """Mean rate becomes the offset: the Earth's rotation goes into it. Returns the names that it has saved.
+
+        Also without success; only the temperature is then not noted. What belongs to no gyro is set to nothing.
+        """
+        before = dict(self.store.values)
         for path in self.paths:
             mean = self._mean(path, t_s)
             for name, value in zip(offset_names(path.instance, "gyro"), mean[:3], strict=True):
                 self.store.set(name, float(value))
-            self._stamp(path, t_s, "GYR")
+            self.store.set(gyro_id_name(path.instance), device_id(path.instance))
+            if converged:
+                self.store.set(caltemp_name(path.instance, "GYR"), path.model.temperature_degc(t_s))
+        for instance in range(len(self.paths) + 1, 6):
+            if (auxiliary := instance > 3) and gyro_id_name(instance) not in self.store:
+                continue
+            fitted = auxiliary and self.store.values[gyro_id_name(instance)] != 0
+            for name in offset_names(instance, "gyro"):
+                self.store.set(name, float(self.random.normal(0.0, 1e-4)) if fitted else 0.0)
+            if not fitted:
+                self.store.set(gyro_id_name(instance), 0)
+                self.store.set(caltemp_name(instance, "GYR"), -300.0)
+        self.gyros_ok = converged
+        return tuple(name for name, value in self.store.values.items() if value != before[name])
 
     def simple_accel(self, t_s: float) -> None:
         """Whatever differs from exactly level becomes the offset; scale 1, trim 0."""
@@ -56,7 +75,8 @@ class Calibrations:
                 self.store.set(name, float(value))
             for name in offset_names(path.instance, "scale"):
                 self.store.set(name, 1.0)
-            self._stamp(path, t_s, "ACC")
+            self.store.set(caltemp_name(path.instance, "ACC"), path.model.temperature_degc(t_s))
+            self.store.set(f"INS_ACC{_number(path)}_ID", device_id(path.instance))
         for axis in "XYZ":
             self.store.set(f"AHRS_TRIM_{axis}", 0.0)
         self.last_accel_s = t_s
@@ -75,10 +95,6 @@ class Calibrations:
         """param5 = 76: what is fitted counts as calibrated."""
         for path in self.paths:
             self.store.set(f"INS_ACC{_number(path)}_ID", device_id(path.instance))
-
-    def _stamp(self, path: InertialPath, t_s: float, kind: str) -> None:
-        self.store.set(f"INS_{kind}{path.instance}_CALTEMP", path.model.temperature_degc(t_s))
-        self.store.set(f"INS_{kind}{_number(path)}_ID", device_id(path.instance))
 
 
 def _number(path: InertialPath) -> str:

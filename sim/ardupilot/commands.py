@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.ardupilot.calibrations import ACCEL_PAUSE_S, ACCEL_TIME_S, AVERAGED_S, GYRO_GIVES_UP_S, GYRO_TIME_S
-from sim.ardupilot.channel import Channel
 from sim.ardupilot.messages import BUILDERS, STREAM_GROUPS
+from sim.ardupilot.versions import Version, since
+from sim.firmware.channel import Channel
+from sim.firmware.command import Command
 
 if TYPE_CHECKING:
     from sim.autopilot import ArduPilotDouble
@@ -22,30 +24,10 @@ ACCEPTED, DENIED, UNSUPPORTED, FAILED = (
     mavlink.MAV_RESULT_FAILED,
 )
 ACK_DELAY_S = 0.003
-_FORCE_ARM = (2989.0, 21196.0)
-
-
-class Command(NamedTuple):
-    """COMMAND_LONG or COMMAND_INT, and where to answer."""
-
-    channel: Channel
-    number: int
-    params: tuple[float, ...]
-    system_id: int
-    component_id: int
-    loop_s: float
-
-
-def command_of(
-    channel: Channel, message: mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_int_message, loop_s: float
-) -> Command:
-    """The common content of the two kinds; in COMMAND_INT x, y, z are params 5 to 7."""
-    first = (message.param1, message.param2, message.param3, message.param4)
-    if isinstance(message, mavlink.MAVLink_command_int_message):
-        params = (*first, float(message.x), float(message.y), message.z)
-    else:
-        params = (*first, message.param5, message.param6, message.param7)
-    return Command(channel, message.command, params, message.get_srcSystem(), message.get_srcComponent(), loop_s)
+REBOOT_DELAY_S = 0.7
+"""From the acknowledgement to the restart; until then it goes on as if nothing were."""
+_FORCE_ARM: dict[float, Version] = {2989.0: "4.3", 21196.0: "4.6"}
+"""The words that force arming, and since when."""
 
 
 class CommandServer:
@@ -87,7 +69,7 @@ class CommandServer:
         answer = mavlink.MAVLink_command_ack_message(
             command.number, result, 0, 0, command.system_id, command.component_id
         )
-        self._double.later(delay_s, lambda: self._double.answer(command.channel, answer))
+        self._double.soon(delay_s, lambda: self._double.answer(command.channel, answer))
 
     def _known(self, message_id: int) -> bool:
         if message_id == mavlink.MAVLINK_MSG_ID_HIGHRES_IMU and not self._double.has_highres_imu:
@@ -112,7 +94,7 @@ class CommandServer:
         interval_ms = int(interval_us / 1000.0)
         fastest_ms = double.fastest_interval_ms
         if interval_ms < fastest_ms:
-            if double.version != "4.5":
+            if since(double.version, "4.6"):
                 double.say(
                     mavlink.MAV_SEVERITY_INFO,
                     f"Requested rate for message ID {message_id} too fast. Increase SCHED_LOOP_RATE",
@@ -151,7 +133,7 @@ class CommandServer:
             return UNSUPPORTED
         if self._double.armed:
             return FAILED
-        self._double.later(0.2, self._double.reboot)  # after the acknowledgement is out
+        self._double.later(REBOOT_DELAY_S, self._double.reboot)
         return ACCEPTED
 
     def _storage(self, command: Command) -> int:
@@ -167,7 +149,9 @@ class CommandServer:
             return ACCEPTED
         if command.params[0] != 1.0:
             return UNSUPPORTED
-        failures = [] if command.params[1] in _FORCE_ARM else double.prearm_failures(command.loop_s)
+        word = _FORCE_ARM.get(command.params[1])
+        forced = word is not None and since(double.version, word)
+        failures = [] if forced else double.prearm_failures(command.loop_s)
         for failure in failures:
             double.say(mavlink.MAV_SEVERITY_CRITICAL, f"Arm: {failure}")
         if failures or double.calibrating:
@@ -189,7 +173,10 @@ class CommandServer:
             double.say(mavlink.MAV_SEVERITY_NOTICE, "Disarm to allow calibration")
             return FAILED
         if double.calibrating:
-            return ACCEPTED if gyros else FAILED  # the real one says so too early, while offsets still read zero
+            if gyros and double.calibrations.gyros_ok:
+                double.estimator.reset_gyro_bias()
+                return ACCEPTED  # the real one says so too early, while offsets still read zero
+            return FAILED
         if gyros or accelerometers == 2.0:
             self._start_gyros(command, then_level=accelerometers == 2.0)
             return None
@@ -210,6 +197,9 @@ class CommandServer:
         double.say(mavlink.MAV_SEVERITY_INFO, "Calibrating gyros")
         double.update_estimator(command.loop_s)
         double.calibrations.clear_gyros()
+        if double.faults.reboot_while_calibrating:
+            double.faults.reboot_while_calibrating = False
+            double.later(GYRO_TIME_S / 2, double.reboot)
         double.later(GYRO_TIME_S, lambda: self._finish_gyros(command, then_level=then_level))
 
     def _finish_gyros(self, command: Command, *, then_level: bool) -> None:
@@ -217,10 +207,11 @@ class CommandServer:
         now_s = double.now_s()
         t_s = double.aircraft.time_at(now_s)
         still = double.aircraft.still_at(t_s) and double.aircraft.still_at(t_s - AVERAGED_S)
+        still = still and not double.faults.gyro_calibration_fails
         if not still and now_s - command.loop_s < GYRO_GIVES_UP_S:
             double.later(0.25, lambda: self._finish_gyros(command, then_level=then_level))
             return
-        double.calibrations.gyros(t_s)  # stored even when it has not converged
+        double.announce(double.calibrations.gyros(t_s, converged=still))  # stored even when it has not converged
         double.calibrating = False
         result = ACCEPTED if still else FAILED
         if still:

@@ -16,6 +16,12 @@ from sim.imu_model import DEG_H
 
 _BIAS_FADES_S = 40.0
 _TILT_FADES_S = 10.0
+_YAW_FADES_S = 40.0
+"""How fast the compass takes a wrong heading back: 5 deg at 40 s after a step of 0.3 deg/s, under 1 deg at 140 s."""
+_TILT_PART_1_S = 0.135
+_TILT_PART_FADES_S = 9.0
+"""After a reset of the gyro biases the estimator takes part of a tilt error that it corrects for gyro bias: 850 deg/h
+of 1.75 deg, gone within half a minute, as the real one showed after a step of 30 mg."""
 _START_ERROR_RAD_S = np.array([60.0, 40.0, -1500.0]) * DEG_H
 
 
@@ -26,7 +32,10 @@ class CoarseEstimator:
         self.gyro_bias_rad_s = np.zeros(3)
         self.tilt_error_rad = np.zeros(2)
         """Roll, pitch."""
+        self.yaw_error_rad = 0.0
         self._start_error = np.zeros(3)
+        self._tilt_part: Array = np.zeros(3)
+        self._tilt_goal: Array = np.zeros(2)
         self._time_s = 0.0
         self.reset(0.0)
 
@@ -34,18 +43,21 @@ class CoarseEstimator:
         """A start at this time: nothing known yet, and the vertical bias about to be mistaken."""
         self.gyro_bias_rad_s[:] = 0.0
         self.tilt_error_rad[:] = 0.0
+        self.yaw_error_rad = 0.0
         self._start_error[:] = _START_ERROR_RAD_S
+        self._tilt_part[:] = 0.0
         self._time_s = t_s
 
     def reset_gyro_bias(self) -> None:
         """What the autopilot's own gyro calibration does."""
         self.gyro_bias_rad_s[:] = 0.0
         self._start_error[:] = 0.0
+        self._tilt_part[:2] = _TILT_PART_1_S * (self._tilt_goal - self.tilt_error_rad)
 
     @property
     def omega_i(self) -> Array:
         """What AHRS.omegaI shows: minus the estimated gyro bias."""
-        result: Array = -(self.gyro_bias_rad_s + self._start_error)
+        result: Array = -(self.gyro_bias_rad_s + self._start_error + self._tilt_part)
         return result
 
     def update(self, t_s: float, gyro_error: Array, accel_error: Array) -> None:
@@ -53,7 +65,12 @@ class CoarseEstimator:
         tilt = np.array([-accel_error[1], accel_error[0]]) / STANDARD_GRAVITY_M_S2
         span = max(t_s - self._time_s, 0.0)
         stays = math.exp(-span / _BIAS_FADES_S)
+        # The heading turns by what the estimate does not know; both fade at the same rate.
+        unknown = float(gyro_error[2] - self.gyro_bias_rad_s[2])
+        self.yaw_error_rad = (self.yaw_error_rad + unknown * span) * math.exp(-span / _YAW_FADES_S)
         self.gyro_bias_rad_s += (1.0 - stays) * (gyro_error - self.gyro_bias_rad_s)
         self._start_error *= stays
+        self._tilt_part *= math.exp(-span / _TILT_PART_FADES_S)
+        self._tilt_goal = tilt
         self.tilt_error_rad += (1.0 - math.exp(-span / _TILT_FADES_S)) * (tilt - self.tilt_error_rad)
         self._time_s = t_s

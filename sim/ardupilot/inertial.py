@@ -13,10 +13,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.ardupilot.parameters import ParameterStore, offset_names
 from sim.earth import Array, mounting_matrix
+from sim.firmware.rotations import rotation_matrix
 from sim.imu_model import ImuModel
 
 RAW_RATE_HZ = 1000.0
@@ -24,8 +24,6 @@ RAW_RATE_HZ = 1000.0
 ORIENTATION_PERIOD_S = 1.0
 _MOVING_STEP_S = 0.0025
 _DAMPING = math.sqrt(0.5)
-_FINE_DEG = {68.0: 68.8, 293.0: 293.3}
-_PREFIX = "MAV_SENSOR_ROTATION_"
 
 
 def orientation_matrix(store: ParameterStore) -> Array:
@@ -36,16 +34,7 @@ def orientation_matrix(store: ParameterStore) -> Array:
             return np.eye(3)
         prefix = f"CUST_ROT{number - 100}_"
         return mounting_matrix(*(store.effective[prefix + angle] for angle in ("ROLL", "PITCH", "YAW")))
-    later = {41: (0.0, 7.0, 0.0), 42: (45.0, 0.0, 0.0), 43: (315.0, 0.0, 0.0)}
-    if number in later:
-        return mounting_matrix(*later[number])
-    entry = mavlink.enums["MAV_SENSOR_ORIENTATION"].get(number)
-    if entry is None or number >= 100:
-        return np.eye(3)
-    words = entry.name.removeprefix(_PREFIX).split("_")
-    angles = {word: float(value) for word, value in zip(words[0::2], words[1::2], strict=False)}
-    roll, pitch, yaw = (_FINE_DEG.get(angle, angle) for angle in (angles.get(w, 0.0) for w in ("ROLL", "PITCH", "YAW")))
-    return mounting_matrix(roll, pitch, yaw)
+    return rotation_matrix(number)
 
 
 class InertialPath:

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.earth import STANDARD_GRAVITY_M_S2, Array
+from sim.ardupilot.versions import NEWEST
+from sim.earth import STANDARD_GRAVITY_M_S2
+from sim.firmware.messages import (
+    global_position_int,
+    gps_raw_int,
+    magnetic_body,
+    pressure_hpa,
+    sys_status,
+    system_time,
+)
+from sim.firmware.numbers import truncated_16
 
 if TYPE_CHECKING:
     from sim.autopilot import ArduPilotDouble
@@ -17,46 +26,32 @@ Message = mavlink.MAVLink_message
 Builder = Callable[["ArduPilotDouble", float], Message]
 
 
-def truncated_16(value: float) -> int:
-    """A C conversion of float to int16: toward zero; what does not fit is cut at the ends."""
-    return int(max(-32768.0, min(32767.0, value)))
-
-
 def heartbeat(double: ArduPilotDouble, loop_s: float) -> Message:
-    """HEARTBEAT."""
+    """HEARTBEAT; a calibration does not show in it, neither on Copter nor on Plane."""
     base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
     if double.armed:
         base |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
     kind = mavlink.MAV_TYPE_QUADROTOR if double.vehicle == "copter" else mavlink.MAV_TYPE_FIXED_WING
     state = mavlink.MAV_STATE_ACTIVE if double.armed else mavlink.MAV_STATE_STANDBY
-    if double.calibrating:
-        state = mavlink.MAV_STATE_CALIBRATING
     return mavlink.MAVLink_heartbeat_message(kind, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, base, 0, state, 3)
-
-
-def _magnetic_body(double: ArduPilotDouble, t_s: float) -> Array:
-    """Milligauss in body axes."""
-    result: Array = double.aircraft.body_from_ned(t_s) @ double.field_ned
-    return result
 
 
 def highres_imu(double: ArduPilotDouble, loop_s: float) -> Message:
     """HIGHRES_IMU: floats of the first IMU; the temperature is the barometer's, the magnetic unit is wrong by 10^6."""
     t_s = double.aircraft.time_at(loop_s)
     gx, gy, gz, ax, ay, az = double.imu_output(0, loop_s).tolist()
-    mx, my, mz = (_magnetic_body(double, t_s) * 1000.0).tolist()
-    pressure = 1013.25 * (1.0 - double.aircraft.site.height_m / 44330.8) ** 5.25588
+    mx, my, mz = (magnetic_body(double, t_s) * 1000.0).tolist()
     baro_degc = double.aircraft.temperature_degc(t_s) + 7.5
     return mavlink.MAVLink_highres_imu_message(
         double.boot_us(loop_s), ax, ay, az, gx, gy, gz, mx, my, mz,
-        pressure, 0.0, double.aircraft.site.height_m, baro_degc, 8191, 0,
+        pressure_hpa(double), 0.0, double.aircraft.site.height_m, baro_degc, 8191, 0,
     )  # fmt: skip
 
 
 def _integers(double: ArduPilotDouble, index: int, loop_s: float) -> tuple[int, ...]:
     """xacc..zgyro of RAW and SCALED messages (mG, mrad/s), magnetic field in milligauss, temperature in 0.01 degC."""
     t_s = double.aircraft.time_at(loop_s)
-    mx, my, mz = (truncated_16(float(value)) for value in _magnetic_body(double, t_s))
+    mx, my, mz = (truncated_16(float(value)) for value in magnetic_body(double, t_s))
     if index >= len(double.imus):
         return (0, 0, 0, 0, 0, 0, mx, my, mz, 0)  # the trap of SCALED_IMU3: sent, with a compass and no IMU
     output = double.imu_output(index, loop_s)
@@ -89,12 +84,6 @@ def scaled_imu3(double: ArduPilotDouble, loop_s: float) -> Message:
     return mavlink.MAVLink_scaled_imu3_message(double.boot_ms(loop_s), *_integers(double, 2, loop_s))
 
 
-def system_time(double: ArduPilotDouble, loop_s: float) -> Message:
-    """SYSTEM_TIME; the date is known because there is GNSS."""
-    unix_us = 0 if not double.has_position else int(double.unix_s(loop_s) * 1e6)
-    return mavlink.MAVLink_system_time_message(unix_us, double.boot_ms(loop_s))
-
-
 def attitude(double: ArduPilotDouble, loop_s: float) -> Message:
     """ATTITUDE: the estimator's, in the vehicle frame, that is with AHRS_TRIM taken off."""
     roll, pitch, yaw = double.estimated_angles_rad(loop_s)
@@ -109,41 +98,6 @@ def ahrs(double: ArduPilotDouble, loop_s: float) -> Message:
     return mavlink.MAVLink_ahrs_message(x, y, z, 0.0, 0.0, 0.001, 0.002)
 
 
-def global_position_int(double: ArduPilotDouble, loop_s: float) -> Message:
-    """GLOBAL_POSITION_INT; zeros without a position."""
-    site = double.aircraft.site
-    _, _, yaw = double.estimated_angles_rad(loop_s)
-    heading = int(math.degrees(yaw) % 360.0 * 100.0) % 36000
-    if not double.has_position:
-        return mavlink.MAVLink_global_position_int_message(double.boot_ms(loop_s), 0, 0, 0, 0, 0, 0, 0, heading)
-    return mavlink.MAVLink_global_position_int_message(
-        double.boot_ms(loop_s), round(site.latitude_deg * 1e7), round(site.longitude_deg * 1e7),
-        round(site.height_m * 1000.0), 0, 0, 0, 0, heading,
-    )  # fmt: skip
-
-
-def gps_raw_int(double: ArduPilotDouble, loop_s: float) -> Message:
-    """GPS_RAW_INT: a 3D fix, or none."""
-    site = double.aircraft.site
-    if not double.has_position:
-        return mavlink.MAVLink_gps_raw_int_message(double.boot_us(loop_s), 1, 0, 0, 0, 65535, 65535, 0, 0, 0)
-    return mavlink.MAVLink_gps_raw_int_message(
-        double.boot_us(loop_s), 3, round(site.latitude_deg * 1e7), round(site.longitude_deg * 1e7),
-        round(site.height_m * 1000.0), 80, 120, 0, 0, 14, round(site.height_m * 1000.0), 1200, 1800,
-    )  # fmt: skip
-
-
-def sys_status(double: ArduPilotDouble, loop_s: float) -> Message:
-    """SYS_STATUS, with the health bit of the pre-arm checks."""
-    sensors = (
-        mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
-        | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
-        | mavlink.MAV_SYS_STATUS_PREARM_CHECK
-    )
-    health = sensors if not double.prearm_failures(loop_s) else sensors & ~mavlink.MAV_SYS_STATUS_PREARM_CHECK
-    return mavlink.MAVLink_sys_status_message(sensors, sensors, health, 180, 12600, -1, -1, 0, 0, 0, 0, 0, 0)
-
-
 def autopilot_version(double: ArduPilotDouble, loop_s: float) -> Message:
     """AUTOPILOT_VERSION: PARAM_FLOAT, and neither C_CAST nor BYTEWISE."""
     capabilities = (
@@ -154,7 +108,7 @@ def autopilot_version(double: ArduPilotDouble, loop_s: float) -> Message:
         | mavlink.MAV_PROTOCOL_CAPABILITY_FTP
     )
     major, minor = (int(part) for part in double.version.split("."))
-    software = major << 24 | minor << 16 | (0 if double.version == "4.8" else mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL)
+    software = major << 24 | minor << 16 | (0 if double.version == NEWEST else mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL)
     nothing = [0] * 8
     return mavlink.MAVLink_autopilot_version_message(
         capabilities, software, 0, 0, 0, nothing, nothing, nothing, 0x1209, 0x5740, 0

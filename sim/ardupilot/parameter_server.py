@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.ardupilot.channel import Channel
-from sim.ardupilot.faults import names_match
+from sim.ardupilot.versions import since
+from sim.firmware.channel import Channel
+from sim.firmware.faults import names_match
+from sim.firmware.writes import Write, after_write
 
 if TYPE_CHECKING:
     from sim.autopilot import ArduPilotDouble
@@ -18,18 +20,6 @@ LIST_PERIOD_S = 0.00176
 """Time per parameter of a list: 1362 took 2.4 s on the real firmware."""
 _CHUNK = 5
 DOES_NOT_EXIST, OUT_OF_RANGE, PERMISSION_DENIED = 1, 2, 3
-
-
-class Write(NamedTuple):
-    """One PARAM_SET as it arrived: the independent witness of what the companion wrote, and when."""
-
-    t_s: float
-    """The loop's clock."""
-    name: str
-    value: float
-    armed: bool
-    system_id: int
-    component_id: int
 
 
 class ParameterServer:
@@ -60,7 +50,7 @@ class ParameterServer:
             return
         double.update_estimator(loop_s)
         double.parameters.set(name, value, takes_effect=not faults.echo_without_effect)
-        if not self._after_write(loop_s):
+        if not after_write(double):
             wrong = names_match(faults.wrong_echo, name)
             for member in double.parameters.family(name):
                 self.announce(member, wrong=wrong and member == name)
@@ -78,10 +68,10 @@ class ParameterServer:
             name, index = message.param_id, NO_INDEX
             if name not in double.parameters:
                 if not names_match(double.faults.ignore, name):
-                    self._error(channel, message, name, -1, DOES_NOT_EXIST)
+                    self._error(self._whose_turn(channel), message, name, -1, DOES_NOT_EXIST)
                 return
         if not names_match(double.faults.ignore, name):
-            double.later(double.answer_delay_s(), lambda: self._send(channel, name, index))
+            double.soon(double.read_delay_s(), lambda: self._send(channel, name, index))
 
     def list_all(self, channel: Channel) -> None:
         """PARAM_REQUEST_LIST: paced, with true indices; the other streams slow down meanwhile."""
@@ -95,38 +85,25 @@ class ParameterServer:
         for index in range(start, min(start + _CHUNK, len(names))):
             self._send(channel, names[index], index)
         if start + _CHUNK < len(names):
-            self._double.later(LIST_PERIOD_S * _CHUNK, lambda: self._list_from(channel, start + _CHUNK))
+            self._double.soon(LIST_PERIOD_S * _CHUNK, lambda: self._list_from(channel, start + _CHUNK))
         else:
             channel.listing = False
 
+    def _whose_turn(self, asker: Channel) -> Channel:
+        """The link by which the error to a read leaves: the one that is served when it is ready."""
+        where = self._double.faults.error_port
+        others = [channel for channel in self._double.channels if channel is not asker]
+        if where == "asker's" or not others:
+            return asker
+        return others[0] if where == "other" or self._double.coin() else asker
+
     def announce(self, name: str, *, wrong: bool = False) -> None:
         """PARAM_VALUE on every port, index 65535, as after a write."""
-        self._double.later(self._double.answer_delay_s(), lambda: self._send_everywhere(name, wrong=wrong))
+        self._double.soon(self._double.answer_delay_s(), lambda: self._send_everywhere(name, wrong=wrong))
 
     def _send_everywhere(self, name: str, *, wrong: bool) -> None:
         for channel in self._double.channels:
             self._send(channel, name, NO_INDEX, wrong=wrong)
-
-    def _after_write(self, loop_s: float) -> bool:
-        """Count down the faults that wait for a write; True if this one rebooted the autopilot."""
-        double, faults = self._double, self._double.faults
-        if faults.foreign_write_after is not None:
-            count, name, value = faults.foreign_write_after
-            faults.foreign_write_after = (count - 1, name, value) if count > 1 else None
-            if count <= 1:
-                double.later(0.01, lambda: double.write_as_another_station(name, value))
-        if faults.arm_after_writes is not None:
-            faults.arm_after_writes -= 1
-            if faults.arm_after_writes <= 0:
-                faults.arm_after_writes = None
-                double.arm()
-        if faults.reboot_after_writes is not None:
-            faults.reboot_after_writes -= 1
-            if faults.reboot_after_writes <= 0:
-                faults.reboot_after_writes = None
-                double.reboot()
-                return True
-        return False
 
     def _send(self, channel: Channel, name: str, index: int, *, wrong: bool = False) -> None:
         if self._double.faults.silent:
@@ -149,9 +126,9 @@ class ParameterServer:
         index: int,
         error: int,
     ) -> None:
-        if self._double.version == "4.5":
+        if not since(self._double.version, "4.7"):
             return
         answer = mavlink.MAVLink_param_error_message(
             message.get_srcSystem(), message.get_srcComponent(), name.encode(), index, error
         )
-        self._double.later(self._double.answer_delay_s(), lambda: self._double.answer(channel, answer))
+        self._double.soon(self._double.answer_delay_s(), lambda: self._double.answer(channel, answer))

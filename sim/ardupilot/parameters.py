@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import struct
 from typing import Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-Version = Literal["4.8", "4.5"]
+from sim.ardupilot.versions import NEWEST, Version, since
+from sim.firmware.numbers import float32
+
 REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
 INT8 = mavlink.MAV_PARAM_TYPE_INT8
 INT16 = mavlink.MAV_PARAM_TYPE_INT16
@@ -17,17 +18,26 @@ _LIMITS = {INT8: (-128, 127), INT16: (-32768, 32767), INT32: (-(2**31), 2**31 - 
 AXES = ("X", "Y", "Z")
 
 
-def float32(value: float) -> float:
-    """The nearest float32, as everything the autopilot stores."""
-    return float(struct.unpack("<f", struct.pack("<f", value))[0])
-
-
 def offset_names(instance: int, kind: Literal["gyro", "accel", "scale"]) -> tuple[str, str, str]:
-    """Parameter names of instance 1 to 3; the first one is irregular (there is no INS_ACC1OFFS_X)."""
+    """Parameter names of instance 1 to 5; the first one is irregular (there is no INS_ACC1OFFS_X), so are 4 and 5."""
     first = {"gyro": "INS_GYROFFS", "accel": "INS_ACCOFFS", "scale": "INS_ACCSCAL"}
     later = {"gyro": "INS_GYR{}OFFS", "accel": "INS_ACC{}OFFS", "scale": "INS_ACC{}SCAL"}
     base = first[kind] if instance == 1 else later[kind].format(instance)
+    if instance > 3:
+        base = first[kind].replace("INS_", f"INS{instance}_")
     return f"{base}_X", f"{base}_Y", f"{base}_Z"
+
+
+def gyro_id_name(instance: int) -> str:
+    """Name of the gyro's device id."""
+    if instance > 3:
+        return f"INS{instance}_GYR_ID"
+    return f"INS_GYR{'' if instance == 1 else instance}_ID"
+
+
+def caltemp_name(instance: int, kind: Literal["GYR", "ACC"]) -> str:
+    """Name of the calibration temperature; here the first has its number."""
+    return f"INS{instance}_{kind}_CALTEMP" if instance > 3 else f"INS_{kind}{instance}_CALTEMP"
 
 
 class ParameterStore:
@@ -82,13 +92,15 @@ class ParameterStore:
         return (name,)
 
 
-def default_parameters(version: Version, imus: int) -> dict[str, tuple[float, int]]:
+def default_parameters(version: Version, imus: int, *, auxiliary: bool = False) -> dict[str, tuple[float, int]]:
     """The parameters a companion meets, in a fixed order, with values of a calibrated board with `imus` IMUs.
+
+    With `auxiliary` there are names of IMU 4 and 5 too, and a gyro behind 4; not before 4.4.
 
     Offsets of 0.001 m/s^2 stand for "has been accelerometer-calibrated", as ArduPilot's own simulator does.
     """
-    table: dict[str, tuple[float, int]] = {"FORMAT_VERSION": (120 if version == "4.8" else 16, INT16)}
-    old = version == "4.5"
+    table: dict[str, tuple[float, int]] = {"FORMAT_VERSION": (120 if version == NEWEST else 16, INT16)}
+    old = not since(version, "4.7")
     table["SYSID_THISMAV" if old else "MAV_SYSID"] = (1, INT16)
     table["SYSID_MYGCS" if old else "MAV_GCS_SYSID"] = (255, INT16)
     table["ARMING_CHECK" if old else "ARMING_SKIPCHK"] = (1 if old else 0, INT32)
@@ -99,6 +111,8 @@ def default_parameters(version: Version, imus: int) -> dict[str, tuple[float, in
         table |= {f"CUST_ROT{number}_{angle}": (0.0, REAL32) for angle in ("ROLL", "PITCH", "YAW")}
     for instance in (1, 2, 3):
         table |= _imu_parameters(instance, exists=instance <= imus)
+    for instance in (4, 5) if auxiliary and since(version, "4.4") else ():
+        table |= _auxiliary_parameters(instance, exists=instance == 4)
     table |= {
         "INS_GYR_CAL": (1, INT8),
         "INS_ENABLE_MASK": (127, INT8),
@@ -128,7 +142,7 @@ def default_parameters(version: Version, imus: int) -> dict[str, tuple[float, in
         "SCHED_LOOP_RATE": (400, INT16),
         "SCR_ENABLE": (0, INT8),
         "VISO_TYPE": (0, INT8),
-        "GPS_TYPE" if old else "GPS1_TYPE": (1, INT8),
+        "GPS1_TYPE" if since(version, "4.6") else "GPS_TYPE": (1, INT8),
         "LOG_BITMASK": (176126, INT32),
         "LOG_DISARMED": (0, INT8),
         "STAT_BOOTCNT": (1, INT16),
@@ -155,6 +169,22 @@ def _imu_parameters(instance: int, *, exists: bool) -> dict[str, tuple[float, in
     }
     table |= {f"INS_POS{instance}_{axis}": (0.0, REAL32) for axis in AXES}
     return table
+
+
+def _auxiliary_parameters(instance: int, *, exists: bool) -> dict[str, tuple[float, int]]:
+    table: dict[str, tuple[float, int]] = dict.fromkeys(
+        offset_names(instance, "gyro"), (2e-4 if exists else 0.0, REAL32)
+    )
+    table |= dict.fromkeys(offset_names(instance, "scale"), (1.0 if exists else 0.0, REAL32))
+    table |= dict.fromkeys(offset_names(instance, "accel"), (0.001 if exists else 0.0, REAL32))
+    return table | {
+        f"INS{instance}_GYR_ID": (device_id(instance) if exists else 0, INT32),
+        f"INS{instance}_ACC_ID": (device_id(instance) if exists else 0, INT32),
+        f"INS{instance}_USE": (1, INT8),
+        f"INS{instance}_GYR_CALTEMP": (-300.0, REAL32),
+        f"INS{instance}_ACC_CALTEMP": (-300.0, REAL32),
+        f"INS{instance}_TCAL_ENABLE": (0, INT8),
+    }
 
 
 def device_id(instance: int) -> int:

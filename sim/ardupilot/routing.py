@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sim.ardupilot.channel import Channel, Message
+from sim.firmware.channel import Channel, Message
 
 
 class Router:

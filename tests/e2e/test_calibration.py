@@ -189,3 +189,15 @@ def test_a_serial_imu_that_the_autopilot_consumes_gets_its_offsets_there_and_the
             assert {w.outcome for w in record.imus[0].written.values()} == {"verified"}
 
     run_virtual(main())
+
+
+def test_a_long_calibration_does_not_make_the_look_at_the_write_long(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, min_still_s=70.0, max_s=70.0, feed_s=0.2, imu_rate_hz=50.0).running() as rig:
+            await rig.ready()
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            assert {what.outcome for what in record.imus[0].written.values()} == {"verified"}
+            assert record.duration_s < 70.0 + 30.0
+
+    run_virtual(main())

@@ -15,6 +15,7 @@ from sim.autopilot import ArduPilotDouble
 from sim.devices import HMR3300, Gradienter, ImuLine, SerialDevice, VectorNavBinary
 from sim.earth import EARTH_RATE_RAD_S, angles_of, body_from_ned
 from sim.imu_model import ImuModel
+from sim.px4.double import PX4Double
 from sim.station import Station
 from tests.support.virtual_time import run_virtual
 
@@ -70,12 +71,15 @@ def test_devices_survive_any_command(chunks: list[bytes]) -> None:
         device.frames_until(1.0)
 
 
+@pytest.mark.parametrize(("kind", "name"), [(ArduPilotDouble, "INS_GYR_CAL"), (PX4Double, "IMU_GYRO_CAL_EN")])
 @settings(deadline=None, max_examples=30)
-@given(st.lists(st.binary(max_size=300), max_size=20))
-def test_the_double_survives_any_bytes_and_still_answers(chunks: list[bytes]) -> None:
+@given(chunks=st.lists(st.binary(max_size=300), max_size=20))
+def test_the_doubles_survive_any_bytes_and_still_answer(
+    kind: type[ArduPilotDouble | PX4Double], name: str, chunks: list[bytes]
+) -> None:
     async def main() -> None:
         aircraft = VirtualAircraft()
-        double = ArduPilotDouble(aircraft, [ImuModel(aircraft)])
+        double = kind(aircraft, [ImuModel(aircraft)])
         station = Station()
         loop = asyncio.get_running_loop()
         double.attach(lambda data: station.receive(data, loop.time()))
@@ -83,7 +87,7 @@ def test_the_double_survives_any_bytes_and_still_answers(chunks: list[bytes]) ->
         for chunk in chunks:
             double.receive(chunk, loop.time())
         double.receive(bytes(300), loop.time())  # whatever was half received is over now
-        assert len(await station.read_parameter("INS_GYR_CAL")) == 1
+        assert len(await station.read_parameter(name)) == 1
 
     run_virtual(main())
 

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.calibration.request import What
 from companion.component.component import Component
-from companion.component.service import Job, JobResult, Refusal
+from companion.component.service import ArmAnswer, Job, JobResult, Refusal
 from companion.links.mavlink import MavlinkLink
 from tests.support.wire import Wire
 
@@ -115,11 +115,14 @@ class ScriptedService:
     def __init__(self) -> None:
         self.mav_state = int(mavlink.MAV_STATE_ACTIVE)
         self.started: list[Started] = []
+        self.reboots: list[bool] = []
+        """Of every calibration that was asked for, whether with a restart of the autopilot."""
         self.refusal: Refusal | None = None
         self.error: Exception | None = None
         self.takes_s: float | None = None
 
-    def start_calibration(self, what: What, requester: str) -> Job | Refusal:
+    def start_calibration(self, what: What, requester: str, *, reboot: bool = False) -> Job | Refusal:
+        self.reboots.append(reboot)
         return self._start(what, requester)
 
     def start_undo(self, requester: str) -> Job | Refusal:
@@ -156,6 +159,18 @@ class FakeVehicle:
         self.system_id = system_id
 
 
+class ScriptedGate:
+    """Says what the test tells it."""
+
+    def __init__(self) -> None:
+        self.at_arm: Literal["gate", "warn", "off"] = "gate"
+        self.asks_script = False
+        self.says = ArmAnswer("accept", "calibrated 3 min ago, 2.1 deg/h")
+
+    def answer(self) -> ArmAnswer:
+        return self.says
+
+
 class Bench(NamedTuple):
     link: MavlinkLink
     component: Component
@@ -164,22 +179,29 @@ class Bench(NamedTuple):
     ground: Ground
     wire: Wire
     task: asyncio.Task[None]
+    gate: ScriptedGate
 
 
 @asynccontextmanager
 async def bench(
-    *, seed: int = 0, loss: float = 0.0, duplicate: float = 0.0, prepare: Callable[[Component], None] | None = None
+    *,
+    seed: int = 0,
+    loss: float = 0.0,
+    duplicate: float = 0.0,
+    system_id: int | None = None,
+    ground: Ground | None = None,
+    prepare: Callable[[Component], None] | None = None,
 ) -> AsyncIterator[Bench]:
     """The component running at one end of a wire."""
-    link, ground = MavlinkLink(), Ground()
-    service, vehicle = ScriptedService(), FakeVehicle()
-    component = Component(link, vehicle, service)
+    link, ground = MavlinkLink(), ground or Ground()
+    service, vehicle, gate = ScriptedService(), FakeVehicle(system_id), ScriptedGate()
+    component = Component(link, vehicle, service, gate)
     if prepare is not None:
         prepare(component)
     wire = Wire(link, ground, seed=seed, loss=loss, duplicate=duplicate)
     task = asyncio.create_task(component.run())
     try:
-        yield Bench(link, component, service, vehicle, ground, wire, task)
+        yield Bench(link, component, service, vehicle, ground, wire, task, gate)
     finally:
         task.cancel()
         with suppress(asyncio.CancelledError):

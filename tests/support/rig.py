@@ -9,15 +9,18 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from companion.config import parse
+from companion.daemon.ledger import Offload
 from companion.daemon.service import Service
 from companion.links.mavlink import MavlinkLink
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.autopilot import ArduPilotDouble
 from sim.devices import HMR3300, Gradienter, Law, SerialDevice, VectorNavBinary
+from sim.firmware.double import AutopilotDouble
 from sim.imu_model import DEG_H, MG, ImuModel
+from sim.px4.double import PX4Double
 from sim.scenario import site_at
 from tests.support.component import Ground
 from tests.support.wire import Wire
@@ -46,6 +49,7 @@ sigma_deg = 1.0
 [calibration]
 min_still_s = {min_still_s}
 max_s = {max_s}
+at_arm = "{at_arm}"
 [storage]
 directory = "{folder}"
 {more}
@@ -60,13 +64,23 @@ profile = "adis16470"
 """
 
 
+# What every rig sets: no gyro calibration at boot; a companion that the ground station can reach.
+_FIRMWARES: dict[str, tuple[Callable[..., AutopilotDouble], dict[str, float]]] = {
+    "ardupilot": (ArduPilotDouble, {"INS_GYR_CAL": 0.0}),
+    "px4": (PX4Double, {"MAV_1_FORWARD": 1.0}),
+}
+
+
 async def inline(function: Callable[..., Any], *arguments: Any) -> Any:
     """Runs a blocking call on the spot: there are no threads on virtual time."""
     return function(*arguments)
 
 
 class Rig:
-    """One aircraft, its autopilot, its devices, the daemon, and a ground station behind the autopilot."""
+    """One aircraft, its autopilot, its devices, the daemon, and a ground station behind the autopilot.
+
+    Nothing calibrates by itself unless `at_arm` says so: most tests ask for what they look at.
+    """
 
     def __init__(
         self,
@@ -78,19 +92,23 @@ class Rig:
         part: str = "icm42688p",
         own_imu: bool = False,
         vehicle: str = "copter",
+        firmware: Literal["ardupilot", "px4"] = "ardupilot",
         min_still_s: float = 10.0,
         max_s: float = 30.0,
         parameters: dict[str, float] | None = None,
         imus: int = 2,
+        mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        at_arm: str = "off",
         more: str = "",
         loss: float = 0.0,
         duplicate: float = 0.0,
+        baud: int | None = None,
         imu_rate_hz: float = 100.0,
         device_rate_hz: float | None = None,
         feed_s: float = 0.05,
         **autopilot: Any,
     ) -> None:
-        self.imu_rate_hz, self.feed_s = imu_rate_hz, feed_s
+        self.imu_rate_hz, self.feed_s = imu_rate_hz if baud is None else None, feed_s
         self.site: Site = site_at(40.0, 116.0, 50.0)
         self.aircraft = VirtualAircraft(pose, self.site)
         self.model = ImuModel(
@@ -99,25 +117,30 @@ class Rig:
             seed=seed,
             gyro_bias_rad_s=[value * DEG_H for value in GYRO_BIAS_DEG_H],
             accel_bias_m_s2=[value * MG for value in ACCEL_BIAS_MG],
+            mounting_deg=mounting_deg,
         )
-        models = [self.model, *(ImuModel(self.aircraft, part, seed=seed + 10 + k) for k in range(imus - 1))]
-        self.double = ArduPilotDouble(
-            self.aircraft,
-            models,
-            vehicle=vehicle,  # type: ignore[arg-type]
-            parameters={"INS_GYR_CAL": 0.0, **(parameters or {})},
-            seed=seed,
-            **autopilot,
+        if firmware == "px4":
+            # Nobody looks at them, and half of the time goes there; but they are what a serial line has to carry.
+            autopilot.setdefault("default_streams", baud is not None)
+        others = [ImuModel(self.aircraft, part, seed=seed + 10 + k, mounting_deg=mounting_deg) for k in range(imus - 1)]
+        models = [self.model, *others]
+        kind, usual = _FIRMWARES[firmware]
+        self.autopilot = kind(
+            self.aircraft, models, vehicle=vehicle, parameters={**usual, **(parameters or {})}, seed=seed, **autopilot
         )
+        """The double, whichever it is; `double` and `px4` are the same by its own type."""
         text = CONFIG.format(
             part=part,
             own=OWN if own_imu else "",
             law=law,
             min_still_s=min_still_s,
             max_s=max_s,
+            at_arm=at_arm,
             folder=folder,
             more=more,
         )
+        if baud is not None:
+            text = text.replace("udpout:127.0.0.1:9", f"serial:/nowhere/autopilot:{baud}")
         self.config = parse(text, "rig.toml")
         self.link = MavlinkLink()
         self.devices: dict[str, SerialDevice] = {
@@ -134,11 +157,26 @@ class Rig:
             )
             self.devices["own"] = VectorNavBinary(self.own_model)
         self.ground = Ground()
-        self.wire = Wire(self.link, self.double, seed=seed, loss=loss, duplicate=duplicate)
-        self.radio = Wire(self.ground, self.double.ground, seed=seed + 1)
+        self.wire = Wire(self.link, self.autopilot, seed=seed, loss=loss, duplicate=duplicate)
+        if baud is not None:
+            self.wire.bytes_per_s = baud / 10.0
+        self.radio = Wire(self.ground, self.autopilot.ground, seed=seed + 1)
+        self.offload: Offload = inline
         self.unplugged: set[str] = set()
         """Devices that say nothing."""
         self.service: Service
+
+    @property
+    def double(self) -> ArduPilotDouble:
+        """The ArduPilot of the default rig."""
+        assert isinstance(self.autopilot, ArduPilotDouble)
+        return self.autopilot
+
+    @property
+    def px4(self) -> PX4Double:
+        """The PX4 of a rig with `firmware="px4"`."""
+        assert isinstance(self.autopilot, PX4Double)
+        return self.autopilot
 
     @property
     def now_s(self) -> float:
@@ -147,11 +185,11 @@ class Rig:
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[Rig]:
         """Run everything; the daemon is stopped in order at the end."""
-        self.service = Service(self.config, link=self.link, offload=inline, imu_rate_hz=self.imu_rate_hz)
+        self.service = Service(self.config, link=self.link, offload=self.offload, imu_rate_hz=self.imu_rate_hz)
         tasks = [
             asyncio.create_task(coroutine)
             for coroutine in (
-                self.double.run(),
+                self.autopilot.run(),
                 self._feed(),
                 self._ground_heartbeat(),
                 self.service.serve(mavlink=False, ports=False),

@@ -191,6 +191,8 @@ class ScriptedAutopilot:
         result = self.result_of(message)
         if result == mavlink.MAV_RESULT_ACCEPTED and message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
             self.intervals[int(message.param1)] = message.param2 * 1e-6
+            if message.param2 == 0:  # back to the default: not sent
+                del self.intervals[int(message.param1)]
             if int(message.param1) == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
                 self.heartbeat_s = message.param2 * 1e-6
         if message.command == mavlink.MAV_CMD_REQUEST_MESSAGE and int(message.param1) == 148:

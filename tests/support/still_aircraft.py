@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ QUIET = NoiseProfile("quiet", AllanModel(1e-9, 1e-9, 1e-12), AllanModel(1e-9, 1e
 
 
 def settings(**more: float) -> Settings:
-    values = {
+    values: dict[str, Any] = {
         "min_still_s": 10.0,
         "max_s": 60.0,
         "target_gyro_sigma_rad_s": 5.0 * DEG_H,

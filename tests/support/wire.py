@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import random
 from collections.abc import Callable
 from typing import Protocol
+
+BUFFER_BYTES = 1024.0
+"""Transmit buffer of a flight controller's UART."""
 
 
 class End(Protocol):
@@ -17,7 +21,18 @@ class End(Protocol):
 
 
 class Wire:
-    """Carries bytes both ways between two ends; `loss` and `duplicate` are probabilities per packet."""
+    """Carries bytes both ways between two ends.
+
+    Args:
+        one: the companion's end.
+        other: the autopilot's.
+        seed: of what is lost, doubled and late.
+        delay_s: shortest and longest time under way.
+        loss: probability per packet.
+        duplicate: likewise.
+        bytes_per_s: of a serial line, each way; what finds no room in BUFFER_BYTES is dropped, as by the UART of a
+            flight controller.
+    """
 
     def __init__(
         self,
@@ -28,10 +43,15 @@ class Wire:
         delay_s: tuple[float, float] = (0.001, 0.003),
         loss: float = 0.0,
         duplicate: float = 0.0,
+        bytes_per_s: float = math.inf,
     ) -> None:
         self.loss, self.duplicate, self.delay_s = loss, duplicate, delay_s
         self.cut = False
         """True: nothing passes in either direction."""
+        self.bytes_per_s = bytes_per_s
+        self.dropped = 0
+        """Packets for which a serial line had no room."""
+        self._free_s: dict[int, float] = {}
         self._random = random.Random(seed)
         self._last_due_s: dict[int, float] = {}
         self._ends = (one, other)
@@ -43,13 +63,22 @@ class Wire:
         for end in self._ends:
             end.attach(None)
 
+    def carry_from_other(self, data: bytes) -> None:
+        """Put a packet on the wire towards the companion's end, beside what the autopilot itself sends."""
+        self._carry(data, self._ends[0])
+
     def _carry(self, data: bytes, to: End) -> None:
         if self.cut or self._random.random() < self.loss:
             return
         loop = asyncio.get_running_loop()
         copies = 2 if self._random.random() < self.duplicate else 1
         for _ in range(copies):
-            due_s = loop.time() + self._random.uniform(*self.delay_s)
+            sent_s = max(loop.time(), self._free_s.get(id(to), 0.0)) + len(data) / self.bytes_per_s
+            if sent_s - loop.time() > BUFFER_BYTES / self.bytes_per_s:
+                self.dropped += 1
+                continue
+            self._free_s[id(to)] = sent_s
+            due_s = sent_s + self._random.uniform(*self.delay_s)
             # A wire keeps the order; the loop runs timers of the very same instant in any order.
             due_s = max(due_s, self._last_due_s.get(id(to), 0.0) + 1e-6)
             self._last_due_s[id(to)] = due_s

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.ardupilot import (
+from companion.autopilot.ardupilot import parameters_of
+from companion.autopilot.firmwares import read_calibration
+from companion.autopilot.imu_calibration import (
     ImuCalibration,
-    ImuParameters,
     accel_offset_after,
     changes_for,
     offsets_after,
     output_step,
-    read_calibration,
     whole_bias,
 )
 from companion.autopilot.parameters import ParameterClient
@@ -62,8 +62,8 @@ def read(parameters: dict[str, float], instance: int = 1, autopilot: ScriptedAut
     return run_virtual(main())
 
 
-def test_names_of_the_three_instances() -> None:
-    one, two, three = ImuParameters(1), ImuParameters(2), ImuParameters(3)
+def test_names_of_the_instances_of_which_the_first_is_irregular() -> None:
+    one, two, three = parameters_of(1), parameters_of(2), parameters_of(3)
     assert one.gyro_offset == ("INS_GYROFFS_X", "INS_GYROFFS_Y", "INS_GYROFFS_Z")
     assert one.accel_offset[1] == "INS_ACCOFFS_Y"
     assert one.accel_scale[2] == "INS_ACCSCAL_Z"
@@ -76,11 +76,14 @@ def test_names_of_the_three_instances() -> None:
     assert (two.gyro_caltemp, two.tcal_enable) == ("INS_GYR2_CALTEMP", "INS_TCAL2_ENABLE")
     assert three.accel_offset[2] == "INS_ACC3OFFS_Z"
     assert one.tcal_enable == "INS_TCAL1_ENABLE"
-    for names in (one, two, three):
+    four = parameters_of(4)
+    assert four.gyro_offset == ("INS4_GYROFFS_X", "INS4_GYROFFS_Y", "INS4_GYROFFS_Z")
+    assert (four.gyro_id, four.gyro_caltemp, four.use) == ("INS4_GYR_ID", "INS4_GYR_CALTEMP", "INS4_USE")
+    for names in (one, two, three, four):
         for name in (*names.gyro_offset, *names.accel_scale, names.accel_caltemp, names.tcal_enable):
             assert len(name) <= 16
-    with pytest.raises(AutopilotError, match="IMU 4"):
-        ImuParameters(4)
+    with pytest.raises(AutopilotError, match="IMU 6"):
+        parameters_of(6)
 
 
 def test_reads_what_is_there() -> None:
@@ -89,38 +92,44 @@ def test_reads_what_is_there() -> None:
     assert calibration.accel_offset_m_s2 == (f32(0.1), f32(0.2), f32(0.3))
     assert calibration.accel_scale == (f32(1.01), f32(0.99), 1.0)
     assert (calibration.gyro_id, calibration.accel_id) == (2752772, 2753028)
-    assert (calibration.tcal_enable, calibration.gyr_cal) == (0, 0)
+    assert (calibration.tcal_enable, calibration.rivals) == (0, ())
     assert np.array_equal(calibration.orientation, np.eye(3))
     assert calibration.warnings == ()
 
 
+def board_x(orientation: int, **angles: float) -> list[float]:
+    """Where the board's x axis points in the vehicle."""
+    calibration = read(IMU1 | {"AHRS_ORIENTATION": orientation} | angles)
+    pointing: list[float] = (calibration.orientation @ np.array([1.0, 0.0, 0.0])).tolist()
+    return pointing
+
+
 @pytest.mark.parametrize(
-    ("orientation", "extra", "of_board_x"),
+    ("orientation", "expected"),
     [
-        (2, {}, (0, 1, 0)),
-        (6, {}, (0, -1, 0)),
-        (24, {}, (0, 0, -1)),
-        (12, {}, (-1, 0, 0)),
-        (42, {}, (1, 0, 0)),
-        (41, {}, (math.cos(math.radians(7)), 0, -math.sin(math.radians(7)))),
-        (
-            101,
-            {"CUST_ROT_ENABLE": 1, "CUST_ROT1_ROLL": 0, "CUST_ROT1_PITCH": 0, "CUST_ROT1_YAW": 30},
-            (math.cos(math.radians(30)), math.sin(math.radians(30)), 0),
-        ),
-        (
-            102,
-            {"CUST_ROT_ENABLE": 1, "CUST_ROT2_ROLL": 20, "CUST_ROT2_PITCH": 90, "CUST_ROT2_YAW": 0},
-            (0, 0, -1),
-        ),
-        (100, {"AHRS_CUSTOM_ROLL": 0, "AHRS_CUSTOM_PIT": 0, "AHRS_CUSTOM_YAW": 180}, (-1, 0, 0)),
+        (2, (0, 1, 0)),
+        (6, (0, -1, 0)),
+        (24, (0, 0, -1)),
+        (12, (-1, 0, 0)),
+        (42, (1, 0, 0)),
+        (41, (math.cos(math.radians(7)), 0, -math.sin(math.radians(7)))),
     ],
 )
-def test_where_the_boards_x_points_for_an_orientation(
-    orientation: int, extra: dict[str, float], of_board_x: tuple[float, float, float]
-) -> None:
-    calibration = read(IMU1 | {"AHRS_ORIENTATION": orientation} | extra)
-    assert calibration.orientation @ np.array([1.0, 0.0, 0.0]) == pytest.approx(of_board_x, abs=1e-7)
+def test_ahrs_orientation_turns_the_board(orientation: int, expected: tuple[float, float, float]) -> None:
+    assert board_x(orientation) == pytest.approx(expected, abs=1e-7)
+
+
+def test_orientations_101_and_102_are_the_custom_rotations_1_and_2() -> None:
+    yaw_30 = (math.cos(math.radians(30)), math.sin(math.radians(30)), 0)
+    first = board_x(101, CUST_ROT_ENABLE=1, CUST_ROT1_ROLL=0, CUST_ROT1_PITCH=0, CUST_ROT1_YAW=30)
+    assert first == pytest.approx(yaw_30, abs=1e-7)
+    second = board_x(102, CUST_ROT_ENABLE=1, CUST_ROT2_ROLL=20, CUST_ROT2_PITCH=90, CUST_ROT2_YAW=0)
+    assert second == pytest.approx((0, 0, -1), abs=1e-7)
+
+
+def test_orientation_100_of_4_1_and_before_has_angles_of_its_own() -> None:
+    turned = board_x(100, AHRS_CUSTOM_ROLL=0, AHRS_CUSTOM_PIT=0, AHRS_CUSTOM_YAW=180)
+    assert turned == pytest.approx((-1, 0, 0), abs=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -145,28 +154,38 @@ def test_an_instance_that_does_not_exist() -> None:
         read(IMU1, 3)
 
 
-def test_old_firmware_without_temperature_calibration() -> None:
+def test_a_1_mb_board_without_temperature_calibration_by_param_error_or_by_silence() -> None:
     missing = {name: value for name, value in IMU1.items() if name != "INS_TCAL1_ENABLE"}
-    assert read(missing, autopilot=ScriptedAutopilot(param_errors=False)).tcal_enable is None
+    for param_errors in (True, False):
+        assert read(missing, autopilot=ScriptedAutopilot(param_errors=param_errors)).tcal_enable is None
 
 
-@pytest.mark.parametrize(
-    ("changed", "words"),
-    [
-        ({"INS_GYR_CAL": 1}, "INS_GYR_CAL = 1: the next boot"),
-        ({"INS_ACCOFFS_X": 0, "INS_ACCOFFS_Y": 0, "INS_ACCOFFS_Z": 0}, "3D Accel calibration needed"),
-        ({"INS_ACCSCAL_X": 1.3}, "outside 0.8 to 1.2"),
-        ({"INS_USE": 0}, "INS_USE = 0"),
-    ],
-)
-def test_what_is_odd_is_a_warning(changed: dict[str, float], words: str) -> None:
+def only_warning(**changed: float) -> str:
     (warning,) = read(IMU1 | changed).warnings
-    assert words in warning
+    return warning
 
 
-def test_px4_is_not_supported_yet() -> None:
-    with pytest.raises(AutopilotError, match="PX4 is not supported yet by this version"):
-        read(IMU1, autopilot=ScriptedAutopilot(autopilot=mavlink.MAV_AUTOPILOT_PX4))
+def test_ins_gyr_cal_1_is_a_warning_that_the_next_boot_throws_the_gyro_offsets_away() -> None:
+    assert "INS_GYR_CAL = 1: the next boot" in only_warning(INS_GYR_CAL=1)
+
+
+def test_an_accelerometer_vector_of_zero_is_told_to_count_as_uncalibrated() -> None:
+    warning = only_warning(INS_ACCOFFS_X=0, INS_ACCOFFS_Y=0, INS_ACCOFFS_Z=0)
+    assert "3D Accel calibration needed" in warning
+    assert "param5 = 76" in warning
+
+
+def test_a_scale_outside_0_8_to_1_2_is_a_warning() -> None:
+    assert "outside 0.8 to 1.2" in only_warning(INS_ACCSCAL_X=1.3)
+
+
+def test_ins_use_0_is_a_warning() -> None:
+    assert "INS_USE = 0" in only_warning(INS_USE=0)
+
+
+def test_neither_ardupilot_nor_px4_is_not_supported() -> None:
+    with pytest.raises(AutopilotError, match="neither ArduPilot nor PX4"):
+        read(IMU1, autopilot=ScriptedAutopilot(autopilot=mavlink.MAV_AUTOPILOT_GENERIC))
 
 
 def test_a_restart_while_reading_is_no_calibration() -> None:
@@ -186,6 +205,7 @@ def test_a_restart_while_reading_is_no_calibration() -> None:
 def plain(**changes: object) -> ImuCalibration:
     calibration = ImuCalibration(
         instance=1,
+        parameters=parameters_of(1),
         gyro_offset_rad_s=(0.001, 0.002, 0.003),
         accel_offset_m_s2=(0.1, 0.2, 0.3),
         accel_scale=(1.0, 1.0, 1.0),
@@ -193,7 +213,7 @@ def plain(**changes: object) -> ImuCalibration:
         accel_id=1,
         tcal_enable=0,
         orientation=np.eye(3),
-        gyr_cal=0,
+        zero_is_uncalibrated=True,
     )
     return dataclasses.replace(calibration, **changes)  # type: ignore[arg-type]
 

@@ -94,6 +94,28 @@ def test_optional_missing_by_param_error_is_quick() -> None:
     run_virtual(main())
 
 
+def test_a_name_that_is_absent_is_asked_for_once_a_boot() -> None:
+    """On 4.8 as well as on old firmware: its PARAM_ERROR to a read may leave by another of its links."""
+
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters={X: 0.5}, param_errors=False)
+        async with aboard(autopilot) as (client, vehicle, _):
+            loop = asyncio.get_running_loop()
+            begun_s = loop.time()
+            assert await client.read_many([X, "INS4_GYROFFS_X", "INS5_GYROFFS_X"], optional=True) == {X: 0.5}
+            first_s, begun_s = loop.time() - begun_s, loop.time()
+            assert 3.0 < first_s < 8.0  # all at once, not one after the other
+            assert await client.read_optional("INS4_GYROFFS_X") is None
+            assert loop.time() == begun_s
+            # A boot may bring another firmware, and an announcement tells that it is there after all.
+            autopilot.parameters["INS4_GYROFFS_X"] = 0.25
+            await autopilot.reboot()
+            await vehicle.hear_boot_time()
+            assert await client.read_optional("INS4_GYROFFS_X") == 0.25
+
+    run_virtual(main())
+
+
 @pytest.mark.parametrize("read_before", [False, True])
 def test_optional_missing_by_silence_of_old_firmware(read_before: bool) -> None:
     async def main() -> None:

@@ -13,6 +13,11 @@ from companion.links.mavlink import MavlinkLink
 from tests.support.scripted_autopilot import ScriptedAutopilot, flying_on
 from tests.support.virtual_time import run_virtual
 
+ARDUPILOT, PX4 = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4
+PARAM_FLOAT = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+BYTEWISE = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+C_CAST = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
+
 
 def heartbeat(
     link: MavlinkLink,
@@ -310,3 +315,35 @@ def test_boot_clock_32_bit_wrap_is_none() -> None:
 
 def test_boot_clock_slow_simulation_and_drift_are_none() -> None:
     assert not any(feed(BootClock(), *[(0.6 * t, t) for t in range(0, 300, 3)]))
+
+
+@pytest.mark.parametrize(
+    ("capabilities", "autopilot", "expected"),
+    [
+        (None, ARDUPILOT, False),
+        (None, PX4, True),
+        (PARAM_FLOAT, ARDUPILOT, False),
+        (PARAM_FLOAT, PX4, True),
+        (PARAM_FLOAT | BYTEWISE, PX4, True),
+        (PARAM_FLOAT | C_CAST, ARDUPILOT, False),
+        (PARAM_FLOAT | C_CAST, PX4, False),
+        (PARAM_FLOAT | BYTEWISE, ARDUPILOT, True),
+    ],
+)
+def test_integers_are_bytes_by_the_capability_bits_and_else_on_px4_only(
+    capabilities: int | None, autopilot: int, expected: bool
+) -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        heartbeat(link, autopilot=autopilot)
+        vehicle.capabilities = capabilities
+        assert vehicle.integers_bytewise == expected
+        vehicle.close()
+
+    run_virtual(main())
+
+
+def test_boot_clock_an_autopilot_up_for_longer_than_we_heard_nothing_has_not_restarted() -> None:
+    # ArduPilot calibrates its gyros, and the machine that simulates it is too busy: little simulated time, no messages.
+    assert not any(feed(BootClock(), (60, 0), (60.2, 3.5), (60.5, 4.1), (61, 5.2)))

@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.ardupilot import changes_for, output_step, read_calibration
+from companion.autopilot.firmwares import read_calibration
+from companion.autopilot.imu_calibration import changes_for, output_step
 from companion.autopilot.imu_stream import ImuStream
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.vehicle import Vehicle
@@ -29,6 +31,18 @@ GYRO_BIAS = np.array([1080.0, -900.0, 1000.0]) * DEG_H
 ACCEL_BIAS = np.array([30.0, -20.0, 25.0]) * MG
 POSE = Pose(5.0, -3.0, 40.0)
 # Independent of companion.physics: Earth rate and gravity of autopilots 9.3, in the body of that pose.
+_TEN = (
+    mavlink.MAVLINK_MSG_ID_ATTITUDE,
+    mavlink.MAVLINK_MSG_ID_AHRS,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS,
+    mavlink.MAVLINK_MSG_ID_RAW_IMU,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU2,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU3,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
+)
 RATE = np.array([9.64, -6.93, -9.24]) * DEG_H
 
 
@@ -36,6 +50,7 @@ class Stage:
     def __init__(self, *, count: int = 1, **options: Any) -> None:
         self.aircraft = VirtualAircraft(POSE)
         mounting = options.pop("mounting_deg", (0.0, 0.0, 0.0))
+        instance, rate_hz = options.pop("instance", 1), options.pop("stream_rate_hz", 100.0)
         imus = [
             ImuModel(
                 self.aircraft,
@@ -55,7 +70,7 @@ class Stage:
         self.client = ParameterClient(self.link, self.vehicle)
         self.writer = ParameterWriter(self.client, self.vehicle)
         self.samples: list[ImuSample] = []
-        self.stream = ImuStream(self.link, self.vehicle, 1, self.samples.append)
+        self.stream = ImuStream(self.link, self.vehicle, instance, self.samples.append, rate_hz=rate_hz)
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
@@ -193,13 +208,74 @@ def test_faults_of_one_parameter(fault: str, kind: str) -> None:
     run_virtual(main())
 
 
-def test_old_firmware_and_a_plane() -> None:
+async def stream_of(stage: Stage, seconds: float = 8.0) -> tuple[str | None, float]:
+    """The message that the samples come from, and how many come a second."""
+    await asyncio.sleep(seconds)
+    before = stage.stream.samples
+    await asyncio.sleep(4.0)
+    kind = stage.stream.kind
+    return None if kind is None else kind.message, (stage.stream.samples - before) / 4.0
+
+
+@pytest.mark.parametrize(("version", "int_only"), [("4.5", False), ("4.8", True)])
+def test_without_highres_imu_before_4_6_or_with_1_mb_of_flash_the_integers_serve(version: str, int_only: bool) -> None:
     async def main() -> None:
-        for stage in (Stage(version="4.5"), Stage(vehicle="plane")):
-            async with stage.running():
-                await asyncio.sleep(15.0)
-                assert stage.stream.kind is not None
-                assert stage.stream.samples > 200
-                await read_calibration(stage.client, 1)
+        stage = Stage(version=version)
+        stage.double.faults.int_only = int_only
+        async with stage.running():
+            message, found_hz = await stream_of(stage)
+            assert message == "SCALED_IMU"
+            assert found_hz == pytest.approx(100.0, abs=2.0)
+            await read_calibration(stage.client, 1)
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize(("version", "rate_hz"), [("4.8", 100.0), ("4.6", 100.0), ("4.5", 333.3)])
+def test_a_rate_above_the_loops_is_denied_and_the_next_lower_taken_or_before_4_6_capped_and_taken_as_it_comes(
+    version: str, rate_hz: float
+) -> None:
+    async def main() -> None:
+        stage = Stage(version=version, stream_rate_hz=400.0)
+        async with stage.running():
+            _, found_hz = await stream_of(stage)
+            assert found_hz == pytest.approx(rate_hz, rel=0.02)
+            assert stage.stream.problem == ""
+
+    run_virtual(main())
+
+
+def test_a_plane_with_a_loop_of_50_hz_gives_40_hz() -> None:
+    async def main() -> None:
+        stage = Stage(vehicle="plane")
+        async with stage.running():
+            message, found_hz = await stream_of(stage)
+            assert message == "HIGHRES_IMU"
+            assert found_hz == pytest.approx(40.0, abs=1.0)
+
+    run_virtual(main())
+
+
+def test_when_all_ten_intervals_of_the_link_are_taken_the_nearest_serves() -> None:
+    async def main() -> None:
+        stage = Stage()
+        for number, message_id in enumerate(_TEN):
+            stage.double.channels[0].set_stream(message_id, 0.045 + 0.025 * number, 0.0)
+        async with stage.running():
+            _, found_hz = await stream_of(stage)
+            assert found_hz == pytest.approx(1000.0 / 45.0, abs=1.0)
+            assert stage.stream.problem == ""
+
+    run_virtual(main())
+
+
+def test_an_all_zero_scaled_imu3_is_not_an_imu() -> None:
+    async def main() -> None:
+        stage = Stage(count=2, instance=3)
+        async with stage.running():
+            await asyncio.sleep(8.0)
+            assert stage.stream.kind is None
+            assert stage.stream.problem == "SCALED_IMU3 is all zero: there is no third IMU"
+            assert stage.samples == []
 
     run_virtual(main())

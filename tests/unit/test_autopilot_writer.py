@@ -162,7 +162,7 @@ def test_another_value_is_named_and_rolled_back() -> None:
     run_virtual(main())
 
 
-def test_a_value_changed_behind_our_back_is_found_by_the_fresh_read_back() -> None:
+def test_a_value_that_another_station_sets_in_the_middle_is_left_to_it_and_only_ours_is_put_back() -> None:
     async def main() -> None:
         autopilot = ScriptedAutopilot(parameters=BEFORE)
 
@@ -172,9 +172,13 @@ def test_a_value_changed_behind_our_back_is_found_by_the_fresh_read_back() -> No
 
         on_nth_set(autopilot, 3, meddle)
         async with aboard(autopilot) as (writer, _, _):
-            with pytest.raises(WriteFailedError, match=r"INS_GYROFFS_X was set to 0\.0109999999 and reads 0\.5"):
+            with pytest.raises(
+                WriteFailedError, match=r"INS_GYROFFS_X was set to 0\.0109999999 and reads 0\.5"
+            ) as caught:
                 await writer.apply(CHANGES)
-            assert autopilot.parameters == rounded(BEFORE)
+            assert caught.value.kind == "changed by someone else"
+            assert caught.value.left_changed == (X,)
+            assert autopilot.parameters == {**rounded(BEFORE), X: 0.5}
 
     run_virtual(main())
 

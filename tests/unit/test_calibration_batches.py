@@ -171,6 +171,13 @@ def test_a_pile_at_the_end_of_the_range_is_clipping() -> None:
     assert not one([(x,) for x in np.round(rng.normal(0.3, 0.3, 400))]).clipped
 
 
+def test_few_integers_a_second_are_hardly_ever_taken_for_clipping() -> None:
+    # A gate that shuts once in a minute for no reason is switched off by its pilot.
+    rng = np.random.default_rng(5)
+    seconds = np.trunc(rng.normal(rng.uniform(-3.0, 3.0, (3000, 1)), 2.0, (3000, 50)))
+    assert sum(one([(x,) for x in second]).clipped for second in seconds) <= 1
+
+
 def test_headings_are_averaged_over_north() -> None:
     source = BatchSource((1e3,), 5, circle=True)
     source.add(0.9, (0.0,))

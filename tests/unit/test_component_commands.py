@@ -43,6 +43,7 @@ NAN = math.nan
         (CALIBRATE, (2,), What.ACCELEROMETERS),
         (PREFLIGHT, (1, 0, 0, 0, 1), What.BOTH),
         (PREFLIGHT, (1,), What.GYROS),
+        (PREFLIGHT, (1, 0, 1), What.GYROS),  # what Mission Planner's "Preflight Calibration" button sends
         (PREFLIGHT, (0, 0, 0, 0, 1), What.ACCELEROMETERS),
         (UNDO, (), "undo"),
     ],
@@ -72,7 +73,8 @@ def test_what_is_asked_for_is_started(
         (PREFLIGHT, (NAN,)),
         (PREFLIGHT, (0.5,)),
         (PREFLIGHT, (0, 1)),
-        (PREFLIGHT, (1, 0, 1)),
+        (PREFLIGHT, (0, 0, 1)),
+        (PREFLIGHT, (1, 0, 2)),
         (PREFLIGHT, (1, 0, 0, NAN)),
         (PREFLIGHT, (0, 0, 0, 0, 2)),
         (PREFLIGHT, (0, 0, 0, 0, 76)),

@@ -88,6 +88,7 @@ def test_names_of_three_instances_exist_and_acc1offs_does_not() -> None:
                     for name in offset_names(instance, kind):
                         assert len(await stage.companion.read_parameter(name)) == 1
             assert offset_names(1, "accel")[0] == "INS_ACCOFFS_X"
+            stage.double.faults.error_port = "asker's"
             assert await stage.companion.read_parameter("INS_ACC1OFFS_X") == []
             error = stage.companion.all(mavlink.MAVLink_param_error_message)[0]
             assert (error.param_id, error.error) == ("INS_ACC1OFFS_X", 1)
@@ -98,12 +99,82 @@ def test_names_of_three_instances_exist_and_acc1offs_does_not() -> None:
     run_virtual(main())
 
 
-def test_an_old_version_is_silent_about_unknown_names() -> None:
+def test_the_error_to_a_read_leaves_by_whichever_link_is_served_first() -> None:
     async def main() -> None:
-        async with Stage(version="4.5") as stage:
+        async with Stage() as stage:
+            for _ in range(16):
+                assert await stage.companion.read_parameter("NO_SUCH") == []
+            errors = [len(each.all(mavlink.MAVLink_param_error_message)) for each in (stage.companion, stage.ground)]
+            assert sum(errors) == 16
+            assert min(errors) > 0
+
+    run_virtual(main())
+
+
+def test_a_gyro_calibration_writes_temperatures_and_all_instances_and_announces_them() -> None:
+    async def main() -> None:
+        async with Stage(imus=2, auxiliary=True, parameters={"INS_GYR3OFFS_Y": 0.2, "INS_GYR3_ID": 7}) as stage:
+            double = stage.double
+            assert await stage.companion.command(CALIBRATE, 1, wait_s=2.0) == 0
+            names = [name for instance in (1, 2, 4) for name in offset_names(instance, "gyro")]
+            assert all(double.parameter(name) for name in names)
+            assert double.parameter("INS_GYR1_CALTEMP") == double.parameter("INS_GYR2_CALTEMP") == 25.0
+            assert double.parameter("INS_GYR3OFFS_Y") == double.parameter("INS_GYR3_ID") == 0.0
+            await asyncio.sleep(0.5)
+            told = {message.param_id for message in stage.ground.all(mavlink.MAVLink_param_value_message)}
+            assert {*names, "INS_GYR2_CALTEMP", "INS_GYR3OFFS_Y"} <= told
+
+    run_virtual(main())
+
+
+def test_a_gyro_calibration_that_does_not_converge_is_stored_and_blocks_arming_until_a_boot() -> None:
+    async def main() -> None:
+        async with Stage() as stage:
+            stage.double.faults.gyro_calibration_fails = True
+            stage.companion.send(mavlink.MAVLink_command_long_message(1, 1, CALIBRATE, 0, 1, 0, 0, 0, 0, 0, 0))
+            await asyncio.sleep(31.0)
+            assert stage.companion.all(mavlink.MAVLink_command_ack_message)[-1].result == 4
+            assert stage.double.parameter("INS_GYROFFS_X") != 0.0
+            assert stage.double.parameter("INS_GYR1_CALTEMP") == -300.0
+            assert await stage.ground.command(ARM, 1) == 4
+            assert "Arm: Gyros not calibrated" in stage.ground.texts()
+            stage.double.reboot(down_s=1.0)
+            await asyncio.sleep(1.5)
+            assert await stage.ground.command(ARM, 1) == 0
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("version", ["4.3", "4.6"])
+def test_before_4_7_an_unknown_name_is_answered_with_silence(version: str) -> None:
+    async def main() -> None:
+        async with Stage(version=version) as stage:
             assert await stage.companion.read_parameter("NO_SUCH") == []
             assert await stage.companion.set_parameter("NO_SUCH", 1.0) == []
             assert stage.companion.all(mavlink.MAVLink_param_error_message) == []
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize(("version", "renamed"), [("4.3", False), ("4.6", False), ("4.7", True), ("4.8", True)])
+def test_4_7_renamed_sysid_thismav_sr_and_arming_check(version: str, renamed: bool) -> None:
+    double = Stage(version=version, auxiliary=True).double
+    old = {"SYSID_THISMAV", "SYSID_MYGCS", "SR0_RAW_SENS", "ARMING_CHECK"}
+    new = {"MAV_SYSID", "MAV_GCS_SYSID", "MAV1_RAW_SENS", "ARMING_SKIPCHK"}
+    names = set(double.parameters.names)
+    assert (new if renamed else old) <= names
+    assert not (old if renamed else new) & names
+    assert ("INS4_GYROFFS_X" in names) == (version != "4.3")  # from 4.4 on
+
+
+@pytest.mark.parametrize(
+    ("version", "word", "armed"), [("4.5", 21196, False), ("4.5", 2989, True), ("4.6", 21196, True)]
+)
+def test_arming_is_forced_by_2989_and_from_4_6_on_by_21196(version: str, word: int, armed: bool) -> None:
+    async def main() -> None:
+        async with Stage(version=version, parameters=dict.fromkeys(offset_names(1, "accel"), 0.0)) as stage:
+            await stage.ground.command(ARM, 1, word)
+            assert stage.double.armed == armed
 
     run_virtual(main())
 

@@ -15,7 +15,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion import config
 from sim.__main__ import main
-from sim.autopilot import ArduPilotDouble
 from sim.imu_model import DEG_H, MG
 from sim.scenario import demo, site_at
 from sim.serve import configuration, describe, serve
@@ -70,7 +69,7 @@ def test_the_demo_is_the_documented_place_and_size() -> None:
 
 def test_the_double_answers_over_udp_to_its_target_and_to_whoever_speaks() -> None:
     async def scene(*, listening: bool) -> None:
-        double: ArduPilotDouble = demo().autopilot
+        double = demo().autopilot
         station = Station(1, 191)
         if listening:
             server = await open_udp(double, listen=("127.0.0.1", 0))
@@ -98,6 +97,27 @@ def test_the_double_answers_over_udp_to_its_target_and_to_whoever_speaks() -> No
 
     asyncio.run(scene(listening=True))
     asyncio.run(scene(listening=False))
+
+
+def test_the_command_line_serves_a_px4_that_answers_as_one() -> None:
+    async def scene() -> None:
+        station = Station(1, 191)
+        client = await open_udp(station, listen=("127.0.0.1", 0))
+        host, port = client.local
+        command = (sys.executable, "-m", "sim", "autopilot", "--firmware", "px4", "--udp", f"{host}:{port}")
+        process = await asyncio.create_subprocess_exec(*command, cwd=ROOT, stdout=asyncio.subprocess.PIPE)
+        try:
+            async with asyncio.timeout(20.0):
+                while not station.all(mavlink.MAVLink_highres_imu_message):
+                    await asyncio.sleep(0.01)
+            assert station.all(mavlink.MAVLink_heartbeat_message)[0].autopilot == mavlink.MAV_AUTOPILOT_PX4
+        finally:
+            process.terminate()
+            await process.communicate()
+            client.close()
+        assert process.returncode == 0
+
+    asyncio.run(scene())
 
 
 def test_udp_wants_one_of_target_and_listen() -> None:

@@ -142,12 +142,12 @@ def test_journal_and_undo_outlive_the_process(tmp_path: Path) -> None:
     log = ChangeLog(tmp_path)
     assert log.journal.read() is None
     log.journal.write(changes)
-    log.undo.write(changes)
+    log.undo_of(1).write(changes)
     assert ChangeLog(tmp_path).journal.read() == changes
     log.journal.clear()
     log.journal.clear()
     assert ChangeLog(tmp_path).journal.read() is None
-    assert ChangeLog(tmp_path).undo.read() == changes
+    assert ChangeLog(tmp_path).undo_of(1).read() == changes
 
 
 def test_a_journal_that_cannot_be_understood_is_an_error_not_an_empty_one(tmp_path: Path) -> None:

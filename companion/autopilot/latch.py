@@ -1,0 +1,63 @@
+"""Which of all the heartbeats on a network is that of the autopilot to calibrate."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+ADOPT_OTHER_COMPONENT_S: Final = 2.0
+"""So long an autopilot on another component than 1 must have been heard before it is taken for the one."""
+
+_NOT_AIRCRAFT: Final = frozenset(
+    {
+        mavlink.MAV_TYPE_ANTENNA_TRACKER,
+        mavlink.MAV_TYPE_GCS,
+        mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
+        mavlink.MAV_TYPE_GIMBAL,
+        mavlink.MAV_TYPE_ADSB,
+        mavlink.MAV_TYPE_CAMERA,
+        mavlink.MAV_TYPE_CHARGING_STATION,
+        mavlink.MAV_TYPE_FLARM,
+        mavlink.MAV_TYPE_SERVO,
+        mavlink.MAV_TYPE_ODID,
+        mavlink.MAV_TYPE_BATTERY,
+        mavlink.MAV_TYPE_PARACHUTE,
+        mavlink.MAV_TYPE_LOG,
+        mavlink.MAV_TYPE_OSD,
+        mavlink.MAV_TYPE_IMU,
+        mavlink.MAV_TYPE_GPS,
+        mavlink.MAV_TYPE_WINCH,
+        mavlink.MAV_TYPE_ILLUMINATOR,
+        mavlink.MAV_TYPE_GRIPPER,
+    }
+)
+
+
+def is_aircraft(message: mavlink.MAVLink_heartbeat_message) -> bool:
+    """Whether it claims to be a vehicle with an autopilot: ground stations, gimbals and the like are not."""
+    return message.type not in _NOT_AIRCRAFT and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
+
+
+class Latch:
+    """Decides which autopilot is taken.
+
+    Args:
+        system_id: the only one that may be, or None for the first real one that is heard.
+    """
+
+    def __init__(self, system_id: int | None) -> None:
+        self._system_id = system_id
+        self._candidates: dict[tuple[int, int], float] = {}
+
+    def takes(self, message: mavlink.MAVLink_heartbeat_message, t_s: float) -> bool:
+        """Whether this heartbeat of an aircraft, heard at `t_s`, is the one to go by from now on."""
+        system, component = message.get_srcSystem(), message.get_srcComponent()
+        if self._system_id not in (None, system) or system == 0:
+            return False
+        if component == mavlink.MAV_COMP_ID_AUTOPILOT1:
+            return True
+        if message.autopilot not in (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4):
+            return False
+        first_s = self._candidates.setdefault((system, component), t_s)
+        return t_s - first_s >= ADOPT_OTHER_COMPONENT_S

@@ -1,0 +1,81 @@
+"""Means of the gradienter and of the compass over a still stretch (method section 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.allan import white_noise
+from companion.calibration.batches import Batch
+from companion.calibration.robust import huber_mean
+
+Floats = NDArray[np.float64]
+
+_MAX_DECIMALS: Final = 4
+
+
+class TiltWindow(msgspec.Struct, frozen=True, kw_only=True):
+    """Means of the gradienter in its own axes; sigmas are statistical."""
+
+    samples: int
+    x_deg: float
+    y_deg: float
+    x_sigma_deg: float
+    y_sigma_deg: float
+    temperature_degc: float | None
+
+
+class HeadingWindow(msgspec.Struct, frozen=True, kw_only=True):
+    """Mean on the circle of the compass' heading in [0, 360); sigma is statistical."""
+
+    samples: int
+    heading_deg: float
+    sigma_deg: float
+
+
+def tilt_window(batches: Sequence[Batch]) -> TiltWindow:
+    """The gradienter's window from its good batches, at least one."""
+    mean, sigma = _pose_mean(batches, np.array([batch.mean for batch in batches]))
+    temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
+    return TiltWindow(
+        samples=sum(batch.n for batch in batches),
+        x_deg=float(mean[0]),
+        y_deg=float(mean[1]),
+        x_sigma_deg=float(sigma[0]),
+        y_sigma_deg=float(sigma[1]),
+        temperature_degc=float(np.mean(temperatures)) if temperatures else None,
+    )
+
+
+def heading_window(batches: Sequence[Batch]) -> HeadingWindow:
+    """The compass' window from its good batches, at least one."""
+    first = batches[0].mean
+    turned = np.array([np.mod(batch.mean - first + 180.0, 360.0) - 180.0 for batch in batches])
+    mean, sigma = _pose_mean(batches, turned)
+    return HeadingWindow(
+        samples=sum(batch.n for batch in batches),
+        heading_deg=float(np.mod(mean[0] + first[0], 360.0)),
+        sigma_deg=float(sigma[0]),
+    )
+
+
+def _pose_mean(batches: Sequence[Batch], values: Floats) -> tuple[Floats, Floats]:
+    slots = np.array([batch.slot for batch in batches], dtype=np.int64)
+    variance = np.square(white_noise(slots, values)) / len(values) + np.square(_resolution(batches)) / 12.0
+    return huber_mean(values), np.asarray(np.sqrt(variance))
+
+
+def _resolution(batches: Sequence[Batch]) -> Floats:
+    """Step of a reading that shows fewer than 3 values: their distance, or that of the last decimal it prints."""
+    low = np.min([batch.low for batch in batches], axis=0)
+    high = np.max([batch.high for batch in batches], axis=0)
+    few = np.max([batch.distinct for batch in batches], axis=0) < 3
+    decimal = np.full(len(low), 10.0**-_MAX_DECIMALS)
+    for digits in range(_MAX_DECIMALS - 1, -1, -1):
+        prints = (np.abs(low - np.round(low, digits)) < 1e-9) & (np.abs(high - np.round(high, digits)) < 1e-9)
+        decimal = np.where(prints, 10.0**-digits, decimal)
+    return np.where(few, np.where(high > low, high - low, decimal), 0.0)

@@ -1,0 +1,100 @@
+"""Arm authorisation: PX4 asks before it arms, and gets its answer in the same pass of the loop.
+
+What PX4 sends and takes was seen on the running firmware (autopilots 9.2) and differs from the message definitions:
+the validity goes into result_param2, the reason into progress, and an answer that is not addressed to the vehicle's
+own system id is ignored. An attempt brings two requests, and retransmissions of both; each gets an answer, but people
+are told once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable
+from typing import Final
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.component.service import ArmGate, VehicleView
+from companion.component.statustext import Severity, Weight
+from companion.links.mavlink import MavlinkLink
+
+VALID_S: Final = 10
+"""How long the autopilot may arm on an ACCEPTED without asking again; 0 would expire at once."""
+TOLD_BY_US: Final = 1
+"""MAV_ARM_AUTH_DENIED_REASON_NONE: the autopilot stays silent, since our STATUSTEXT says it better."""
+REPEAT_S: Final = 0.05
+"""Every answer is given once more so much later. PX4 drops one that carries the very time of its question, as a quick
+one does in SITL's lockstep, and then asks no more; and links lose packets. A second answer changes nothing for it."""
+ATTEMPT_S: Final = 1.5
+"""A request so long after the first of an attempt, and no retransmission, begins a new one."""
+MISDIRECTED_EVERY_S: Final = 60.0
+
+
+class ArmAuthoriser:
+    """Answers MAV_CMD_ARM_AUTHORIZATION_REQUEST of our autopilot; of anybody else it is ignored."""
+
+    def __init__(
+        self,
+        link: MavlinkLink,
+        vehicle: VehicleView,
+        gate: ArmGate,
+        say: Callable[[Severity, str, Weight], object],
+    ) -> None:
+        self._link, self._vehicle, self._gate, self._say = link, vehicle, gate, say
+        self._attempt_s = self._misdirected_s = -math.inf
+        self._repeat: asyncio.TimerHandle | None = None
+        self.answered = 0
+        self._unsubscribe = link.subscribe(mavlink.MAVLink_command_long_message, self._on_message)
+
+    def close(self) -> None:
+        """Answer nobody any more."""
+        self._unsubscribe()
+        if self._repeat is not None:
+            self._repeat.cancel()
+
+    def _on_message(self, message: mavlink.MAVLink_command_long_message, now_s: float) -> None:
+        if message.command != mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST:
+            return
+        system_id = self._vehicle.system_id
+        sender = (message.get_srcSystem(), message.get_srcComponent())
+        if system_id is None or sender != (system_id, mavlink.MAV_COMP_ID_AUTOPILOT1):
+            return
+        if message.target_component not in (0, self._link.component_id) or self._gate.at_arm == "off":
+            return
+        if message.target_system != self._link.system_id:
+            self._misdirected(message.target_system, now_s)
+            return
+        answer, gate = self._gate.answer(), self._gate.at_arm == "gate"
+        result = mavlink.MAV_RESULT_ACCEPTED
+        if gate:
+            result = {
+                "accept": mavlink.MAV_RESULT_ACCEPTED,
+                "wait": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
+                "refuse": mavlink.MAV_RESULT_DENIED,
+            }[answer.verdict]
+        accepted = result == mavlink.MAV_RESULT_ACCEPTED
+        progress = TOLD_BY_US if result == mavlink.MAV_RESULT_DENIED else 0
+        ack = mavlink.MAVLink_command_ack_message(
+            message.command, result, progress, VALID_S if accepted else 0, *sender
+        )
+        self._link.send(ack)
+        self._repeat = asyncio.get_running_loop().call_later(REPEAT_S, self._link.send, ack)
+        self.answered += 1
+        if self._begins_attempt(message.confirmation, now_s) and answer.verdict != "accept":
+            words = f"{'Not armed' if gate else 'Arming uncalibrated'}: {answer.words}"
+            self._say(Severity.WARNING, words, Weight.REFUSAL)
+
+    def _begins_attempt(self, confirmation: int, now_s: float) -> bool:
+        """Whether people have not been told of this attempt yet."""
+        if now_s - self._attempt_s <= ATTEMPT_S or (confirmation > 0 and now_s - self._attempt_s <= 3 * ATTEMPT_S):
+            return False
+        self._attempt_s = now_s
+        return True
+
+    def _misdirected(self, target: int, now_s: float) -> None:
+        """PX4 asks the system that COM_ARM_AUTH_ID names, on every link: we hear when that is not us."""
+        if now_s - self._misdirected_s >= MISDIRECTED_EVERY_S:
+            self._misdirected_s = now_s
+            own = self._link.system_id
+            self._say(Severity.WARNING, f"Arming asks system {target}: set COM_ARM_AUTH_ID to {own}", Weight.REFUSAL)

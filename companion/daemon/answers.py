@@ -1,0 +1,175 @@
+"""What the control socket answers: commands of `companion`, and the daemon's status."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Sequence
+from typing import Any, Final, Protocol
+
+import msgspec
+
+from companion.autopilot.vehicle import Vehicle
+from companion.calibration.record import Record
+from companion.calibration.request import What
+from companion.calibration.rolling import RollingCollector
+from companion.component.service import Refusal
+from companion.daemon.armings import Armings, with_armings
+from companion.daemon.automatic import Automatic
+from companion.daemon.conductor import Conductor
+from companion.daemon.control import Object
+from companion.daemon.gate_setup import GateSetup
+from companion.daemon.job import Job
+from companion.daemon.ledger import Offload
+from companion.daemon.mend import Mender
+from companion.daemon.reach import Reach
+from companion.daemon.readiness import Readiness
+from companion.daemon.rivalry import Rivalry
+from companion.errors import CalibrationRefusedError
+from companion.storage.records import RecordStore
+
+MONITOR_EVERY_S: Final = 0.5
+PROGRESS_EVERY_S: Final = 0.2
+
+
+class Device(Protocol):
+    """What has a line in `companion status`."""
+
+    def status(self) -> Object:
+        """How it does."""
+        ...
+
+
+class Answers:
+    """Turns requests of the control socket into what the daemon does, and what it does into JSON."""
+
+    def __init__(
+        self,
+        conductor: Conductor,
+        vehicle: Vehicle,
+        collector: RollingCollector,
+        devices: Sequence[Device],
+        store: RecordStore,
+        offload: Offload,
+        *,
+        mavlink_url: str,
+        rivalry: Rivalry,
+        reach: Reach,
+        mender: Mender,
+        readiness: Readiness,
+        armings: Armings,
+        gate_setup: GateSetup,
+        automatic: Automatic,
+    ) -> None:
+        self._conductor, self._vehicle, self._collector, self._devices = conductor, vehicle, collector, devices
+        self._store, self._offload, self._mavlink_url = store, offload, mavlink_url
+        self._rivalry, self._reach, self._mender, self._readiness = rivalry, reach, mender, readiness
+        self._armings, self._gate_setup, self._automatic = armings, gate_setup, automatic
+
+    async def answer(self, request: Object) -> AsyncIterator[Object]:
+        """Answer one request of the control socket."""
+        command = request.get("command")
+        if command == "status":
+            yield {"kind": "result", "status": self.status()}
+        elif command == "calibrate":
+            async for reply in self._answer_calibrate(request):
+                yield reply
+        elif command == "cancel":
+            running = self._conductor.cancel("companion cancel")
+            if running and self._conductor.job is not None:
+                await asyncio.shield(self._conductor.job.finished)
+            reason = self._conductor.reason if running else "nothing was running"
+            yield {"kind": "result", "state": self._conductor.state.value, "reason": reason}
+        elif command == "undo":
+            job = _accepted(self._conductor.start_undo("companion undo", force=request.get("force") is True))
+            result = await asyncio.shield(job.finished)
+            written = {name: _plain(what) for name, what in job.written.items()}
+            yield {"kind": "result", "state": result.outcome, "reason": result.reason, "written": written}
+        elif command == "history":
+            limit = request.get("limit")
+            number = limit if isinstance(limit, int) and limit > 0 else None
+            # A thousand records take longer to read than a ground station waits for an answer.
+            records, armings = await self._offload(self._history, number)
+            yield {"kind": "result", "records": records, "armings": armings}
+        elif command == "monitor":
+            while True:
+                yield {"kind": "progress", "status": self.status()}
+                await asyncio.sleep(MONITOR_EVERY_S)
+        else:
+            yield {"kind": "error", "reason": f"unknown command {command!r}"}
+
+    def _history(self, limit: int | None) -> tuple[list[Object], list[Object]]:
+        armings = self._armings.history()
+        records = with_armings(self._store.history(limit), armings)
+        return [_plain(record) for record in records], [_plain(arming) for arming in armings[:limit]]
+
+    async def _answer_calibrate(self, request: Object) -> AsyncIterator[Object]:
+        try:
+            what = What[str(request.get("what", "both")).upper()]
+            timeout_s = request.get("timeout_s")
+            timeout_s = None if timeout_s is None else float(timeout_s)
+        except (KeyError, TypeError, ValueError) as error:
+            raise CalibrationRefusedError(f"calibrate: {error} is not understood") from None
+        reboot = request.get("reboot") is True
+        job = _accepted(self._conductor.start_calibration(what, "companion calibrate", timeout_s, reboot=reboot))
+        if not request.get("wait"):
+            yield {"kind": "result", "state": self._conductor.state.value, "reason": "calibration started"}
+            return
+        while not job.finished.done():
+            yield {
+                "kind": "progress",
+                "state": self._conductor.state.value,
+                "percent": job.progress_percent,
+                "text": job.words,
+            }
+            await asyncio.wait([job.finished], timeout=PROGRESS_EVERY_S)
+        yield {"kind": "result", "record": _plain(job.record)}
+
+    def status(self) -> Object:
+        """What the daemon is doing, as JSON can hold it."""
+        conductor, job = self._conductor, self._conductor.job
+        busy = job is not None and not job.finished.done()
+        now_s = asyncio.get_running_loop().time()
+        still = self._collector.status(now_s)
+        return {
+            "state": conductor.state.value,
+            "reason": job.words if busy and job is not None else conductor.reason,
+            "progress": job.progress_percent if busy and job is not None else None,
+            "still_s": round(still.still_s, 1),
+            "waiting_for": still.waiting_for,
+            "vehicle": {
+                "system_id": self._vehicle.system_id,
+                "firmware": self._vehicle.firmware,
+                "armed": self._vehicle.arm_state.value,
+                "summary": f"{self._vehicle.name}, {self._vehicle.arm_state.value}"
+                if self._vehicle.system_id is not None
+                else f"not heard yet on {self._mavlink_url}",
+            },
+            "warnings": self._rivalry.warnings,
+            "ground_stations": dict(zip(("good", "summary"), self._reach.words(), strict=True)),
+            "fault": self._mender.fault,
+            "putting_back": self._mender.pending,
+            "devices": [device.status() for device in self._devices],
+            "arming": {
+                **self._readiness.status(),
+                "setup": self._gate_setup.status(),
+                "last": _plain(self._armings.last),
+            },
+            "automatic": self._automatic.status(),
+            "last": _summary(conductor.last),
+        }
+
+
+def _accepted(answer: Job | Refusal) -> Job:
+    if isinstance(answer, Refusal):
+        raise CalibrationRefusedError(answer.reason)
+    return answer
+
+
+def _plain(value: object) -> Any:
+    return msgspec.to_builtins(value)
+
+
+def _summary(record: Record | None) -> Object | None:
+    if record is None:
+        return None
+    return {"state": record.state, "started_at": record.started_at, "reason": record.reason}

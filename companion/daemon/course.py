@@ -1,0 +1,282 @@
+"""The course of one calibration: wait for stillness, measure, work out, write, watch its effect, let the EKF settle.
+
+It tells the state table where it is and raises where it cannot go on; who may start it, and what becomes of its end,
+is the conductor's.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Callable, Mapping
+from typing import Final, Literal
+
+import msgspec
+import numpy as np
+
+from companion.autopilot.change import WriteFailedError
+from companion.autopilot.vehicle import ArmState, Vehicle
+from companion.calibration.machine import Event, Machine, State
+from companion.calibration.request import What
+from companion.calibration.rolling import RollingCollector, Settings, Window
+from companion.calibration.solve import Solution, solve_at
+from companion.component.statustext import Severity, Weight
+from companion.config import Config
+from companion.daemon import models
+from companion.daemon.autopilot_imu import AutopilotImu
+from companion.daemon.dither import Ditherer
+from companion.daemon.job import Job, JobCancelledError
+from companion.daemon.ledger import Offload
+from companion.daemon.plan import Plan
+from companion.daemon.push import Pusher
+from companion.daemon.reboot import Reboot
+from companion.daemon.report import Draft
+from companion.errors import AutopilotError, CalibrationRefusedError, CompanionError
+from companion.physics.units import DEG_H, MG
+
+logger = logging.getLogger(__name__)
+
+Say = Callable[[Severity, str, Weight], object]
+Stage = Literal["dithering", "writing", "checking", "restarting", "settling", "putting back"]
+
+POLL_S: Final = 0.2
+SAY_WAITING_EVERY_S: Final = 10.0
+READ_ATTEMPTS: Final = 2
+"""So often, within one calibration, the autopilot's offsets may fail to be read."""
+WRONG_IMU_ATTEMPTS: Final = 3
+"""Of three IMUs two may have been taken for the one that is meant."""
+# Shares of the progress bar: measuring, then writing, then verifying, then waiting for the EKF.
+MEASURED_PERCENT: Final = 70.0
+WRITTEN_PERCENT: Final = 80.0
+SETTLING_PERCENT: Final = 95.0
+
+
+class Course:
+    """What a calibration does, from the first look at the readings to offsets that are known to be in use."""
+
+    def __init__(
+        self,
+        config: Config,
+        vehicle: Vehicle,
+        collector: RollingCollector,
+        imus: Mapping[str, AutopilotImu],
+        pusher: Pusher,
+        say: Say,
+        offload: Offload,
+        reboot: Reboot,
+        ditherer: Ditherer,
+    ) -> None:
+        self._config, self._vehicle, self._collector, self._imus = config, vehicle, collector, imus
+        self._pusher, self._ditherer, self._reboot = pusher, ditherer, reboot
+        self._say, self._offload = say, offload
+        self.machine = Machine()
+        """Where it stands."""
+        self.settings = models.settings(config)
+        """How good is good enough."""
+        self._late: Stage = "checking"
+        """Of State.VERIFYING."""
+        self._settled_by_s = 0.0
+
+    @property
+    def is_dithering(self) -> bool:
+        """Whether offsets are being stepped at this moment."""
+        return self._ditherer.active
+
+    @property
+    def stage(self) -> Stage | None:
+        """What of a write is under way; None while nothing is being written."""
+        if self.is_dithering:
+            return "dithering"
+        if self.machine.state is State.WRITING:
+            return "writing"
+        return self._late if self.machine.state is State.VERIFYING else None
+
+    @property
+    def settling_s(self) -> float:
+        """For how long the autopilot's EKF will be waited for yet, at most."""
+        return max(0.0, self._settled_by_s - asyncio.get_running_loop().time())
+
+    @property
+    def dither_s(self) -> float:
+        """How long a dither under way will take yet."""
+        return self._ditherer.left_s
+
+    async def run(self, job: Job, draft: Draft) -> None:
+        """Measure, work out, write, verify and settle, filling the draft on the way.
+
+        Raises:
+            CompanionError: it failed, and why; the autopilot is in order, or it is said what is not.
+            JobCancelledError: cancelled; likewise.
+        """
+        if not job.automatic:
+            self._say(Severity.NOTICE, "Calibration started: keep the aircraft still", Weight.NEWS)
+        for _ in range(WRONG_IMU_ATTEMPTS - 1):
+            try:
+                await self._measure_and_push(job, draft)
+            except WriteFailedError as error:
+                if error.kind != "not as believed" or error.left_changed:
+                    raise
+                self.machine.on(Event.AGAIN)
+                logger.warning("%s; put back, measuring again for the right one", error.reason)
+                draft.begin_again(f"{error.reason}; put back, and written where it belongs")
+                job.check_cancelled()
+            else:
+                return
+        await self._measure_and_push(job, draft)
+
+    async def _measure_and_push(self, job: Job, draft: Draft) -> None:
+        self._collector.retarget(self._wanted(job.what))
+        while True:
+            measured = window = await self._measure(job)
+            if await self._pusher.offsets_still_hold():
+                window = await self._refine(measured, job, draft)
+                if window is measured or await self._pusher.offsets_still_hold():
+                    break
+            # The window holds telemetry under other offsets than those now in force.
+            self.machine.on(Event.MOVED)
+        solution: Solution = await self._offload(
+            solve_at,
+            window,
+            models.whereabouts(self._config, self._vehicle),
+            models.gradienter_model(self._config.gradienter),
+            models.compass_model(self._config.compass),
+            job.what,
+        )
+        draft.solution = solution
+        plan = await self._pusher.plan(solution, draft)
+        job.check_cancelled()
+        if not plan.changes:
+            self.machine.on(Event.NOTHING_TO_WRITE)
+            return
+        self.machine.on(Event.WRITE)
+        job.progress(MEASURED_PERCENT, f"writing {len(plan.changes)} parameters")
+        plan = await self._pusher.write(plan, draft, lambda words: job.progress(MEASURED_PERCENT, words))
+        self._late = "checking"
+        self.machine.on(Event.WRITTEN)
+        job.progress(WRITTEN_PERCENT, "watching the telemetry take the new offsets")
+
+        def go_on(words: str) -> None:
+            job.check_cancelled()
+            share = self._collector.status(asyncio.get_running_loop().time()).still_s / self.settings.min_still_s
+            job.progress(
+                WRITTEN_PERCENT + (100.0 - WRITTEN_PERCENT) * min(share, 1.0),
+                words or "watching the telemetry take the new offsets",
+            )
+
+        try:
+            await self._pusher.verify(plan, window, draft, go_on)
+        except JobCancelledError as cancelled:
+            try:
+                await self._pusher.roll_back(plan, draft, str(cancelled))
+            except CompanionError as said:
+                raise JobCancelledError(str(said)) from None
+        except BaseException:
+            self._pusher.leave_to_mender()
+            raise
+        self._late = "restarting" if job.reboot else "checking"
+        boots = self._vehicle.boots
+        await self._reboot.conclude(job, plan, window, draft)
+        if self._vehicle.boots == boots:  # after a restart the EKF has started afresh
+            await self._settle(job, plan, draft)
+            if self._vehicle.boots != boots:
+                await self._reboot.survived(plan, draft)
+        self.machine.on(Event.VERIFIED)
+
+    async def _settle(self, job: Job, plan: Plan, draft: Draft) -> None:
+        """The write is done and stays; a cancel ends only the waiting for the autopilot's EKF."""
+
+        def go_on(words: str) -> None:
+            job.check_cancelled()
+            job.progress(SETTLING_PERCENT, words)
+
+        self._settled_by_s = asyncio.get_running_loop().time() + self._pusher.settles_within_s(plan)
+        self._late = "settling"
+        try:
+            words = await self._pusher.settle(plan, go_on)
+        except JobCancelledError as cancelled:
+            words = f"{cancelled} while the EKF was settling: the new offsets stay, wait 2 min before take-off"
+        if words is not None:
+            draft.warnings.append(words)
+            self._say(Severity.WARNING, words, Weight.NEWS)
+
+    async def _refine(self, window: Window, job: Job, draft: Draft) -> Window:
+        """The window with better means for IMUs whose integers do not tell, where that is allowed."""
+        if not self._pusher.enabled:
+            return window
+        return await self._ditherer.refine(window, job, draft, lambda words: job.progress(MEASURED_PERCENT, words))
+
+    def _wanted(self, what: What) -> Settings:
+        """The targets of what was asked for; the rest may be as bad as it likes."""
+        return msgspec.structs.replace(
+            self.settings,
+            target_gyro_sigma_rad_s=self.settings.target_gyro_sigma_rad_s if what.gyros else math.inf,
+            target_accel_sigma_m_s2=self.settings.target_accel_sigma_m_s2 if what.accelerometers else math.inf,
+        )
+
+    async def _measure(self, job: Job) -> Window:
+        """Wait for stillness and for enough of it; returns the averages.
+
+        Raises:
+            CalibrationRefusedError: armed in the middle, out of time, or the readings fail their checks.
+            JobCancelledError: cancelled.
+        """
+        loop = asyncio.get_running_loop()
+        said_s = -math.inf
+        said = ""
+        failures = {name: imu.failures for name, imu in self._imus.items()}
+        while True:
+            now_s = loop.time()
+            if self._vehicle.arm_state is ArmState.ARMED:
+                raise CalibrationRefusedError("armed during the measurement; nothing was written")
+            for name, imu in self._imus.items():
+                failures[name] = min(failures[name], imu.failures)
+                if imu.failures - failures[name] >= READ_ATTEMPTS:
+                    # Patience is for what can change by itself; an autopilot that does not answer is a fault.
+                    raise AutopilotError(f"imu {name}: {imu.problem}")
+            status = self._collector.status(now_s)
+            waiting_for = self._not_ready() or status.waiting_for
+            if waiting_for is not None:
+                if self.machine.state is State.COLLECTING:
+                    self.machine.on(Event.MOVED)
+                job.progress(MEASURED_PERCENT * status.progress, waiting_for)
+                if not job.automatic and waiting_for != said and now_s - said_s >= SAY_WAITING_EVERY_S:
+                    said, said_s = waiting_for, now_s
+                    self._say(Severity.INFO, f"Calibration: {waiting_for}", Weight.NEWS)
+            else:
+                if self.machine.state is State.WAITING:
+                    self.machine.on(Event.STILL)
+                job.progress(MEASURED_PERCENT * status.progress, f"still for {status.still_s:.0f} s, measuring")
+                if status.enough:
+                    self.machine.on(Event.ENOUGH)
+                    job.progress(MEASURED_PERCENT, "working out the biases")
+                    return self._collector.window(now_s)
+            if job.deadline_s is not None and now_s >= job.deadline_s:
+                raise CalibrationRefusedError(f"not finished in the time given: {job.words}")
+            await job.pause(POLL_S)
+
+    def _not_ready(self) -> str | None:
+        """What of the autopilot is missing for a measurement, in one line."""
+        if (conflict := self._vehicle.conflict) is not None:
+            return f"waiting: {conflict}"
+        if self._vehicle.arm_state is ArmState.UNKNOWN:
+            return "waiting for the autopilot's heartbeat"
+        for imu in self._imus.values():
+            if imu.stream.problem or imu.calibration is None:
+                return f"waiting for imu {imu.name}: {imu.stream.problem or imu.problem}"
+        return None
+
+
+def in_words(solution: Solution | None) -> str:
+    """The figures of a result: the largest sigma over axes and IMUs; short enough for one STATUSTEXT."""
+    if solution is None:
+        return "nothing measured"
+    parts: list[str] = []
+    gyros = [imu.gyro_sigma_use_rad_s for imu in solution.imus if imu.gyro_rad_s is not None]
+    accels = [imu.accel_sigma_use_m_s2 for imu in solution.imus if imu.accel_m_s2 is not None]
+    if gyros:
+        parts.append(f"{np.max(gyros) / DEG_H:.1f} deg/h")
+    if accels:
+        parts.append(f"{np.max(accels) / MG:.2f} mg")
+    unknown = f"; not known: {', '.join(solution.unknown)}" if solution.unknown else ""
+    return f"sigma {', '.join(parts)}{unknown}"

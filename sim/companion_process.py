@@ -1,0 +1,100 @@
+"""The real daemon as its own process, and its command line: for demonstrations and tests on a real clock."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+READY_WITHIN_S: Final = 20.0
+
+Record = dict[str, Any]
+
+
+class CompanionProcess:
+    """`companion run` with the `companion.toml` of a folder; its log becomes `daemon.log` there.
+
+    An async context manager: starts on entering, and is stopped in order on leaving.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._process: asyncio.subprocess.Process | None = None
+
+    def command(self, *words: str) -> list[str]:
+        """A command line of the companion with this configuration."""
+        return [sys.executable, "-m", "companion", "-c", str(self.folder / "companion.toml"), *words]
+
+    def log(self) -> str:
+        """What it has logged."""
+        return (self.folder / "daemon.log").read_text(encoding="utf-8", errors="replace")
+
+    async def __aenter__(self) -> Self:
+        with (self.folder / "daemon.log").open("wb") as log:
+            self._process = await asyncio.create_subprocess_exec(*self.command("run"), stderr=log)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        assert self._process is not None
+        if self._process.returncode is None:
+            self._process.terminate()
+        await self._process.wait()
+
+    def kill(self) -> None:
+        """SIGKILL, as a crash."""
+        assert self._process is not None
+        self._process.kill()
+
+    async def status(self) -> Record | None:
+        """`companion status --json`; None while it does not answer."""
+        asking = await asyncio.create_subprocess_exec(
+            *self.command("status", "--json"), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL
+        )
+        output, _ = await asking.communicate()
+        return json.loads(output) if asking.returncode == 0 else None
+
+    async def ready(self, within_s: float = READY_WITHIN_S) -> None:
+        """Wait until the daemon answers and knows that the aircraft is disarmed.
+
+        Raises:
+            RuntimeError: it ended; its log is in the message.
+            TimeoutError: it did not become ready.
+        """
+        assert self._process is not None
+        loop = asyncio.get_running_loop()
+        deadline_s = loop.time() + within_s
+        while loop.time() < deadline_s:
+            if self._process.returncode is not None:
+                raise RuntimeError(f"the daemon ended:\n{self.log()}")
+            status = await self.status()
+            if status is not None and status["vehicle"]["armed"] == "disarmed":
+                return
+        raise TimeoutError(f"the daemon is not ready after {within_s:g} s:\n{self.log()}")
+
+    async def undo(self) -> Record:
+        """`companion undo --json`."""
+        process = await asyncio.create_subprocess_exec(
+            *self.command("undo", "--json"), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL
+        )
+        output, _ = await process.communicate()
+        record: Record = json.loads(output)
+        return record
+
+    async def calibrate(self, within_s: float) -> Record:
+        """`companion calibrate --wait --json`, its progress on our stderr; the record.
+
+        Raises:
+            RuntimeError: it printed none.
+        """
+        words = ("calibrate", "--wait", "--timeout", str(within_s), "--json")
+        process = await asyncio.create_subprocess_exec(*self.command(*words), stdout=asyncio.subprocess.PIPE)
+        output, _ = await process.communicate()
+        if not output.strip():
+            raise RuntimeError(f"companion calibrate printed no record (exit code {process.returncode}):\n{self.log()}")
+        record: Record = json.loads(output)
+        return record

@@ -1,0 +1,91 @@
+"""One MAVLink port of a double: its own sequence numbers, streams and bytes. When streams are due is the firmware's."""
+
+from __future__ import annotations
+
+import abc
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+Message = mavlink.MAVLink_message
+
+
+@dataclass(slots=True)
+class Stream:
+    """One message that is sent by itself."""
+
+    interval_s: float
+    next_s: float
+
+
+class Channel(abc.ABC):
+    """An `End` as tests/support/wire.py means it: attach how to send, receive what came."""
+
+    def __init__(self, system_id: int, handle: Callable[[Channel, Message, float], None]) -> None:
+        self.received: Counter[str] = Counter()
+        """Messages by name, and "bad" for bytes that are none."""
+        self.sent: Counter[str] = Counter()
+        self.streams: dict[int, Stream] = {}
+        """By message id."""
+        self.listing = False
+        """A parameter list is under way."""
+        self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=1)
+        self._codec.robust_parsing = True
+        self._transmit: Callable[[bytes], None] | None = None
+        self._handle = handle
+
+    def attach(self, transmit: Callable[[bytes], None] | None) -> None:
+        """Give the function that sends bytes, or None to pull the plug."""
+        self._transmit = transmit
+        self._codec.buf = bytearray()
+        self._codec.buf_index = 0
+
+    @property
+    def attached(self) -> bool:
+        """Whether anything is plugged in."""
+        return self._transmit is not None
+
+    def receive(self, data: bytes, t_s: float) -> None:
+        """Take bytes; never raises, whatever they are."""
+        try:
+            messages = self._codec.parse_buffer(data) or ()
+        except Exception:  # noqa: BLE001 - the generated parser's own faults on garbage
+            self.received["bad"] += 1
+            self._codec.buf = bytearray()
+            self._codec.buf_index = 0
+            return
+        for message in messages:
+            name = message.get_type()
+            if name == "BAD_DATA":
+                self.received["bad"] += 1
+                continue
+            self.received[name] += 1
+            self._handle(self, message, t_s)
+
+    def send(self, message: Message) -> None:
+        """Pack with this port's sequence number and send; nothing happens when nothing is plugged in."""
+        if self._transmit is None:
+            return
+        data = message.pack(self._codec)
+        self._codec.seq = (self._codec.seq + 1) % 256
+        self.sent[message.get_type()] += 1
+        self._transmit(data)
+
+    def forward(self, data: bytes) -> None:
+        """Send somebody else's packet unchanged."""
+        if self._transmit is not None:
+            self._transmit(data)
+
+    @abc.abstractmethod
+    def set_stream(self, message_id: int, interval_s: float | None, now_s: float) -> None:
+        """Start, change or (None) stop a stream."""
+
+    @abc.abstractmethod
+    def due(self, now_s: float) -> list[int]:
+        """Message ids whose time has come."""
+
+    def next_due_s(self) -> float | None:
+        """When the next stream wants to be sent."""
+        return min((stream.next_s for stream in self.streams.values()), default=None)

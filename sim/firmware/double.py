@@ -1,0 +1,256 @@
+"""The outside of a double and the loop it runs on: the same for every firmware."""
+
+from __future__ import annotations
+
+import abc
+import asyncio
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.aircraft import VirtualAircraft
+from sim.firmware.channel import Channel, Message
+from sim.firmware.faults import Faults
+from sim.firmware.writes import Write
+from sim.imu_model import Bias, ImuModel
+
+HEARTBEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT
+FIELD_MILLIGAUSS = (280.0, 450.0)
+"""Horizontal and vertical part of the magnetic field."""
+
+
+class AutopilotDouble(abc.ABC):
+    """An autopilot on a virtual aircraft with two ports, `self` for the companion and `ground` for a ground station.
+
+    It is an `End` (attach, receive). `run` sends what is due; answers need only the running loop. Time is the loop's
+    clock. What a firmware does with a message, and what it says, is its own.
+
+    Args:
+        aircraft: the truth.
+        imus: the models; the first is IMU 1.
+        channels: the companion's port and the ground station's.
+        up_s: how long it has been running when the simulation begins.
+        has_position: whether it has a GNSS fix, and so a position and a date.
+        clock_ppm: how much faster its clock runs.
+    """
+
+    def __init__(
+        self,
+        aircraft: VirtualAircraft,
+        imus: Sequence[ImuModel],
+        channels: tuple[Channel, Channel],
+        *,
+        up_s: float,
+        has_position: bool,
+        clock_ppm: float,
+        seed: int,
+    ) -> None:
+        self.aircraft, self.imus = aircraft, tuple(imus)
+        self.has_position, self.clock_ppm = has_position, clock_ppm
+        self.faults = Faults()
+        self.armed = False
+        self.calibrating = False
+        self.boots = 0
+        declination = math.radians(aircraft.site.declination_deg)
+        north, down = FIELD_MILLIGAUSS
+        self.field_ned = np.array([north * math.cos(declination), north * math.sin(declination), down])
+        """Magnetic field at the site in milligauss."""
+        self.channels = channels
+        self._port, self.ground = channels
+        self.random = np.random.default_rng([seed, 4])
+        """For everything that varies and is not a sensor's noise."""
+        self._up_s = up_s
+        self._booted_s: float | None = None
+        self._down = False
+        self._generation = 0
+        self._lanes: dict[str, float] = {}
+        self._failed: asyncio.Future[None] | None = None
+        self._timer: asyncio.TimerHandle | None = None
+
+    # The outside: two ends, and the loop.
+
+    def attach(self, transmit: Callable[[bytes], None] | None) -> None:
+        """Plug the companion's wire in (None: out)."""
+        self._port.attach(transmit)
+
+    def receive(self, data: bytes, t_s: float) -> None:
+        """Bytes from the companion's wire; never raises."""
+        self._port.receive(data, t_s)
+
+    async def run(self) -> None:
+        """Send heartbeats and streams until cancelled."""
+        loop = asyncio.get_running_loop()
+        self._failed = loop.create_future()
+        self._begin(loop.time())
+        self._tick()
+        try:
+            await self._failed
+        finally:
+            self._failed = None
+            if self._timer is not None:
+                self._timer.cancel()
+
+    # What a firmware says of itself.
+
+    @abc.abstractmethod
+    def parameter(self, name: str) -> float:
+        """What is read back; KeyError if there is none of that name."""
+
+    @abc.abstractmethod
+    def set_parameter(self, name: str, value: float) -> None:
+        """Set without telling anyone, as if it had always been so."""
+
+    @abc.abstractmethod
+    def write_as_another_station(self, name: str, value: float) -> None:
+        """Another ground station sets a parameter."""
+
+    @abc.abstractmethod
+    def arm(self) -> None:
+        """The pilot arms."""
+
+    @abc.abstractmethod
+    def disarm(self) -> None:
+        """The pilot disarms."""
+
+    @property
+    @abc.abstractmethod
+    def writes(self) -> list[Write]:
+        """Every PARAM_SET that arrived, obeyed or not, in order."""
+
+    @abc.abstractmethod
+    def estimated_angles_rad(self, loop_s: float) -> tuple[float, float, float]:
+        """Roll, pitch, yaw as ATTITUDE tells them."""
+
+    @abc.abstractmethod
+    def residual(self, instance: int, loop_s: float) -> Bias:
+        """What is left in the output of IMU `instance` (1..) after its offsets and scales: output minus truth, FRD."""
+
+    @abc.abstractmethod
+    def prearm_failures(self, loop_s: float) -> list[str]:
+        """Why it would not arm, in the firmware's words without the prefix."""
+
+    @abc.abstractmethod
+    def build(self, message_id: int, loop_s: float) -> Message | None:
+        """The message of a stream, now; None when there is nothing to send."""
+
+    @abc.abstractmethod
+    def _started(self, loop_s: float) -> None:
+        """The first instant on a loop: it has been up for a while."""
+
+    @abc.abstractmethod
+    def _restarted(self, loop_s: float) -> None:
+        """A boot: forget what is not stored, set up the streams."""
+
+    @abc.abstractmethod
+    def _receive_message(self, channel: Channel, message: Message, loop_s: float) -> None:
+        """A message came while it was up."""
+
+    # What happens to it.
+
+    def reboot(self, down_s: float = 1.5) -> None:
+        """Restart: silence for `down_s`, then time from zero, streams and routes forgotten, stored parameters kept."""
+        self._down = True
+        self._generation += 1
+        generation = self._generation
+        self.armed = self.calibrating = False
+        loop = asyncio.get_running_loop()
+        loop.call_later(down_s, lambda: self._boot(loop.time()) if generation == self._generation else None)
+
+    # What its parts use.
+
+    def boot_us(self, loop_s: float) -> int:
+        """Microseconds since boot on its own clock."""
+        assert self._booted_s is not None
+        return int((loop_s - self._booted_s) * (1.0 + self.clock_ppm * 1e-6) * 1e6)
+
+    def boot_ms(self, loop_s: float) -> int:
+        """Milliseconds since boot."""
+        return self.boot_us(loop_s) // 1000
+
+    def unix_s(self, loop_s: float) -> float:
+        """The date it knows."""
+        return self.aircraft.unix_s + self.aircraft.time_at(loop_s)
+
+    def now_s(self) -> float:
+        """The loop's clock."""
+        return asyncio.get_running_loop().time()
+
+    def later(self, delay_s: float, action: Callable[[], None]) -> None:
+        """Do something after a delay, unless a reboot comes first."""
+        generation = self._generation
+        loop = asyncio.get_running_loop()
+        loop.call_later(delay_s, lambda: action() if generation == self._generation else None)
+
+    def soon(self, delay_s: float, action: Callable[[], None], *, lane: str = "") -> None:
+        """The same for what must keep its order among the others of its lane, such as answers on a port."""
+        now_s = self.now_s()
+        at_s = max(now_s + delay_s, self._lanes.get(lane, 0.0) + 1e-6)
+        self._lanes[lane] = at_s
+        self.later(at_s - now_s, action)
+
+    def answer(self, channel: Channel, message: Message) -> None:
+        """Send an answer, unless it answers nothing."""
+        if not self._down and not self.faults.silent:
+            channel.send(message)
+
+    def wake(self) -> None:
+        """Tell `run` that something is due earlier than it thought."""
+        if self._failed is not None:
+            asyncio.get_running_loop().call_soon(self._tick)
+
+    # The inside.
+
+    def _begin(self, loop_s: float) -> None:
+        if self._booted_s is None:
+            self.aircraft.begin(loop_s)
+            self._booted_s = loop_s - self._up_s
+            self.boots = 1
+            self._started(loop_s)
+
+    def _boot(self, loop_s: float) -> None:
+        self._down = False
+        self._booted_s = loop_s
+        self.boots += 1
+        for channel in self.channels:
+            channel.streams.clear()
+            channel.listing = False
+        self._restarted(loop_s)
+        self.wake()
+
+    def _tick(self) -> None:
+        """Send what is due and come back for what is next: plain callbacks, cheaper than a task."""
+        if self._failed is None or self._failed.done():
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        loop = asyncio.get_running_loop()
+        try:
+            self._send_due(loop.time())
+        except Exception as error:  # noqa: BLE001 - handed to whoever awaits run()
+            self._failed.set_exception(error)
+            return
+        due = [at for channel in self.channels if (at := channel.next_due_s()) is not None]
+        if due and not self._down:
+            self._timer = loop.call_at(min(due), self._tick)
+
+    def _holds_back(self, message_id: int) -> bool:
+        """Whether a fault keeps this stream from being sent."""
+        return self.faults.heartbeat_off if message_id == HEARTBEAT else self.faults.telemetry_off
+
+    def _send_due(self, loop_s: float) -> None:
+        if self._down:
+            return
+        for channel in self.channels:
+            for message_id in channel.due(loop_s):
+                if channel.attached and not self._holds_back(message_id):
+                    message = self.build(message_id, loop_s)
+                    if message is not None:
+                        channel.send(message)
+
+    def _handle(self, channel: Channel, message: Message, loop_s: float) -> None:
+        if not self._down:
+            self._begin(loop_s)
+            self._receive_message(channel, message, loop_s)

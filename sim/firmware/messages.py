@@ -1,0 +1,67 @@
+"""Messages that both firmwares fill alike."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.earth import Array
+
+if TYPE_CHECKING:
+    from sim.firmware.double import AutopilotDouble
+
+Message = mavlink.MAVLink_message
+
+
+def pressure_hpa(double: AutopilotDouble) -> float:
+    """Of the standard atmosphere at the site."""
+    return float(1013.25 * (1.0 - double.aircraft.site.height_m / 44330.8) ** 5.25588)
+
+
+def magnetic_body(double: AutopilotDouble, t_s: float) -> Array:
+    """Milligauss in body axes."""
+    result: Array = double.aircraft.body_from_ned(t_s) @ double.field_ned
+    return result
+
+
+def system_time(double: AutopilotDouble, loop_s: float) -> Message:
+    """SYSTEM_TIME; the date is known because there is GNSS."""
+    unix_us = 0 if not double.has_position else int(double.unix_s(loop_s) * 1e6)
+    return mavlink.MAVLink_system_time_message(unix_us, double.boot_ms(loop_s))
+
+
+def global_position_int(double: AutopilotDouble, loop_s: float) -> Message:
+    """GLOBAL_POSITION_INT; zeros without a position."""
+    site = double.aircraft.site
+    _, _, yaw = double.estimated_angles_rad(loop_s)
+    heading = int(math.degrees(yaw) % 360.0 * 100.0) % 36000
+    if not double.has_position:
+        return mavlink.MAVLink_global_position_int_message(double.boot_ms(loop_s), 0, 0, 0, 0, 0, 0, 0, heading)
+    return mavlink.MAVLink_global_position_int_message(
+        double.boot_ms(loop_s), round(site.latitude_deg * 1e7), round(site.longitude_deg * 1e7),
+        round(site.height_m * 1000.0), 0, 0, 0, 0, heading,
+    )  # fmt: skip
+
+
+def gps_raw_int(double: AutopilotDouble, loop_s: float) -> Message:
+    """GPS_RAW_INT: a 3D fix, or none."""
+    site = double.aircraft.site
+    if not double.has_position:
+        return mavlink.MAVLink_gps_raw_int_message(double.boot_us(loop_s), 1, 0, 0, 0, 65535, 65535, 0, 0, 0)
+    return mavlink.MAVLink_gps_raw_int_message(
+        double.boot_us(loop_s), 3, round(site.latitude_deg * 1e7), round(site.longitude_deg * 1e7),
+        round(site.height_m * 1000.0), 80, 120, 0, 0, 14, round(site.height_m * 1000.0), 1200, 1800,
+    )  # fmt: skip
+
+
+def sys_status(double: AutopilotDouble, loop_s: float) -> Message:
+    """SYS_STATUS, with the health bit of the checks before arming."""
+    sensors = (
+        mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
+        | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+        | mavlink.MAV_SYS_STATUS_PREARM_CHECK
+    )
+    health = sensors if not double.prearm_failures(loop_s) else sensors & ~mavlink.MAV_SYS_STATUS_PREARM_CHECK
+    return mavlink.MAVLink_sys_status_message(sensors, sensors, health, 180, 12600, -1, -1, 0, 0, 0, 0, 0, 0)

@@ -1,0 +1,151 @@
+"""PX4 asks before it arms: the request, its repetition on every port, the answers it understands (autopilots 5.2, 9.2).
+
+Facts: PX4 `ArmAuthorization.cpp`, `mavlink_command_sender.cpp` (2026-08) and runs of the firmware.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.px4.port import PX4Port
+
+if TYPE_CHECKING:
+    from sim.px4.double import PX4Double
+
+REQUEST = mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST
+RETRY_S, RETRIES = 0.5, 3
+ANY_COMPONENT = 0
+_DENIALS = {
+    2: "Arm auth: Denied, waypoint {} have a invalid value",
+    3: "Arm auth: Denied by timeout in authorizer",
+    4: "Arm auth: Denied because airspace is in use",
+    5: "Arm auth: Denied because of bad weather",
+}
+_TELLS_NOTHING = 1
+Verdict = Callable[[bool], None]
+
+
+@dataclass(slots=True)
+class Request:
+    """One COMMAND_LONG 3001 and its repetitions."""
+
+    target_system: int
+    rounds: int = 0
+    """Half seconds since it was sent."""
+    answered: bool = False
+
+
+class ArmAuthorization:
+    """The state that the checks before arming ask."""
+
+    def __init__(self, double: PX4Double) -> None:
+        self._double = double
+        self.requests = 0
+        """Requests sent since the start, repetitions not counted."""
+        self.restart()
+
+    def restart(self) -> None:
+        """A boot."""
+        self._state: Literal["idle", "waiting", "approved"] = "idle"
+        self._until_s = 0.0
+        self._verdict: Verdict | None = None
+        self._open: list[Request] = []
+        self._question = 0
+
+    @property
+    def required(self) -> bool:
+        """COM_ARM_AUTH_REQ."""
+        return bool(self._double.parameters["COM_ARM_AUTH_REQ"])
+
+    def check(self, verdict: Verdict) -> None:
+        """Say whether arming is authorised: at once in the two-step method, else with the answer or time-out."""
+        double, now_s = self._double, self._double.now_s()
+        if self._state == "approved" and now_s > self._until_s:
+            self._state = "idle"
+        if self._state != "idle":
+            verdict(self._state == "approved")
+            return
+        self._state = "waiting"
+        self._question += 1
+        question = self._question
+        timeout_s = float(double.parameters["COM_ARM_AUTH_TO"])
+        self._until_s = now_s + timeout_s
+        double.later(timeout_s, lambda: self._time_out(question))
+        two_steps = double.parameters["COM_ARM_AUTH_MET"] == 1
+        self._verdict = None if two_steps else verdict
+        self._send(int(double.parameters["COM_ARM_AUTH_ID"]))
+        if two_steps:
+            double.say(mavlink.MAV_SEVERITY_INFO, "Arm auth: Requesting authorization...")
+            verdict(False)  # noqa: FBT003 - the verdict's only argument
+
+    def acknowledged(self, message: mavlink.MAVLink_command_ack_message) -> None:
+        """A COMMAND_ACK that is addressed to this component or to all; anybody's counts."""
+        if message.command != REQUEST:
+            return
+        for request in self._open:
+            if request.target_system == message.get_srcSystem():
+                request.answered = True  # the oldest that is still kept, though it may have been answered before
+                break
+        if self._state != "waiting" or message.target_system != self._double.system_id:
+            return
+        double, result = self._double, message.result
+        if result == mavlink.MAV_RESULT_IN_PROGRESS:
+            return  # the time-out goes on
+        if result == mavlink.MAV_RESULT_ACCEPTED:
+            seconds = message.result_param2
+            double.say(mavlink.MAV_SEVERITY_INFO, f"Arm auth: Authorized for the next {seconds} seconds")
+            self._until_s = double.now_s() + seconds
+            self._finish(approved=True)
+            return
+        if result == mavlink.MAV_RESULT_TEMPORARILY_REJECTED:
+            double.say(mavlink.MAV_SEVERITY_CRITICAL, "Arm auth: Temporarily rejected")
+        elif message.progress != _TELLS_NOTHING:
+            text = _DENIALS.get(message.progress, "Arm auth: Denied")
+            double.say(mavlink.MAV_SEVERITY_CRITICAL, text.format(message.result_param2))
+        self._finish(approved=False)
+
+    def _time_out(self, question: int) -> None:
+        if self._state == "waiting" and question == self._question:
+            self._double.say(mavlink.MAV_SEVERITY_CRITICAL, "Arm auth: No response")
+            self._finish(approved=False)
+
+    def _finish(self, *, approved: bool) -> None:
+        self._state = "approved" if approved else "idle"
+        verdict, self._verdict = self._verdict, None
+        if verdict is not None:
+            verdict(approved)
+
+    def _send(self, target_system: int) -> None:
+        self.requests += 1
+        request = Request(target_system)
+        self._open.append(request)
+        for port in self._double.ports:
+            self._transmit(request, port, 0)
+        self._double.later(RETRY_S, lambda: self._retry(request))
+        if target_system == self._double.system_id:
+            self._double.commander.receives_own_request(REQUEST)
+
+    def _transmit(self, request: Request, port: PX4Port, confirmation: int) -> None:
+        if confirmation <= RETRIES:
+            self._double.answer(
+                port,
+                mavlink.MAVLink_command_long_message(
+                    request.target_system, ANY_COMPONENT, REQUEST, confirmation, 0, 0, 0, 0, 0, 0, 0
+                ),
+            )
+
+    def _retry(self, request: Request) -> None:
+        """Every half second: the first port begins a round of repetitions, the other follows half a second later."""
+        if request.answered or request.rounds > RETRIES:
+            self._open.remove(request)
+            return
+        companion, ground = self._double.ports
+        if request.rounds:
+            self._transmit(request, companion, request.rounds)
+        request.rounds += 1
+        self._transmit(request, ground, request.rounds)
+        self._double.later(RETRY_S, lambda: self._retry(request))

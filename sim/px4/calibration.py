@@ -1,0 +1,133 @@
+"""One sensor's correction as PX4 keeps it in memory: which slot is its own, which offset is in use, what is refused.
+
+    corrected = R ((raw - OFF) o SCALE),    R = R(SENS_BOARD_X/Y/Z_OFF) R(SENS_BOARD_ROT), external: R(CAL_x_ROT)
+
+Every reader of the parameters in the firmware has such an object of its own (each IMU, the background gyro calibration,
+each commanded calibration), and so has the double. Facts: PX4 `src/lib/sensor_calibration`, autopilots 4.1, 4.2, 9.3.2.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from sim.earth import Array, mounting_matrix
+from sim.firmware.rotations import rotation_matrix
+from sim.px4.defaults import SLOTS
+from sim.px4.parameters import ParameterStore
+
+Kind = Literal["GYRO", "ACC"]
+_PRIORITY, _EXTERNAL_PRIORITY = 50, 75
+THRESHOLD = 0.01
+"""rad/s or m/s^2 (and the same for scales): a vector is only taken when it is farther than this from the one in use."""
+
+
+class SensorCalibration:
+    """The correction of one triad.
+
+    Args:
+        kind: which parameters.
+        device_id: of the sensor.
+        external: whether it turns with its own CAL_x_ROT instead of with the board.
+        store: where the parameters are.
+    """
+
+    def __init__(self, kind: Kind, device_id: int, store: ParameterStore, *, external: bool = False) -> None:
+        self.kind, self.device_id, self.external = kind, device_id, external
+        self._store = store
+        self.slot: int | None = None
+        """The slot that has its device id; None: uncalibrated."""
+        self.offset = np.zeros(3)
+        """In use: rad/s or m/s^2, sensor axes."""
+        self.scale = np.ones(3)
+        self.rotation = np.eye(3)
+        """Sensor to vehicle."""
+        self.count = 0
+        """How often an offset or a scale was taken since the last reset."""
+        self.reset()
+        self.parameters_update()
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether a slot has its device id."""
+        return self.slot is not None
+
+    @property
+    def enabled(self) -> bool:
+        """CAL_x_PRIO 0 takes the sensor out of use."""
+        return self.slot is None or self._store[f"CAL_{self.kind}{self.slot}_PRIO"] != 0
+
+    def correct(self, raw: Array) -> Array:
+        """A reading (3) in sensor axes, corrected and turned into the vehicle's."""
+        result: Array = self.rotation @ ((raw - self.offset) * self.scale)
+        return result
+
+    def reset(self) -> None:
+        """No slot: no offset, the board's rotation."""
+        self.slot = None
+        self.offset, self.scale, self.count = np.zeros(3), np.ones(3), 0
+        self._set_rotation(0 if self.external else int(self._store["SENS_BOARD_ROT"]))
+
+    def parameters_update(self) -> None:
+        """Look for the slot and take from it what is far enough from what is in use."""
+        store = self._store
+        self.slot = find_slot(store, self.kind, self.device_id)
+        if self.slot is None:
+            self.reset()
+            return
+        number = int(store[f"CAL_{self.kind}{self.slot}_ROT"]) if self.external else int(store["SENS_BOARD_ROT"])
+        self._set_rotation(max(number, 0))
+        self.set_offset(np.array(store.vector(self.slot, self.kind, "OFF")))
+        if self.kind == "ACC":
+            scale = np.array(store.vector(self.slot, self.kind, "SCALE"))
+            if _far(self.scale, scale) and np.isfinite(scale).all() and (scale > 0.0).all():
+                self.scale = scale
+                self.count += 1
+
+    def set_offset(self, offset: Array) -> bool:
+        """Take it if it is more than 0.01 (length of the difference) from the one in use.
+
+        A gyro that has taken none yet takes any; an accelerometer does not: below 0.01 it never takes it.
+        """
+        first = self.kind == "GYRO" and self.count == 0
+        if (first or _far(self.offset, offset)) and np.isfinite(offset).all():
+            self.offset = offset.astype(np.float32).astype(np.float64)
+            self.count += 1
+            return True
+        return False
+
+    def save(self, preferred_slot: int) -> bool:
+        """Write what is in use into its slot, or the preferred, or the first free one; False when all are taken."""
+        store = self._store
+        slot = find_slot(store, self.kind, self.device_id)
+        if slot is None:
+            free = [number for number in range(SLOTS) if store[f"CAL_{self.kind}{number}_ID"] == 0]
+            if not free:
+                return False
+            slot = preferred_slot if preferred_slot in free else free[0]
+        self.slot = slot
+        prefix = f"CAL_{self.kind}{slot}_"
+        store.set(f"{prefix}ID", self.device_id)
+        if not 0 <= store[f"{prefix}PRIO"] <= 100:
+            store.set(f"{prefix}PRIO", _EXTERNAL_PRIORITY if self.external else _PRIORITY)
+        if not self.external:
+            store.set(f"{prefix}ROT", -1)
+        for axis, offset, scale in zip("XYZ", self.offset, self.scale, strict=True):
+            store.set(f"{prefix}{axis}OFF", float(offset))
+            if self.kind == "ACC":
+                store.set(f"{prefix}{axis}SCALE", float(scale))
+        return True
+
+    def _set_rotation(self, number: int) -> None:
+        level = mounting_matrix(*(self._store[f"SENS_BOARD_{axis}_OFF"] for axis in "XYZ"))
+        self.rotation = level @ rotation_matrix(number)
+
+
+def find_slot(store: ParameterStore, kind: Kind, device_id: int) -> int | None:
+    """The first slot whose CAL_x_ID is this device's."""
+    return next((slot for slot in range(SLOTS) if store[f"CAL_{kind}{slot}_ID"] == device_id), None)
+
+
+def _far(used: Array, wanted: Array) -> bool:
+    return bool(np.linalg.norm(used - wanted) > THRESHOLD)

@@ -1,0 +1,76 @@
+"""A coarse stand-in for EKF2: its bias estimates, and the tilt that has swallowed the accelerometer's bias.
+
+Only what a companion can see and must reckon with (autopilots 9.2, 9.3.2): the gyro bias is found within seconds, the
+Earth's rotation known; the vertical accelerometer bias likewise. Of a horizontal one everything goes into the tilt at
+the start (attitude is aligned by it); a later change goes mostly into a bias estimate, so that after a write the old
+tilt stays, for minutes, until a reboot. An offset that is taken clears the estimate.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sim.earth import STANDARD_GRAVITY_M_S2, Array
+
+ACCEL_LIMIT_M_S2, GYRO_LIMIT_RAD_S = 0.4, 0.15
+"""EKF2_ABL_LIM and EKF2_GYR_B_LIM."""
+_LEARNS_S = 1.05
+_SHARE_EARLY, _SHARE_LATE, _SETTLES_S = 0.3, 0.2, 60.0
+"""Part of a horizontal change that the tilt takes: about half soon after a start, a fifth later."""
+_OBVIOUS_M_S2 = 0.5
+"""More than this cannot be a bias: it is taken for a tilt."""
+
+
+class Ekf2:
+    """States in vehicle FRD; `update` wants the current errors of the corrected IMU output (output minus truth)."""
+
+    def __init__(self) -> None:
+        self.gyro_bias_rad_s = np.zeros(3)
+        self.accel_bias_m_s2 = np.zeros(3)
+        self._tilt_m_s2 = np.zeros(2)
+        """The horizontal specific force, x and y, that the tilt's error stands for."""
+        self._started_s = 0.0
+        self.time_s = 0.0
+        """Of the last update."""
+        self.accel_steady_since_s = self.gyro_steady_since_s = 0.0
+
+    def reset(self, t_s: float, accel_error: Array) -> None:
+        """A start at this time: level is what the accelerometer says."""
+        self.gyro_bias_rad_s, self.accel_bias_m_s2 = np.zeros(3), np.zeros(3)
+        self._tilt_m_s2 = accel_error[:2].copy()
+        self.time_s = self._started_s = t_s
+        self.accel_steady_since_s = self.gyro_steady_since_s = t_s
+
+    def forget_gyro_bias(self) -> None:
+        """A gyro offset was taken."""
+        self.gyro_bias_rad_s = np.zeros(3)
+        self.gyro_steady_since_s = self.time_s
+
+    def forget_accel_bias(self) -> None:
+        """An accelerometer offset or scale was taken. The tilt stays."""
+        self.accel_bias_m_s2 = np.zeros(3)
+        self.accel_steady_since_s = self.time_s
+
+    @property
+    def tilt_error_rad(self) -> tuple[float, float]:
+        """Errors of roll and pitch."""
+        x, y = self._tilt_m_s2 / STANDARD_GRAVITY_M_S2
+        return -float(y), float(x)
+
+    def update(self, t_s: float, gyro_error: Array, accel_error: Array) -> None:
+        """Go to this time, the errors having been these since the last update."""
+        span = max(t_s - self.time_s, 0.0)
+        learnt = 1.0 - math.exp(-span / _LEARNS_S)
+        self.gyro_bias_rad_s += learnt * (gyro_error - self.gyro_bias_rad_s)
+        np.clip(self.gyro_bias_rad_s, -GYRO_LIMIT_RAD_S, GYRO_LIMIT_RAD_S, out=self.gyro_bias_rad_s)
+        self.accel_bias_m_s2[2] += learnt * (accel_error[2] - self.accel_bias_m_s2[2])
+        mismatch = accel_error[:2] - self.accel_bias_m_s2[:2] - self._tilt_m_s2
+        share = _SHARE_LATE + _SHARE_EARLY * math.exp(-(self.time_s - self._started_s) / _SETTLES_S)
+        if np.linalg.norm(mismatch) > _OBVIOUS_M_S2:
+            share = 1.0
+        self._tilt_m_s2 += learnt * share * mismatch
+        self.accel_bias_m_s2[:2] += learnt * (1.0 - share) * mismatch
+        np.clip(self.accel_bias_m_s2, -ACCEL_LIMIT_M_S2, ACCEL_LIMIT_M_S2, out=self.accel_bias_m_s2)
+        self.time_s = t_s

@@ -1,0 +1,173 @@
+"""What the PX4 double says of itself, message by message (autopilots 4.5, 9.2; PX4 `src/modules/mavlink/streams`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.earth import STANDARD_GRAVITY_M_S2
+from sim.firmware.messages import (
+    global_position_int,
+    gps_raw_int,
+    magnetic_body,
+    pressure_hpa,
+    sys_status,
+    system_time,
+)
+from sim.firmware.numbers import truncated_16
+
+if TYPE_CHECKING:
+    from sim.px4.double import PX4Double
+
+Message = mavlink.MAVLink_message
+Builder = Callable[["PX4Double", float], Message | None]
+_SCALED_IMU = (
+    mavlink.MAVLink_scaled_imu_message,
+    mavlink.MAVLink_scaled_imu2_message,
+    mavlink.MAVLink_scaled_imu3_message,
+)
+_HOLD_MODE = 4 << 16 | 3 << 24
+
+
+def heartbeat(double: PX4Double, loop_s: float) -> Message:
+    """HEARTBEAT: UNINIT while a pre-flight check fails."""
+    base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
+    base |= mavlink.MAV_MODE_FLAG_AUTO_ENABLED | mavlink.MAV_MODE_FLAG_GUIDED_ENABLED
+    state = mavlink.MAV_STATE_UNINIT
+    if double.armed:
+        base |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+        state = mavlink.MAV_STATE_ACTIVE
+    elif double.calibrating:
+        state = mavlink.MAV_STATE_CALIBRATING
+    elif not double.prearm_failures(loop_s):
+        state = mavlink.MAV_STATE_STANDBY
+    kind = mavlink.MAV_TYPE_QUADROTOR if double.vehicle == "copter" else mavlink.MAV_TYPE_FIXED_WING
+    return mavlink.MAVLink_heartbeat_message(kind, mavlink.MAV_AUTOPILOT_PX4, base, _HOLD_MODE, state, 3)
+
+
+def highres_imu(double: PX4Double, loop_s: float) -> Message:
+    """HIGHRES_IMU: the first IMU less what the estimator takes for its bias; the temperature is the air's."""
+    t_s = double.aircraft.time_at(loop_s)
+    sample_s, output = double.imu_output(0, loop_s)
+    double.update_estimators(loop_s)
+    estimator = double.vehicle_imus[0].estimator
+    gx, gy, gz = (output[:3] - estimator.gyro_bias_rad_s).tolist()
+    ax, ay, az = (output[3:] - estimator.accel_bias_m_s2).tolist()
+    mx, my, mz = (magnetic_body(double, t_s) * 0.001).tolist()
+    return mavlink.MAVLink_highres_imu_message(
+        double.boot_us(double.aircraft.loop_time_of(sample_s)), ax, ay, az, gx, gy, gz, mx, my, mz,
+        pressure_hpa(double), 0.0, double.aircraft.site.height_m, double.aircraft.temperature_degc(t_s) + 7.5, 4095, 0,
+    )  # fmt: skip
+
+
+def scaled_imu(double: PX4Double, loop_s: float, index: int) -> Message | None:
+    """SCALED_IMU, 2, 3: corrected, no estimator, truncated to mG and mrad/s; None without that IMU."""
+    if index >= len(double.imus):
+        return None
+    t_s = double.aircraft.time_at(loop_s)
+    sample_s, output = double.imu_output(index, loop_s)
+    milli_g = [truncated_16(float(value) * 1000.0 / STANDARD_GRAVITY_M_S2) for value in output[3:]]
+    milli_rad = [truncated_16(float(value) * 1000.0) for value in output[:3]]
+    magnetic = [truncated_16(float(value)) for value in magnetic_body(double, t_s)]
+    temperature = round(double.imus[index].temperature_degc(t_s) * 100.0) or 1  # 0 means "not known"
+    boot_ms = double.boot_ms(double.aircraft.loop_time_of(sample_s))
+    kind = (
+        mavlink.MAVLink_scaled_imu_message,
+        mavlink.MAVLink_scaled_imu2_message,
+        mavlink.MAVLink_scaled_imu3_message,
+    )
+    fields = (*milli_g, *milli_rad, *magnetic, temperature)
+    return kind[index](boot_ms, *fields)
+
+
+def attitude(double: PX4Double, loop_s: float) -> Message:
+    """ATTITUDE: the estimator's."""
+    roll, pitch, yaw = double.estimated_angles_rad(loop_s)
+    rates = double.imu_output(0, loop_s).output[:3] - double.vehicle_imus[0].estimator.gyro_bias_rad_s
+    return mavlink.MAVLink_attitude_message(double.boot_ms(loop_s), roll, pitch, yaw, *map(float, rates))
+
+
+def timesync(double: PX4Double, loop_s: float) -> Message:
+    """TIMESYNC: a request of its own."""
+    return mavlink.MAVLink_timesync_message(0, double.boot_us(loop_s) * 1000)
+
+
+def home_position(double: PX4Double, loop_s: float) -> Message | None:
+    """HOME_POSITION: set when there is a position."""
+    if not double.has_position:
+        return None
+    site = double.aircraft.site
+    return mavlink.MAVLink_home_position_message(
+        round(site.latitude_deg * 1e7), round(site.longitude_deg * 1e7), round(site.height_m * 1000.0),
+        0.0, 0.0, 0.0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, double.boot_us(loop_s),
+    )  # fmt: skip
+
+
+def extended_sys_state(double: PX4Double, loop_s: float) -> Message:
+    """EXTENDED_SYS_STATE: it never leaves the ground."""
+    return mavlink.MAVLink_extended_sys_state_message(
+        mavlink.MAV_VTOL_STATE_UNDEFINED, mavlink.MAV_LANDED_STATE_ON_GROUND
+    )
+
+
+def autopilot_version(double: PX4Double, loop_s: float) -> Message:
+    """AUTOPILOT_VERSION: PARAM_FLOAT and PARAM_ENCODE_BYTEWISE."""
+    capabilities = (
+        mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+        | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+        | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+        | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+        | mavlink.MAV_PROTOCOL_CAPABILITY_FTP
+        | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    )
+    major, minor = (int(part) for part in double.version.split("."))
+    kind = mavlink.FIRMWARE_VERSION_TYPE_BETA if double.version == "1.18" else mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL
+    nothing = [0] * 8
+    software = major << 24 | minor << 16 | kind
+    return mavlink.MAVLink_autopilot_version_message(
+        capabilities, software, software, 0, 0, nothing, nothing, nothing, 0x26AC, 0x0032, 0
+    )
+
+
+BUILDERS: dict[int, Builder] = {
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: heartbeat,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: sys_status,
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: system_time,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: gps_raw_int,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: lambda double, loop_s: scaled_imu(double, loop_s, 0),
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU2: lambda double, loop_s: scaled_imu(double, loop_s, 1),
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU3: lambda double, loop_s: scaled_imu(double, loop_s, 2),
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: attitude,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: global_position_int,
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: highres_imu,
+    mavlink.MAVLINK_MSG_ID_TIMESYNC: timesync,
+    mavlink.MAVLINK_MSG_ID_HOME_POSITION: home_position,
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: extended_sys_state,
+    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version,
+}
+
+# Streams that run by themselves, in Hz: the modes "onboard" (TELEM2, the companion) and "normal" (TELEM1). GPS_RAW_INT
+# goes out as often as the receiver speaks.
+ONBOARD_RATES: dict[int, float] = {
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
+    mavlink.MAVLINK_MSG_ID_TIMESYNC: 10.0,
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 50.0,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: 100.0,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 50.0,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 10.0,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: 5.0,
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
+    mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
+}
+NORMAL_RATES: dict[int, float] = {
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: 15.0,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 5.0,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: 1.0,
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 1.0,
+    mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
+}

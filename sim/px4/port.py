@@ -1,0 +1,129 @@
+"""PX4's ports: streams looked at once per sensor sample, texts only for ground stations, routes learned per port.
+
+Facts: PX4 `mavlink_stream.cpp`, `mavlink_main.cpp`, `STATUSTEXT.hpp` (2026-08), autopilots 4.5, 5.4, 9.2, 9.3.2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.firmware.channel import Channel, Message, Stream
+
+HEARTBEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT
+MAIN_LOOP_S = 0.0015
+"""The pause of a port's loop on a fast link."""
+GCS_TIMEOUT_S = 2.5
+TEXT_QUEUE = 8
+_OVERHEAD = 12
+"""Bytes of a MAVLink 2 packet around its payload."""
+
+
+@dataclass(slots=True)
+class PacedStream(Stream):
+    """A stream, and when it was sent by its own reckoning."""
+
+    last_s: float = 0.0
+
+
+class PX4Port(Channel):
+    """One MAVLink instance.
+
+    Args:
+        defaults: rates in Hz of the streams that run by themselves.
+        period_s: of the sensor samples: streams are looked at once per sample, so rates are quantised by it.
+        data_rate: bytes per second (MAV_n_RATE) to which the streams are scaled down together; None: enough for all.
+    """
+
+    def __init__(
+        self,
+        system_id: int,
+        handle: Callable[[Channel, Message, float], None],
+        *,
+        defaults: Mapping[int, float],
+        period_s: float,
+        data_rate: float | None,
+    ) -> None:
+        super().__init__(system_id, handle)
+        self.defaults, self.period_s, self.data_rate = dict(defaults), period_s, data_rate
+        self.forwards = False
+        """MAV_n_FORWARD at the last boot."""
+        self.seen: set[tuple[int, int]] = set()
+        """System and component of every sender heard since the boot."""
+        self.gcs_heard_s = -math.inf
+        """When a HEARTBEAT of type GCS came last."""
+        self.texts: deque[tuple[float, int, str]] = deque(maxlen=TEXT_QUEUE)
+        """Time, severity and text of what could not be said yet; the oldest is lost."""
+        self.text_number = 0
+        self.text_next_s = 0.0
+        self._slower = 1.0
+
+    def restart(self, now_s: float) -> None:
+        """A boot: default streams, nobody seen."""
+        self.streams.clear()
+        self.seen.clear()
+        self.texts.clear()
+        self.gcs_heard_s, self.text_number, self.listing = -math.inf, 0, False
+        for message_id in self.defaults:
+            self.set_stream(message_id, 0.0, now_s)
+        self.streams[HEARTBEAT].next_s = now_s
+
+    def has_seen(self, system: int, component: int) -> bool:
+        """Whether a target was heard here; system 0: whether anybody was."""
+        if system == 0:
+            return bool(self.seen)
+        return any(s == system and component in (0, c) for s, c in self.seen)
+
+    def has_ground_station(self, now_s: float) -> bool:
+        """Whether texts are sent here."""
+        return now_s - self.gcs_heard_s <= GCS_TIMEOUT_S
+
+    def set_stream(self, message_id: int, interval_s: float | None, now_s: float) -> None:
+        """Start, change or (None) stop a stream; 0: the default of this port, which may be to stop."""
+        if interval_s == 0.0:
+            rate = self.defaults.get(message_id, 0.0)
+            interval_s = 1.0 / rate if rate else None
+        if interval_s is None:
+            self.streams.pop(message_id, None)
+        else:
+            stream = PacedStream(interval_s, 0.0, now_s)
+            self.streams[message_id] = stream
+        self._scale()
+        for stream_id, other in self.streams.items():
+            self._plan(stream_id, other)
+
+    def due(self, now_s: float) -> list[int]:
+        """Message ids whose time has come."""
+        due = []
+        for message_id, stream in self.streams.items():
+            if stream.next_s <= now_s + 1e-9:
+                due.append(message_id)
+                assert isinstance(stream, PacedStream)
+                interval = self._interval(message_id, stream)
+                late = now_s - stream.last_s
+                # A little late: the next one is reckoned from when this one was due. Very late: from now.
+                stream.last_s = stream.last_s + interval if 1.5 * interval > late else now_s
+                self._plan(message_id, stream)
+        return due
+
+    def _interval(self, message_id: int, stream: Stream) -> float:
+        return stream.interval_s if message_id == HEARTBEAT else stream.interval_s * self._slower
+
+    def _plan(self, message_id: int, stream: Stream) -> None:
+        """The first sample at which it is due, that is 0.3 of a loop's pause before its interval is over."""
+        assert isinstance(stream, PacedStream)
+        wanted_s = stream.last_s + self._interval(message_id, stream) - 0.3 * MAIN_LOOP_S
+        stream.next_s = (math.floor(wanted_s / self.period_s) + 1) * self.period_s
+
+    def _scale(self) -> None:
+        """All streams but HEARTBEAT go slower by one factor when their sum would exceed the data rate."""
+        rate = sum(
+            (mavlink.mavlink_map[message_id].unpacker.size + _OVERHEAD) / stream.interval_s
+            for message_id, stream in self.streams.items()
+            if message_id != HEARTBEAT
+        )
+        self._slower = 1.0 if self.data_rate is None else max(1.0, rate / max(self.data_rate - 21.0, 1.0))

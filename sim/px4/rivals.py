@@ -1,0 +1,203 @@
+"""What else writes offsets: the gyro calibration in the background, and what the estimator learned in the air.
+
+Autopilots 4.3, 9.2, 9.3.2; PX4 `GyroCalibration.cpp`, `VehicleIMU.cpp`, `EKF2.cpp` (2026-08). Both tell nobody but
+through the PARAM_VALUE that follows every change.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sim.earth import STANDARD_GRAVITY_M_S2, Array
+from sim.px4.calibration import SensorCalibration
+from sim.px4.vehicle_imu import VehicleImu
+
+if TYPE_CHECKING:
+    from sim.px4.double import PX4Double
+
+POLL_S = 0.5
+SAMPLE_S = 0.02
+"""It looks at one sample of each sensor at 50 Hz."""
+QUIET_S = 5.0
+MIN_COUNT = 100
+MAX_VARIANCE = 0.001
+MAX_MOVE_M_S2 = 0.5
+MAX_KELVIN = 1.0
+_SETTLES_S = 10.0
+_QUIET_AFTER_CHANGE_S = 31.0
+ACCEL_WORTH_M_S2, GYRO_WORTH_RAD_S = 0.05, 0.01
+
+
+class BackgroundGyroCalibration:
+    """IMU_GYRO_CAL_EN: started at boot, or not; while disarmed and still it replaces offsets that are far wrong."""
+
+    def __init__(self, double: PX4Double) -> None:
+        self._double = double
+        self.running = False
+        self.commits = 0
+        """How often it wrote."""
+        self._begin(0.0)
+
+    def restart(self, loop_s: float) -> None:
+        """A boot: the parameter decides now, and not again before the next one."""
+        self.running = bool(self._double.parameters["IMU_GYRO_CAL_EN"])
+        self._begin(loop_s)
+        if self.running:
+            self._double.later(POLL_S, self._poll)
+
+    def parameters_updated(self, loop_s: float) -> None:
+        """It reads them again, and starts anew; for 5 s it then writes nothing."""
+        for calibration in self._own:
+            calibration.parameters_update()
+        self._changed_s = loop_s
+        self._reset(loop_s)
+
+    def _begin(self, loop_s: float) -> None:
+        store = self._double.parameters
+        self._own = [
+            SensorCalibration("GYRO", imu.device_id, store, external=imu.external) for imu in self._double.vehicle_imus
+        ]
+        self._changed_s = -math.inf
+        self._reference: list[Array | None] = [None] * len(self._own)
+        self._temperature = [math.nan] * len(self._own)
+        self._reset(loop_s)
+
+    def _reset(self, loop_s: float) -> None:
+        self._since_s = self._until_s = loop_s
+        self._samples: list[list[Array]] = [[] for _ in self._own]
+
+    def _poll(self) -> None:
+        double, now_s = self._double, self._double.now_s()
+        double.later(POLL_S, self._poll)
+        if double.armed or double.calibrating or not self._collect(now_s):
+            self._reset(now_s)
+            return
+        if now_s - self._changed_s <= QUIET_S:
+            return
+        if len(self._samples[0]) * POLL_S / SAMPLE_S <= MIN_COUNT:
+            return
+        moments = [self._moments(samples) for samples in self._samples]
+        if any(np.linalg.norm(variance) > MAX_VARIANCE for _, variance in moments):
+            self._reset(now_s)
+            return
+        taken = False
+        for own, (mean, variance) in zip(self._own, moments, strict=True):
+            worth = bool(((mean - own.offset) ** 2 > variance).any()) or not own.calibrated
+            taken |= worth and own.set_offset(mean)
+        if taken:
+            for index, own in enumerate(self._own):
+                own.save(index)
+            self.commits += 1
+            double.parameters_changed()
+            self._reset(now_s)
+
+    def _collect(self, now_s: float) -> bool:
+        """Samples since the last look; False when something moved or warmed."""
+        double = self._double
+        times = np.arange(self._until_s + SAMPLE_S, now_s + SAMPLE_S / 2.0, SAMPLE_S)
+        self._until_s = now_s
+        if not len(times):
+            return True
+        start_s, end_s = double.aircraft.time_at(float(times[0])), double.aircraft.time_at(now_s)
+        for number, imu in enumerate(double.vehicle_imus):
+            grid = np.linspace(start_s, end_s, len(times))
+            noise = double.random.standard_normal((len(times), 6)) * (imu.density / math.sqrt(imu.interval_s))
+            block = imu.model.expected_block(grid) + noise
+            if not self._is_still(number, block[:, 3:], imu.model.temperature_degc(end_s)):
+                return False
+            mean = block[:, :3].mean(axis=0)
+            self._samples[number].append(np.concatenate((mean, block[:, :3].var(axis=0))))
+        return True
+
+    def _is_still(self, number: int, force: Array, degc: float) -> bool:
+        reference = self._reference[number]
+        if reference is None or np.linalg.norm(force - reference, axis=1).max() > MAX_MOVE_M_S2:
+            self._reference[number] = force[-1]
+            return reference is None
+        if not abs(degc - self._temperature[number]) <= MAX_KELVIN:
+            first = math.isnan(self._temperature[number])
+            self._temperature[number] = degc
+            return first
+        return bool(np.linalg.norm(force, axis=1).max() <= 1.3 * STANDARD_GRAVITY_M_S2)
+
+    @staticmethod
+    def _moments(parts: list[Array]) -> tuple[Array, Array]:
+        """Mean and variance of all samples from those of equally long parts."""
+        table = np.array(parts)
+        means, variances = table[:, :3], table[:, 3:]
+        return means.mean(axis=0), variances.mean(axis=0) + means.var(axis=0)
+
+
+class LearnedOffsets:
+    """SENS_IMU_AUTOCAL: what the estimators took for bias while armed becomes the offset at disarming.
+
+    The same happens on the ground to a sensor that has no slot: it is given one.
+    """
+
+    def __init__(self, double: PX4Double) -> None:
+        self._double = double
+        self.commits = 0
+        """How often it wrote."""
+        self._quiet_until_s = -math.inf
+
+    def restart(self) -> None:
+        """A boot: a sensor without a slot gets one as soon as its estimator has settled."""
+        self._quiet_until_s = -math.inf
+        self._double.later(_SETTLES_S + 1.0, self._claim)
+
+    def calibration_changed(self, loop_s: float) -> None:
+        """An offset was taken: nothing is learned for half a minute; then a sensor without a slot gets one."""
+        self._quiet_until_s = loop_s + _QUIET_AFTER_CHANGE_S
+        if not all(imu.calibrated for imu in self._double.vehicle_imus):
+            self._double.later(_QUIET_AFTER_CHANGE_S + _SETTLES_S, self._claim)
+
+    def disarmed(self, loop_s: float, armed_for_s: float) -> None:
+        """The pilot disarmed."""
+        if armed_for_s > 1.0:
+            self._commit(loop_s, self._double.vehicle_imus)
+
+    def _claim(self) -> None:
+        if not self._double.armed:
+            without = [imu for imu in self._double.vehicle_imus if not imu.calibrated]
+            self._commit(self._double.now_s(), without)
+
+    def _commit(self, loop_s: float, imus: Sequence[VehicleImu]) -> None:
+        double = self._double
+        if not double.parameters["SENS_IMU_AUTOCAL"] or loop_s <= self._quiet_until_s:
+            return
+        double.update_estimators(loop_s)
+        t_s = double.aircraft.time_at(loop_s)
+        written = [self._save(imu, t_s) for imu in imus]
+        if any(written):
+            self.commits += 1
+            double.parameters_changed()
+
+    def _save(self, imu: VehicleImu, t_s: float) -> bool:
+        estimator, written = imu.estimator, False
+        for own, bias, since_s, worth, forget in (
+            (
+                imu.accel,
+                estimator.accel_bias_m_s2,
+                estimator.accel_steady_since_s,
+                ACCEL_WORTH_M_S2,
+                estimator.forget_accel_bias,
+            ),
+            (
+                imu.gyro,
+                estimator.gyro_bias_rad_s,
+                estimator.gyro_steady_since_s,
+                GYRO_WORTH_RAD_S,
+                estimator.forget_gyro_bias,
+            ),
+        ):
+            if t_s - since_s < _SETTLES_S:
+                continue
+            learned = own.rotation.T @ bias / own.scale
+            if (np.linalg.norm(learned) > worth or not own.calibrated) and own.set_offset(own.offset + learned):
+                written |= own.save(imu.index)
+                forget()
+        return written

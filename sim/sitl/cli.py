@@ -1,0 +1,199 @@
+"""`python -m sim ardupilot | px4 | residuals`: a real firmware on the virtual aircraft, until Ctrl-C."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from sim.aircraft import Pose
+from sim.imu_model import PARTS
+from sim.scenario import FIRST_ACCEL_MG, FIRST_GYRO_DEG_H, GRADIENTER_OFFSET_DEG, Scenario, demo
+from sim.serve import FIRMWARE_COMMANDS, add_world_options, address, configuration, describe, run_until_stopped, serve
+from sim.sitl.ardupilot import ArduPilotSitl
+from sim.sitl.process import BinaryError
+from sim.sitl.px4 import Px4Sitl
+from sim.sitl.vehicle import SitlVehicle
+
+COMPANION_UDP, GROUND_UDP = "127.0.0.1:14540", "127.0.0.1:14550"
+
+
+def parser() -> argparse.ArgumentParser:
+    """Arguments of the three commands."""
+    top = argparse.ArgumentParser(prog="python -m sim", description="A real firmware on the virtual aircraft.")
+    commands = top.add_subparsers(dest="command", required=True)
+    for name, text in FIRMWARE_COMMANDS.items():
+        command = commands.add_parser(name, help=text, description=text)
+        command.add_argument("--binary", type=Path, required=True, help="the firmware: arducopter, arduplane or px4")
+        _add_aircraft(command)
+        if name != "residuals":
+            command.add_argument(
+                "--dir", type=Path, help="folder for the ports and the firmware's files (default: a new one)"
+            )
+        if name != "px4":
+            command.add_argument(
+                "--defaults", type=Path, action="append", default=[], metavar="FILE",
+                help="ArduPilot parameter file, read before ours; may be repeated",
+            )  # fmt: skip
+        if name == "ardupilot":
+            for option, default, who in (
+                ("--udp", COMPANION_UDP, "companion"),
+                ("--ground", GROUND_UDP, "ground station"),
+            ):
+                command.add_argument(
+                    option, type=address, metavar="HOST:PORT", default=default,
+                    help=f"where the {who} listens (default {default})",
+                )  # fmt: skip
+        if name != "ardupilot":
+            command.add_argument("--etc", type=Path, help="PX4's etc folder (default: ../etc of the binary)")
+    residuals = commands.choices["residuals"]
+    residuals.add_argument(
+        "--firmware", choices=("ardupilot", "px4"), help="which one the binary is (default: by its name)"
+    )
+    residuals.add_argument(
+        "--observe", type=float, default=60.0, metavar="SECONDS", help="length of each look (default 60)"
+    )
+    residuals.add_argument(
+        "--config", type=Path, action="append", default=[], metavar="FILE",
+        help="further lines of the companion's configuration, such as [calibration], instead of a minute of standing"
+        " still; may be repeated",
+    )  # fmt: skip
+    residuals.add_argument(
+        "--companion-only", action="store_true", help="leave the firmware's own calibrations out: three minutes less"
+    )
+    return top
+
+
+def _add_aircraft(command: argparse.ArgumentParser) -> None:
+    add_world_options(command)
+    command.add_argument(
+        "--gyro-bias", type=float, nargs=3, metavar=("X", "Y", "Z"), default=FIRST_GYRO_DEG_H,
+        help="of the flight controller's first IMU in deg/h (default %(default)s)",
+    )  # fmt: skip
+    command.add_argument(
+        "--accel-bias", type=float, nargs=3, metavar=("X", "Y", "Z"), default=FIRST_ACCEL_MG,
+        help="likewise, in mg (default %(default)s)",
+    )  # fmt: skip
+    command.add_argument(
+        "--part", choices=sorted(PARTS), default="icm42688p", help="what that IMU is (default icm42688p)"
+    )
+    command.add_argument(
+        "--gradienter-offset", type=float, nargs=2, metavar=("X", "Y"), default=GRADIENTER_OFFSET_DEG,
+        help="what the gradienter shows too much, in degrees (default %(default)s)",
+    )  # fmt: skip
+    command.add_argument(
+        "--gyr-cal", action="store_true", help="ArduPilot calibrates its gyros at every boot (INS_GYR_CAL = 1)"
+    )
+
+
+def scenario_of(arguments: argparse.Namespace) -> Scenario:
+    """The aircraft that the options describe."""
+    pitch, roll, heading = arguments.pose
+    return demo(
+        pose=Pose(pitch, roll, heading),
+        seed=arguments.seed,
+        unix_s=time.time(),
+        law=arguments.law,
+        part=arguments.part,
+        gyro_deg_h=arguments.gyro_bias,
+        accel_mg=arguments.accel_bias,
+        gradienter_offset_deg=tuple(arguments.gradienter_offset),
+    )
+
+
+def vehicle_of(arguments: argparse.Namespace, scenario: Scenario, folder: Path) -> SitlVehicle:
+    """The firmware that the options name, not started.
+
+    Raises:
+        BinaryError: it is missing or cannot be executed.
+    """
+    firmware = arguments.command
+    if firmware == "residuals":
+        firmware = arguments.firmware or ("px4" if arguments.binary.name.startswith("px4") else "ardupilot")
+    if firmware == "px4":
+        return Px4Sitl(arguments.binary, scenario, folder, etc=arguments.etc)
+    serving = arguments.command == "ardupilot"
+    return ArduPilotSitl(
+        arguments.binary,
+        scenario,
+        folder,
+        defaults=arguments.defaults,
+        gyr_cal=arguments.gyr_cal,
+        companion=arguments.udp if serving else None,
+        ground=arguments.ground if serving else None,
+    )
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run a command until it is done or interrupted; returns the exit code."""
+    arguments = parser().parse_args(argv)
+    made_here = getattr(arguments, "dir", None) is None
+    folder = Path(tempfile.mkdtemp(prefix="companion-sim-")) if made_here else arguments.dir.absolute()
+    scenario = scenario_of(arguments)
+    try:
+        vehicle = vehicle_of(arguments, scenario, folder / "firmware")
+        if arguments.command == "residuals":
+            from sim.sitl.residuals import STILL, report
+
+            more = "".join(path.read_text(encoding="utf-8") for path in arguments.config) or STILL
+            own = not arguments.companion_only
+            return asyncio.run(report(vehicle, folder, arguments.observe, more, own=own))
+        return asyncio.run(
+            run_until_stopped(
+                lambda started: _serve(vehicle, scenario, folder, started), lambda: _words(vehicle, scenario, folder)
+            )
+        )
+    except KeyboardInterrupt:
+        return 130
+    except (BinaryError, OSError) as error:
+        print(f"python -m sim {arguments.command}: {error}", file=sys.stderr)
+        return 1
+    finally:
+        if made_here:  # but not what a companion may have stored beside it
+            shutil.rmtree(folder / "firmware", ignore_errors=True)
+            with contextlib.suppress(OSError):
+                os.rmdir(folder)
+
+
+async def _serve(vehicle: SitlVehicle, scenario: Scenario, folder: Path, started: asyncio.Event) -> None:
+    """Firmware and devices until cancelled.
+
+    Raises:
+        BinaryError: the firmware ended.
+    """
+    async with vehicle:
+        up = asyncio.Event()
+        tasks = [
+            asyncio.create_task(serve(scenario, directory=folder, started=up), name="devices"),
+            asyncio.create_task(vehicle.process.wait(), name="firmware"),
+        ]
+        try:
+            waiting = asyncio.create_task(up.wait())
+            await asyncio.wait({*tasks, waiting}, return_when=asyncio.FIRST_COMPLETED)
+            waiting.cancel()
+            if up.is_set():
+                started.set()
+            await asyncio.gather(*tasks)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _words(vehicle: SitlVehicle, scenario: Scenario, folder: Path) -> str:
+    host, port = vehicle.url.removeprefix("udpin:").rsplit(":", 1)
+    text = describe(scenario, devices=True, autopilot=True)
+    text += f"# Firmware: process {vehicle.process.pid}, its files and log in {vehicle.folder}\n"
+    if vehicle.firmware == "px4":
+        to = ":".join(map(str, vehicle.ground_target))
+        text += f"# Ground station: listen on UDP 14550, or speak first to UDP {to}\n"
+    else:
+        text += f"# Ground station: listen on UDP {':'.join(map(str, vehicle.ground_target))}\n"
+    return text + configuration(scenario, directory=folder, udp=(host, int(port)))

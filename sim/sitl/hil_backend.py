@@ -1,0 +1,197 @@
+"""The physics of a PX4 SITL: a TCP server that feeds HIL_SENSOR in lockstep with HIL_ACTUATOR_CONTROLS."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import socket
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Self, cast
+
+import numpy as np
+
+from sim.aircraft import VirtualAircraft
+from sim.earth import body_from_ned
+from sim.imu_model import ImuModel
+from sim.sitl.hil_frames import Codec, on_fifo_grid, pressure_hpa
+from sim.sitl.samples import Sample, SampleBlocks
+
+FRAME_HZ = 250
+SLOW_EVERY = FRAME_HZ // 50
+"""Magnetometer and barometer: every so many frames."""
+GPS_EVERY = FRAME_HZ // 5
+LOCKSTEP_TIMEOUT_S = 0.2
+"""The firmware answers every frame once its outputs run; before that, and when it hangs, we go on by ourselves."""
+MAX_BEHIND_S = 0.25
+"""Later than this, and the frames that were missed are not made up for."""
+_MAGNETIC_NOISE_GAUSS = 0.0005
+_PRESSURE_NOISE_HPA = 0.01
+_POSITION_NOISE_E7 = 1.0
+
+
+class HilBackend:
+    """Two IMUs, magnetometer, barometer and GNSS for one firmware. An async context manager on a real event loop.
+
+    Args:
+        aircraft: the truth.
+        imus: one or two models; the first becomes sensor 0, which the firmware reads through 16 bits.
+        port: TCP port on 127.0.0.1 (the firmware wants 4560 plus its instance); 0 takes a free one, see `port`.
+        field_gauss: horizontal (towards magnetic north) and vertical part of the Earth's field.
+        seed: of the noise of magnetometer, barometer and GNSS.
+    """
+
+    def __init__(
+        self,
+        aircraft: VirtualAircraft,
+        imus: Sequence[ImuModel],
+        *,
+        port: int = 0,
+        field_gauss: tuple[float, float] = (0.28, 0.45),
+        seed: int = 0,
+    ) -> None:
+        if not 1 <= len(imus) <= 2:
+            raise ValueError(f"imus: found {len(imus)}; allowed: 1 or 2")
+        self._aircraft = aircraft
+        self._blocks = SampleBlocks(aircraft, imus)
+        self._wanted_port = port
+        declination = math.radians(aircraft.site.declination_deg)
+        north, down = field_gauss
+        self._field_ned = np.array([north * math.cos(declination), north * math.sin(declination), down])
+        self._random = np.random.default_rng([seed, 7])
+        self._server: asyncio.Server | None = None
+        self._driving: asyncio.Task[None] | None = None
+        self._answered = asyncio.Event()
+        self._locked = False
+        self.port = 0
+        self.boots = 0
+        """Connections, that is firmware starts."""
+        self.frames = 0
+        """Frames sent, since the last boot."""
+        self.unanswered = 0
+        """Frames that got no answer in time although the firmware had answered before."""
+        self.late = 0
+        """How often the machine was too slow to keep up."""
+        self.armed = False
+        """What the firmware's outputs say."""
+
+    @property
+    def physics_s(self) -> float:
+        """The firmware's simulated time since its boot."""
+        return self.frames / FRAME_HZ
+
+    @property
+    def locked(self) -> bool:
+        """Whether the firmware answers our frames."""
+        return self._locked
+
+    async def __aenter__(self) -> Self:
+        """Listen.
+
+        Raises:
+            OSError: the port is taken.
+        """
+        self._aircraft.begin(asyncio.get_running_loop().time())
+        self._server = await asyncio.start_server(self._connected, "127.0.0.1", self._wanted_port)
+        self.port = self._server.sockets[0].getsockname()[1]
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._server is not None:
+            self._server.close()
+        if self._driving is not None:
+            self._driving.cancel()
+            await asyncio.gather(self._driving, return_exceptions=True)
+            self._driving = None
+        if self._server is not None:
+            await self._server.wait_closed()
+            self._server = None
+
+    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """A firmware is there; the one before it, if any, is gone or hopeless."""
+        if self._driving is not None:
+            self._driving.cancel()
+        cast("socket.socket", writer.get_extra_info("socket")).setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        codec = Codec()
+        self._blocks.restart()
+        self._answered.clear()
+        self._locked = self.armed = False
+        self.boots += 1
+        self.frames = 0
+        driving = self._driving = asyncio.create_task(self._drive(codec, writer), name="hil frames")
+        try:
+            while data := await reader.read(4096):
+                for _, armed in codec.actuator_controls(data):
+                    self.armed = armed
+                    self._locked = True
+                    self._answered.set()
+        except OSError:  # the firmware has gone
+            pass
+        finally:
+            driving.cancel()
+            writer.close()
+            with contextlib.suppress(OSError):
+                await writer.wait_closed()
+
+    async def _drive(self, codec: Codec, writer: asyncio.StreamWriter) -> None:
+        loop = asyncio.get_running_loop()
+        due_s = loop.time()
+        try:
+            while True:
+                self._answered.clear()
+                self.frames += 1
+                writer.write(self._frame(codec, self._blocks.next(1.0 / FRAME_HZ, self._now_s(loop))))
+                await writer.drain()
+                if self._locked and not self._answered.is_set():
+                    await self._wait_answer()
+                due_s += 1.0 / FRAME_HZ
+                behind_s = loop.time() - due_s
+                if behind_s > MAX_BEHIND_S:
+                    due_s += behind_s
+                    self.late += 1
+                await asyncio.sleep(max(-behind_s, 0.0))
+        except OSError:  # the firmware has gone; the reader sees it too
+            return
+
+    async def _wait_answer(self) -> None:
+        try:
+            async with asyncio.timeout(LOCKSTEP_TIMEOUT_S):
+                await self._answered.wait()
+        except TimeoutError:
+            self.unanswered += 1
+
+    def _now_s(self, loop: asyncio.AbstractEventLoop) -> float:
+        return self._aircraft.time_at(loop.time())
+
+    def _frame(self, codec: Codec, sample: Sample) -> bytes:
+        """Everything that is new at this instant; sensor 0 first, since it moves the firmware's clock."""
+        number = self.frames
+        time_us = number * 1_000_000 // FRAME_HZ
+        magnetic: list[float] | None = None
+        barometer: tuple[float, float, float] | None = None
+        if number % SLOW_EVERY == 0:
+            field = body_from_ned(*sample.angles_rad) @ self._field_ned
+            noise = self._random.standard_normal(4)
+            magnetic = (field + _MAGNETIC_NOISE_GAUSS * noise[:3]).tolist()
+            height = self._aircraft.site.height_m
+            pressure = pressure_hpa(height) + _PRESSURE_NOISE_HPA * float(noise[3])
+            barometer = (pressure, height, self._aircraft.temperature_degc(sample.t_s))
+        data = codec.sensor(time_us, 0, on_fifo_grid(sample.readings[0]), magnetic_gauss=magnetic, barometer=barometer)
+        for other, reading in enumerate(sample.readings[1:], 1):
+            data += codec.sensor(time_us, other, reading)
+        if number % GPS_EVERY == 0:
+            data += self._gps(codec, sample.t_s)
+        return data
+
+    def _gps(self, codec: Codec, t_s: float) -> bytes:
+        site = self._aircraft.site
+        north, east = (self._random.standard_normal(2) * _POSITION_NOISE_E7).tolist()
+        return codec.gps(
+            int((self._aircraft.unix_s + t_s) * 1e6),
+            round(site.latitude_deg * 1e7 + north),
+            round(site.longitude_deg * 1e7 + east),
+            round(site.height_m * 1000.0),
+        )

@@ -1,0 +1,148 @@
+"""The physics of an ArduPilot SITL: answers every servo packet with one frame of the virtual aircraft, over UDP."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from types import TracebackType
+from typing import Self
+
+from sim.aircraft import VirtualAircraft
+from sim.imu_model import ImuModel
+from sim.sitl.json_frames import ServoPacket, decode_servos, encode_frame
+from sim.sitl.samples import SampleBlocks
+
+_LARGEST_PACKET = 256
+_ASKS_AGAIN_S = 0.5
+"""The firmware repeats an unanswered packet after a second. A repeat sooner after our answer was queued before it."""
+
+
+class JsonBackend:
+    """One IMU's readings for one firmware; all its IMU instances are fed from it (autopilots 9.3).
+
+    An async context manager on any real event loop. The firmware sets the pace: it keeps itself to the wall clock, so
+    here nothing waits. The reader is bare (no transport): at 1000 frames a second that halves the cost.
+
+    Args:
+        aircraft: the truth.
+        imu: whose readings are sent.
+        port: UDP port on 127.0.0.1; 0 takes a free one, see `port`.
+    """
+
+    def __init__(self, aircraft: VirtualAircraft, imu: ImuModel, *, port: int = 0) -> None:
+        self._aircraft = aircraft
+        self._blocks = SampleBlocks(aircraft, [imu])
+        self._wanted_port = port
+        self._socket: socket.socket | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._peer: tuple[str, int] | None = None
+        self._count = -1
+        self._physics_s = 0.0
+        self._last = b""
+        self._last_s = 0.0
+        self.port = 0
+        self.boots = 0
+        """Firmware starts seen."""
+        self.frames = 0
+        """Frames sent, since the last boot."""
+        self.resent = 0
+        """Answers sent again because the firmware asked again."""
+        self.lost = 0
+        """Frame numbers that never came; more than 0 means that the physics did not see what the firmware did."""
+        self.ignored = 0
+        """Packets that were none, and repeats of an answered one."""
+        self.pwm_us: tuple[int, ...] = ()
+        """Servo outputs of the last frame."""
+
+    @property
+    def physics_s(self) -> float:
+        """The firmware's simulated time since its boot."""
+        return self._physics_s
+
+    @property
+    def jumps(self) -> int:
+        """How often the machine was too slow to keep up."""
+        return self._blocks.jumps
+
+    async def __aenter__(self) -> Self:
+        """Bind the port.
+
+        Raises:
+            OSError: the port is taken.
+        """
+        self._loop = asyncio.get_running_loop()
+        self._aircraft.begin(self._loop.time())
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.setblocking(False)  # noqa: FBT003
+            self._socket.bind(("127.0.0.1", self._wanted_port))
+        except BaseException:
+            self._socket.close()
+            raise
+        self.port = self._socket.getsockname()[1]
+        self._loop.add_reader(self._socket.fileno(), self._readable)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._socket is not None and self._loop is not None:
+            self._loop.remove_reader(self._socket.fileno())
+            self._socket.close()
+            self._socket = None
+
+    def _readable(self) -> None:
+        assert self._socket is not None
+        try:
+            data, peer = self._socket.recvfrom(_LARGEST_PACKET)
+        except OSError:  # nothing after all, or the firmware has gone: it is not our business here
+            return
+        answer = self.answer(data, peer)
+        if answer:
+            # A full buffer or a firmware that has gone: it asks again if it still wants to know.
+            with contextlib.suppress(OSError):
+                self._socket.sendto(answer, peer)
+
+    def answer(self, data: bytes, peer: tuple[str, int]) -> bytes:
+        """The answer to a packet, empty if it deserves none; never raises."""
+        packet = decode_servos(data)
+        if packet is None:
+            self.ignored += 1
+            return b""
+        if peer != self._peer or packet.frame_count < self._count:
+            self._begin(peer)
+        elif packet.frame_count == self._count:
+            return self._again()
+        elif self._count >= 0:
+            self.lost += packet.frame_count - self._count - 1
+        return self._frame(packet)
+
+    def _begin(self, peer: tuple[str, int]) -> None:
+        """A firmware has started: its time starts from zero, and so must ours, or it would leap."""
+        self._peer, self._count, self._physics_s = peer, -1, 0.0
+        self._blocks.restart()
+        self.boots += 1
+        self.frames = 0
+
+    def _again(self) -> bytes:
+        """The same frame once more, if the first was lost; a second answer to one packet would stay in its queue."""
+        assert self._loop is not None
+        now_s = self._loop.time()
+        if now_s - self._last_s < _ASKS_AGAIN_S:
+            self.ignored += 1
+            return b""
+        self._last_s = now_s
+        self.resent += 1
+        return self._last
+
+    def _frame(self, packet: ServoPacket) -> bytes:
+        assert self._loop is not None
+        interval_s = 1.0 / packet.frame_rate_hz
+        self._count, self.pwm_us = packet.frame_count, packet.pwm_us
+        self._physics_s += interval_s
+        self._last_s = self._loop.time()
+        now_s = self._aircraft.time_at(self._last_s)
+        self._last = encode_frame(self._physics_s, self._blocks.next(interval_s, now_s))
+        self.frames += 1
+        return self._last

@@ -1,0 +1,159 @@
+"""A firmware binary as a child: its own folder, its own process group, its log, and an end that leaves nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import os
+import shutil
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+GOODBYE_S = 2.0
+"""From SIGTERM to SIGKILL."""
+LOG_LINES = 12
+_PR_SET_PDEATHSIG = 1
+_LOG_TAIL_BYTES = 8192
+
+
+class BinaryError(RuntimeError):
+    """A binary that is missing, cannot run, or has died; the message is one for people."""
+
+
+def check_binary(path: Path, option: str = "--binary") -> Path:
+    """The absolute path of something that can be executed.
+
+    Raises:
+        BinaryError: it is missing or not executable.
+    """
+    path = path.expanduser()
+    found = path if path.parent != Path() or path.exists() else Path(shutil.which(str(path)) or path)
+    if not found.is_file():
+        raise BinaryError(f"{option}: found no file {path}; give the path of the firmware's binary")
+    if not os.access(found, os.X_OK):
+        raise BinaryError(f"{option}: {path} is not executable; try chmod +x")
+    return found.absolute()
+
+
+class FirmwareProcess:
+    """One run of a binary; `start` again for a power cycle, the folder keeps what it stored.
+
+    Args:
+        command: the binary and its arguments.
+        folder: its working directory; exists. Output goes to `firmware.log` there, appended.
+        environment: added to ours.
+    """
+
+    def __init__(self, command: Sequence[str], folder: Path, *, environment: Mapping[str, str] | None = None) -> None:
+        self.command, self.folder = list(command), folder
+        self.environment = dict(environment or {})
+        self.log = folder / "firmware.log"
+        self._process: asyncio.subprocess.Process | None = None
+        self._libc = ctypes.CDLL(None)
+
+    @property
+    def pid(self) -> int | None:
+        """Its process id while it runs."""
+        return self._process.pid if self.running and self._process is not None else None
+
+    @property
+    def running(self) -> bool:
+        """Whether it lives."""
+        return self._process is not None and self._process.returncode is None
+
+    async def start(self) -> None:
+        """Start it.
+
+        Raises:
+            BinaryError: the system refuses to run it.
+            RuntimeError: it runs already.
+        """
+        if self.running:
+            raise RuntimeError(f"{self.command[0]} runs already")
+        with self.log.open("ab") as log:
+            try:
+                self._process = await asyncio.create_subprocess_exec(
+                    *self.command,
+                    cwd=self.folder,
+                    env={**os.environ, **self.environment},
+                    stdin=asyncio.subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=asyncio.subprocess.STDOUT,
+                    start_new_session=True,
+                    preexec_fn=self._die_with_us,
+                )
+            except OSError as error:
+                raise BinaryError(f"{self.command[0]}: cannot be run: {error.strerror}") from None
+
+    async def stop(self) -> None:
+        """End it and all it started, as a power cut does: nothing is saved that was not saved before."""
+        process = self._process
+        if process is None:
+            return
+        self._signal(signal.SIGTERM)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(GOODBYE_S):
+                await process.wait()
+        self._signal(signal.SIGKILL)  # also what is left of the group when the leader has gone
+        await process.wait()
+        self._process = None
+
+    async def wait(self) -> None:
+        """Until it ends by itself.
+
+        Raises:
+            BinaryError: always then, with the last lines of its log.
+        """
+        assert self._process is not None
+        code = await self._process.wait()
+        raise BinaryError(self._obituary(code))
+
+    async def until(self, condition: Callable[[], bool], within_s: float, what: str) -> None:
+        """Wait for something while it lives.
+
+        Raises:
+            BinaryError: it died, or `within_s` passed; with the last lines of its log.
+        """
+        loop = asyncio.get_running_loop()
+        deadline_s = loop.time() + within_s
+        while not condition():
+            if not self.running:
+                code = None if self._process is None else self._process.returncode
+                raise BinaryError(self._obituary(code))
+            if loop.time() > deadline_s:
+                raise BinaryError(
+                    f"{Path(self.command[0]).name}: {what}: not within {within_s:g} s.{self._last_words()}"
+                )
+            await asyncio.sleep(0.02)
+
+    def log_tail(self, lines: int = LOG_LINES) -> list[str]:
+        """The last lines of its log, without blank ones."""
+        try:
+            with self.log.open("rb") as log:
+                log.seek(max(0, self.log.stat().st_size - _LOG_TAIL_BYTES))
+                text = log.read().decode(errors="replace")
+        except OSError:
+            return []
+        return [line for line in text.splitlines() if line.strip()][-lines:]
+
+    def _obituary(self, code: int | None) -> str:
+        if code is None:
+            return f"{Path(self.command[0]).name} does not run"
+        how = f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+        return f"{Path(self.command[0]).name} ended with {how}.{self._last_words()}"
+
+    def _last_words(self) -> str:
+        tail = self.log_tail()
+        return "" if not tail else " Its last words:\n  " + "\n  ".join(tail)
+
+    def _signal(self, number: signal.Signals) -> None:
+        """To its group, whose id is the leader's process id."""
+        assert self._process is not None
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, number)
+
+    def _die_with_us(self) -> None:
+        """In the child: be ended when the simulator is killed and cannot do it itself (Linux)."""
+        self._libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -1,0 +1,143 @@
+"""A real PX4 on the virtual aircraft: `none_iris`, fed by our TCP server, with its companion and ground links."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Mapping
+from pathlib import Path
+
+from sim.imu_model import Bias, ImuModel
+from sim.scenario import Scenario
+from sim.sitl.hil_backend import HilBackend
+from sim.sitl.ports import LOOPBACK, ports_free, unlocked
+from sim.sitl.process import BinaryError, FirmwareProcess, check_binary
+from sim.sitl.vehicle import SitlVehicle
+
+MODEL = "none_iris"
+INSTANCES = 10
+"""Beyond ten, the firmware gives several vehicles the same companion port."""
+_TCP_SIMULATOR = 4560
+_UDP_COMPANION, _UDP_COMPANION_LOCAL = 14540, 14580
+_UDP_GROUND_LOCAL = 18570
+_UDP_PAYLOAD_LOCAL, _UDP_GIMBAL_LOCAL = 14280, 13030
+
+MEASURING_PARAMETERS: dict[str, float] = {
+    "SDLOG_MODE": -1,  # no logs: a run would leave hundreds of megabytes
+    "COM_RC_IN_MODE": 4,  # no radio control, and none expected
+    "NAV_DLL_ACT": 0,  # no ground station is no emergency
+    "NAV_RCL_ACT": 0,
+    "COM_DISARM_PRFLT": -1,  # stays armed until told otherwise
+    "CBRK_SUPPLY_CHK": 894281,
+    "COM_ARM_WO_GPS": 1,
+}
+"""Set at the first boot only; what is stored afterwards is the firmware's own business."""
+
+
+def ports_of(instance: int) -> list[tuple[int, socket.SocketKind]]:
+    """All ports an instance or its peers bind, except the ground station's 14550, which all instances share."""
+    udp = (_UDP_COMPANION, _UDP_COMPANION_LOCAL, _UDP_GROUND_LOCAL, _UDP_PAYLOAD_LOCAL, _UDP_GIMBAL_LOCAL)
+    return [(_TCP_SIMULATOR + instance, socket.SOCK_STREAM)] + [(p + instance, socket.SOCK_DGRAM) for p in udp]
+
+
+def free_instance() -> int:
+    """The first instance whose ports and lock are free.
+
+    Raises:
+        BinaryError: ten are running.
+    """
+    for instance in range(INSTANCES):
+        if unlocked(Path(f"/tmp/px4_lock-{instance}")) and ports_free(ports_of(instance)):  # noqa: S108 - PX4's own
+            return instance
+    raise BinaryError(f"px4: instances 0 to {INSTANCES - 1} are all taken; end one")
+
+
+class Px4Sitl(SitlVehicle):
+    """A `px4` of SITL on a scenario's aircraft.
+
+    Links: the firmware sends to 127.0.0.1 port 14540 plus its instance (companion), and to 14550 until a ground
+    station has spoken to `ground_target`, then to that one.
+
+    Args:
+        binary: the firmware.
+        etc: its `etc` folder of start scripts; None: `../etc` of the binary.
+        scenario: see `SitlVehicle`.
+        folder: see `SitlVehicle`.
+        parameters: set at the first boot, besides `MEASURING_PARAMETERS`.
+        instance: of the firmware; None: the first that is free.
+
+    Raises:
+        BinaryError: binary or folder is missing, or no instance is free.
+    """
+
+    firmware = "px4"
+
+    def __init__(
+        self,
+        binary: Path,
+        scenario: Scenario,
+        folder: Path,
+        *,
+        etc: Path | None = None,
+        parameters: Mapping[str, float] | None = None,
+        instance: int | None = None,
+    ) -> None:
+        super().__init__(scenario, folder)
+        self._binary = check_binary(binary)
+        self._etc = (etc if etc is not None else self._binary.parent.parent / "etc").absolute()
+        if not (self._etc / "init.d-posix" / "rcS").is_file():
+            raise BinaryError(f"--etc: found no init.d-posix/rcS in {self._etc}; give the etc folder of the build")
+        self._parameters = MEASURING_PARAMETERS | dict(parameters or {})
+        self.instance = free_instance() if instance is None else instance
+        self.system_id = self.instance + 1
+        self.backend = HilBackend(
+            scenario.aircraft, scenario.flight_controller_imus[:2], port=_TCP_SIMULATOR + self.instance
+        )
+
+    @property
+    def url(self) -> str:
+        """The companion listens where the onboard link sends to."""
+        return f"udpin:{LOOPBACK}:{_UDP_COMPANION + self.instance}"
+
+    @property
+    def ground_target(self) -> tuple[str, int]:
+        """Where the firmware's ground link listens; it answers whoever speaks to it first."""
+        return LOOPBACK, _UDP_GROUND_LOCAL + self.instance
+
+    @property
+    def physics_s(self) -> float:
+        """The firmware's simulated time since its boot."""
+        return self.backend.physics_s if self.backend.locked else 0.0
+
+    @property
+    def backend_boots(self) -> int:
+        """Connections seen."""
+        return self.backend.boots
+
+    @property
+    def stored(self) -> tuple[str, ...]:
+        """Parameters and their backup."""
+        return "parameters.bson", "parameters_backup.bson"
+
+    @property
+    def imus(self) -> tuple[ImuModel, ...]:
+        """Sensor 0 and sensor 1."""
+        return self.scenario.flight_controller_imus[:2]
+
+    def true_bias(self, instance: int, t_s: float) -> Bias:
+        """Each sensor has its own model."""
+        return self.imus[instance - 1].true_bias(t_s)
+
+    async def _open(self, stack: contextlib.AsyncExitStack) -> FirmwareProcess:
+        await stack.enter_async_context(self.backend)
+        return FirmwareProcess(
+            [str(self._binary), "-d", "-i", str(self.instance), "-w", str(self.folder), str(self._etc)], self.folder
+        )
+
+    async def power_on(self) -> None:
+        """Start the binary with what it has stored; when that is nothing, with our parameters."""
+        environment = {"PX4_SIM_MODEL": MODEL, "PX4_SIM_HOST_ADDR": LOOPBACK}
+        if not (self.folder / self.stored[0]).exists():
+            environment |= {f"PX4_PARAM_{name}": f"{value:g}" for name, value in self._parameters.items()}
+        self.process.environment = environment
+        await super().power_on()

@@ -1,0 +1,137 @@
+"""ArduPilot's releases: what differs between them never changes what a calibration leaves (autopilots 1, 2)."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.calibration.request import What
+from sim.autopilot import offset_names
+from sim.imu_model import DEG_H, MG
+from tests.e2e.test_calibration import calibrated, started
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+RENAMED = re.compile(r"SR\d_|MAV\d?_|SYSID_|ARMING_CHECK|ARMING_SKIPCHK|SERIAL\d_OPTIONS")
+"""Names that 4.7 changed."""
+DITHER = "[push]\ndither = true\n"
+
+
+def slow(folder: Path, **more: Any) -> Rig:
+    """At rates that are enough where no noise is averaged: minutes of settling cost less."""
+    return Rig(folder, max_s=12.0, imu_rate_hz=20.0, device_rate_hz=5.0, feed_s=0.4, **more)
+
+
+@dataclasses.dataclass
+class Traffic:
+    """What the autopilot is asked for, and what it is told to do: parameter names and command numbers."""
+
+    rig: Rig
+    names: set[str] = dataclasses.field(default_factory=set)
+    commands: list[int] = dataclasses.field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        send = self.rig.link.send
+
+        def noted(message: mavlink.MAVLink_message) -> bool:
+            if isinstance(message, mavlink.MAVLink_param_set_message | mavlink.MAVLink_param_request_read_message):
+                self.names.add(message.param_id)
+            elif isinstance(message, mavlink.MAVLink_command_long_message | mavlink.MAVLink_command_int_message):
+                self.commands.append(message.command)
+            return send(message)
+
+        self.rig.link.send = noted  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("version", ["4.3", "4.6", "4.7"])
+def test_from_4_3_on_a_calibration_is_right_and_needs_no_name_that_4_7_changed(tmp_path: Path, version: str) -> None:
+    async def main() -> None:
+        rig = Rig(tmp_path, max_s=12.0, version=version, more=DITHER, imu_rate_hz=50.0, device_rate_hz=5.0, feed_s=0.4)
+        traffic = Traffic(rig)
+        async with rig.running():
+            await rig.ready()
+            result, record = await calibrated(rig, timeout_s=400.0)
+            assert result.outcome == "done", result
+            integers = version == "4.3"
+            kind = rig.service.imus["fc"].stream.kind
+            assert kind is not None
+            assert (kind.message == "HIGHRES_IMU") == (not integers)
+            assert list(record.imus[0].written) == [*offset_names(1, "accel"), *offset_names(1, "gyro")]
+            left = rig.double.residual(1, rig.now_s)
+            assert np.abs(left.gyro_rad_s).max() < 20 * DEG_H
+            assert np.abs(left.accel_m_s2).max() < 0.3 * MG
+            assert {"INS_GYROFFS_X", "AHRS_ORIENTATION"} <= traffic.names
+            assert not [name for name in traffic.names if RENAMED.match(name)]
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+def test_preflight_storage_is_never_sent_and_the_firmwares_gyro_calibration_at_most_once(
+    tmp_path: Path, firmware: str
+) -> None:
+    async def main() -> None:
+        part = "icm42688p" if firmware == "ardupilot" else "bmi088"
+        rig = slow(tmp_path, firmware=firmware, part=part)
+        traffic = Traffic(rig)
+        async with rig.running():
+            await rig.ready()
+            await calibrated(rig, timeout_s=200.0)
+            await started(rig.service.conductor.start_undo("test")).finished
+        assert mavlink.MAV_CMD_PREFLIGHT_STORAGE not in traffic.commands
+        assert traffic.commands.count(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION) == (firmware == "ardupilot")
+        harmless = {
+            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
+            mavlink.MAV_CMD_REQUEST_MESSAGE,
+            mavlink.MAV_CMD_PREFLIGHT_CALIBRATION,
+        }
+        assert set(traffic.commands) <= harmless
+
+    run_virtual(main())
+
+
+def test_streams_at_a_quarter_of_their_rate_during_a_parameter_transfer_do_no_harm(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=20.0).running() as rig:
+            await rig.ready()
+            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            await asyncio.sleep(4.0)
+            seen = rig.service.imus["fc"].stream.samples
+            rig.double.channels[0].listing = True  # on our own link somebody reads all parameters, by a slow radio
+            await asyncio.sleep(6.0)
+            assert rig.service.imus["fc"].stream.samples - seen == pytest.approx(150, abs=10)
+            rig.double.channels[0].listing = False
+            result = await job.finished
+            assert result.outcome == "done", result
+            left = rig.double.residual(1, rig.now_s)
+            assert np.abs(left.gyro_rad_s).max() < 20 * DEG_H
+            assert np.abs(left.accel_m_s2).max() < 0.3 * MG
+
+    run_virtual(main())
+
+
+def test_caltemp_is_left_alone_so_that_new_is_old_plus_residual(tmp_path: Path) -> None:
+    async def main() -> None:
+        temperatures = {"INS_GYR1_CALTEMP": 41.5, "INS_ACC1_CALTEMP": 39.25, "INS_TCAL1_ENABLE": 1.0}
+        rig = slow(tmp_path, parameters=temperatures)
+        async with rig.running():
+            await rig.ready()
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            assert {name: rig.double.parameter(name) for name in temperatures} == temperatures
+            assert not [write.name for write in rig.double.writes if "CALTEMP" in write.name]
+            imu = record.imus[0]
+            assert imu.residual_gyro_rad_s is not None
+            for name, residual in zip(offset_names(1, "gyro"), imu.residual_gyro_rad_s, strict=True):
+                written = imu.written[name]
+                assert written.before is not None
+                assert written.after == pytest.approx(written.before + residual, abs=1e-9)
+
+    run_virtual(main())

@@ -1,0 +1,446 @@
+"""The firmware's own gyro calibration inside a write: its EKF is right afterwards, and everything comes back."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.calibration.machine import State
+from companion.calibration.request import What
+from companion.component.service import JobResult, Refusal
+from sim.autopilot import offset_names
+from sim.imu_model import DEG_H
+from tests.e2e.test_calibration import FC_PARAMETERS, calibrated, started
+from tests.support.component import CALIBRATE, UNDO
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+GYRO_CALIBRATION = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
+FINE_DEG_H = 20.0
+
+
+@dataclasses.dataclass
+class Sent:
+    """What leaves the companion, in order: parameter names, and the number of the calibration command."""
+
+    rig: Rig
+    log: list[str | int] = dataclasses.field(default_factory=list)
+    lose_command: bool = False
+
+    def __post_init__(self) -> None:
+        real_send = self.rig.link.send
+
+        def send(message: mavlink.MAVLink_message) -> bool:
+            if isinstance(message, mavlink.MAVLink_param_set_message):
+                self.log.append(message.param_id)
+            elif isinstance(message, mavlink.MAVLink_command_long_message) and message.command == GYRO_CALIBRATION:
+                self.log.append(message.command)
+                if self.lose_command:
+                    return True
+            return real_send(message)
+
+        self.rig.link.send = send  # type: ignore[method-assign]
+
+    @property
+    def commands(self) -> int:
+        return self.log.count(GYRO_CALIBRATION)
+
+
+def imu_parameters(rig: Rig) -> dict[str, float]:
+    return {name: value for name, value in rig.double.parameters.values.items() if name.startswith("INS")}
+
+
+def make(folder: Path, **more: object) -> Rig:
+    values: dict[str, object] = {"max_s": 12.0, **more}
+    return Rig(folder, **values)  # type: ignore[arg-type]
+
+
+def gyro_error_deg_h(rig: Rig) -> float:
+    return float(np.abs(rig.double.residual(1, rig.now_s).gyro_rad_s).max() / DEG_H)
+
+
+def test_accelerometers_then_the_firmwares_calibration_once_then_the_fine_gyro_offsets(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with make(tmp_path, auxiliary=True, max_s=30.0).running() as rig:
+            await rig.ready()
+            sent = Sent(rig)
+            before = imu_parameters(rig)
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            assert sent.commands == 1
+            place = sent.log.index(GYRO_CALIBRATION)
+            assert set(offset_names(1, "accel")) <= set(sent.log[:place])
+            assert set(sent.log[place + 1 :]) == set(offset_names(1, "gyro"))
+            # Over the firmware's coarse ones, of which no trace is left in ours.
+            assert gyro_error_deg_h(rig) < FINE_DEG_H
+            rig.double.update_estimator(rig.now_s)
+            assert np.abs(rig.double.estimator.omega_i).max() < 72 * DEG_H
+            written = record.imus[0].written
+            assert list(written) == FC_PARAMETERS
+            assert {name: what.before for name, what in written.items()} == {n: before[n] for n in FC_PARAMETERS}
+            assert {what.outcome for what in written.values()} == {"verified"}
+            # Everything else that the firmware has changed is named, and comes back.
+            others = {n for n, value in imu_parameters(rig).items() if value != before[n]} - set(FC_PARAMETERS)
+            assert {"INS_GYR2OFFS_X", "INS4_GYROFFS_Z", "INS_GYR1_CALTEMP"} <= others
+            words = " ".join(record.warnings)
+            assert all(name in words for name in others)
+            started(rig.service.conductor.start_undo("test"))
+            await rig.until(lambda: imu_parameters(rig) == before, 20.0)
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("orientation", [4, 12, 101])
+def test_the_fine_offsets_are_right_on_a_turned_board(tmp_path: Path, orientation: int) -> None:
+    parameters = {
+        "AHRS_ORIENTATION": float(orientation),
+        "CUST_ROT_ENABLE": 1.0,
+        "CUST_ROT1_ROLL": 10.0,
+        "CUST_ROT1_PITCH": -20.0,
+        "CUST_ROT1_YAW": 30.0,
+        "INS_GYROFFS_X": 1e-3,
+        "INS_GYROFFS_Y": -2e-3,
+    }
+    angles = {4: (0.0, 0.0, 180.0), 12: (0.0, 180.0, 0.0), 101: (10.0, -20.0, 30.0)}[orientation]
+
+    async def main() -> None:
+        rig = make(tmp_path, max_s=30.0, parameters=parameters, mounting_deg=angles)
+        async with rig.running():
+            await rig.ready()
+            sent = Sent(rig)
+            result, _ = await calibrated(rig)
+            assert result.outcome == "done", result
+            assert sent.commands == 1
+            assert gyro_error_deg_h(rig) < FINE_DEG_H
+
+    run_virtual(main())
+
+
+def test_with_a_temperature_calibration_on_any_imu_it_is_left_out_and_the_ekf_waited_for(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with make(tmp_path, parameters={"INS_TCAL2_ENABLE": 1.0}).running() as rig:
+            await rig.ready()
+            sent = Sent(rig)
+            words: set[str] = set()
+            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            while not job.finished.done():
+                words.add(job.words)
+                await asyncio.sleep(0.5)
+            assert job.finished.result().outcome == "done"
+            assert sent.commands == 0
+            assert job.record is not None
+            assert "INS_TCAL2_ENABLE is on" in " ".join(job.record.warnings)
+            assert any(each.startswith("EKF settling: 0.") for each in words), words
+            rig.double.update_estimator(rig.now_s)
+            assert np.abs(rig.double.estimator.omega_i).max() < 80 * DEG_H
+
+    run_virtual(main())
+
+
+def test_an_ekf_that_does_not_settle_in_time_is_a_warning_with_the_figure(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with make(tmp_path, parameters={"INS_TCAL1_ENABLE": 1.0}).running() as rig:
+            await rig.ready()
+            rig.double.estimator.update = lambda *_: None  # type: ignore[method-assign]
+            rig.double.estimator.gyro_bias_rad_s[:] = np.radians([0.0, 0.31, 0.0])
+            result, record = await calibrated(rig)
+            assert result.outcome == "done"
+            assert any(
+                "not settled within 150 s (0." in each and "wait, or restart" in each for each in record.warnings
+            )
+
+    run_virtual(main())
+
+
+def test_arming_or_a_cancel_while_the_ekf_settles_ends_the_waiting_and_not_the_result(tmp_path: Path) -> None:
+    async def settling(folder: Path, act: Callable[[Rig], object]) -> tuple[JobResult, str, bool]:
+        async with make(folder, parameters={"INS_TCAL1_ENABLE": 1.0}).running() as rig:
+            await rig.ready()
+            before = imu_parameters(rig)
+            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: job.words.startswith("EKF settling"), 90.0)
+            act(rig)
+            await rig.until(job.finished.done, 3.0)
+            assert job.record is not None
+            return job.finished.result(), " ".join(job.record.warnings), imu_parameters(rig) != before
+
+    result, words, changed = run_virtual(settling(tmp_path / "armed", lambda rig: rig.double.arm()))
+    assert (result.outcome, changed) == ("done", True)
+    assert "armed while the EKF was still settling" in words
+    cancel = settling(tmp_path / "cancelled", lambda rig: rig.service.conductor.cancel("test"))
+    result, words, changed = run_virtual(cancel)
+    assert (result.outcome, changed) == ("done", True)
+    assert "the new offsets stay" in words
+
+
+def test_a_lost_command_is_not_repeated_and_the_fine_offsets_are_in_force(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with make(tmp_path).running() as rig:
+            await rig.ready()
+            sent = Sent(rig, lose_command=True)
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            assert sent.commands == 1
+            assert "did not run" in " ".join(record.warnings)
+            assert gyro_error_deg_h(rig) < FINE_DEG_H
+
+    run_virtual(main())
+
+
+def test_a_command_that_comes_twice_is_answered_too_early_and_waited_out(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with make(tmp_path, duplicate=1.0).running() as rig:
+            await rig.ready()
+            result, _ = await calibrated(rig)
+            assert result.outcome == "done", result
+            assert rig.double.channels[0].received["COMMAND_LONG"] > 1
+            assert not rig.double.calibrating
+            assert gyro_error_deg_h(rig) < FINE_DEG_H
+
+    run_virtual(main())
+
+
+def test_a_calibration_of_the_firmware_that_fails_is_said_and_ours_stays(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with make(tmp_path).running() as rig:
+            await rig.ready()
+            sent = Sent(rig)
+            rig.double.faults.gyro_calibration_fails = True
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            assert sent.commands == 1
+            assert "Gyros not calibrated" in " ".join(record.warnings)
+            assert "Gyros not calibrated" in rig.double.prearm_failures(rig.now_s)
+            assert gyro_error_deg_h(rig) < FINE_DEG_H
+
+    run_virtual(main())
+
+
+def test_a_small_step_is_not_worth_the_firmwares_calibration(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with make(tmp_path, max_s=30.0).running() as rig:
+            await rig.ready()
+            assert (await calibrated(rig))[0].outcome == "done"
+            sent = Sent(rig)
+            assert (await calibrated(rig))[0].outcome == "done"
+            assert sent.commands == 0
+            result, _ = await calibrated(rig, What.ACCELEROMETERS)
+            assert result.outcome == "done"
+            assert sent.commands == 0
+
+    run_virtual(main())
+
+
+PHASES: dict[str, Callable[[Rig, Sent], bool]] = {
+    "before the first write": lambda rig, sent: rig.service.conductor.state is State.WRITING,
+    "in the middle of the first write": lambda rig, sent: len(sent.log) == 3,
+    "between it and the firmware's calibration": lambda rig, sent: len(sent.log) == 6,
+    "during the firmware's calibration": lambda rig, sent: rig.double.calibrating,
+    "before the fine offsets": lambda rig, sent: sent.commands == 1 and not rig.double.calibrating,
+    "in the middle of the fine offsets": lambda rig, sent: sent.log[-2:-1] == [GYRO_CALIBRATION],
+    "while the effect is looked at": lambda rig, sent: rig.service.conductor.state is State.VERIFYING,
+}
+
+
+@pytest.mark.parametrize("gyr_cal", [0.0, 1.0])
+@pytest.mark.parametrize("phase", PHASES)
+def test_a_reboot_in_any_phase_leaves_the_old_values_or_says_what_the_boot_has_measured(
+    tmp_path: Path, phase: str, gyr_cal: float
+) -> None:
+    async def main() -> None:
+        async with make(tmp_path, parameters={"INS_GYR_CAL": gyr_cal}).running() as rig:
+            await rig.ready()
+            # The boot has just measured them; another offset makes the step worth the firmware's calibration.
+            rig.double.write_as_another_station("INS_GYROFFS_X", 0.004)
+            rig.double.write_as_another_station("INS_GYR2OFFS_Y", 0.002)
+            await asyncio.sleep(1.0)
+            sent = Sent(rig)
+            before = imu_parameters(rig)
+            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            while not PHASES[phase](rig, sent):
+                await asyncio.sleep(0.005)
+                assert not job.finished.done(), job.finished.result()
+            rig.double.reboot(down_s=1.0)
+            result = await job.finished
+            assert result.outcome == "failed", result
+            await rig.until(lambda: not rig.service.mender.pending, 60.0)
+            after = imu_parameters(rig)
+            differ = {name for name in before if after[name] != before[name]}
+            if gyr_cal:
+                # What the start-up calibration wrote is its own; nothing of ours is left.
+                gyros = {name for name in before if ("GYR" in name and "OFFS" in name) or "CALTEMP" in name}
+                assert differ <= gyros
+                assert job.record is not None
+                written = job.record.imus[0].written
+                assert all(after[name] != written[name].after for name in written)
+            else:
+                assert differ == set()
+            assert rig.service.mender.why_no_undo() == "nothing to undo"
+            assert sent.commands <= 1
+
+    run_virtual(main())
+
+
+def test_a_reboot_in_the_middle_of_the_calibration_itself(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with make(tmp_path).running() as rig:
+            await rig.ready()
+            before = imu_parameters(rig)
+            rig.double.faults.reboot_while_calibrating = True
+            result, _ = await calibrated(rig)
+            assert result.outcome == "failed"
+            assert "restarted" in result.reason or "rebooted" in result.reason
+            await rig.until(lambda: not rig.service.mender.pending, 60.0)
+            assert imu_parameters(rig) == before
+
+    run_virtual(main())
+
+
+def test_a_daemon_that_died_during_the_firmwares_calibration_puts_everything_back_when_it_comes_again(
+    tmp_path: Path,
+) -> None:
+    async def until_it_dies() -> tuple[dict[str, float], dict[str, float], bytes]:
+        async with make(tmp_path / "first", auxiliary=True).running() as rig:
+            await rig.ready()
+            before = imu_parameters(rig)
+            started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.double.calibrating, 90.0)
+            return before, imu_parameters(rig), (tmp_path / "first" / "journal.json").read_bytes()
+
+    async def again(before: dict[str, float], left: dict[str, float], journal: bytes, coarse: float) -> None:
+        folder = tmp_path / f"again {coarse}"
+        folder.mkdir()
+        (folder / "journal.json").write_bytes(journal)
+        left = {name: coarse if "GYR" in name and "OFFS" in name else value for name, value in left.items()}
+        async with make(folder, auxiliary=True, parameters=left).running() as rig:
+            await rig.until(lambda: not rig.service.mender.pending, 60.0)
+            assert imu_parameters(rig) == before
+            assert not (folder / "journal.json").exists()
+
+    kept = run_virtual(until_it_dies())
+    for coarse in (0.0, 3e-4):
+        run_virtual(again(*kept, coarse))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_fifth_of_all_packets_lost_leaves_the_whole_result_or_the_old_values(tmp_path: Path, seed: int) -> None:
+    async def main() -> None:
+        async with make(tmp_path, seed=seed).running() as rig:
+            await rig.ready()
+            sent = Sent(rig)
+            before = imu_parameters(rig)
+            rig.wire.loss = 0.2
+            result, _ = await calibrated(rig)
+            await rig.until(lambda: not rig.service.mender.pending, 120.0)
+            assert sent.commands <= 1
+            if result.outcome == "done":
+                assert gyro_error_deg_h(rig) < FINE_DEG_H + 15.0
+            else:
+                assert imu_parameters(rig) == before
+
+    run_virtual(main())
+
+
+def test_another_station_that_sets_a_gyro_offset_meanwhile_is_not_overwritten_unsaid(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with make(tmp_path).running() as rig:
+            await rig.ready()
+            rig.double.faults.foreign_write_after = (9, "INS_ACCOFFS_Y", 0.25)
+            result, _ = await calibrated(rig)
+            assert result.outcome == "failed"
+            assert "INS_ACCOFFS_Y" in result.reason
+            assert rig.double.parameter("INS_ACCOFFS_Y") == 0.25
+
+    run_virtual(main())
+
+
+def test_a_ground_station_hears_progress_while_the_firmware_calibrates(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with make(tmp_path).running() as rig:
+            await rig.ready()
+            rig.double.faults.gyro_calibration_fails = True  # so it takes its full 30 s
+            await rig.until(lambda: rig.double.hears(191), 5.0)
+            rig.ground.command(CALIBRATE, 0.0, target=(1, 191))
+            await rig.until(lambda: rig.double.calibrating, 90.0)
+            since = len(rig.ground.acks(CALIBRATE))
+            await asyncio.sleep(10.0)
+            assert len(rig.ground.acks(CALIBRATE)) >= since + 15
+            await rig.until(lambda: bool(rig.ground.finals(CALIBRATE)), 300.0)
+            rig.ground.command(UNDO, target=(1, 191))
+            await rig.until(lambda: bool(rig.ground.finals(UNDO)), 60.0)
+
+    run_virtual(main())
+
+
+def test_an_undo_names_what_others_have_changed_since_and_restores_the_rest_only_when_forced(tmp_path: Path) -> None:
+    async def main() -> None:
+        rig = make(tmp_path)
+        async with rig.running():
+            await rig.ready()
+            before = imu_parameters(rig)
+            assert (await calibrated(rig))[0].outcome == "done"
+            ours = rig.double.parameter("INS_GYROFFS_Y")
+            rig.double.write_as_another_station("INS_GYROFFS_Y", 0.003)
+            await asyncio.sleep(2.0)
+            calibrated_values = imu_parameters(rig)
+            refused = await started(rig.service.conductor.start_undo("test")).finished
+            assert refused.outcome == "failed"
+            assert f"INS_GYROFFS_Y is 0.003, we had set {ours:.6g} (before: 0)" in refused.reason
+            assert "INS_GYROFFS_X" not in refused.reason
+            assert imu_parameters(rig) == calibrated_values
+            forced = await started(rig.service.conductor.start_undo("test", force=True)).finished
+            assert forced.outcome == "done", forced
+            assert imu_parameters(rig) == {**before, "INS_GYROFFS_Y": np.float32(0.003)}
+
+    run_virtual(main())
+
+
+def test_an_undo_restores_exactly_after_the_daemon_has_started_again(tmp_path: Path) -> None:
+    async def first() -> tuple[dict[str, float], dict[str, float]]:
+        async with make(tmp_path).running() as rig:
+            await rig.ready()
+            before = imu_parameters(rig)
+            assert (await calibrated(rig))[0].outcome == "done"
+            return before, imu_parameters(rig)
+
+    async def second(before: dict[str, float], after: dict[str, float]) -> None:
+        async with make(tmp_path, parameters=after).running() as rig:
+            await rig.ready()
+            undone = await started(rig.service.conductor.start_undo("test")).finished
+            assert undone.outcome == "done", undone
+            assert imu_parameters(rig) == before
+            record = rig.service.store.history()[0]
+            assert (record.state, record.system_id) == ("done", 1)
+            assert record.undone_at is not None
+
+    run_virtual(second(*run_virtual(first())))
+
+
+def test_the_undo_of_one_vehicle_is_never_written_to_another_and_waits_for_its_own(tmp_path: Path) -> None:
+    async def calibrate(system_id: int) -> dict[str, float]:
+        async with make(tmp_path, system_id=system_id).running() as rig:
+            await rig.ready()
+            assert (await calibrated(rig))[0].outcome == "done"
+            return imu_parameters(rig)
+
+    async def undo(system_id: int, after: dict[str, float]) -> None:
+        async with make(tmp_path, system_id=system_id, parameters=after).running() as rig:
+            await rig.ready()
+            answer = rig.service.conductor.start_undo("test")
+            if system_id == 3:
+                assert isinstance(answer, Refusal)
+                assert "only on system 1, 2" in answer.reason
+                return
+            assert (await started(answer).finished).outcome == "done"
+            assert rig.double.parameter("INS_GYROFFS_X") == 0.0
+
+    one, two = run_virtual(calibrate(1)), run_virtual(calibrate(2))
+    run_virtual(undo(3, one))
+    run_virtual(undo(1, one))
+    run_virtual(undo(2, two))

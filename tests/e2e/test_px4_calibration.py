@@ -1,0 +1,419 @@
+"""The daemon on PX4's double: what PX4 really uses is the judge, not what its parameters say."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from companion.calibration.record import Record
+from companion.calibration.request import What
+from companion.component.service import JobResult, Refusal
+from companion.daemon.job import Job
+from companion.storage.changes import ChangeLog
+from tests.support.component import ACCEPTED, CALIBRATE, UNDO
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+NO_RIVALS = {"IMU_GYRO_CAL_EN": 0.0, "SENS_IMU_AUTOCAL": 0.0}
+
+
+def names(sensor: str, slot: int = 0) -> list[str]:
+    return [f"CAL_{sensor}{slot}_{axis}OFF" for axis in "XYZ"]
+
+
+ALL = [*names("ACC"), *names("GYRO")]
+
+
+def px4_rig(folder: Path, **options: Any) -> Rig:
+    """Quick: few samples, of a part whose noise dithers the integers, and nothing streamed that nobody asked for."""
+    options["parameters"] = NO_RIVALS | options.get("parameters", {})
+    quick: dict[str, Any] = {
+        "min_still_s": 4.0,
+        "max_s": 8.0,
+        "default_streams": False,
+        "feed_s": 0.2,
+        "imu_rate_hz": 50.0,
+        "part": "bmi088",
+    }
+    return Rig(folder, firmware="px4", **(quick | options))
+
+
+def started(answer: Job | Refusal) -> Job:
+    assert isinstance(answer, Job), answer
+    return answer
+
+
+async def calibrated(rig: Rig, *, reboot: bool = False) -> tuple[JobResult, Record]:
+    job = started(rig.service.conductor.start_calibration(What.BOTH, "test", reboot=reboot))
+    result = await job.finished
+    assert job.record is not None
+    return result, job.record
+
+
+def values(rig: Rig, wanted: list[str] = ALL) -> dict[str, float]:
+    return {name: rig.px4.parameter(name) for name in wanted}
+
+
+def uses(rig: Rig, instance: int = 1) -> tuple[list[float], list[float]]:
+    """Gyro and accelerometer offsets that PX4 really takes off."""
+    applied = rig.px4.applied(instance)
+    return applied.gyro_offset_rad_s.tolist(), applied.accel_offset_m_s2.tolist()
+
+
+def in_use_as_stored(rig: Rig, instance: int = 1, slot: int = 0) -> bool:
+    gyro, accel = uses(rig, instance)
+    return gyro == [*values(rig, names("GYRO", slot)).values()] and accel == [*values(rig, names("ACC", slot)).values()]
+
+
+def test_offsets_that_px4_would_ignore_are_in_use_after_a_calibration_and_out_after_an_undo(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with px4_rig(tmp_path).running() as rig:
+            await rig.ready()
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            (fc,) = record.imus
+            assert list(fc.written) == ALL
+            assert {written.outcome for written in fc.written.values()} == {"verified"}
+            gyro, _ = uses(rig)
+            assert 0.0 < np.linalg.norm(gyro) < 0.01  # the whole vector is one that a plain write would not bring in
+            assert in_use_as_stored(rig)
+            left = rig.px4.residual(1, rig.now_s)
+            assert fc.gyro_sigma_use_rad_s is not None
+            assert fc.accel_sigma_use_m_s2 is not None
+            assert np.abs(left.gyro_rad_s / fc.gyro_sigma_use_rad_s).max() < 3.5
+            assert np.abs(left.accel_m_s2 / fc.accel_sigma_use_m_s2).max() < 3.5
+            assert any("reboot the autopilot before flight" in warning for warning in record.warnings)
+            undo = started(rig.service.conductor.start_undo("test"))
+            assert (await undo.finished).outcome == "done"
+            await asyncio.sleep(1.5)
+            assert set(values(rig).values()) == {0.0}
+            assert in_use_as_stored(rig)
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize(
+    ("options", "slot"),
+    [
+        ({"version": "1.16"}, 0),
+        ({"mounting_deg": (0.0, 0.0, 90.0), "parameters": {"SENS_BOARD_ROT": 2.0}}, 0),
+        (
+            {
+                "mounting_deg": (2.0, -3.0, 1.0),
+                "parameters": {"SENS_BOARD_X_OFF": 2.0, "SENS_BOARD_Y_OFF": -3.0, "SENS_BOARD_Z_OFF": 1.0},
+            },
+            0,
+        ),
+        (
+            {
+                "mounting_deg": (180.0, 0.0, 0.0),
+                "external": (0,),
+                "parameters": {"CAL_GYRO0_ROT": 8.0, "CAL_ACC0_ROT": 8.0, "SENS_BOARD_ROT": 2.0},
+            },
+            0,
+        ),
+        ({"slots": (2,)}, 2),
+        ({"parameters": {"CAL_ACC0_XSCALE": 1.01, "CAL_GYRO0_XOFF": 0.02, "CAL_ACC0_ZOFF": -0.3}}, 0),
+    ],
+    ids=["1.16 is silent", "board", "level", "external", "another slot", "offsets were there"],
+)
+def test_whatever_the_slot_and_the_rotation_the_residual_is_out(
+    tmp_path: Path, options: dict[str, Any], slot: int
+) -> None:
+    async def main() -> None:
+        async with px4_rig(tmp_path, imus=1, **options).running() as rig:
+            await rig.ready()
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            (fc,) = record.imus
+            assert {written.outcome for written in fc.written.values()} == {"verified"}
+            assert in_use_as_stored(rig, slot=slot)
+            left = rig.px4.residual(1, rig.now_s)
+            assert fc.gyro_sigma_use_rad_s is not None
+            assert fc.accel_sigma_use_m_s2 is not None
+            assert np.abs(left.gyro_rad_s / fc.gyro_sigma_use_rad_s).max() < 3.5
+            assert np.abs(left.accel_m_s2 / fc.accel_sigma_use_m_s2).max() < 3.5
+
+    run_virtual(main())
+
+
+def test_a_slot_that_is_another_imus_is_put_back_and_the_same_job_finds_the_right_one(tmp_path: Path) -> None:
+    async def main() -> None:
+        # The second IMU's slot comes first.
+        async with px4_rig(tmp_path, slots=(1, 0)).running() as rig:
+            await rig.ready()
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            (fc,) = record.imus
+            assert list(fc.written) == [*names("ACC", 1), *names("GYRO", 1)]
+            assert set(values(rig).values()) == {0.0}
+            assert uses(rig, 2) == ([0.0] * 3, [0.0] * 3)
+            assert in_use_as_stored(rig, 1, slot=1)
+            assert any("CAL_GYRO0 act on the gyro of IMU 2, not of IMU 1" in warning for warning in record.warnings), (
+                record.warnings
+            )
+            # The next job knows.
+            writes = len(rig.px4.writes)
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            assert {write.name[:9] for write in rig.px4.writes[writes:]} == {"CAL_ACC1_", "CAL_GYRO1"}
+            assert not any("IMU 2" in warning for warning in record.warnings)
+
+    run_virtual(main())
+
+
+def test_two_imus_with_their_slots_exchanged_are_both_right_in_the_end(tmp_path: Path) -> None:
+    async def main() -> None:
+        second = '[[imu]]\nname = "fc2"\nsource = "autopilot"\ninstance = 2\nprofile = "bmi088"\n'
+        async with px4_rig(tmp_path, slots=(1, 0), more=second).running() as rig:
+            await rig.ready()
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            assert [list(imu.written)[-1] for imu in record.imus] == ["CAL_GYRO1_ZOFF", "CAL_GYRO0_ZOFF"]
+            assert in_use_as_stored(rig, 1, slot=1)
+            assert in_use_as_stored(rig, 2, slot=0)
+
+    run_virtual(main())
+
+
+def test_a_small_accelerometer_vector_is_brought_into_use_before_anything_is_measured(tmp_path: Path) -> None:
+    async def main() -> None:
+        rig = px4_rig(tmp_path, parameters={"CAL_ACC0_XOFF": 0.006, "CAL_ACC0_YOFF": -0.005})
+        async with rig.running():
+            await rig.ready()
+            assert uses(rig)[1] == [0.0, 0.0, 0.0]  # as PX4 starts
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            (fc,) = record.imus
+            assert in_use_as_stored(rig)
+            left = rig.px4.residual(1, rig.now_s)
+            assert fc.accel_sigma_use_m_s2 is not None
+            assert np.abs(left.accel_m_s2 / fc.accel_sigma_use_m_s2).max() < 3.5
+            undo = started(rig.service.conductor.start_undo("test"))
+            assert (await undo.finished).outcome == "done"
+            assert values(rig)["CAL_ACC0_XOFF"] == np.float32(0.006)
+
+    run_virtual(main())
+
+
+# --- what may come in between
+
+
+@pytest.mark.parametrize("after", [1, 5, 6, 9, 12], ids=lambda n: f"after write {n}")
+def test_power_cut_of_the_companion_between_the_steps_is_mended(tmp_path: Path, after: int) -> None:
+    async def main() -> None:
+        parameters = {"CAL_GYRO0_XOFF": 0.004, "CAL_ACC0_ZOFF": 0.25}
+        rig = px4_rig(tmp_path, parameters=parameters)
+        before: dict[str, float] = {}
+        async with rig.running():
+            await rig.ready()
+            before |= values(rig)
+            started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: len(rig.px4.writes) >= after, 60.0)
+            rig.wire.cut = True  # the companion is gone for good
+            journal = (tmp_path / "journal.json").read_bytes()
+            assert ChangeLog(tmp_path).journal.read() is not None
+        (tmp_path / "journal.json").write_bytes(journal)
+        again = px4_rig(tmp_path, parameters=NO_RIVALS)
+        for name in before:
+            again.px4.set_parameter(name, rig.px4.parameter(name))
+        async with again.running():
+            await again.until(lambda: not again.service.mender.pending, 40.0)
+            await asyncio.sleep(1.5)
+            assert values(again) == before
+            assert in_use_as_stored(again)
+
+    run_virtual(main())
+
+
+def test_armed_between_the_steps_nothing_is_written_until_disarmed_and_then_the_old_values_are_in_use(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        async with px4_rig(tmp_path).running() as rig:
+            await rig.ready()
+            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: len(rig.px4.writes) == 6, 60.0)
+            rig.px4.arm()
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "NOT put back" in result.reason
+            await asyncio.sleep(1.0)
+            assert "DISARM NOW: gyro/accel offsets are off" in rig.ground.texts()
+            await asyncio.sleep(5.0)
+            assert not any(write.armed for write in rig.px4.writes)
+            rig.px4.disarm()
+            await rig.until(lambda: not rig.service.mender.pending, 30.0)
+            await asyncio.sleep(1.5)
+            assert set(values(rig).values()) == {0.0}
+            assert in_use_as_stored(rig)
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("writes", [0, 3, 6, 9, 12])
+def test_a_reboot_at_any_phase_leaves_the_old_values_or_the_new_ones_in_use(tmp_path: Path, writes: int) -> None:
+    async def main() -> None:
+        async with px4_rig(tmp_path, parameters={"CAL_ACC0_ZOFF": 0.25}).running() as rig:
+            await rig.ready()
+            before = values(rig)
+            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.conductor.state.value == "collecting", 30.0)
+            await rig.until(lambda: len(rig.px4.writes) >= writes, 60.0)
+            rig.px4.reboot()
+            result = await job.finished
+            await rig.until(lambda: not rig.service.mender.pending, 60.0)
+            await asyncio.sleep(3.0)
+            if result.outcome == "done":
+                assert writes == 0
+            else:
+                assert values(rig) == before
+            assert in_use_as_stored(rig)
+
+    run_virtual(main())
+
+
+# --- a restart, when it is asked for
+
+
+def test_the_autopilot_is_rebooted_only_when_asked_and_what_was_written_is_confirmed(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with px4_rig(tmp_path).running() as rig:
+            await rig.ready()
+            result, record = await calibrated(rig, reboot=True)
+            assert result.outcome == "done", result
+            assert "rebooted, offsets in force" in record.reason
+            assert rig.service.vehicle.boots == 1
+            assert in_use_as_stored(rig)
+            assert not any("attitude stays wrong" in warning for warning in record.warnings)
+            result, record = await calibrated(rig)
+            assert rig.service.vehicle.boots == 1
+
+    run_virtual(main())
+
+
+def test_a_ground_station_may_ask_for_the_reboot_with_param2(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with px4_rig(tmp_path).running() as rig:
+            await rig.ready()
+            await rig.until(lambda: any(m.get_srcComponent() == 191 for _, m in rig.ground.received), 10.0)
+            rig.ground.command(CALIBRATE, 0.0, 1.0)
+            await rig.until(lambda: rig.ground.finals(CALIBRATE) == [ACCEPTED], 120.0)
+            assert rig.service.vehicle.boots == 1
+            assert in_use_as_stored(rig)
+            rig.ground.command(UNDO)
+            await rig.until(lambda: rig.ground.finals(UNDO) == [ACCEPTED], 30.0)
+
+    run_virtual(main())
+
+
+# --- rivals
+
+
+def test_rivals_are_told_once_and_named_with_the_key_that_stops_them(tmp_path: Path) -> None:
+    async def main() -> None:
+        rivals = {"IMU_GYRO_CAL_EN": 1.0, "SENS_IMU_AUTOCAL": 1.0}
+        async with px4_rig(tmp_path, parameters=rivals).running() as rig:
+            await rig.ready()
+            await rig.until(lambda: len(rig.ground.texts()) >= 2, 10.0)
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            texts = rig.ground.texts()
+            assert texts.count("IMU_GYRO_CAL_EN=1 may overwrite gyro biases") == 1
+            assert texts.count("SENS_IMU_AUTOCAL=1 may overwrite gyro+accel biases") == 1
+            warnings = rig.service.status()["warnings"]
+            assert [words.split(":")[0] for words in warnings] == ["IMU_GYRO_CAL_EN = 1", "SENS_IMU_AUTOCAL = 1"]
+            assert all("push.stop_rivals = true" in words for words in warnings)
+            assert set(warnings) <= set(record.imus[0].warnings)
+            assert rig.px4.parameter("IMU_GYRO_CAL_EN") == 1
+
+    run_virtual(main())
+
+
+def test_rivals_are_stopped_with_the_biases_and_the_undo_starts_them_again(tmp_path: Path) -> None:
+    async def main() -> None:
+        rivals = {"IMU_GYRO_CAL_EN": 1.0, "SENS_IMU_AUTOCAL": 1.0}
+        async with px4_rig(tmp_path, parameters=rivals, more="[push]\nstop_rivals = true\n").running() as rig:
+            await rig.ready()
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            assert [rig.px4.parameter(name) for name in rivals] == [0, 0]
+            assert list(record.imus[0].written)[:2] == list(rivals)
+            # Switched off, but only a boot looks at it.
+            await rig.until(lambda: any("gyro calibration still runs" in text for text in rig.ground.texts()), 10.0)
+            (warning,) = rig.service.status()["warnings"]
+            assert "IMU_GYRO_CAL_EN is off from the next boot on" in warning
+            undo = started(rig.service.conductor.start_undo("test"))
+            assert (await undo.finished).outcome == "done"
+            assert [rig.px4.parameter(name) for name in rivals] == [1, 1]
+            assert set(values(rig).values()) == {0.0}
+
+    run_virtual(main())
+
+
+def test_a_rival_that_was_switched_off_acts_and_is_named_until_the_next_boot(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with px4_rig(tmp_path, parameters={"IMU_GYRO_CAL_EN": 1.0}).running() as rig:
+            await rig.ready()
+            rig.px4.write_as_another_station("IMU_GYRO_CAL_EN", 0)
+            await rig.until(
+                lambda: any("Reboot PX4: its gyro calibration" in text for text in rig.ground.texts()), 10.0
+            )
+            rig.px4.write_as_another_station("CAL_GYRO0_XOFF", 0.05)
+            writes = rig.service.parameters.writes
+            await rig.until(lambda: abs(rig.px4.parameter("CAL_GYRO0_XOFF")) < 0.02, 60.0)
+            await rig.until(lambda: any("(on until reboot) rewrote" in text for text in rig.ground.texts()), 10.0)
+            await asyncio.sleep(30.0)
+            assert rig.service.parameters.writes == writes  # nobody fights
+            rig.px4.reboot()
+            await rig.until(lambda: rig.service.vehicle.boots > 0, 30.0)
+            await rig.until(lambda: all(imu.calibration is not None for imu in rig.service.imus.values()), 30.0)
+            assert rig.service.status()["warnings"] == []
+
+    run_virtual(main())
+
+
+def test_a_rival_that_rewrote_our_offsets_is_told_as_what_it_is(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with px4_rig(tmp_path, parameters={"IMU_GYRO_CAL_EN": 1.0}).running() as rig:
+            await rig.ready()
+            result, _ = await calibrated(rig)
+            assert result.outcome == "done", result
+            # The bias runs away with temperature, by more than PX4 lets pass.
+            rig.px4.write_as_another_station("CAL_GYRO0_XOFF", 0.05)
+            await rig.until(lambda: abs(rig.px4.parameter("CAL_GYRO0_XOFF")) < 0.02, 60.0)
+            await rig.until(
+                lambda: any("IMU_GYRO_CAL_EN=1 rewrote gyro biases of fc" in text for text in rig.ground.texts()), 10.0
+            )
+
+    run_virtual(main())
+
+
+# --- reaching the companion
+
+
+def test_a_link_that_px4_does_not_forward_is_told_with_the_fix(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with px4_rig(tmp_path, parameters={"MAV_1_FORWARD": 0.0}).running() as rig:
+            await rig.ready()
+            await asyncio.sleep(6.0)
+            ground = rig.service.status()["ground_stations"]
+            assert not ground["good"]
+            assert "set MAV_1_FORWARD=1 and reboot" in ground["summary"]
+            assert "MAV_0" not in ground["summary"]
+
+    run_virtual(main())
+
+
+def test_a_ground_station_that_is_heard_is_well(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with px4_rig(tmp_path).running() as rig:
+            await rig.ready()
+            await asyncio.sleep(6.0)
+            assert rig.service.status()["ground_stations"]["good"]
+
+    run_virtual(main())

@@ -1,0 +1,95 @@
+-- The bindings of ArduPilot that companion_arming.lua uses, faked. Reads commands from stdin, one a line, and prints
+-- one line after each: the state of the authorisation. Argument 1: the script; 2: how mavlink behaves.
+local path, kind = arg[1], arg[2] or "both"
+local now = 0
+local state, text = "none", ""
+local said, queue = {}, {}
+local values = { MAV_SYSID = 7 }
+if kind == "4.5" then values = { SYSID_THISMAV = 7 } end
+
+local meta = {}
+local function stamp(ms)
+    return setmetatable({ ms = ms }, meta)
+end
+meta.__sub = function(a, b) return stamp((a.ms - b.ms) % 2 ^ 32) end
+meta.__index = { toint = function(self) return math.floor(self.ms) end }
+function millis() return stamp(now % 2 ^ 32) end
+
+gcs = { send_text = function(_, severity, words) said[#said + 1] = severity .. ":" .. words end }
+local parameters = {}
+param = {
+    get = function(_, name) return values[name] end,
+    add_table = function(_, key, prefix, count) parameters.prefix = prefix; return key > 0 and count == 2 end,
+    add_param = function(_, _, _, name, default)
+        local full = parameters.prefix .. name
+        if values[full] == nil then values[full] = default end
+        return true
+    end,
+}
+arming = {
+    get_aux_auth_id = function(_) return kind ~= "full" and 0 or nil end,
+    set_aux_auth_passed = function(_, id) assert(id == 0); state, text = "passed", "" end,
+    set_aux_auth_failed = function(_, id, words) assert(id == 0); state, text = "failed", words end,
+}
+local function bound(count, work)
+    -- 4.5 wants exactly `count` arguments; later versions want the table before them, and take both.
+    return function(...)
+        local given = { ... }
+        if given[1] == mavlink then
+            if kind == "4.5" then error("too many arguments") end
+            table.remove(given, 1)
+        elseif kind == "colon" then
+            error("argument #1: mavlink expected")
+        end
+        if #given ~= count then error("wrong number of arguments") end
+        return work(table.unpack(given))
+    end
+end
+local registered = {}
+if kind ~= "4.4" then
+    mavlink = {
+        init = bound(2, function(depth, ids) assert(depth == ids) end),
+        register_rx_msgid = bound(1, function(id)
+            if kind == "taken" then error("no registrations free") end
+            registered[id] = true
+            return true
+        end),
+        receive_chan = bound(0, function()
+            local first = table.remove(queue, 1)
+            if first == nil then return end
+            if first == "boom" then return {} end
+            return first, 1, millis()
+        end),
+    }
+end
+
+local update = assert(loadfile(path))()
+local wait = 200
+if type(update) ~= "function" then update = nil end
+local function show()
+    print(state .. "|" .. text .. "|" .. table.concat(said, ";"))
+    said = {}
+    io.stdout:flush()
+end
+show()
+for line in io.lines() do
+    local word, rest = line:match("^(%S+)%s*(.*)$")
+    if word == "run" then -- milliseconds
+        local till = now + tonumber(rest)
+        while now + wait <= till do
+            now = now + wait
+            update, wait = update()
+        end
+        now = till
+    elseif word == "skip" then -- time passes and nothing runs
+        now = now + tonumber(rest)
+    elseif word == "set" then
+        local name, value = rest:match("(%S+) (%S+)")
+        values[name] = tonumber(value)
+    elseif word == "receive" then -- hexadecimal bytes of a message as ArduPilot hands it over
+        queue[#queue + 1] = (rest:gsub("%x%x", function(two) return string.char(tonumber(two, 16)) end))
+    elseif word == "break" then
+        queue[#queue + 1] = "boom"
+    end
+    show()
+end

@@ -1,0 +1,224 @@
+"""Which IMU a PX4 slot acts on, and offsets that may not be in use: seen and put right around a write."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from companion.autopilot.change import Change, WriteFailedError
+from companion.autopilot.firmwares import read_calibration
+from companion.autopilot.imu_calibration import ImuCalibration, changes_for
+from companion.autopilot.parameters import ParameterClient
+from companion.autopilot.px4_slots import NO_IMU, SlotMemory
+from companion.autopilot.vehicle import Vehicle
+from companion.autopilot.writer import ParameterWriter
+from companion.daemon.far_step import FarStepWatch
+from companion.daemon.ledger import Ledger
+from companion.daemon.px4_writes import Px4Writes, step_from_far
+from companion.links.mavlink import MavlinkLink
+from companion.storage.changes import ChangeLog
+from tests.support.scripted_autopilot import flying_on
+from tests.support.scripted_px4 import ICM, ScriptedPx4
+from tests.support.virtual_time import run_virtual
+
+BMI = 6684682
+BOSCH = 9_109_514
+
+
+class Stage(NamedTuple):
+    px4: ScriptedPx4
+    client: ParameterClient
+    writer: ParameterWriter
+    writes: Px4Writes
+    memory: SlotMemory
+
+    async def read(self, instance: int) -> ImuCalibration:
+        return await read_calibration(self.client, instance, self.memory)
+
+    async def write(self, *instances: int) -> list[ImuCalibration]:
+        """Write a small change to each of these IMUs at once."""
+        found = [await self.read(instance) for instance in instances]
+        targets = [(each, small_changes(each)) for each in found]
+        async with self.writes.standing_by(targets) as look:
+            await self.writer.apply([change for _, changes in targets for change in changes], look)
+        return found
+
+
+def small_changes(found: ImuCalibration) -> list[Change]:
+    return changes_for(found, (0.0005, -0.0003, 0.0008), (0.003, 0.002, -0.004))
+
+
+@contextlib.asynccontextmanager
+async def aboard(px4: ScriptedPx4, folder: Path) -> AsyncIterator[Stage]:
+    link = MavlinkLink()
+    vehicle = Vehicle(link)
+    client, memory = ParameterClient(link, vehicle), SlotMemory()
+    writer = ParameterWriter(client, vehicle)
+
+    async def inline(function: Callable[..., Any], *arguments: Any) -> Any:
+        return function(*arguments)
+
+    ledger = Ledger(ChangeLog(folder), inline)
+    ledger.load()
+    writes = Px4Writes(vehicle, writer, ledger, FarStepWatch(link, vehicle, memory), memory, lambda *what: None)
+    async with flying_on(link, px4):
+        await vehicle.wait_found()
+        await asyncio.sleep(1.0)
+        yield Stage(px4, client, writer, writes, memory)
+    client.close()
+    vehicle.close()
+
+
+def test_the_right_slot_is_seen_to_act_and_remembered(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with aboard(ScriptedPx4(devices=(ICM, BMI)), tmp_path) as stage:
+            one, two = await stage.write(1, 2)
+            assert [stage.memory.known("gyro", device) for device in (ICM, BMI)] == [1, 2]
+            assert [stage.memory.known("accel", device) for device in (ICM, BMI)] == [1, 2]
+            # The two made far steps to opposite sides, so that they could not be mistaken for each other.
+            for found, sign in ((one, 1.0), (two, -1.0)):
+                far = stage.writes.seen_far(found)
+                raw_gyro, raw_accel = stage.px4.raw[found.instance - 1]
+                np.testing.assert_allclose(far["gyro"].mean, raw_gyro - 0.02 * sign, atol=3e-3)
+                np.testing.assert_allclose(far["accel"].mean, raw_accel - 0.05 * sign, atol=0.03)
+            gyro_step, accel_step = step_from_far(one, small_changes(one))
+            np.testing.assert_allclose(gyro_step, 0.02 * np.ones(3), atol=1e-3)
+            np.testing.assert_allclose(accel_step, 0.05 * np.ones(3), atol=5e-3)
+
+    run_virtual(main())
+
+
+class SlowPx4(ScriptedPx4):
+    """A simulator on a busy machine: its clock, and all that it does by that, runs at a third of real time."""
+
+    PACE = 0.33
+
+    def uptime_s(self) -> float:
+        return self.PACE * super().uptime_s()
+
+    def changed(self) -> None:
+        if not self._pending:
+            self._pending = True
+            loop = asyncio.get_running_loop()
+            loop.call_at(max(loop.time() + 0.02, self._looked_s + 1.0 / self.PACE), self._look)
+
+
+def test_a_px4_whose_clock_runs_at_a_third_is_given_the_time_to_take_each_value(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with aboard(SlowPx4(devices=(ICM, BMI)), tmp_path) as stage:
+            found = await stage.write(1, 2)
+            assert [stage.memory.known("accel", device) for device in (ICM, BMI)] == [1, 2]
+            await asyncio.sleep(4.0)
+            for each, device in zip(found, (ICM, BMI), strict=True):
+                for sensor, offset in (("GYRO", each.parameters.gyro_offset), ("ACC", each.parameters.accel_offset)):
+                    wanted = [stage.px4.parameters[name] for name in offset]
+                    np.testing.assert_allclose(stage.px4.used[sensor, device], wanted, atol=1e-9)
+
+    run_virtual(main())
+
+
+def test_the_wrong_slot_is_put_back_and_named_and_the_next_write_takes_the_right_one(tmp_path: Path) -> None:
+    px4 = ScriptedPx4(devices=(BMI, ICM))
+    px4.parameters |= {"CAL_GYRO0_ID": ICM, "CAL_GYRO1_ID": BMI, "CAL_ACC0_ID": ICM, "CAL_ACC1_ID": BMI}
+    px4.load(boot=True)
+    before = dict(px4.parameters)
+
+    async def main() -> None:
+        async with aboard(px4, tmp_path) as stage:
+            with pytest.raises(WriteFailedError) as caught:
+                await stage.write(1)
+            assert caught.value.kind == "not as believed"
+            assert "the offsets in CAL_GYRO0 act on the gyro of IMU 2, not of IMU 1" in str(caught.value)
+            assert "the offsets in CAL_ACC0 act on the accelerometer of IMU 2, not of IMU 1" in str(caught.value)
+            assert px4.parameters == before
+            await asyncio.sleep(1.5)
+            assert not np.any(list(px4.used.values()))
+            (found,) = await stage.write(1)
+            assert found.parameters.gyro_offset[0] == "CAL_GYRO1_XOFF"
+            assert found.parameters.accel_offset[0] == "CAL_ACC1_XOFF"
+            assert {name[:9] for name in px4.parameters if px4.parameters[name] != before[name]} == {
+                "CAL_GYRO1",
+                "CAL_ACC1_",
+            }
+
+    run_virtual(main())
+
+
+def test_only_one_half_may_be_in_the_wrong_slot(tmp_path: Path) -> None:
+    # The accelerometers of two chips started in the other order than their gyros.
+    px4 = ScriptedPx4(devices=(ICM, BMI))
+    swapped = {1: BMI, 2: ICM}
+    zero = np.zeros(3)
+
+    def output(instance: int) -> tuple[np.ndarray, np.ndarray]:
+        gyro, accel = px4.raw[instance - 1]
+        device = px4.devices[instance - 1]
+        return gyro - px4.used.get(("GYRO", device), zero), accel - px4.used.get(("ACC", swapped[instance]), zero)
+
+    px4.output = output  # type: ignore[method-assign]
+
+    async def main() -> None:
+        async with aboard(px4, tmp_path) as stage:
+            with pytest.raises(WriteFailedError, match="CAL_ACC0 act on the accelerometer of IMU 2") as caught:
+                await stage.write(1)
+            assert "CAL_GYRO" not in str(caught.value)
+            (found,) = await stage.write(1)
+            assert found.parameters.gyro_offset[0] == "CAL_GYRO0_XOFF"
+            assert found.parameters.accel_offset[0] == "CAL_ACC1_XOFF"
+
+    run_virtual(main())
+
+
+def test_a_slot_of_a_sensor_that_is_not_there_moves_nobody(tmp_path: Path) -> None:
+    px4 = ScriptedPx4(devices=(ICM,))
+    px4.parameters |= {"CAL_GYRO0_ID": BOSCH, "CAL_ACC0_ID": BOSCH, "CAL_GYRO1_ID": ICM, "CAL_ACC1_ID": ICM}
+    px4.load(boot=True)
+
+    async def main() -> None:
+        async with aboard(px4, tmp_path) as stage:
+            with pytest.raises(WriteFailedError, match="CAL_GYRO0 do not act on the gyro of IMU 1"):
+                await stage.write(1)
+            assert stage.memory.known("gyro", BOSCH) == NO_IMU
+            (found,) = await stage.write(1)
+            assert found.parameters.gyro_id == "CAL_GYRO1_ID"
+
+    run_virtual(main())
+
+
+def test_while_the_aircraft_moves_nothing_is_concluded(tmp_path: Path) -> None:
+    px4 = ScriptedPx4(devices=(ICM, BMI))
+
+    async def main() -> None:
+        async with aboard(px4, tmp_path) as stage:
+            found = await stage.read(1)
+            changes = small_changes(found)
+
+            async with stage.writes.standing_by([(found, changes)]) as look:
+                assert look is not None
+                for k, (gyro, accel) in enumerate(px4.raw):  # turned by hand: all IMUs feel it
+                    px4.raw[k] = (gyro + np.array([0.3, 0.1, -0.2]), accel + np.array([1.0, 0.0, 0.1]))
+                await stage.writer.apply(changes, look)
+            assert stage.memory.known("gyro", ICM) is None
+            assert stage.writes.seen_far(found) == {}
+
+    run_virtual(main())
+
+
+def test_the_streams_that_were_asked_for_are_given_back(tmp_path: Path) -> None:
+    px4 = ScriptedPx4(devices=(ICM, BMI))
+
+    async def main() -> None:
+        async with aboard(px4, tmp_path) as stage:
+            await stage.write(1)
+            await asyncio.sleep(1.0)
+            asked = [(int(m.param1), m.param2) for m in px4.requests if m.get_type() == "COMMAND_LONG"]
+            for message_id in (26, 116, 129):
+                assert [interval for which, interval in asked if which == message_id] == [20000.0, 0.0]
+
+    run_virtual(main())

@@ -1,0 +1,73 @@
+"""What keeps ground stations from the companion, in words."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from companion.autopilot.parameters import ParameterClient
+from companion.autopilot.vehicle import Vehicle
+from companion.daemon.reach import Reach
+from companion.links.mavlink import MavlinkLink
+from tests.support.scripted_autopilot import ScriptedAutopilot, flying_on
+from tests.support.scripted_px4 import ScriptedPx4
+from tests.support.virtual_time import run_virtual
+
+
+def words_of(autopilot: ScriptedAutopilot) -> tuple[bool, str]:
+    async def main() -> tuple[bool, str]:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        parameters = ParameterClient(link, vehicle)
+        reach = Reach(link, vehicle, parameters)
+        async with flying_on(link, autopilot):
+            running = asyncio.create_task(reach.run())
+            await asyncio.sleep(8.0)
+            found = reach.words()
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+        vehicle.close()
+        return found
+
+    return run_virtual(main())
+
+
+@pytest.mark.parametrize(
+    ("links", "good", "words"),
+    [
+        ({0: (101, 1), 1: (102, 0), 2: (0, 0)}, False, "MAV_1: if the companion or the ground station is on it"),
+        ({0: (101, 1), 1: (102, 0), 2: (103, 0)}, False, "MAV_1, MAV_2: if the companion"),
+        ({0: (101, 1), 1: (102, 1), 2: (0, 0)}, True, "forwards between all its links"),
+    ],
+)
+def test_px4_links_that_do_not_forward_are_named_with_the_fix(
+    links: dict[int, tuple[int, int]], good: bool, words: str
+) -> None:
+    px4 = ScriptedPx4()
+    for n, (config, forward) in links.items():
+        px4.parameters |= {f"MAV_{n}_CONFIG": config, f"MAV_{n}_FORWARD": forward}
+    found = words_of(px4)
+    assert found[0] == good
+    assert words in found[1]
+    assert good or "set MAV_1_FORWARD=1 and reboot" in found[1]
+
+
+def test_an_autopilot_that_never_answers_does_not_hear_us() -> None:
+    autopilot = ScriptedAutopilot()
+
+    def deaf(_message: Any) -> bool:
+        return False
+
+    autopilot.on_message = deaf
+    good, words = words_of(autopilot)
+    assert not good
+    assert "does not hear our heartbeat" in words
+
+
+def test_ardupilot_needs_nothing_but_our_heartbeat() -> None:
+    good, words = words_of(ScriptedAutopilot(parameters={"INS_GYR_CAL": 0.0}))
+    assert good
+    assert "none heard" in words
+    assert "heard our heartbeat" in words

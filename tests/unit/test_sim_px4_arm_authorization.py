@@ -1,0 +1,373 @@
+"""The whole table of PX4's arm authorisation (autopilots 5.2, 9.2)."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.station import Station
+from tests.support.px4_stage import ARM, PX4Stage, now_s
+from tests.support.virtual_time import run_virtual
+
+ASK = mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST
+ON = {"COM_ARM_AUTH_REQ": 1, "COM_ARM_AUTH_ID": 1}
+
+
+def requests(station: Station) -> list[tuple[float, mavlink.MAVLink_command_long_message]]:
+    return [(t, m) for t, m in station.timed(mavlink.MAVLink_command_long_message) if m.command == ASK]
+
+
+def firsts(station: Station) -> list[float]:
+    return [t_s for t_s, message in requests(station) if message.confirmation == 0]
+
+
+class Authorizer:
+    """Answers every request 100 ms later with what it is told."""
+
+    def __init__(
+        self,
+        stage: PX4Stage,
+        result: int,
+        *,
+        station: Station | None = None,
+        progress: int = 0,
+        param2: int = 5,
+        target: tuple[int, int] = (1, 1),
+        after_s: float = 0.1,
+    ) -> None:
+        self.station = station or stage.companion
+        self.result, self.progress, self.param2, self.target, self.after_s = result, progress, param2, target, after_s
+        self.answers = 0
+        self._seen = 0
+        self._task = asyncio.create_task(self._watch())
+
+    def stop(self) -> None:
+        self._task.cancel()
+
+    async def _watch(self) -> None:
+        while True:
+            await asyncio.sleep(0.005)
+            new = [m for _, m in requests(self.station) if m.confirmation == 0][self._seen :]
+            for _ in new:
+                self._seen += 1
+                asyncio.get_running_loop().call_later(self.after_s, self.answer)
+
+    def answer(self) -> None:
+        self.answers += 1
+        self.station.send(
+            mavlink.MAVLink_command_ack_message(ASK, self.result, self.progress, self.param2, *self.target)
+        )
+
+
+async def arm(stage: PX4Stage, *, force: float = 0.0) -> tuple[int, float]:
+    """Result of an arm command from the ground and the time it took."""
+    begun_s = now_s()
+    result = await stage.ground.command(ARM, 1, force, wait_s=10.0)
+    return result, now_s() - begun_s
+
+
+def test_the_request_goes_out_on_all_links_to_the_authorizer_component_0_with_all_params_0() -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters={**ON, "COM_ARM_AUTH_ID": 77}) as stage:
+            await arm(stage)
+            for station in (stage.companion, stage.ground):
+                request = requests(station)[0][1]
+                assert (request.get_srcSystem(), request.get_srcComponent()) == (1, 1)
+                assert (request.target_system, request.target_component, request.confirmation) == (77, 0, 0)
+                assert {getattr(request, f"param{n}") for n in range(1, 8)} == {0.0}
+
+    run_virtual(main())
+
+
+def test_without_the_parameter_nobody_is_asked() -> None:
+    async def main() -> None:
+        async with PX4Stage() as stage:
+            assert (await arm(stage))[0] == 0
+            assert requests(stage.companion) == []
+
+    run_virtual(main())
+
+
+def test_no_answer_denies_after_two_timeouts_with_two_requests() -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters=ON) as stage:
+            result, took_s = await arm(stage)
+            assert result == 1
+            assert took_s == pytest.approx(2.05, abs=0.07)
+            first, second = firsts(stage.companion)
+            assert second - first == pytest.approx(1.0, abs=0.01)
+            await asyncio.sleep(1.0)
+            texts = stage.ground.texts()
+            assert [text for text in texts if text.startswith("Arm auth")] == ["Arm auth: No response"] * 2
+            assert "".join(texts).endswith("Arming denied: Resolve system health failures first\t")
+            assert texts[-2:] == ["Arming denied: Resolve system health failures firs", "t\t"]
+            assert stage.double.authorization.requests == 2
+
+    run_virtual(main())
+
+
+def test_a_request_is_repeated_three_times_every_half_second_until_that_system_answers() -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters={**ON, "COM_ARM_AUTH_TO": 5.0}) as stage:
+            stage.ground.send(mavlink.MAVLink_command_long_message(1, 1, ARM, 0, 1, 0, 0, 0, 0, 0, 0))
+            await asyncio.sleep(4.0)
+            for station, expected in ((stage.ground, [0.5, 0.5, 0.5]), (stage.companion, [1.0, 0.5, 0.5])):
+                asked = requests(station)
+                assert [m.confirmation for _, m in asked] == [0, 1, 2, 3]
+                gaps = [b - a for (a, _), (b, _) in itertools.pairwise(asked)]
+                assert gaps == pytest.approx(expected, abs=0.01)  # 1.02, 0.52, 0.52 on a port of the real one
+        async with PX4Stage(parameters={**ON, "COM_ARM_AUTH_TO": 5.0}) as stage:
+            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED)
+            assert (await arm(stage))[0] == 0
+            await asyncio.sleep(3.0)
+            assert len(requests(stage.companion)) == 1
+            authorizer.stop()
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("target", [(1, 1), (1, 0)])
+def test_accepted_arms_within_milliseconds_of_the_answer_and_says_for_how_long(target: tuple[int, int]) -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters=ON) as stage:
+            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, target=target)
+            result, took_s = await arm(stage)
+            assert result == 0
+            assert 0.1 < took_s < 0.125  # 109 to 117 ms in the real one
+            assert stage.double.armed
+            await asyncio.sleep(0.2)
+            assert "Arm auth: Authorized for the next 5 seconds" in stage.ground.texts()
+            # Within the window nobody is asked again, after it they are.
+            stage.double.disarm()
+            assert (await arm(stage))[0] == 0
+            assert len(firsts(stage.companion)) == 1
+            stage.double.disarm()
+            await asyncio.sleep(5.0)
+            assert (await arm(stage))[0] == 0
+            assert len(firsts(stage.companion)) == 2
+            authorizer.stop()
+
+    run_virtual(main())
+
+
+def test_a_validity_of_zero_seconds_still_arms_this_time() -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters=ON) as stage:
+            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, param2=0)
+            assert (await arm(stage))[0] == 0
+            stage.double.disarm()
+            await asyncio.sleep(0.1)
+            assert (await arm(stage))[0] == 0
+            assert len(firsts(stage.companion)) == 2
+            authorizer.stop()
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("target", [(0, 0), (2, 1), (1, 191)])
+def test_an_answer_whose_target_is_not_the_vehicle_is_ignored(target: tuple[int, int]) -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters=ON) as stage:
+            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, target=target)
+            assert (await arm(stage))[0] == 1
+            await asyncio.sleep(0.5)
+            assert "Arm auth: No response" in stage.ground.texts()
+            authorizer.stop()
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize(
+    ("result", "progress", "text"),
+    [
+        (2, 0, "Arm auth: Denied"),
+        (2, 1, None),
+        (2, 2, "Arm auth: Denied, waypoint 7 have a invalid value"),
+        (2, 3, "Arm auth: Denied by timeout in authorizer"),
+        (2, 4, "Arm auth: Denied because airspace is in use"),
+        (2, 5, "Arm auth: Denied because of bad weather"),
+        (1, 0, "Arm auth: Temporarily rejected"),
+        (3, 0, "Arm auth: Denied"),
+        (4, 0, "Arm auth: Denied"),
+    ],
+)
+def test_a_denial_denies_and_says_the_reason_in_progress(result: int, progress: int, text: str | None) -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters=ON) as stage:
+            authorizer = Authorizer(stage, result, progress=progress, param2=7)
+            acknowledged, took_s = await arm(stage)
+            assert acknowledged == 1
+            assert 0.1 < took_s < 0.3  # 110 to 220 ms in the real one
+            assert not stage.double.armed
+            await asyncio.sleep(0.5)
+            said = [said for said in stage.ground.texts() if said.startswith("Arm auth")]
+            assert said == ([] if text is None else [text[:50]] * 2)
+            assert authorizer.answers == 2  # both requests of the attempt
+            authorizer.stop()
+
+    run_virtual(main())
+
+
+def test_after_a_denial_the_second_request_is_still_repeated() -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters=ON) as stage:
+            authorizer = Authorizer(stage, mavlink.MAV_RESULT_DENIED, progress=4)
+            assert (await arm(stage))[0] == 1
+            await asyncio.sleep(4.0)
+            assert [m.confirmation for _, m in requests(stage.companion)] == [0, 0, 1, 2, 3]
+            authorizer.stop()
+
+    run_virtual(main())
+
+
+def test_an_attempt_within_seconds_of_a_denied_one_asks_only_once() -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters=ON) as stage:
+            authorizer = Authorizer(stage, mavlink.MAV_RESULT_DENIED)
+            for gap_s, asked in ((3.0, 2), (10.0, 1), (0.0, 2)):
+                before = len(firsts(stage.companion))
+                assert (await arm(stage))[0] == 1
+                assert len(firsts(stage.companion)) - before == asked
+                await asyncio.sleep(gap_s)
+            authorizer.stop()
+
+    run_virtual(main())
+
+
+def test_the_second_request_of_an_attempt_can_still_arm() -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters=ON) as stage:
+            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, after_s=1.6)
+            result, took_s = await arm(stage)
+            assert result == 0
+            assert took_s == pytest.approx(1.61, abs=0.02)
+            authorizer.stop()
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize(("accepted_s", "armed"), [(0.6, True), (1.6, True), (2.4, False)])
+def test_in_progress_does_not_extend_the_time_out(accepted_s: float, armed: bool) -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters=ON) as stage:
+            working = Authorizer(stage, mavlink.MAV_RESULT_IN_PROGRESS, after_s=0.02)
+            loop = asyncio.get_running_loop()
+            done = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, after_s=100.0)
+            loop.call_later(accepted_s, done.answer)
+            result, _ = await arm(stage)
+            assert (result == 0) is armed
+            working.stop()
+            done.stop()
+
+    run_virtual(main())
+
+
+def test_a_longer_time_out_waits_longer() -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters={**ON, "COM_ARM_AUTH_TO": 5.0}) as stage:
+            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, after_s=2.0)
+            result, took_s = await arm(stage)
+            assert result == 0
+            assert took_s == pytest.approx(2.01, abs=0.02)
+            authorizer.stop()
+
+    run_virtual(main())
+
+
+def test_one_step_blocks_the_commander_but_not_the_telemetry() -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters=ON) as stage:
+            stage.ground.send(mavlink.MAVLink_command_long_message(1, 1, ARM, 0, 1, 0, 0, 0, 0, 0, 0))
+            await asyncio.sleep(0.1)
+            begun_s = now_s()
+            assert await stage.companion.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 26, 20000) == 0
+            assert now_s() - begun_s < 0.05
+            assert await stage.companion.command(mavlink.MAV_CMD_RUN_PREARM_CHECKS, wait_s=5.0) == 0
+            assert now_s() - begun_s > 1.8
+            assert len(stage.companion.all(mavlink.MAVLink_scaled_imu_message)) > 50
+
+    run_virtual(main())
+
+
+def test_two_steps_deny_the_first_attempt_at_once_and_let_the_second_one_pass() -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters={**ON, "COM_ARM_AUTH_MET": 1}) as stage:
+            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED)
+            result, took_s = await arm(stage)
+            assert result == 1
+            assert took_s < 0.02
+            await asyncio.sleep(0.5)
+            assert "Arm auth: Requesting authorization..." in stage.ground.texts()
+            assert len(firsts(stage.companion)) == 1
+            assert (await arm(stage))[0] == 0
+            authorizer.stop()
+
+    run_virtual(main())
+
+
+def test_an_answer_before_any_request_is_ignored() -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters=ON) as stage:
+            stage.companion.send(mavlink.MAVLink_command_ack_message(ASK, 0, 0, 60, 1, 1))
+            await asyncio.sleep(0.1)
+            assert (await arm(stage))[0] == 1
+
+    run_virtual(main())
+
+
+def test_anybodys_answer_counts_but_only_the_authorizers_stops_the_repetitions() -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters={**ON, "COM_ARM_AUTH_ID": 10}) as stage:
+            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED, station=stage.ground)
+            assert (await arm(stage))[0] == 0
+            await asyncio.sleep(3.0)
+            assert [m.confirmation for _, m in requests(stage.companion)] == [0, 1, 2, 3]
+            authorizer.stop()
+
+    run_virtual(main())
+
+
+def test_a_companion_with_the_vehicles_system_id_can_be_the_authorizer_and_hears_an_unsupported_to_nobody() -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters=ON) as stage:
+            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED)
+            assert (await arm(stage))[0] == 0
+            await asyncio.sleep(0.1)
+            (ack,) = [m for m in stage.companion.all(mavlink.MAVLink_command_ack_message) if m.command == ASK]
+            assert (ack.result, ack.target_system, ack.target_component) == (3, 0, 0)
+            authorizer.stop()
+
+    run_virtual(main())
+
+
+def test_force_arming_does_not_bypass_it() -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters=ON) as stage:
+            assert (await arm(stage, force=21196.0))[0] == 1
+            assert len(firsts(stage.companion)) == 2
+
+    run_virtual(main())
+
+
+def test_the_parameters_count_at_once_without_a_reboot() -> None:
+    async def main() -> None:
+        async with PX4Stage() as stage:
+            await stage.set("COM_ARM_AUTH_REQ", 1)
+            await stage.set("COM_ARM_AUTH_ID", 42)
+            assert (await arm(stage))[0] == 1
+            assert requests(stage.companion)[0][1].target_system == 42
+
+    run_virtual(main())
+
+
+def test_a_failed_check_is_not_healed_by_an_authorisation() -> None:
+    async def main() -> None:
+        async with PX4Stage(parameters={**ON, "COM_ARMABLE": 0}) as stage:
+            authorizer = Authorizer(stage, mavlink.MAV_RESULT_ACCEPTED)
+            assert (await arm(stage))[0] == 1
+            authorizer.stop()
+
+    run_virtual(main())
