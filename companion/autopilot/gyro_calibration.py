@@ -119,7 +119,7 @@ async def calibrate_gyros(
     sent_s = loop.time()
     try:
         while loop.time() < sent_s + TIMEOUT_S:
-            await asyncio.wait([answer], timeout=_LOOK_S)
+            await _pause(answer)
             _require_same_boot(vehicle, boots)
             state = await _look(parameters, before)
             result = answer.result() if answer.done() else None
@@ -137,6 +137,17 @@ async def calibrate_gyros(
         return _judge(before, after, answer.result() if answer.done() else None)
     finally:
         answer.cancel()
+
+
+async def _pause(answer: asyncio.Future[int | None]) -> None:
+    """Until the answer or the next look; an answer that has come does not shorten the next one.
+
+    Offsets may stay at zero after it, and looking without a pause would fill the line.
+    """
+    if answer.done():
+        await asyncio.sleep(_LOOK_S)
+    else:
+        await asyncio.wait([answer], timeout=_LOOK_S)
 
 
 def _judge(before: GyroParameters, after: GyroParameters, result: int | None) -> GyroCalibration:

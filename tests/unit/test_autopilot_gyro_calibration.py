@@ -1,0 +1,56 @@
+"""The firmware's own gyro calibration as it is watched from outside; the whole of it is in tests/e2e."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable
+from typing import cast
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.gyro_calibration import TIMEOUT_S, GyroParameters, calibrate_gyros
+from companion.autopilot.parameters import ParameterClient
+from companion.autopilot.vehicle import ArmState
+from tests.support.virtual_time import run_virtual
+
+OFFSETS = {f"INS_GYROFFS_{axis}": 0.01 for axis in "XYZ"}
+
+
+class _Autopilot:
+    """Answers everything at once; its gyro offsets stay at zero, as if its calibration never ended."""
+
+    name = "ArduPilot, system 1"
+    boots = 1
+    arm_state = ArmState.DISARMED
+
+    def __init__(self, result: int) -> None:
+        self.vehicle = self.commands = self
+        self.result = result
+        self.looks = 0
+
+    async def fresh_heartbeat(self) -> None:
+        pass
+
+    def send(self, command: int, *parameters: float, timeout_s: float) -> asyncio.Future[int | None]:
+        answer: asyncio.Future[int | None] = asyncio.get_running_loop().create_future()
+        answer.set_result(self.result)
+        return answer
+
+    async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]:
+        self.looks += 1
+        return dict.fromkeys(names, 0.0)
+
+
+@pytest.mark.parametrize("result", [mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED])
+def test_offsets_that_stay_at_zero_after_the_answer_are_looked_at_four_times_a_second(result: int) -> None:
+    autopilot = _Autopilot(result)
+    before = GyroParameters(OFFSETS, gyros=(1,), tcal=())
+
+    async def main() -> float:
+        began_s = asyncio.get_running_loop().time()
+        await calibrate_gyros(cast(ParameterClient, autopilot), before, lambda words: None)
+        return asyncio.get_running_loop().time() - began_s
+
+    assert TIMEOUT_S <= run_virtual(main()) < TIMEOUT_S + 2.0
+    assert autopilot.looks <= 4.0 * TIMEOUT_S + 10
