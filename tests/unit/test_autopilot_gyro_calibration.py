@@ -49,7 +49,7 @@ def test_offsets_that_stay_at_zero_after_the_answer_are_looked_at_four_times_a_s
 
     async def main() -> float:
         began_s = asyncio.get_running_loop().time()
-        await calibrate_gyros(cast(ParameterClient, autopilot), before, lambda words: None)
+        await calibrate_gyros(cast("ParameterClient", autopilot), before, lambda words: None)
         return asyncio.get_running_loop().time() - began_s
 
     assert TIMEOUT_S <= run_virtual(main()) < TIMEOUT_S + 2.0
