@@ -113,7 +113,7 @@ class Automatic:
         if self._writes_today() >= PER_DAY or self._writes_this_boot() >= PER_BOOT:
             return "calibrate (flash spared)"
         if (wait_s := self._next_s - asyncio.get_running_loop().time()) > 0 and not self._is_urgent():
-            return f"by itself in {math.ceil(wait_s / 60)} min"
+            return f"again in {math.ceil(wait_s / 60)} min"
         return None
 
     def _is_urgent(self) -> bool:
