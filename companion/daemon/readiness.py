@@ -61,6 +61,8 @@ class Readiness:
         self._forecast = Forecast(vehicle, collector, conductor)
         self.why_not_by_itself: Callable[[], str | None] = lambda: "calibrate first"
         """Why no calibration will start by itself, and what to do, or None when one will."""
+        self.reboot_owed: Callable[[], str | None] = lambda: None
+        """Why the autopilot must be restarted first although its offsets are right; None when it need not."""
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
         self._has_gated = False
@@ -145,6 +147,8 @@ class Readiness:
             if why_not is None:
                 return ArmAnswer("wait", f"hold still {self._until_calibrated_s(now_s):.0f} s")
             return ArmAnswer("refuse", f"{findings[0].words}: {why_not}")
+        if (owed := self.reboot_owed()) is not None:
+            return ArmAnswer("refuse", owed)
         if glance.moving or glance.steady_s < STEADY_S:
             return ArmAnswer("wait", f"hold still {max(1.0, STEADY_S - glance.steady_s):.0f} s")
         return ArmAnswer("accept", self.in_words(now_s))

@@ -108,6 +108,7 @@ class Service:
             FirmwareCalibration(self.vehicle, self.parameters, writer, self.ledger, ekf),
         )
         self.mender = Mender(self.vehicle, self.parameters, writer, self.ledger, self._say, self._changing)
+        reboot = Reboot(self.vehicle, self.parameters, pusher, self._say)
         course = Course(
             config,
             self.vehicle,
@@ -116,7 +117,7 @@ class Service:
             pusher,
             self._say,
             offload,
-            Reboot(self.vehicle, self.parameters, pusher, self._say),
+            reboot,
             Ditherer(config, self.vehicle, self.parameters, self.imus, self.collector, writer, self.ledger),
         )
         self.conductor = Conductor(
@@ -125,6 +126,7 @@ class Service:
         self.reach = Reach(self.link, self.vehicle, self.parameters)
         self.in_force = InForce(config, self.vehicle, self.collector, self.imus, offload)
         self.readiness = Readiness(self.vehicle, self.collector, self.conductor, self.mender, self.in_force)
+        self.readiness.reboot_owed = lambda: reboot.owed
         self.automatic = Automatic(
             self.vehicle,
             self.collector,
