@@ -106,6 +106,7 @@ class Service:
             px4,
             Planner(config, self.vehicle, self.parameters, self.imus, self.slots, self.rivalry),
             FirmwareCalibration(self.vehicle, self.parameters, writer, self.ledger, ekf),
+            offload,
         )
         self.mender = Mender(self.vehicle, self.parameters, writer, self.ledger, self._say, self._changing)
         reboot = Reboot(self.vehicle, self.parameters, pusher, self._say)
