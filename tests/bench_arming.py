@@ -168,6 +168,7 @@ def main() -> None:
     options.add_argument("--busy", type=int, default=4 * (os.cpu_count() or 1), help="processes that make the load")
     options.add_argument("--nice", type=int, default=0, help="of the daemon; its service has a negative one")
     given = options.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # what was started must not outlive it
     with tempfile.TemporaryDirectory() as text, contextlib.ExitStack() as stack:
         folder = Path(text)
         echo = stack.enter_context(running([sys.executable, "-c", ECHO], stdout=subprocess.PIPE))
