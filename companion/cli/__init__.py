@@ -60,8 +60,13 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
 
 def load_config(options: argparse.Namespace) -> config.Config:
     """The configuration that -c names, or the default one."""
+    return config.load(config_path(options))
+
+
+def config_path(options: argparse.Namespace) -> Path:
+    """The file that -c names, or the default one."""
     path: Path = getattr(options, "config", config.DEFAULT_PATH)
-    return config.load(path)
+    return path
 
 
 class _Parser(argparse.ArgumentParser):

@@ -39,6 +39,8 @@ class MavlinkLink:
         self.dropped = 0
         """Messages that could not be sent: no transport was attached, or its buffer was full."""
         self.last_received_s: float | None = None
+        self.on_beat: Callable[[], None] = lambda: None
+        """Called again and again by whatever carries the link's bytes, as long as it works."""
         self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._codec.robust_parsing = True
         self._transmit: Callable[[bytes], object] | None = None
