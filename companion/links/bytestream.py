@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 
 from companion.errors import LinkError
 from companion.links.backoff import Backoff
-from companion.links.serial_port import SerialOpener
+from companion.links.serial_port import SerialOpener, close_serial
 
 logger = logging.getLogger(__name__)
 
@@ -227,7 +227,7 @@ class ByteLink:
         loop = asyncio.get_running_loop()
         loop.remove_reader(descriptor)
         loop.remove_writer(descriptor)
-        os.close(descriptor)
+        close_serial(descriptor)
 
     def _report_down(self, reason: str) -> None:
         self.last_error = reason

@@ -7,6 +7,7 @@ checking, and VMIN = 1. Its object is dropped at once and only the file descript
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import fcntl
 import grp
@@ -56,6 +57,16 @@ def open_serial(path: str, baud: int, parity: Parity) -> int:
     finally:
         port.close()
     return descriptor
+
+
+def close_serial(descriptor: int) -> None:
+    """Close a port so that it can be opened again.
+
+    A pseudo-terminal (socat, a simulator) lives on while its other end is open, and TIOCEXCL with it.
+    """
+    with contextlib.suppress(OSError):  # gone already, or a socket
+        fcntl.ioctl(descriptor, termios.TIOCNXCL)
+    os.close(descriptor)
 
 
 def _finish_settings(descriptor: int, parity: Parity) -> None:
@@ -187,7 +198,7 @@ class _Attempt:
         with self._lock:
             if self._abandoned:
                 if descriptor is not None:
-                    os.close(descriptor)
+                    close_serial(descriptor)
                 return
             self._descriptor, self._error = descriptor, error
         try:
@@ -214,4 +225,4 @@ class _Attempt:
             self._abandoned = True
             descriptor, self._descriptor = self._descriptor, None
         if descriptor is not None:
-            os.close(descriptor)
+            close_serial(descriptor)
