@@ -51,8 +51,9 @@ def _matches(port: SerialPort, ports: Sequence[SerialPort]) -> tuple[str, str]:
     why = f"{' and '.join(twins)} has the same serial number" if port.serial_number else "it has no serial number"
     words = f"the socket it is plugged into ({why}): plug it in there again"
     if port.by_path:
-        path = re.sub(r"-port\d+$", "", port.by_path[0].rpartition("/")[2])
-        return f'ENV{{ID_PATH}}=="{_pattern(path)}", {product}', words
+        path, _, number = port.by_path[0].rpartition("/")[2].partition("-port")
+        which = f', ENV{{.ID_PORT}}=="{number}"' if number else ""
+        return f'ENV{{ID_PATH}}=="{_pattern(path)}"{which}, {product}', words
     if port.usb_interface is not None:
         # KERNELS and ATTRS of one rule must be of one parent: here the interface says it all.
         return f'KERNELS=="{_pattern(port.usb_interface)}"', words
