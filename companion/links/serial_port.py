@@ -86,7 +86,10 @@ def explain(path: str, baud: int, error: Exception) -> str:
     number = _errno_of(error)
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
         return f"{path}: no such device; is it plugged in? (`companion ports` lists what is there)"
-    if number in (errno.EACCES, errno.EPERM):
+    if number == errno.EPERM:
+        # Not the file's mode: systemd's device control, which knows the classes of the drivers loaded at its start.
+        return f"{path}: not permitted: the service's unit does not allow this kind of port (docs/service.md)"
+    if number == errno.EACCES:
         return f"{path}: permission denied; {_who_may(path)}"
     if number in (errno.EBUSY, errno.EAGAIN):
         holders = ", ".join(f"{holder.name}, process {holder.pid}" for holder in find_holders(path))

@@ -46,6 +46,25 @@ def hang(owner, name, only=lambda self: True):
 sys.exit(main())
 """
 
+NOTHING_THERE = """
+[mavlink]
+url = "udpout:127.0.0.1:9"
+[[imu]]
+name = "fc"
+source = "autopilot"
+[gradienter]
+port = "tcp://127.0.0.1:9"
+protocol = "inclinometer_xy"
+law = "axis"
+[compass]
+port = "/nowhere/compass"
+protocol = "hmr3300"
+[control]
+socket = "{folder}/control.sock"
+[storage]
+directory = "{folder}/state"
+"""
+
 
 @contextlib.asynccontextmanager
 async def service(
@@ -104,6 +123,26 @@ def test_a_task_that_hangs_starves_the_watchdog_and_is_named(tmp_path: Path, pat
             (line,) = [line for line in daemon.log().splitlines() if "watchdog:" in line]
             assert f"watchdog: {name} has not gone on for" in line
             assert "waits in" in line
+
+    asyncio.run(main())
+
+
+def test_ports_and_autopilots_that_are_not_there_are_no_reason_to_restart(tmp_path: Path) -> None:
+    """Who waits for a device goes on; only who waits for ever is hung."""
+
+    async def main() -> None:
+        patch = "bytestream.BEAT_WITHIN_S = 3.0"
+        entry = ("-c", HANGING.replace("{patch}", patch))
+        (tmp_path / "companion.toml").write_text(NOTHING_THERE.format(folder=tmp_path))
+        with NotifySocket(tmp_path / "notify") as manager:
+            environment = manager.environment(WATCHDOG_S)
+            async with CompanionProcess(tmp_path, environment=environment, entry=entry) as daemon:
+                await manager.until("READY")
+                await manager.until("WATCHDOG", count=20)
+                fed = manager.times("WATCHDOG")
+                assert max(after - before for before, after in itertools.pairwise(fed)) < WATCHDOG_S / 2
+                assert "watchdog:" not in daemon.log()
+                assert "compass: " in manager.status
 
     asyncio.run(main())
 

@@ -12,14 +12,6 @@ from typing import Final
 import pytest
 
 UDEVADM: Final = shutil.which("udevadm") or ""
-_CAN: Final = (
-    bool(UDEVADM)
-    and os.geteuid() == 0
-    and subprocess.run(["unshare", "--mount", "true"], capture_output=True, check=False).returncode == 0
-)
-needs_udevadm = pytest.mark.skipif(
-    not _CAN, reason="needs udevadm (Debian: apt-get install udev), root and mount namespaces"
-)
 SOC: Final = "sys/devices/platform/soc"
 # In a mount namespace of its own: the tree as /sys, the rules, and a /dev in which links may be made.
 _TEST: Final = """
@@ -32,6 +24,19 @@ mount --bind "$1/sys" /sys
 mount -t tmpfs tmpfs /dev
 SYSTEMD_DEVICE_VERIFY_SYSFS=0 exec "$3" test --action=add "$4" 2>&1
 """
+
+
+def _why_not() -> str | None:
+    if not UDEVADM:
+        return "udevadm is not here (Debian: apt-get install udev)"
+    if os.geteuid() != 0:
+        return "putting a made-up /sys before udev needs root"
+    tried = subprocess.run(["unshare", "--mount", "true"], capture_output=True, text=True, check=False)
+    return f"no namespaces for a made-up /sys: {tried.stderr.strip()}" if tried.returncode else None
+
+
+_WHY_NOT: Final = _why_not()
+needs_udevadm = pytest.mark.skipif(_WHY_NOT is not None, reason=str(_WHY_NOT))
 
 
 class UsbTree:

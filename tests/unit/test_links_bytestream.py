@@ -601,3 +601,8 @@ def test_explanations_name_the_mode_of_a_device() -> None:
     mode = stat.S_IMODE(os.stat("/dev/null").st_mode)
     assert said.startswith("/dev/null: permission denied; user ")
     assert said.endswith(f"mode {mode:04o})")
+
+
+def test_what_the_units_device_control_forbids_is_not_taken_for_a_missing_group() -> None:
+    said = serial_port.explain("/dev/null", 9600, PermissionError(1, "Operation not permitted"))
+    assert said.startswith("/dev/null: not permitted: the service's unit does not allow this kind of port")
