@@ -30,6 +30,9 @@ COMPONENT_S: Final = 5.0
 ESTIMATOR_S: Final = 10.0
 """A look is due every quarter of a second; a small board that solves a full window may take two."""
 
+AUTOMATIC_S: Final = 180.0
+"""It may have to read a dozen parameters over a bad radio link, each with all its retries."""
+
 
 class Supervisor:
     """Looks after a service's tasks; `run` it beside `Service.run`."""
@@ -51,6 +54,7 @@ class Supervisor:
         service.component.on_beat = self._expect("MAVLink component", "component", COMPONENT_S)
         service.link.on_beat = self._expect("MAVLink connection", "mavlink", link_s)
         service.readiness.on_beat = self._expect("estimator", "readiness", ESTIMATOR_S)
+        service.automatic.on_beat = self._expect("automatic calibration", "automatic", AUTOMATIC_S)
         for imu in service.imus.values():
             imu.stream.on_beat = self._expect(f"imu {imu.name}", f"{imu.name} telemetry", imu_stream.BEAT_WITHIN_S)
         for sensor in service.sensors:

@@ -7,7 +7,6 @@ can be done again and again.
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -28,6 +27,8 @@ HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S10
 """What the unit hides from the service: ProtectHome and PrivateTmp."""
 SERIAL_GROUPS: Final = ("dialout", "uucp")
 """Of Debian and Fedora; of Arch."""
+
+UDEV_RUNS: Final = Path("/run/udev/control")
 
 Outcome = Literal["written", "updated", "unchanged", "kept", "removed", "absent", "done", "failed", "skipped"]
 Run = Callable[[Sequence[str]], str | None]
@@ -232,7 +233,9 @@ def _reload(target: Target, run: Run) -> Iterator[Step]:
         return
     yield _command(target, run, "systemctl", "daemon-reload")
     yield _command(target, run, "systemctl", "restart", "systemd-modules-load.service")
-    if shutil.which("udevadm") is not None:
+    if not UDEV_RUNS.exists():
+        yield Step("udev", "skipped", "does not run here: its rules hold from the next start on")
+    else:
         yield _command(target, run, "udevadm", "control", "--reload")
         subsystems = ("--subsystem-match=tty", "--subsystem-match=usb-serial")
         yield _command(target, run, "udevadm", "trigger", *subsystems)

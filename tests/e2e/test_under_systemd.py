@@ -127,7 +127,7 @@ async def spoken_to_by_the_group_alone(machine: Machine) -> None:
 
 
 async def calibrated(machine: Machine) -> None:
-    record = await ask(machine, "calibrate", "--wait", "--timeout", "60")
+    record = await ask(machine, "calibrate", "--accelerometers", "--wait", "--timeout", "60")
     assert record["state"] == "done", record
     _, out, _ = await machine.run("stat", "-c", "%U", "/var/lib/private/companion")
     assert out.strip() not in ("root", "")

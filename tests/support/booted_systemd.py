@@ -29,6 +29,8 @@ def why_not() -> str | None:
         return "booting a systemd in namespaces needs root"
     if not SYSTEMD.exists() or shutil.which("nsenter") is None:
         return "systemd is not here (Debian: apt-get install systemd)"
+    if _packages() is None:
+        return "our packages are in no folder that a service could use"
     if _cgroups() is None:
         return "this kernel has no cgroup2 mounted"
     tried = subprocess.run(["unshare", *NAMESPACES, "true"], capture_output=True, text=True, check=False)
@@ -87,8 +89,9 @@ async def booted(folder: Path) -> AsyncIterator[Machine]:
     Raises:
         TimeoutError: it did not come up; its console is in the message.
     """
-    base = _cgroups()
+    base, packages = _cgroups(), _packages()
     assert base is not None
+    assert packages is not None
     group = base / f"companion-test-{os.getpid()}"
     group.mkdir()
     place, console = folder / "machine", folder / "console"
@@ -97,7 +100,7 @@ async def booted(folder: Path) -> AsyncIterator[Machine]:
         process = await asyncio.create_subprocess_exec(
             # The group first: the namespace then begins there, and what systemd makes can be removed again.
             "sh", "-c", f'echo $$ >{group}/cgroup.procs; exec unshare "$@"', "sh", *NAMESPACES,
-            str(BOOT), str(place), str(PROJECT), sys.base_prefix, _packages(), stdout=out, stderr=out,
+            str(BOOT), str(place), str(PROJECT), sys.base_prefix, packages, stdout=out, stderr=out,
         )  # fmt: skip
     try:
         machine = Machine(await _first_process(process, console))
@@ -132,9 +135,9 @@ def _systemd_below(parent: int) -> int | None:
     return None
 
 
-def _packages() -> str:
+def _packages() -> str | None:
     """The folder of the packages that we run with."""
-    return next(path for path in site.getsitepackages() if Path(path, "numpy").is_dir())
+    return next((path for path in site.getsitepackages() if Path(path, "numpy").is_dir()), None)
 
 
 async def _until_up(machine: Machine) -> None:
