@@ -104,6 +104,7 @@ def _parser() -> argparse.ArgumentParser:
         local.lua,
         "print the arming script for ArduPilot (> APM/scripts/companion_arming.lua), and how to install it",
     )
+    install.add_commands(add)
     add("status", client.status, "what the daemon is doing")
     calibrate = add("calibrate", client.calibrate, "calibrate now (the aircraft must be disarmed and still)")
     what = calibrate.add_mutually_exclusive_group()
@@ -124,21 +125,6 @@ def _parser() -> argparse.ArgumentParser:
     history = add("history", client.history, "list past calibrations")
     history.add_argument("-n", "--limit", type=_count, default=20, metavar="N", help="the latest N (default 20)")
     add("monitor", client.monitor, "watch the daemon until Ctrl-C")
-    for name, command, words in (
-        ("install-service", install.install, "start the companion at every boot: unit, udev rules, configuration"),
-        ("uninstall-service", install.uninstall, "take that away again; configuration and records stay"),
-    ):
-        service = add(name, command, words)
-        service.add_argument("--root", default="/", metavar="DIR", help="below this folder, for packages (default /)")
-        service.add_argument(
-            "--prefix", type=Path, default=Path("/usr/local"), help="whose lib takes the unit (default /usr/local)"
-        )
-        service.add_argument("--dry-run", action="store_true", help="only tell what would be done")
-        if command is install.install:
-            service.add_argument("--executable", metavar="PATH", help="the companion (default: the one that runs this)")
-    udev = add("udev-rule", install.udev_rule, "print a udev rule that gives a plugged-in device a name of its own")
-    udev.add_argument("--port", required=True, metavar="DEVICE", help="such as /dev/ttyUSB0")
-    udev.add_argument("--name", default="sensor", help="it becomes /dev/companion-NAME (default: sensor)")
     return parser
 
 

@@ -5,14 +5,33 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from companion.cli import DONE, FAILED, print_json
+from companion.cli import DONE, FAILED, Command, print_json
 
 if TYPE_CHECKING:
     from companion.installation.install import Step, Target
+
+
+def add_commands(add: Callable[[str, Command, str], argparse.ArgumentParser]) -> None:
+    """Add `install-service`, `uninstall-service` and `udev-rule`; `add` makes a parser of name, command and help."""
+    for name, command, words in (
+        ("install-service", install, "start the companion at every boot: unit, udev rules, configuration"),
+        ("uninstall-service", uninstall, "take that away again; configuration and records stay"),
+    ):
+        service = add(name, command, words)
+        service.add_argument("--root", default="/", metavar="DIR", help="below this folder, for packages (default /)")
+        service.add_argument(
+            "--prefix", type=Path, default=Path("/usr/local"), help="whose lib takes the unit (default /usr/local)"
+        )
+        service.add_argument("--dry-run", action="store_true", help="only tell what would be done")
+        if command is install:
+            service.add_argument("--executable", metavar="PATH", help="the companion (default: the one that runs this)")
+    udev = add("udev-rule", udev_rule, "print a udev rule that gives a plugged-in device a name of its own")
+    udev.add_argument("--port", required=True, metavar="DEVICE", help="such as /dev/ttyUSB0")
+    udev.add_argument("--name", default="sensor", help="it becomes /dev/companion-NAME (default: sensor)")
 
 
 async def install(options: argparse.Namespace) -> int:

@@ -71,6 +71,8 @@ class Service:
         imu_rate_hz: float | None = None,
     ) -> None:
         self.config = config
+        self.on_ready: Callable[[], None] = lambda: None
+        """Called when it can be talked to."""
         self.link = link or MavlinkLink(
             system_id=config.vehicle.system_id or 1, component_id=config.mavlink.component_id
         )
@@ -158,8 +160,6 @@ class Service:
             gate_setup=self.gate_setup,
             automatic=self.automatic,
         )
-        self.on_ready: Callable[[], None] = lambda: None
-        """Called when it can be talked to."""
 
     def _on_ended(self, job: Job, result: JobResult) -> None:
         self.in_force.on_ended(job, result)

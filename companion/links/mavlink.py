@@ -33,14 +33,14 @@ class MavlinkLink:
 
     def __init__(self, *, system_id: int = 1, component_id: int = 191) -> None:
         self.component_id = component_id
+        self.on_beat: Callable[[], None] = lambda: None
+        """Called again and again by whatever carries the link's bytes, as long as it works."""
         self.received: Counter[str] = Counter()
         """Messages by type, plus "bad" (failed checks), "unknown" (not in the dialect) and "handler error"."""
         self.sent = 0
         self.dropped = 0
         """Messages that could not be sent: no transport was attached, or its buffer was full."""
         self.last_received_s: float | None = None
-        self.on_beat: Callable[[], None] = lambda: None
-        """Called again and again by whatever carries the link's bytes, as long as it works."""
         self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._codec.robust_parsing = True
         self._transmit: Callable[[bytes], object] | None = None
