@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import faulthandler
 import sys
 
 from companion.cli import DONE, FAILED, config_path, load_config, logs, print_json, show
@@ -12,6 +13,8 @@ from companion.cli import DONE, FAILED, config_path, load_config, logs, print_js
 async def run(options: argparse.Namespace) -> int:
     """`companion run`."""
     config = load_config(options)
+    # Where the whole process stands still the watchdog's SIGABRT is the only witness: let it say where that was.
+    faulthandler.enable()
     logs.set_up("debug" if options.verbose else config.log.level)
     from companion.daemon import process
 

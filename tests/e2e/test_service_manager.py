@@ -127,6 +127,23 @@ def test_a_task_that_hangs_starves_the_watchdog_and_is_named(tmp_path: Path, pat
     asyncio.run(main())
 
 
+def test_where_the_whole_process_stands_still_is_in_the_log(tmp_path: Path) -> None:
+    """The loop itself is blocked, nobody is fed, and the manager's SIGABRT finds out where."""
+
+    async def main() -> None:
+        patch = "import time\ndef block(*_):\n    time.sleep(1000)\nComponent._step = block"
+        async with service(tmp_path, entry=("-c", HANGING.replace("{patch}", patch))) as (_, daemon, manager):
+            await asyncio.sleep(WATCHDOG_S)
+            assert len(manager.times("WATCHDOG")) <= 1
+            daemon.signal(signal.SIGABRT)
+            assert await daemon.ended(10.0) == -signal.SIGABRT
+            assert "Fatal Python error: Aborted" in daemon.log()
+            assert ", line " in daemon.log()
+            assert " in block" in daemon.log()
+
+    asyncio.run(main())
+
+
 def test_ports_and_autopilots_that_are_not_there_are_no_reason_to_restart(tmp_path: Path) -> None:
     """Who waits for a device goes on; only who waits for ever is hung."""
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from companion.installation import files
 from tests.support.booted_systemd import Machine, booted, why_not
 from tests.support.live_aircraft import QUICK, live_aircraft
 
@@ -70,6 +71,7 @@ def test_the_life_of_the_service(tmp_path: Path) -> None:
         async with booted(tmp_path) as machine, aircraft(tmp_path) as configuration:
             await installed(machine, configuration)
             await restricted(machine)
+            await serial_ports_alone(machine)
             await spoken_to_by_the_group_alone(machine)
             await calibrated(machine)
             await reloaded(machine, configuration)
@@ -112,6 +114,34 @@ async def restricted(machine: Machine) -> None:
     assert {fields[name].strip("0") for name in ("CapPrm", "CapEff", "CapBnd", "CapAmb")} == {""}
     _, out, _ = await machine.run("ps", "-o", "ni=", "-p", process)
     assert out.strip() == "-10"
+
+
+async def serial_ports_alone(machine: Machine) -> None:
+    """Under the unit's device rules even root opens serial ports, pseudo-terminals and nothing else."""
+    lines = [
+        line
+        for line in files.content(files.SERVICE).decode().splitlines()
+        if line.startswith(("DevicePolicy", "DeviceAllow"))
+    ]
+    code = (
+        "import os\n"
+        "for name in ('ttyS0', 'ptmx', 'kmsg', 'loop0'):\n"
+        "    try: os.close(os.open('/dev/' + name, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)); found = 'open'\n"
+        "    except OSError as error: found = error.strerror\n"
+        "    print(name, found)\n"
+    )
+    await machine.write("/opt/companion/open.py", code)
+    unit = ["[Service]", "Type=oneshot", "StandardOutput=file:/run/opened", *lines]
+    unit.append("ExecStart=/opt/companion/python/bin/python3 /opt/companion/open.py")
+    await machine.write("/etc/systemd/system/opening.service", "\n".join(unit) + "\n")
+    await machine.run("systemctl", "daemon-reload")
+    await machine.run("systemctl", "start", "opening.service")
+    _, out, _ = await machine.run("cat", "/run/opened")
+    opened = dict(line.split(" ", 1) for line in out.splitlines())
+    refused = "Operation not permitted"
+    assert opened["ptmx"] == "open"
+    assert opened["ttyS0"] != refused  # without hardware behind it, an input/output error
+    assert (opened["kmsg"], opened["loop0"]) == (refused, refused)
 
 
 async def spoken_to_by_the_group_alone(machine: Machine) -> None:
