@@ -23,7 +23,7 @@ from typing import Any, Final, Self
 
 import msgspec
 
-from companion.errors import CompanionError, DaemonUnreachableError, LinkError
+from companion.errors import CompanionError, DaemonDeniedError, DaemonUnreachableError, LinkError
 
 logger = logging.getLogger(__name__)
 
@@ -191,7 +191,7 @@ async def ask(path: Path, request: Object) -> AsyncIterator[Object]:
             errno.ECONNREFUSED: "nobody listens there",
         }.get(error.errno or 0, str(error))
         if error.errno == errno.EACCES:
-            raise DaemonUnreachableError(f"the daemon at {path} may not be asked: {_who_may(path)}") from None
+            raise DaemonDeniedError(f"the daemon at {path} may not be asked: {_who_may(path)}") from None
         raise DaemonUnreachableError(f"no daemon answers at {path} ({why}); start it with: companion run") from None
     try:
         await _write(writer, request)

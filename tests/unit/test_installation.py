@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import stat
 import subprocess
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -137,6 +139,20 @@ def test_without_root_this_machine_is_left_alone(
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     assert cli.main(["install-service"]) == 1
     assert "this needs root: sudo " in capsys.readouterr().err
+
+
+def test_the_files_are_found_in_a_checkout_and_in_a_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    project = Path(files.__file__).parents[2]
+    assert files.folder() == project / "systemd"
+    building = tomllib.loads((project / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]
+    ((source, place),) = building["wheel"]["force-include"].items()
+    shutil.copytree(project / source, tmp_path / place)
+    assert source in building["sdist"]["include"]
+    monkeypatch.setattr(files, "__file__", str(tmp_path / "companion/installation/files.py"))
+    assert files.folder() == tmp_path / "companion/installation/systemd"
+    shutil.rmtree(tmp_path / place)
+    with pytest.raises(CompanionError, match="the installation is not complete"):
+        files.folder()
 
 
 # --- what systemd says to it
