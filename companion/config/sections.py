@@ -16,6 +16,7 @@ CompassProtocol = Literal["hmr3300"]
 Law = Literal["axis", "slope", "euler"]
 Parity = Literal["none", "even", "odd"]
 AtArm = Literal["gate", "warn", "off"]
+LogLevel = Literal["debug", "info", "warning", "error"]
 
 Latitude = Annotated[float, Meta(ge=-90, le=90)]
 Longitude = Annotated[float, Meta(ge=-180, le=180)]
@@ -128,9 +129,16 @@ class Mqtt(Section, frozen=True):
 
 
 class Control(Section, frozen=True):
-    """The socket on which `companion status`, `calibrate`, ... find the daemon."""
+    """The socket on which `companion status`, `calibrate`, ... find the daemon, and who may use it."""
 
     socket: NonEmpty | None = None
+    group: NonEmpty | None = None
+    """Whose members may use it, besides the daemon's own user and root."""
+
+    @property
+    def group_name(self) -> str | None:
+        """The group: as configured, else the one that the service's unit names, else None."""
+        return self.group or os.environ.get("COMPANION_CONTROL_GROUP") or None
 
     @property
     def path(self) -> Path:
@@ -153,6 +161,12 @@ class Storage(Section, frozen=True):
         return Path(os.environ.get("STATE_DIRECTORY", "/var/lib/companion"))
 
 
+class Log(Section, frozen=True):
+    """How much is told on stderr, which under systemd is the journal."""
+
+    level: LogLevel = "info"
+
+
 class Web(Section, frozen=True):
     """The page; the section absent means no page."""
 
@@ -172,4 +186,5 @@ class Config(Section, frozen=True):
     mqtt: Mqtt | None = None
     control: Control = Control()
     storage: Storage = Storage()
+    log: Log = Log()
     web: Web | None = None

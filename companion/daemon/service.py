@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from companion.autopilot.ekf import EkfWatch
@@ -44,7 +43,6 @@ from companion.daemon.readiness import Readiness
 from companion.daemon.reboot import Reboot
 from companion.daemon.rivalry import Rivalry
 from companion.daemon.sensors import SerialSensor
-from companion.errors import CompanionError
 from companion.links.mavlink import MavlinkLink
 from companion.links.mavlink_transport import run_transport
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
@@ -73,6 +71,8 @@ class Service:
         imu_rate_hz: float | None = None,
     ) -> None:
         self.config = config
+        self.on_ready: Callable[[], None] = lambda: None
+        """Called when it can be talked to."""
         self.link = link or MavlinkLink(
             system_id=config.vehicle.system_id or 1, component_id=config.mavlink.component_id
         )
@@ -250,8 +250,10 @@ class Service:
         """
         for words in models.not_in_this_version(self.config):
             logger.warning("%s", words)
-        async with ControlServer(self.config.control.path, self.answers.answer):
-            logger.info("ready: %s", self.config.control.path)
+        control = self.config.control
+        async with ControlServer(control.path, self.answers.answer, group=control.group_name):
+            logger.info("ready: %s", control.path)
+            self.on_ready()
             await self.serve()
 
     async def serve(self, *, mavlink: bool = True, ports: bool = True) -> None:
@@ -309,43 +311,3 @@ class Service:
     def status(self) -> Object:
         """What the daemon is doing, as JSON can hold it."""
         return self.answers.status()
-
-
-async def run(config: Config) -> None:
-    """Run the daemon until SIGTERM or SIGINT.
-
-    Raises:
-        CompanionError: it cannot start.
-    """
-    service = Service(config)
-    loop = asyncio.get_running_loop()
-    task = asyncio.current_task()
-    stopped = False
-
-    def stop() -> None:
-        nonlocal stopped
-        stopped = True
-        if task is not None:
-            task.cancel()
-
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop)
-    try:
-        await service.run()
-    except asyncio.CancelledError:
-        if not stopped:
-            raise
-        logger.info("stopped")
-    except BaseExceptionGroup as group:
-        known = group.subgroup(CompanionError)
-        if known is None:
-            raise
-        raise CompanionError("; ".join(str(error) for error in _leaves(known))) from group
-
-
-def _leaves(group: BaseExceptionGroup[Any]) -> Iterator[BaseException]:
-    for error in group.exceptions:
-        if isinstance(error, BaseExceptionGroup):
-            yield from _leaves(error)
-        else:
-            yield error
