@@ -1,0 +1,313 @@
+"""The connection to an MQTT broker, for as long as it takes.
+
+aiomqtt carries it (paho below): asyncio without a thread of ours, typed, and its version 2 speaks MQTT 3.1.1 and 5.
+All that knows aiomqtt is in this module, as its version 3 will be another library. MQTT 5 is tried first: only there
+can a message say that it was published to be retained, and only there is the broker told how large a message may be.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import importlib
+import importlib.util
+import logging
+from collections.abc import Awaitable, Callable, Sequence
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from companion.config import Mqtt
+from companion.errors import LinkError
+from companion.links.backoff import Backoff
+from companion.links.mqtt_outbox import Outbox
+from companion.links.mqtt_secrets import is_open_to_all, read_password, tls_context
+from companion.links.mqtt_words import UNSUPPORTED_PROTOCOL, explain, reason_code
+
+if TYPE_CHECKING:
+    import aiomqtt
+
+logger = logging.getLogger(__name__)
+_quiet = logging.getLogger(f"{__name__}.aiomqtt")
+# What it warns of (a full queue) is what a flood would fill the log with; errors reach us as exceptions.
+_quiet.setLevel(logging.CRITICAL)
+
+INSTALL: Final = "pip install 'aiomqtt>=2.5,<3' where the companion is installed"
+CONNECT_DEADLINE_S: Final = 4.0
+ANSWER_DEADLINE_S: Final = 5.0
+LEAVE_DEADLINE_S: Final = 1.0
+FIRST_WAIT_S: Final = 0.5
+LONGEST_WAIT_S: Final = 30.0
+WORTH_S: Final = 10.0
+"""A connection that lasted so long was worth one: the next attempts begin with short waits again."""
+MAX_INCOMING: Final = 64
+MAX_PACKET_BYTES: Final = 64 * 1024
+"""That the broker may send us; told to it where it speaks MQTT 5."""
+MQTT_3_1_1: Final = 4
+MQTT_5: Final = 5
+"""The numbers of the two protocols on the wire."""
+_REFUSED: Final = 128
+
+Offload = Callable[..., Awaitable[Any]]
+
+
+class Incoming(NamedTuple):
+    """A message from the broker."""
+
+    topic: str
+    payload: bytes
+    retained: bool
+    """Kept by the broker from earlier, or (seen in MQTT 5 only) published now to be kept."""
+
+
+class MqttLink:
+    """Keeps a connection to the broker, sends what is in `outbox`, hands over what comes.
+
+    Args:
+        settings: which broker.
+        client_id: who we are to it; a second client of that name takes over from the first.
+        will: topic and payload that the broker publishes, retained, when we are gone without a word.
+        subscriptions: topics to hear.
+        on_message: told of each message; must not block.
+        offload: runs a blocking call elsewhere.
+    """
+
+    def __init__(
+        self,
+        settings: Mqtt,
+        *,
+        client_id: str,
+        will: tuple[str, bytes] | None = None,
+        subscriptions: Sequence[str] = (),
+        on_message: Callable[[Incoming], None] = lambda message: None,
+        offload: Offload = asyncio.to_thread,
+    ) -> None:
+        self.settings, self.client_id = settings, client_id
+        self.outbox = Outbox()
+        self.last_error: str | None = None
+        """Why there is, or last was, no connection; one line for people."""
+        self.connections = 0
+        """How often the broker was reached."""
+        self._will, self._subscriptions, self._on_message = will, tuple(subscriptions), on_message
+        self._offload = offload
+        self._backoff = Backoff(FIRST_WAIT_S, LONGEST_WAIT_S)
+        self._protocol: int = MQTT_5
+        self._connected_s: float | None = None
+        self._retry_s: float | None = None
+        self._refused: list[str] = []
+        self._warned: str | None = None
+        self._warned_open = False
+
+    @property
+    def connected(self) -> bool:
+        """Whether the broker has accepted us."""
+        return self._connected_s is not None
+
+    @property
+    def where(self) -> str:
+        """The broker's address."""
+        return f"{self.settings.host}:{self.settings.broker_port}"
+
+    def status(self) -> dict[str, object]:
+        """For `companion status` and `check`."""
+        now_s = asyncio.get_running_loop().time()
+        since_s = None if self._connected_s is None else now_s - self._connected_s
+        retry_s = None if self._retry_s is None else max(0.0, self._retry_s - now_s)
+        if since_s is not None:
+            words = f"connected to {self.where} for {_duration(since_s)}"
+            words += "".join(f"; {refused}" for refused in self._refused)
+        else:
+            words = self.last_error or f"{self.where}: not connected yet"
+            words += "" if retry_s is None else f"; next attempt in {retry_s:.0f} s"
+        return {
+            "good": since_s is not None and not self._refused,
+            "summary": words,
+            "connected": since_s is not None,
+            "connected_s": None if since_s is None else round(since_s, 1),
+            "connections": self.connections,
+            "last_error": self.last_error,
+            "retry_in_s": None if retry_s is None else round(retry_s, 1),
+            "dropped": self.outbox.dropped,
+        }
+
+    async def run(self) -> None:
+        """Keep the connection until cancelled; a loss is an event to report, never an exception."""
+        loop = asyncio.get_running_loop()
+        problem = await self._offload(_load_library)
+        if problem is not None:
+            self._down(problem)
+            await loop.create_future()
+        while True:
+            began_s, protocol = loop.time(), self._protocol
+            try:
+                await self._serve()
+            except* LinkError as group:
+                self._down(f"{self.where}: {group.exceptions[0]}")
+            except* Exception as group:  # a fault of whatever kind costs the connection, not the daemon
+                logger.debug("mqtt", exc_info=group)
+                if reason_code(group) == UNSUPPORTED_PROTOCOL and protocol == MQTT_5:
+                    self._protocol = MQTT_3_1_1
+                else:
+                    self._down(f"{self.where}: {explain(group, self.settings, self.client_id)}")
+            if self._protocol != protocol:
+                continue
+            if loop.time() - began_s >= WORTH_S:
+                self._backoff.reset()
+            delay_s = self._backoff.next_s()
+            self._retry_s = loop.time() + delay_s
+            await asyncio.sleep(delay_s)
+            self._retry_s = None
+
+    async def flush(self, within_s: float) -> None:
+        """Wait until everything was sent, if there is a connection, and for so long at most."""
+        if self.connected:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(within_s):
+                    await self.outbox.empty()
+
+    async def _serve(self) -> None:
+        client = await self._connect()
+        try:
+            await self._subscribe(client)
+            self._up()
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self._send(client), name="mqtt sender")
+                group.create_task(self._receive(client), name="mqtt receiver")
+        finally:
+            self._connected_s = None
+            self.outbox.closed()
+            await _leave(client)
+
+    async def _connect(self) -> aiomqtt.Client:
+        """Reach the broker.
+
+        Raises:
+            LinkError: password or certificates cannot be used.
+            aiomqtt.MqttError: no broker, or it refuses.
+        """
+        import aiomqtt
+        from paho.mqtt.packettypes import PacketTypes
+        from paho.mqtt.properties import Properties
+
+        password = await self._offload(read_password, self.settings)
+        if not self._warned_open and is_open_to_all(self.settings):
+            self._warned_open = True
+            path = self.settings.password_path
+            logger.warning("mqtt: password file %s: everybody on this computer can read it (chmod o-r)", path)
+        context = await self._offload(tls_context, self.settings)
+        properties = None
+        if self._protocol == MQTT_5:
+            properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+            properties.MaximumPacketSize = MAX_PACKET_BYTES
+        client = aiomqtt.Client(
+            self.settings.host,
+            self.settings.broker_port,
+            username=self.settings.username,
+            password=password,
+            identifier=self.client_id,
+            protocol=aiomqtt.ProtocolVersion(self._protocol),
+            will=aiomqtt.Will(self._will[0], self._will[1], qos=1, retain=True) if self._will else None,
+            clean_session=True if properties is None else None,
+            keepalive=self.settings.keepalive_s,
+            properties=properties,
+            tls_context=context,
+            timeout=ANSWER_DEADLINE_S,
+            max_queued_incoming_messages=MAX_INCOMING,
+            logger=_quiet,
+        )
+        _paho(client).connect_timeout = CONNECT_DEADLINE_S
+        entering = asyncio.get_running_loop().create_task(client.__aenter__(), name="mqtt connect")
+        try:
+            await asyncio.shield(entering)
+        except asyncio.CancelledError:
+            # The thread that connects cannot be stopped, and left alone its connection would live on without us.
+            while not entering.done() and _paho(client).socket() is None:
+                await asyncio.sleep(0.02)
+            entering.cancel()
+            with contextlib.suppress(asyncio.CancelledError, aiomqtt.MqttError):
+                await entering
+            _paho(client).disconnect()
+            raise
+        except Exception:
+            # Where the broker accepted the connection but said nothing, it is still open.
+            _paho(client).disconnect()
+            raise
+        return client
+
+    async def _subscribe(self, client: aiomqtt.Client) -> None:
+        from paho.mqtt.subscribeoptions import SubscribeOptions
+
+        self._refused = []
+        for topic in self._subscriptions:
+            if self._protocol == MQTT_5:
+                options = SubscribeOptions(qos=1, retainAsPublished=True)
+                granted = await client.subscribe(topic, options=options)
+            else:
+                granted = await client.subscribe(topic, qos=1)
+            if any(getattr(code, "value", code) >= _REFUSED for code in granted):
+                self._refused.append(f"the broker does not let us hear {topic}")
+                logger.warning("mqtt: %s: %s (its access list?)", self.where, self._refused[-1])
+
+    async def _send(self, client: aiomqtt.Client) -> None:
+        while True:
+            parcel = await self.outbox.next()
+            await client.publish(
+                parcel.topic, parcel.payload, qos=parcel.qos, retain=parcel.retain, timeout=ANSWER_DEADLINE_S
+            )
+            self.outbox.sent(parcel)
+
+    async def _receive(self, client: aiomqtt.Client) -> None:
+        async for message in client.messages:
+            try:
+                self._on_message(Incoming(message.topic.value, message.payload, bool(message.retain)))
+            except Exception:
+                logger.exception("an MQTT message could not be dealt with")
+
+    def _up(self) -> None:
+        self._connected_s = asyncio.get_running_loop().time()
+        self.connections += 1
+        self.outbox.opened()
+        protocol = {MQTT_5: "MQTT 5", MQTT_3_1_1: "MQTT 3.1.1"}[self._protocol]
+        logger.info("mqtt: %s to %s (%s)", "connected again" if self._warned else "connected", self.where, protocol)
+        self._warned = None
+
+    def _down(self, reason: str) -> None:
+        self.last_error = reason
+        logger.log(logging.DEBUG if self._warned == reason else logging.WARNING, "mqtt: %s", reason)
+        self._warned = reason
+
+
+def _load_library() -> str | None:
+    """Import aiomqtt, in a thread as it takes a while; returns what is wrong with it, in words."""
+    try:
+        if importlib.util.find_spec("aiomqtt") is None:
+            return f"MQTT needs aiomqtt, which is not installed ({INSTALL}); the companion goes on without MQTT"
+        importlib.import_module("aiomqtt")
+        found = version("aiomqtt")
+    except Exception as error:  # noqa: BLE001 - whatever a broken installation raises
+        return f"aiomqtt cannot be loaded: {error} ({INSTALL}); the companion goes on without MQTT"
+    if not found.startswith("2."):
+        return f"aiomqtt {found} is of another make ({INSTALL}); the companion goes on without MQTT"
+    return None
+
+
+def _paho(client: aiomqtt.Client) -> Any:
+    """What aiomqtt is built on: only there a connection that came about half way can be closed."""
+    return client._client  # noqa: SLF001
+
+
+async def _leave(client: aiomqtt.Client) -> None:
+    """Say goodbye if that is still possible; the socket is closed in any case."""
+    import aiomqtt
+
+    try:
+        async with asyncio.timeout(LEAVE_DEADLINE_S):
+            await client.__aexit__(None, None, None)
+    except (aiomqtt.MqttError, OSError, TimeoutError):
+        pass
+    _paho(client).disconnect()
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000.0 else f"{seconds / 3600:.0f} h"
