@@ -17,11 +17,10 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from companion.config import Mqtt
-from companion.errors import LinkError
 from companion.links.backoff import Backoff
 from companion.links.mqtt_outbox import Outbox
 from companion.links.mqtt_secrets import is_open_to_all, read_password, tls_context
-from companion.links.mqtt_words import UNSUPPORTED_PROTOCOL, explain, reason_code
+from companion.links.mqtt_words import ClosedEarlyError, explain, is_of_protocol
 
 if TYPE_CHECKING:
     import aiomqtt
@@ -39,6 +38,8 @@ FIRST_WAIT_S: Final = 0.5
 LONGEST_WAIT_S: Final = 30.0
 WORTH_S: Final = 10.0
 """A connection that lasted so long was worth one: the next attempts begin with short waits again."""
+MANY: Final = 3
+"""So many connections in a row that were not worth one are more than bad luck."""
 MAX_INCOMING: Final = 64
 MAX_PACKET_BYTES: Final = 64 * 1024
 """That the broker may send us; told to it where it speaks MQTT 5."""
@@ -46,6 +47,7 @@ MQTT_3_1_1: Final = 4
 MQTT_5: Final = 5
 """The numbers of the two protocols on the wire."""
 _REFUSED: Final = 128
+_MOMENT_S: Final = 0.05
 
 Offload = Callable[..., Awaitable[Any]]
 
@@ -96,6 +98,7 @@ class MqttLink:
         self._refused: list[str] = []
         self._warned: str | None = None
         self._warned_open = False
+        self._short = 0
 
     @property
     def connected(self) -> bool:
@@ -137,18 +140,12 @@ class MqttLink:
             self._down(problem)
             await loop.create_future()
         while True:
-            began_s, protocol = loop.time(), self._protocol
+            began_s, protocol, before = loop.time(), self._protocol, self.connections
             try:
                 await self._serve()
-            except* LinkError as group:
-                self._down(f"{self.where}: {group.exceptions[0]}")
-            except* Exception as group:  # a fault of whatever kind costs the connection, not the daemon
-                logger.debug("mqtt", exc_info=group)
-                if reason_code(group) == UNSUPPORTED_PROTOCOL and protocol == MQTT_5:
-                    self._protocol = MQTT_3_1_1
-                else:
-                    self._down(f"{self.where}: {explain(group, self.settings, self.client_id)}")
-            if self._protocol != protocol:
+            except* Exception as group:  # noqa: BLE001 - whatever it is, it costs the connection and nothing else
+                self._lost(group, began_s, reached=self.connections > before)
+            if (protocol, self._protocol) == (MQTT_5, MQTT_3_1_1):
                 continue
             if loop.time() - began_s >= WORTH_S:
                 self._backoff.reset()
@@ -156,6 +153,22 @@ class MqttLink:
             self._retry_s = loop.time() + delay_s
             await asyncio.sleep(delay_s)
             self._retry_s = None
+
+    def _lost(self, error: BaseException, began_s: float, *, reached: bool) -> None:
+        """Say why there is no connection, unless the older protocol has to be tried first."""
+        logger.debug("mqtt", exc_info=error)
+        if is_of_protocol(error) and not reached:
+            # A broker that is too old for MQTT 5 says so, or says nothing, or closes the connection.
+            self._protocol = MQTT_3_1_1 if self._protocol == MQTT_5 else MQTT_5
+            if self._protocol == MQTT_3_1_1:
+                return
+        why = explain(error, self.settings, self.client_id, reached=reached)
+        is_short = reached and asyncio.get_running_loop().time() - began_s < WORTH_S
+        self._short = self._short + 1 if is_short else 0
+        if self._short >= MANY:
+            # Two clients of one name throw each other out for ever, and few brokers say so.
+            why += f"; again and again: is another client called {self.client_id!r}, too?"
+        self._down(f"{self.where}: {why}")
 
     async def flush(self, within_s: float) -> None:
         """Wait until everything was sent, if there is a connection, and for so long at most."""
@@ -217,19 +230,12 @@ class MqttLink:
         _paho(client).connect_timeout = CONNECT_DEADLINE_S
         entering = asyncio.get_running_loop().create_task(client.__aenter__(), name="mqtt connect")
         try:
-            await asyncio.shield(entering)
-        except asyncio.CancelledError:
-            # The thread that connects cannot be stopped, and left alone its connection would live on without us.
-            while not entering.done() and _paho(client).socket() is None:
-                await asyncio.sleep(0.02)
+            await _entered(client, entering)
+        except BaseException:
+            # Left alone, a connection that came about half way would live on without us.
+            await _close(client)
             entering.cancel()
-            with contextlib.suppress(asyncio.CancelledError, aiomqtt.MqttError):
-                await entering
-            _paho(client).disconnect()
-            raise
-        except Exception:
-            # Where the broker accepted the connection but said nothing, it is still open.
-            _paho(client).disconnect()
+            await asyncio.wait([entering])
             raise
         return client
 
@@ -295,16 +301,65 @@ def _paho(client: aiomqtt.Client) -> Any:
     return client._client  # noqa: SLF001
 
 
+async def _entered(client: aiomqtt.Client, entering: asyncio.Task[aiomqtt.Client]) -> None:
+    """Wait until the broker has accepted or refused the connection.
+
+    aiomqtt would wait to its deadline for a broker that closes the connection instead, and its thread that connects
+    cannot be stopped.
+
+    Raises:
+        ClosedEarlyError: the broker has closed the connection.
+        aiomqtt.MqttError: it refuses, or cannot be reached.
+    """
+    closed = _closing(client)
+    either: list[asyncio.Future[Any]] = [entering, closed]
+    try:
+        await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
+        # A refusal closes the connection too, and `entering` learns of it a moment later.
+        await asyncio.wait([entering], timeout=_MOMENT_S)
+        if not entering.done():
+            raise ClosedEarlyError("the broker closes the connection without a word")
+    except asyncio.CancelledError:
+        while not entering.done() and _paho(client).socket() is None and not closed.done():
+            await asyncio.sleep(_MOMENT_S)
+        raise
+    await entering
+
+
+def _closing(client: aiomqtt.Client) -> asyncio.Future[None]:
+    """Done when the client's socket is closed."""
+    loop = asyncio.get_running_loop()
+    closed: asyncio.Future[None] = loop.create_future()
+    paho = _paho(client)
+    of_aiomqtt = paho.on_socket_close
+
+    def on_close(*arguments: Any) -> None:
+        of_aiomqtt(*arguments)
+        if not loop.is_closed():
+            loop.call_soon_threadsafe(lambda: None if closed.done() else closed.set_result(None))
+
+    paho.on_socket_close = on_close
+    return closed
+
+
 async def _leave(client: aiomqtt.Client) -> None:
     """Say goodbye if that is still possible; the socket is closed in any case."""
     import aiomqtt
 
-    try:
+    with contextlib.suppress(aiomqtt.MqttError, OSError, TimeoutError):
         async with asyncio.timeout(LEAVE_DEADLINE_S):
             await client.__aexit__(None, None, None)
-    except (aiomqtt.MqttError, OSError, TimeoutError):
-        pass
-    _paho(client).disconnect()
+    await _close(client)
+
+
+async def _close(client: aiomqtt.Client) -> None:
+    """Close the socket, and wait until the loop has done so."""
+    paho = _paho(client)
+    paho.disconnect()
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(LEAVE_DEADLINE_S):
+            while paho.socket() is not None:
+                await asyncio.sleep(0.01)
 
 
 def _duration(seconds: float) -> str:

@@ -8,6 +8,7 @@ import ssl
 from typing import Final
 
 from companion.config import Mqtt
+from companion.errors import LinkError
 
 UNSUPPORTED_PROTOCOL: Final = 132
 """Reason codes of MQTT 5 (its section 2.4); paho turns those of MQTT 3.1.1 into the same."""
@@ -20,6 +21,10 @@ _LOST: Final = (7, 128)
 """paho's own number, and what it makes of it for MQTT 5."""
 _SILENT: Final = (16, 141)
 """Likewise: nothing was heard for twice the keepalive."""
+
+
+class ClosedEarlyError(LinkError):
+    """What listens there took the connection and closed it before it said anything."""
 
 
 def causes(error: BaseException) -> list[BaseException]:
@@ -44,18 +49,32 @@ def reason_code(error: BaseException) -> int | None:
     return None
 
 
-def explain(error: BaseException, settings: Mqtt, client_id: str) -> str:
-    """Why there is no connection, in one line without the broker's address."""
+def is_of_protocol(error: BaseException) -> bool:
+    """Whether the broker may not speak the version of MQTT that it was spoken to in."""
+    closed = any(isinstance(cause, ClosedEarlyError) for cause in causes(error))
+    return closed or reason_code(error) == UNSUPPORTED_PROTOCOL or _is_unanswered(error)
+
+
+def _is_unanswered(error: BaseException) -> bool:
+    """Whether what listens there took the connection and then said nothing in time (aiomqtt has no type for it)."""
+    return any(str(cause) == "Operation timed out" for cause in causes(error))
+
+
+def explain(error: BaseException, settings: Mqtt, client_id: str, *, reached: bool) -> str:
+    """Why there is no connection, in one line without the broker's address; `reached`: there was one."""
     code = reason_code(error)
     if code is not None:
         return _of_code(code, error, settings, client_id)
+    hint = "" if settings.tls else " (does it want tls = true?)"
+    if _is_unanswered(error):
+        return "the broker does not answer any more" if reached else f"what listens there says nothing{hint}"
     for cause in causes(error):
+        if isinstance(cause, ClosedEarlyError):
+            return f"{cause}{hint}"
+        if isinstance(cause, LinkError):
+            return str(cause)
         if isinstance(cause, OSError) and (words := _of_system(cause, settings)):
             return words
-    if any("timed out" in str(cause) for cause in causes(error)):
-        return "what listens there does not answer as an MQTT broker" + (
-            "" if settings.tls else " (does it want tls = true?)"
-        )
     return str(error) or type(error).__name__
 
 

@@ -98,6 +98,7 @@ def _shown(value: object) -> str:
         text = msgspec.json.encode(value).decode()
     except (OverflowError, RecursionError):
         return "what is too large"
+    text = text if text.isprintable() else ascii(text)[1:-1]
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
 
 
