@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import datetime
 import importlib
 import importlib.util
 import logging
@@ -94,6 +95,7 @@ class MqttLink:
         self._backoff = Backoff(FIRST_WAIT_S, LONGEST_WAIT_S)
         self._protocol: int = MQTT_5
         self._connected_s: float | None = None
+        self._since = datetime.datetime.now(tz=datetime.UTC)
         self._retry_s: float | None = None
         self._refused: list[str] = []
         self._warned: str | None = None
@@ -116,7 +118,7 @@ class MqttLink:
         since_s = None if self._connected_s is None else now_s - self._connected_s
         retry_s = None if self._retry_s is None else max(0.0, self._retry_s - now_s)
         if since_s is not None:
-            words = f"connected to {self.where} for {_duration(since_s)}"
+            words = f"connected to {self.where} since {self._since:%H:%M:%S} UTC"
             words += "".join(f"; {refused}" for refused in self._refused)
         else:
             words = self.last_error or f"{self.where}: not connected yet"
@@ -125,6 +127,7 @@ class MqttLink:
             "good": since_s is not None and not self._refused,
             "summary": words,
             "connected": since_s is not None,
+            "connected_since": None if since_s is None else self._since.isoformat(timespec="seconds"),
             "connected_s": None if since_s is None else round(since_s, 1),
             "connections": self.connections,
             "last_error": self.last_error,
@@ -270,6 +273,7 @@ class MqttLink:
 
     def _up(self) -> None:
         self._connected_s = asyncio.get_running_loop().time()
+        self._since = datetime.datetime.now(tz=datetime.UTC)
         self.connections += 1
         self.outbox.opened()
         protocol = {MQTT_5: "MQTT 5", MQTT_3_1_1: "MQTT 3.1.1"}[self._protocol]
@@ -360,9 +364,3 @@ async def _close(client: aiomqtt.Client) -> None:
         async with asyncio.timeout(LEAVE_DEADLINE_S):
             while paho.socket() is not None:
                 await asyncio.sleep(0.01)
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 100.0:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 6000.0 else f"{seconds / 3600:.0f} h"
