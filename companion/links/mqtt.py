@@ -33,6 +33,8 @@ _quiet.setLevel(logging.CRITICAL)
 
 INSTALL: Final = "pip install 'aiomqtt>=2.5,<3' where the companion is installed"
 CONNECT_DEADLINE_S: Final = 4.0
+GREETING_DEADLINE_S: Final = 5.0
+"""For the broker's first words; until then MQTT 3.1.1 is not tried on one that is silent to MQTT 5."""
 ANSWER_DEADLINE_S: Final = 5.0
 LEAVE_DEADLINE_S: Final = 1.0
 FIRST_WAIT_S: Final = 0.5
@@ -226,7 +228,7 @@ class MqttLink:
             keepalive=self.settings.keepalive_s,
             properties=properties,
             tls_context=context,
-            timeout=ANSWER_DEADLINE_S,
+            timeout=GREETING_DEADLINE_S,
             max_queued_incoming_messages=MAX_INCOMING,
             logger=_quiet,
         )
@@ -249,9 +251,9 @@ class MqttLink:
         for topic in self._subscriptions:
             if self._protocol == MQTT_5:
                 options = SubscribeOptions(qos=1, retainAsPublished=True)
-                granted = await client.subscribe(topic, options=options)
+                granted = await client.subscribe(topic, options=options, timeout=ANSWER_DEADLINE_S)
             else:
-                granted = await client.subscribe(topic, qos=1)
+                granted = await client.subscribe(topic, qos=1, timeout=ANSWER_DEADLINE_S)
             if any(getattr(code, "value", code) >= _REFUSED for code in granted):
                 self._refused.append(f"the broker does not let us hear {topic}")
                 logger.warning("mqtt: %s: %s (its access list?)", self.where, self._refused[-1])

@@ -155,7 +155,7 @@ async def broker(folder: Path, kind: Kind = BEST, *, users: bool = False, tls: b
 def hurry(monkeypatch: pytest.MonkeyPatch, kind: Kind) -> None:
     """amqtt says nothing to MQTT 5; do not wait for long until MQTT 3.1.1 is tried."""
     if kind == "amqtt":
-        monkeypatch.setattr(link, "ANSWER_DEADLINE_S", 0.7)
+        monkeypatch.setattr(link, "GREETING_DEADLINE_S", 0.7)
 
 
 class Heard(NamedTuple):
