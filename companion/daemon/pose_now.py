@@ -1,6 +1,7 @@
 """How the aircraft stands at this moment, from the latest readings of gradienter and compass.
 
-Right while it stands still: a gradienter in motion shows accelerations too, so `still` goes with it.
+Right while it stands still: a gradienter in motion shows accelerations too. So `still` goes with it; it is false, too,
+where no IMU tells.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class PoseNow:
             "heading_deg": None,
             "north": None,
             "source": "gradienter",
-            "still": not self._collector.glance(now_s).moving,
+            "still": self._collector.glance(now_s).obstacle is None,
         }
         if self._compass is not None and heading is not None and now_s - heading.t_s <= OLDEST_S:
             heading_deg = vehicle_heading_rad(self._compass, heading.heading_deg, up) / DEG

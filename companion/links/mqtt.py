@@ -71,7 +71,7 @@ class MqttLink:
         settings: which broker.
         client_id: who we are to it; a second client of that name takes over from the first.
         will: topic and payload that the broker publishes, retained, when we are gone without a word.
-        subscriptions: topics to hear.
+        subscriptions: topics to hear; the will's should be among them, to know that what we say there comes through.
         on_message: told of each message; must not block.
         offload: runs a blocking call elsewhere.
     """
@@ -103,6 +103,7 @@ class MqttLink:
         self._warned: str | None = None
         self._warned_open = False
         self._short = 0
+        self._echoed = will is None
 
     @property
     def connected(self) -> bool:
@@ -119,14 +120,18 @@ class MqttLink:
         now_s = asyncio.get_running_loop().time()
         since_s = None if self._connected_s is None else now_s - self._connected_s
         retry_s = None if self._retry_s is None else max(0.0, self._retry_s - now_s)
+        refused_now = [*self._refused]
+        if since_s is not None and since_s > ANSWER_DEADLINE_S and not self._echoed:
+            # Few brokers tell a client that they let it neither speak nor hear.
+            refused_now.append("our own messages do not come back (the broker's access list?)")
         if since_s is not None:
             words = f"connected to {self.where} since {self._since:%H:%M:%S} UTC"
-            words += "".join(f"; {refused}" for refused in self._refused)
+            words += "".join(f"; {refused}" for refused in refused_now)
         else:
             words = self.last_error or f"{self.where}: not connected yet"
             words += "" if retry_s is None else f"; next attempt in {retry_s:.0f} s"
         return {
-            "good": since_s is not None and not self._refused,
+            "good": since_s is not None and not refused_now,
             "summary": words,
             "connected": since_s is not None,
             "connected_since": None if since_s is None else self._since.isoformat(timespec="seconds"),
@@ -255,8 +260,8 @@ class MqttLink:
             else:
                 granted = await client.subscribe(topic, qos=1, timeout=ANSWER_DEADLINE_S)
             if any(getattr(code, "value", code) >= _REFUSED for code in granted):
-                self._refused.append(f"the broker does not let us hear {topic}")
-                logger.warning("mqtt: %s: %s (its access list?)", self.where, self._refused[-1])
+                self._refused.append(f"the broker does not let us hear {topic} (its access list?)")
+                logger.warning("mqtt: %s: %s", self.where, self._refused[-1])
 
     async def _send(self, client: aiomqtt.Client) -> None:
         while True:
@@ -268,6 +273,7 @@ class MqttLink:
 
     async def _receive(self, client: aiomqtt.Client) -> None:
         async for message in client.messages:
+            self._echoed |= self._will is not None and message.topic.value == self._will[0]
             try:
                 self._on_message(Incoming(message.topic.value, message.payload, bool(message.retain)))
             except Exception:
@@ -276,6 +282,7 @@ class MqttLink:
     def _up(self) -> None:
         self._connected_s = asyncio.get_running_loop().time()
         self._since = datetime.datetime.now(tz=datetime.UTC)
+        self._echoed = self._will is None
         self.connections += 1
         self.outbox.opened()
         protocol = {MQTT_5: "MQTT 5", MQTT_3_1_1: "MQTT 3.1.1"}[self._protocol]

@@ -65,7 +65,9 @@ def explain(error: BaseException, settings: Mqtt, client_id: str, *, reached: bo
     code = reason_code(error)
     if code is not None:
         return _of_code(code, error, settings, client_id)
-    hint = "" if settings.tls else " (does it want tls = true?)"
+    hint = " (does it want tls = true?)"
+    if settings.tls:
+        hint = " (does it want a certificate? mqtt.cert_file)" if settings.cert_file is None else ""
     if _is_unanswered(error):
         return "the broker does not answer any more" if reached else f"what listens there says nothing{hint}"
     for cause in causes(error):

@@ -399,6 +399,69 @@ def test_tls_by_an_authority_of_ones_own(tmp_path: Path, kind: Kind, monkeypatch
     asyncio.run(main())
 
 
+@mosquitto_only
+@pytest.mark.filterwarnings("ignore:unclosed <ssl.SSLSocket:ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_broker_that_asks_for_certificates(tmp_path: Path) -> None:
+    async def main() -> None:
+        one = Broker(tmp_path, tls=True)
+        one.more = f"cafile {one.ca_file}\nrequire_certificate true"
+        mine = {"cert_file": str(one.folder / "client.pem"), "key_file": str(one.folder / "client-key.pem")}
+        try:
+            await one.start()
+            async with alone(tmp_path, one.section(**mine)) as service:
+                await until_connected(service)
+            async with alone(tmp_path, one.section()) as service:
+                assert "certificate" in await until_problem(service, "certificate")
+        finally:
+            one.kill()
+
+    asyncio.run(main())
+
+
+async def until_bad(service: Service, words: str) -> None:
+    async with asyncio.timeout(10.0):
+        while words not in service.status()["mqtt"]["summary"]:
+            await asyncio.sleep(0.05)
+    assert service.status()["mqtt"]["connected"]
+    assert not service.status()["mqtt"]["good"]
+
+
+@mosquitto_only
+@pytest.mark.parametrize("access", ["topic read #", "topic write #"])
+def test_an_access_list_that_keeps_us_from_speaking_or_hearing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, access: str
+) -> None:
+    monkeypatch.setattr(link, "ANSWER_DEADLINE_S", 0.5)
+    path = tmp_path / "access"
+    path.write_text(access + "\n")
+    path.chmod(0o644)
+
+    async def main() -> None:
+        async with broker(tmp_path, more=f"acl_file {path}") as one, alone(tmp_path, one.section()) as service:
+            await until_bad(service, "our own messages do not come back")
+
+    asyncio.run(main())
+
+
+def test_an_access_list_that_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hurry(monkeypatch, "amqtt")
+
+    async def main() -> None:
+        one = Broker(tmp_path, "amqtt")
+        one.plugins["amqtt.plugins.topic_checking.TopicAccessControlListPlugin"] = {
+            "acl": {"anonymous": [f"{BASE}/status"]}
+        }
+        try:
+            await one.start()
+            async with alone(tmp_path, one.section()) as service:
+                await until_bad(service, f"does not let us hear {BASE}/request/+")
+        finally:
+            one.kill()
+
+    asyncio.run(main())
+
+
 # --- requests that nobody wants
 
 

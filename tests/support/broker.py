@@ -46,10 +46,15 @@ class Broker:
         kind: which.
         users: whether USER with PASSWORD is needed.
         tls: whether it speaks TLS, with a certificate for 127.0.0.1 by the authority in `ca_file`.
+        more: lines more of its configuration (of Mosquitto's).
     """
 
-    def __init__(self, folder: Path, kind: Kind = BEST, *, users: bool = False, tls: bool = False) -> None:
-        self.kind, self.users, self.tls = kind, users, tls
+    def __init__(
+        self, folder: Path, kind: Kind = BEST, *, users: bool = False, tls: bool = False, more: str = ""
+    ) -> None:
+        self.kind, self.users, self.tls, self.more = kind, users, tls, more
+        self.plugins: dict[str, dict[str, object]] = {}
+        """amqtt's, with their configuration."""
         self.folder = folder / f"broker-{kind}"
         self.folder.mkdir(exist_ok=True)
         self.port = free_port()
@@ -64,6 +69,9 @@ class Broker:
         authority = trustme.CA()
         server = authority.issue_cert("127.0.0.1")
         authority.cert_pem.write_to_path(self.ca_file)
+        client = authority.issue_cert("companion")
+        client.private_key_pem.write_to_path(self.folder / "client-key.pem")
+        client.cert_chain_pems[0].write_to_path(self.folder / "client.pem")
         server.private_key_pem.write_to_path(self.folder / "key.pem")
         server.cert_chain_pems[0].write_to_path(self.folder / "cert.pem")
 
@@ -83,19 +91,20 @@ class Broker:
             lines = [f"listener {self.port} 127.0.0.1", f"allow_anonymous {str(not self.users).lower()}", "user root"]
             lines += [f"password_file {self.folder}/users"] * self.users
             lines += [f"certfile {self.folder}/cert.pem", f"keyfile {self.folder}/key.pem"] * self.tls
+            lines.append(self.more)
             config = self.folder / "mosquitto.conf"
             config.write_text("\n".join(lines) + "\n")
             return [str(MOSQUITTO), "-c", str(config)]
         listener: dict[str, object] = {"type": "tcp", "bind": f"127.0.0.1:{self.port}"}
         if self.tls:
             listener |= {"ssl": True, "certfile": f"{self.folder}/cert.pem", "keyfile": f"{self.folder}/key.pem"}
-        plugins = {
+        plugins: dict[str, dict[str, object] | None] = {
             "amqtt.plugins.authentication.FileAuthPlugin": {"password_file": f"{self.folder}/users"}
             if self.users
             else None,
             "amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": not self.users},
         }
-        wanted = {name: what for name, what in plugins.items() if what is not None}
+        wanted = {name: what for name, what in plugins.items() if what is not None} | self.plugins
         config = self.folder / "amqtt.yaml"  # JSON is YAML
         config.write_text(json.dumps({"listeners": {"default": listener}, "plugins": wanted}))
         start = "import sys; from amqtt.scripts.broker_script import main; sys.argv[0] = 'amqtt'; main()"
@@ -143,9 +152,11 @@ class Broker:
 
 
 @contextlib.asynccontextmanager
-async def broker(folder: Path, kind: Kind = BEST, *, users: bool = False, tls: bool = False) -> AsyncIterator[Broker]:
+async def broker(
+    folder: Path, kind: Kind = BEST, *, users: bool = False, tls: bool = False, more: str = ""
+) -> AsyncIterator[Broker]:
     """A running broker."""
-    one = Broker(folder, kind, users=users, tls=tls)
+    one = Broker(folder, kind, users=users, tls=tls, more=more)
     try:
         yield await one.start()
     finally:
