@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 _quiet = logging.getLogger(f"{__name__}.aiomqtt")
-# What it warns of (a full queue) is what a flood would fill the log with; errors reach us as exceptions.
+# What goes wrong there reaches us as an exception, and is said once, in words for people.
 _quiet.setLevel(logging.CRITICAL)
 
 INSTALL: Final = "pip install 'aiomqtt>=2.5,<3' where the companion is installed"
@@ -43,7 +43,6 @@ WORTH_S: Final = 10.0
 """A connection that lasted so long was worth one: the next attempts begin with short waits again."""
 MANY: Final = 3
 """So many connections in a row that were not worth one are more than bad luck."""
-MAX_INCOMING: Final = 64
 MAX_PACKET_BYTES: Final = 64 * 1024
 """That the broker may send us; told to it where it speaks MQTT 5."""
 MQTT_3_1_1: Final = 4
@@ -130,6 +129,8 @@ class MqttLink:
         else:
             words = self.last_error or f"{self.where}: not connected yet"
             words += "" if retry_s is None else f"; next attempt in {retry_s:.0f} s"
+        if self.outbox.dropped:
+            words += f"; {self.outbox.dropped} answers dropped in a flood of requests"
         return {
             "good": since_s is not None and not refused_now,
             "summary": words,
@@ -234,7 +235,7 @@ class MqttLink:
             properties=properties,
             tls_context=context,
             timeout=GREETING_DEADLINE_S,
-            max_queued_incoming_messages=MAX_INCOMING,
+            queue_type=_inbox(self._take),
             logger=_quiet,
         )
         _paho(client).connect_timeout = CONNECT_DEADLINE_S
@@ -272,12 +273,17 @@ class MqttLink:
             self.outbox.sent(parcel)
 
     async def _receive(self, client: aiomqtt.Client) -> None:
+        """Wait for the end of the connection; what comes is dealt with as it comes (`_inbox`)."""
         async for message in client.messages:
-            self._echoed |= self._will is not None and message.topic.value == self._will[0]
-            try:
-                self._on_message(Incoming(message.topic.value, message.payload, bool(message.retain)))
-            except Exception:
-                logger.exception("an MQTT message could not be dealt with")
+            self._take(message)
+
+    def _take(self, message: aiomqtt.Message) -> None:
+        topic = message.topic.value
+        self._echoed |= self._will is not None and topic == self._will[0]
+        try:
+            self._on_message(Incoming(topic, message.payload, bool(message.retain)))
+        except Exception:
+            logger.exception("an MQTT message could not be dealt with")
 
     def _up(self) -> None:
         self._connected_s = asyncio.get_running_loop().time()
@@ -307,6 +313,20 @@ def _load_library() -> str | None:
     if not found.startswith("2."):
         return f"aiomqtt {found} is of another make ({INSTALL}); the companion goes on without MQTT"
     return None
+
+
+def _inbox(take: Callable[[aiomqtt.Message], None]) -> type[asyncio.Queue[aiomqtt.Message]]:
+    """A queue that never holds anything: it hands over at once.
+
+    aiomqtt reads faster than its iterator gives, so that a flood would fill any queue, and what is beyond its end is
+    lost without an answer.
+    """
+
+    class Inbox(asyncio.Queue[Any]):
+        def put_nowait(self, item: Any) -> None:
+            take(item)
+
+    return Inbox
 
 
 def _paho(client: aiomqtt.Client) -> Any:

@@ -178,6 +178,8 @@ def test_a_flood_of_requests_is_answered_and_disturbs_nothing(tmp_path: Path) ->
                 assert mqtt is not None
                 assert mqtt.link is not None
                 assert len(mqtt.link.outbox) < 100
+                dropped = rig.service.status()["mqtt"]["dropped"]
+                assert len([one for one in answers if one["transaction"] != "last"]) >= 500 - dropped
 
     asyncio.run(main())
 

@@ -14,6 +14,7 @@ import pytest
 from companion.calibration.machine import State
 from companion.config import parse
 from companion.daemon.mqtt import face
+from companion.daemon.mqtt.face import FLUSH_S
 from companion.daemon.service import Service
 from companion.links import mqtt as link
 from tests.support.broker import BEST, KINDS, Broker, Kind, broker, hurry, peer
@@ -65,7 +66,7 @@ def test_a_daemon_that_is_stopped_says_goodbye_and_ends_at_once(tmp_path: Path) 
                 await until_connected(service)
                 await watcher.until(f"{BASE}/status", is_(b"online"))
                 began_s = asyncio.get_running_loop().time()
-            assert asyncio.get_running_loop().time() - began_s < 0.8
+            assert asyncio.get_running_loop().time() - began_s < FLUSH_S
             await watcher.until(f"{BASE}/status", is_(b"offline"))
 
     asyncio.run(main())
@@ -131,7 +132,7 @@ def test_something_that_listens_and_says_nothing(tmp_path: Path, monkeypatch: py
                 while len(connected) == seen:
                     await asyncio.sleep(0.02)
             began_s = loop.time()
-        assert loop.time() - began_s < 0.8  # stopped in the middle of an attempt
+        assert loop.time() - began_s < 5.0  # stopped in the middle of an attempt
         for writer in connected:
             writer.close()
         server.close()
