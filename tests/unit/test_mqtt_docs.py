@@ -41,9 +41,22 @@ def test_the_examples_are_json() -> None:
         json.loads(example.replace(", ...}", "}").replace("{...}", "{}").replace("[...]", "[]"))
 
 
-def test_the_configuration_shown_is_accepted_with_every_key() -> None:
+SAMPLE = (Path(__file__).parents[2] / "systemd" / "companion.toml").read_text(encoding="utf-8")
+
+
+def _shown_in_docs() -> str:
     (shown,) = re.findall(r"```toml\n(.*?)```", DOCS, re.DOTALL)
-    everything = re.sub(r"^# ", "", shown, flags=re.MULTILINE)
-    config = parse('[mavlink]\nurl="tcp:h:1"\n[[imu]]\nname="a"\nsource="autopilot"\n' + everything, "docs")
+    return re.sub(r"^# ", "", shown, flags=re.MULTILINE)
+
+
+def _shown_in_sample() -> str:
+    (shown,) = re.findall(r"^#\[mqtt\]\n.*?\n$", SAMPLE, re.DOTALL | re.MULTILINE)
+    lines = [line[1:] for line in shown.splitlines() if re.match(r"#[\[\w]", line)]
+    return "\n".join(lines).replace("tls = false", "tls = true")
+
+
+@pytest.mark.parametrize("shown", [_shown_in_docs(), _shown_in_sample()], ids=["docs", "sample"])
+def test_the_configuration_shown_is_accepted_with_every_key(shown: str) -> None:
+    config = parse('[mavlink]\nurl="tcp:h:1"\n[[imu]]\nname="a"\nsource="autopilot"\n' + shown, "shown")
     assert config.mqtt is not None
-    assert set(tomllib.loads(everything)["mqtt"]) == set(config.mqtt.__struct_fields__)
+    assert set(tomllib.loads(shown)["mqtt"]) == set(config.mqtt.__struct_fields__)
