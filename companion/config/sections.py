@@ -120,12 +120,34 @@ class Mqtt(Section, frozen=True):
     """A broker to speak to; the section absent means no MQTT."""
 
     host: NonEmpty
-    port: Annotated[int, Meta(ge=1, le=65535)] = 1883
-    base_topic: NonEmpty = "companion"
+    port: Annotated[int, Meta(ge=1, le=65535)] | None = None
+    """8883 with TLS, else 1883, where it is not said."""
+    base_topic: NonEmpty | None = None
+    """What all topics begin with; "companion/" and the vehicle's system id where it is not said."""
+    client_id: NonEmpty | None = None
+    """The base topic with "-" for "/" where it is not said."""
     username: NonEmpty | None = None
     password_file: NonEmpty | None = None
     tls: bool = False
-    tls_ca_file: NonEmpty | None = None
+    ca_file: NonEmpty | None = None
+    """Who is trusted to sign the broker's certificate; the system's authorities where it is not said."""
+    cert_file: NonEmpty | None = None
+    key_file: NonEmpty | None = None
+    keepalive_s: Annotated[int, Meta(ge=5, le=600)] = 15
+    discovery: NonEmpty | None = None
+    """Home Assistant's discovery prefix (its default is "homeassistant"); absent: no discovery messages."""
+
+    @property
+    def broker_port(self) -> int:
+        """The port: as configured, else that of the protocol."""
+        return self.port or (8883 if self.tls else 1883)
+
+    @property
+    def password_path(self) -> Path | None:
+        """The password's file; one without a folder is looked for among systemd's credentials."""
+        if self.password_file is None:
+            return None
+        return Path(os.environ.get("CREDENTIALS_DIRECTORY", "/")) / self.password_file
 
 
 class Control(Section, frozen=True):

@@ -54,6 +54,8 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
     findings += [Finding("warning", good=True, words=words) for words in status["warnings"]]
     ground = status["ground_stations"]
     findings.append(Finding("ground stations", good=ground["good"], words=ground["summary"]))
+    if (mqtt := status["mqtt"]) is not None:
+        findings.append(Finding("mqtt", good=mqtt["good"], words=mqtt["summary"]))
     if config.calibration.at_arm == "gate":
         findings.append(_gate(config, status["arming"]["setup"]))
     for kind in ("gradienter", "compass"):

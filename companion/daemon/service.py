@@ -35,7 +35,9 @@ from companion.daemon.in_force import InForce
 from companion.daemon.job import Job
 from companion.daemon.ledger import Ledger, Offload
 from companion.daemon.mend import Mender
+from companion.daemon.mqtt.face import MqttFace
 from companion.daemon.plan import Planner
+from companion.daemon.pose_now import PoseNow
 from companion.daemon.push import Pusher
 from companion.daemon.px4_writes import Px4Writes
 from companion.daemon.reach import Reach
@@ -160,6 +162,18 @@ class Service:
             gate_setup=self.gate_setup,
             automatic=self.automatic,
         )
+        self.pose = PoseNow(config, self.vehicle, self.collector, offload)
+        self.mqtt = self._mqtt_face(offload)
+
+    def _mqtt_face(self, offload: Offload) -> MqttFace | None:
+        if self.config.mqtt is None:
+            return None
+        wanted = self.config.vehicle.system_id
+        face = MqttFace(
+            self.config.mqtt, self.answers, self.conductor, self.vehicle, self.pose.look, offload, system_id=wanted
+        )
+        self.answers.mqtt = face.status
+        return face
 
     def _on_ended(self, job: Job, result: JobResult) -> None:
         self.in_force.on_ended(job, result)
@@ -237,6 +251,7 @@ class Service:
         return take
 
     def _take(self, sample: Sample) -> None:
+        self.pose.take(sample)
         if isinstance(sample, TiltSample):
             self.collector.add_tilt(sample)
         elif isinstance(sample, CompassSample):
@@ -281,6 +296,8 @@ class Service:
                     group.create_task(self.armings.run(), name="armings")
                     group.create_task(self.automatic.run(), name="automatic")
                     group.create_task(self.gate_setup.run(), name="gate setup")
+                    if self.mqtt is not None:
+                        group.create_task(self.mqtt.run(), name="mqtt")
                     for imu in self.imus.values():
                         group.create_task(imu.run(), name=imu.name)
                     for sensor in self.sensors if ports else ():
@@ -299,6 +316,9 @@ class Service:
         running = [self.component.run(), run_transport(self.link, self.config.mavlink.url)]
         running += [self.reach.run(), self.gate_setup.run(), *(imu.run() for imu in self.imus.values())]
         running += [sensor.run() for sensor in self.sensors]
+        if self.mqtt is not None:
+            self.mqtt.only_listening = True
+            running.append(self.mqtt.run())
         tasks = [asyncio.get_running_loop().create_task(one) for one in running]
         try:
             await asyncio.sleep(seconds)
