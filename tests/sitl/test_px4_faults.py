@@ -86,7 +86,8 @@ def test_a_daemon_that_dies_at_the_far_value_puts_the_old_ones_back_when_it_live
                 with contextlib.suppress(RuntimeError, AssertionError, ValueError):
                     await calibrating
             assert changed(before, await ground.whole_list(60.0))
-            async with companion_daemon(vehicle, folder, more=QUICK) as daemon:
+            # Not by itself again: what is looked for is that the old values are back.
+            async with companion_daemon(vehicle, folder, more=f'{QUICK}at_arm = "off"\n') as daemon:
                 async with asyncio.timeout(60.0):
                     while changed(before, await ground.whole_list(60.0)):
                         await asyncio.sleep(1.0)

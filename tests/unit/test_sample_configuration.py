@@ -43,7 +43,8 @@ def test_it_is_understood_as_it_stands_and_with_everything_on() -> None:
     as_it_stands = parse(SAMPLE, "sample")
     assert as_it_stands.gradienter is None
     assert as_it_stands.mqtt is None
-    everything = parse(EVERYTHING, "sample")
+    # Certificates are for TLS alone, which is off by default.
+    everything = parse(EVERYTHING.replace("tls = false", "tls = true"), "sample")
     assert None not in [getattr(everything, name) for name in Config.__struct_fields__]
 
 
