@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -32,7 +33,7 @@ def blocks(path: Path) -> list[Block]:
         if language is None and fence:
             language, lines, began = fence[1] or "text", [], number
         elif language is not None and fence:
-            found.append(Block(path, began, language, "\n".join(lines)))
+            found.append(Block(path, began, language, textwrap.dedent("\n".join(lines))))
             language = None
         elif language is not None:
             lines.append(line)
