@@ -1,7 +1,7 @@
 """The console sessions in the documents happen as they are shown.
 
-Real are the command line's parser, commands and words, and the whole daemon behind them, on virtual time; only the socket
-between the two is left out (tests/e2e/test_commands.py has it).
+Real are the command line's parser, commands and words, and the whole daemon behind them, on virtual time; only the
+socket between the two is left out (tests/e2e/test_commands.py has it).
 """
 
 from __future__ import annotations
