@@ -23,6 +23,7 @@ from companion.daemon.ledger import Offload
 from companion.daemon.mend import Mender
 from companion.daemon.reach import Reach
 from companion.daemon.readiness import Readiness
+from companion.daemon.recorder import Recorder
 from companion.daemon.rivalry import Rivalry
 from companion.errors import CalibrationRefusedError
 from companion.storage.records import RecordStore
@@ -59,11 +60,13 @@ class Answers:
         armings: Armings,
         gate_setup: GateSetup,
         automatic: Automatic,
+        recorder: Recorder,
     ) -> None:
         self._conductor, self._vehicle, self._collector, self._devices = conductor, vehicle, collector, devices
         self._store, self._offload, self._mavlink_url = store, offload, mavlink_url
         self._rivalry, self._reach, self._mender, self._readiness = rivalry, reach, mender, readiness
         self._armings, self._gate_setup, self._automatic = armings, gate_setup, automatic
+        self._recorder = recorder
 
     async def answer(self, request: Object) -> AsyncIterator[Object]:
         """Answer one request of the control socket."""
@@ -90,6 +93,9 @@ class Answers:
             # A thousand records take longer to read than a ground station waits for an answer.
             records, armings = await self._offload(self._history, number)
             yield {"kind": "result", "records": records, "armings": armings}
+        elif command == "record":
+            async for reply in self._recorder.answer(request):
+                yield reply
         elif command == "monitor":
             while True:
                 yield {"kind": "progress", "status": self.status()}
@@ -155,6 +161,7 @@ class Answers:
                 "last": _plain(self._armings.last),
             },
             "automatic": self._automatic.status(),
+            "recording": self._recorder.status(),
             "last": _summary(conductor.last),
         }
 
