@@ -42,6 +42,8 @@ FLUSH_S: Final = 1.0
 RETRY_S: Final = 60.0
 DEFAULT_MB: Final = 64
 """Some 35 minutes of a 200 Hz IMU beside 100 Hz telemetry."""
+WINDOWS_TAKEN_ALONG: Final = 8
+"""Into the next file, for a calibration that is being worked out in this moment."""
 MOST_FILE_BYTES: Final = 4 << 30
 PROGRESS_S: Final = 0.5
 HANGS_S: Final = 5.0
@@ -253,7 +255,7 @@ class Recorder:
                 "collector": freeze(self._collector, RollingCollector),
                 "decoders": {name: freeze(sensor.decoder) for name, sensor in self._sensors.items()},
                 "mavlink": self._link.half_received,
-                "windows": list(self._collector.windows),
+                "windows": list(self._collector.windows)[-WINDOWS_TAKEN_ALONG:],
                 "where": self._around.where,
                 "offsets": self._around.offsets,
                 "solved": self._solved,

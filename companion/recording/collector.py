@@ -11,8 +11,8 @@ from companion.calibration.rolling import Glance, ImuInput, RollingCollector, Se
 from companion.recording.journal import Journal
 from companion.samples import CompassSample, ImuSample, TiltSample
 
-WINDOWS_KEPT: Final = 8
-"""Between a measurement and its solution others look at the readings too, but not often."""
+WINDOWS_KEPT: Final = 240
+"""Between a measurement and its solution a dither may lie, while others look at the readings once a second."""
 
 
 class RecordedCollector(RollingCollector):

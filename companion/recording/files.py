@@ -220,6 +220,7 @@ class Ring:
         self.bytes_in_all = 0
         self._opener, self._free_bytes = opener, free_bytes
         self._current: RecordingFile | None = None
+        self._head_bytes = 0
 
     @property
     def path(self) -> Path | None:
@@ -228,8 +229,10 @@ class Ring:
 
     @property
     def is_full(self) -> bool:
-        """Whether the present file has had its share."""
-        return self._current is not None and self._current.bytes_written >= self.most_bytes // PARTS
+        """Whether the present file has had its share, beside the state that it begins with."""
+        if self._current is None:
+            return False
+        return self._current.bytes_written - self._head_bytes >= self.most_bytes // PARTS
 
     def write(self, items: Sequence[Entry | Beginning]) -> None:
         """Add messages; every `Beginning` begins a file.
@@ -270,6 +273,8 @@ class Ring:
     def _put(self, items: Sequence[Entry | Beginning]) -> None:
         if self._current is not None and items:
             self._current.write(items)
+            if isinstance(items[0], Beginning):
+                self._head_bytes = self._current.bytes_written
 
     def _next(self) -> None:
         self.close()

@@ -380,7 +380,7 @@ def test_the_independent_reader_finds_every_message_as_its_schema_says(usual: tu
     validators: dict[str, Any] = {}
     count: dict[str, int] = {}
     with path.open("rb") as file:
-        for schema, channel, message in make_reader(file).iter_messages():
+        for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
             assert schema is not None
             assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
             if schema.name not in validators:

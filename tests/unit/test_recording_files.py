@@ -62,7 +62,7 @@ def test_the_ring_keeps_within_its_size_and_the_oldest_go_first(tmp_path: Path) 
     ring.close()
     assert most <= 2 * MB
     assert most > 1.5 * MB
-    assert len(seen) > 12
+    assert len(seen) >= 10
     assert kept.exists()
     left = sorted(path for path in (tmp_path / "ring").glob("0*.mcap"))
     assert len(left) >= 5
