@@ -76,6 +76,8 @@ def status_lines(status: Object) -> list[str]:
     recording = status["recording"]
     if recording["fault"] is not None:
         lines.append(f"recordings: none at present: {recording['fault']}")
+    if recording["lost"]:
+        lines.append(f"recordings: {recording['lost']} messages lost so far, the disk is too slow")
     if recording["file"] is not None:
         file = recording["file"]
         lines.append(f"recording to {file['path']}: {file['seconds']:.0f} s, {file['bytes'] / 1e6:.1f} MB")

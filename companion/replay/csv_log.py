@@ -45,6 +45,12 @@ MAX_STILL_S: Final = 3600.0
 NAME: Final = "imu"
 # The collector drops the second in which a stream begins: here that is its first millisecond.
 _FIRST_S: Final = 999.999
+_IN_OPTIONS: Final = (
+    ("set vehicle.latitude_deg or wait for GPS", "say --latitude-deg"),
+    ("set vehicle.height_m or wait for GPS", "say --height-m"),
+    ("no compass:", "no --heading-deg:"),
+)
+"""Warnings of the estimator that speak of the daemon's configuration, in the words of the command line."""
 _LONGER: Final = 1.1
 """A window is worked out again when the stretch has grown by so much."""
 
@@ -210,7 +216,14 @@ def estimate(
         draft.solution = solve_at(*_posed(best, pose), What.BOTH if tilt_known else What.GYROS)
     except CalibrationRefusedError as error:
         return draft.record("failed", str(error), seconds)
-    return draft.record("done", in_words(draft.solution), seconds)
+    record = draft.record("done", in_words(draft.solution), seconds)
+    return msgspec.structs.replace(record, warnings=tuple(map(_in_options, record.warnings)))
+
+
+def _in_options(words: str) -> str:
+    for of_the_daemon, of_the_command in _IN_OPTIONS:
+        words = words.replace(of_the_daemon, of_the_command)
+    return words
 
 
 def _window(collector: RollingCollector, now_s: float, best: Window | None) -> tuple[Window | None, str]:

@@ -27,8 +27,9 @@ from companion.daemon import recorder as recorder_module
 from companion.daemon.control import Object
 from companion.errors import CompanionError, StorageError
 from companion.recording import topics
-from companion.recording.files import Ring
+from companion.recording.files import Ring, versions
 from companion.recording.walk import MAGIC, Message, Recording
+from companion.replay import engine
 from companion.replay.engine import Replay, Result
 from sim.imu_model import DEG_H
 from tests.e2e.test_calibration import calibrated
@@ -609,6 +610,20 @@ def test_a_fault_of_the_recorder_s_own_does_not_take_the_daemon_along(
 
     run_virtual(main())
     assert len([entry for entry in caplog.records if entry.levelno == logging.ERROR]) == 1
+
+
+def test_another_version_is_named_and_another_format_refused(
+    usual: tuple[Path, Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours = versions()
+    monkeypatch.setattr(engine, "versions", lambda: {**ours, "numpy": "99.0", "machine": "pdp11"})
+    (note,) = replayed(usual[0]).notes
+    assert f"numpy {ours['numpy']}, here 99.0" in note
+    assert "pdp11: the last digits may differ" in note
+    path = tmp_path / "later.mcap"
+    path.write_bytes(usual[0].read_bytes().replace(b"format\x01\x00\x00\x001", b"format\x01\x00\x00\x002"))
+    with pytest.raises(StorageError, match="found format 2; allowed: 1"):
+        replayed(path)
 
 
 # --- the command line

@@ -99,8 +99,11 @@ def test_what_is_not_said_widens_sigma_and_is_named(tmp_path: Path, capsys: pyte
     assert code == 0
     assert imu["accel_bias_m_s2"] is None
     words = " | ".join(record["warnings"])
-    assert "--pitch-deg" in words
-    assert "latitude unknown" in words
+    for option in ("--pitch-deg", "--heading-deg", "say --latitude-deg"):
+        assert option in words
+    assert "GPS" not in words
+    _, record = replay(capsys, path, "--latitude-deg", "40")
+    assert any("say --height-m" in warning for warning in record["warnings"])
     off = np.subtract(imu["gyro_bias_rad_s"], model.mean_bias(3.0, 33.0).gyro_rad_s)
     assert (np.abs(off) / imu["gyro_sigma_use_rad_s"]).max() < 3.5
     assert max(imu["gyro_sigma_use_rad_s"]) > 6.0 * DEG_H
