@@ -47,6 +47,11 @@ def needs_reboot(changes: Sequence[Change]) -> bool:
     return px4.needs_reboot(changes)
 
 
+def stale_tilt_deg(changes: Sequence[Change]) -> float:
+    """How far the autopilot's attitude may be off after these changes until it is restarted."""
+    return px4.stale_tilt_deg(changes)
+
+
 def settle_s(firmware: Firmware | None) -> float:
     """How long after a write the telemetry may still show the old offsets."""
     return _SETTLE_S.get(firmware or "other", 2.0)

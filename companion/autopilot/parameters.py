@@ -12,7 +12,6 @@ import asyncio
 import contextlib
 import logging
 import math
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import Final
 
@@ -20,6 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.float32 import float32, same_float32
 from companion.autopilot.parameter_encoding import REAL32, decode, encode, is_integer
+from companion.autopilot.parameter_inbox import Inbox, Rebooted, Refusal
 from companion.autopilot.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.errors import (
     AutopilotRebootedError,
@@ -34,67 +34,19 @@ logger = logging.getLogger(__name__)
 
 _NO_ERROR: Final = 0
 _DOES_NOT_EXIST: Final = 1
-_ERROR_WORDS: Final = {
-    1: "it does not exist",
-    2: "the value is out of range",
-    3: "no permission",
-    4: "no such component",
-    5: "it is read-only",
-    6: "its type is not supported",
-    7: "its type does not match",
-    8: "it could not be read",
-}
-"""MAV_PARAM_ERROR in words; the generated dialect knows only the first five."""
-
-_INBOX: Final = 64
 _REMEMBERED_TYPES: Final = 4096
 """More parameters than any firmware has; what is not remembered is asked for."""
 
+_TRIES: Final = 4
+_TRIES_MORE: Final = 8
+"""While the autopilot's heartbeats come, or the line is known to lose packets: with a fifth of them lost both ways
+four tries fail once in sixty exchanges, which is once a calibration; eight once in 3500."""
+_LOSSY: Final = 0.05
+"""Share of answered requests that had to be repeated, above which silence says little about a name."""
+_LOSS_MEMORY: Final = 0.1
+
 _AT_ONCE: Final = 6
 """Requests in flight: ArduPilot queues some twenty and answers one every few milliseconds."""
-
-
-class _Inbox:
-    """What arrives about one name during one exchange; when full the oldest answer is dropped."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self._arrived: deque[float | _Refusal | _Reboot] = deque(maxlen=_INBOX)
-        self._bell = asyncio.Event()
-
-    def put(self, item: float | _Refusal | _Reboot) -> None:
-        self._arrived.append(item)
-        self._bell.set()
-
-    def clear(self) -> None:
-        self._arrived.clear()
-        self._bell.clear()
-
-    async def get(self, deadline_s: float) -> float | _Refusal | _Reboot | None:
-        """The next item, or None at the deadline (loop's clock)."""
-        while not self._arrived:
-            self._bell.clear()
-            try:
-                async with asyncio.timeout_at(deadline_s):
-                    await self._bell.wait()
-            except TimeoutError:
-                return None
-        return self._arrived.popleft()
-
-
-class _Refusal:
-    """A PARAM_ERROR."""
-
-    def __init__(self, code: int) -> None:
-        self.code = code
-
-    @property
-    def words(self) -> str:
-        return _ERROR_WORDS.get(self.code, f"error {self.code}")
-
-
-class _Reboot:
-    """The autopilot restarted."""
 
 
 class ParameterClient:
@@ -104,17 +56,17 @@ class ParameterClient:
         link: the connection.
         vehicle: whose parameters they are, and whether it is armed.
         timeout_s: how long one message's answer is awaited.
-        retries: how often the message is repeated after that.
     """
 
-    def __init__(self, link: MavlinkLink, vehicle: Vehicle, *, timeout_s: float = 1.0, retries: int = 3) -> None:
+    def __init__(self, link: MavlinkLink, vehicle: Vehicle, *, timeout_s: float = 1.0) -> None:
         self.vehicle = vehicle
         self.writes = 0
         """How many PARAM_SET have left, repetitions included."""
         self._link = link
         self._timeout_s = timeout_s
-        self._tries = 1 + retries
-        self._inboxes: list[_Inbox] = []
+        self._repeated = 0.0
+        """Share of requests that were answered only after a repetition, of late."""
+        self._inboxes: list[Inbox] = []
         self._watchers: list[Callable[[str, float], None]] = []
         self._answering: str | None = None
         self._absent: set[str] = set()
@@ -135,15 +87,18 @@ class ParameterClient:
             ParameterRefusedError: PARAM_ERROR, such as that it does not exist.
             AutopilotRebootedError: the autopilot restarted meanwhile.
         """
+        tries = 0
         with self._exchange(name) as inbox:
-            for _ in range(self._tries):
+            for tries in self._required_tries():
                 answer = await self._ask(inbox, name, -1)
+                if answer is not None:
+                    self._learn_loss(tries)
                 if isinstance(answer, float):
                     return answer
-                if isinstance(answer, _Refusal):
+                if isinstance(answer, Refusal):
                     raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.words}")
         raise ParameterTimeoutError(
-            f"{self.vehicle.name} does not answer for {name} ({self._tries} requests, {self._timeout_s:g} s each)"
+            f"{self.vehicle.name} does not answer for {name} ({tries} requests, {self._timeout_s:g} s each)"
         )
 
     async def read_optional(self, name: str) -> float | None:
@@ -163,11 +118,13 @@ class ParameterClient:
             return None
         boots = self.vehicle.boots
         with self._exchange(name) as inbox:
-            for _ in range(self._tries):
+            for tries in range(1, (_TRIES_MORE if self._repeated > _LOSSY else _TRIES) + 1):
                 answer = await self._ask(inbox, name, -1)
+                if answer is not None:
+                    self._learn_loss(tries)
                 if isinstance(answer, float):
                     return answer
-                if isinstance(answer, _Refusal):
+                if isinstance(answer, Refusal):
                     if answer.code == _DOES_NOT_EXIST:
                         self._absent.add(name)
                         return None
@@ -227,25 +184,29 @@ class ParameterClient:
             what = "a whole number" if whole else "a number"
             raise ParameterRefusedError(f"{name}: {value} is not {what} that may be written")
         other: float | None = None
+        tries = 0
         # The last heartbeat may be older than an arming; one that was asked for just now is not.
         await self.vehicle.fresh_heartbeat()
         with self._exchange(name) as inbox:
-            for _ in range(self._tries):
+            for tries in self._required_tries():
+                if other is not None and tries > _TRIES:
+                    break
                 self._require_disarmed(name)
                 deadline_s = self._send(self._set_message(name, carried, kind), inbox)
                 while (answer := await self._next(inbox, deadline_s)) is not None:
-                    if isinstance(answer, _Refusal):
+                    if isinstance(answer, Refusal):
                         raise ParameterRefusedError(
                             f"{self.vehicle.name} refuses {name} = {wanted:.9g}: {answer.words}"
                         )
                     if answer == wanted if whole else same_float32(answer, wanted):
+                        self._learn_loss(tries)
                         return answer
                     other = answer
                 await self.vehicle.fresh_heartbeat()
         if other is not None:
             raise ParameterMismatchError(f"{name} was set to {wanted:.9g}, {self.vehicle.name} answers {other:.9g}")
         raise ParameterTimeoutError(
-            f"{self.vehicle.name} does not answer to setting {name} ({self._tries} times, {self._timeout_s:g} s each)"
+            f"{self.vehicle.name} does not answer to setting {name} ({tries} times, {self._timeout_s:g} s each)"
         )
 
     @property
@@ -275,29 +236,39 @@ class ParameterClient:
             raise NotDisarmedError(f"{name} is not written: {why}")
 
     @contextlib.contextmanager
-    def _exchange(self, name: str) -> Iterator[_Inbox]:
-        inbox = _Inbox(name)
+    def _exchange(self, name: str) -> Iterator[Inbox]:
+        inbox = Inbox(name)
         self._inboxes.append(inbox)
         try:
             yield inbox
         finally:
             self._inboxes.remove(inbox)
 
+    def _required_tries(self) -> Iterator[int]:
+        """1, 2, ... of a request that must be answered: the more, while the autopilot is heard."""
+        for tries in range(1, _TRIES_MORE + 1):
+            if tries > _TRIES and not self.vehicle.alive:
+                return
+            yield tries
+
+    def _learn_loss(self, tries: int) -> None:
+        self._repeated += _LOSS_MEMORY * (float(tries > 1) - self._repeated)
+
     def _send(
-        self, message: mavlink.MAVLink_param_set_message | mavlink.MAVLink_param_request_read_message, inbox: _Inbox
+        self, message: mavlink.MAVLink_param_set_message | mavlink.MAVLink_param_request_read_message, inbox: Inbox
     ) -> float:
         """Send; the deadline of the answer. Nothing may be awaited between the guard and this."""
         if self._link.send(message) and isinstance(message, mavlink.MAVLink_param_set_message):
             self.writes += 1
         return asyncio.get_running_loop().time() + self._timeout_s
 
-    async def _next(self, inbox: _Inbox, deadline_s: float) -> float | _Refusal | None:
+    async def _next(self, inbox: Inbox, deadline_s: float) -> float | Refusal | None:
         answer = await inbox.get(deadline_s)
-        if isinstance(answer, _Reboot):
+        if isinstance(answer, Rebooted):
             raise AutopilotRebootedError(f"{self.vehicle.name} restarted while {inbox.name} was exchanged")
         return answer
 
-    async def _ask(self, inbox: _Inbox, name: str, index: int) -> float | _Refusal | None:
+    async def _ask(self, inbox: Inbox, name: str, index: int) -> float | Refusal | None:
         """One PARAM_REQUEST_READ and the first answer to it."""
         deadline_s = self._send(self._read_message(name, index), inbox)
         answer = await self._next(inbox, deadline_s)
@@ -309,7 +280,7 @@ class ParameterClient:
         """Whether a parameter that must exist is answered for: the last one that was, else the first of the list."""
         name, index = (self._answering, -1) if self._answering is not None else ("", 0)
         with self._exchange(name) as inbox:
-            for _ in range(self._tries):
+            for _ in self._required_tries():
                 if await self._ask(inbox, name, index) is not None:
                     return True
         return False
@@ -358,7 +329,7 @@ class ParameterClient:
             return
         for inbox in self._inboxes:
             if inbox.name == message.param_id:
-                inbox.put(_Refusal(message.error))
+                inbox.put(Refusal(message.error))
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event == "rebooted":
@@ -366,7 +337,7 @@ class ParameterClient:
             self._absent.clear()
             self._types.clear()
             for inbox in self._inboxes:
-                inbox.put(_Reboot())
+                inbox.put(Rebooted())
 
 
 def _wire_name(name: str) -> bytes:

@@ -137,6 +137,16 @@ def needs_reboot(changes: Sequence[Change]) -> bool:
     )
 
 
+def stale_tilt_deg(changes: Sequence[Change]) -> float:
+    """How far EKF2's tilt may be off until a restart, because the accelerometers step under it; 0 without a step."""
+    step: dict[str, float] = {}
+    for change in changes:
+        if change.parameter.startswith(PREFIX["accel"]):
+            slot = change.parameter.partition("_")[2].partition("_")[0]
+            step[slot] = math.hypot(step.get(slot, 0.0), change.after - change.before)
+    return math.degrees(max(step.values(), default=0.0) / (1e3 * MG))
+
+
 def warnings_about(calibration: ImuCalibration, changes: Sequence[Change]) -> tuple[str, ...]:
     """What PX4 makes of these changes later, for people."""
     found: list[str] = []

@@ -14,12 +14,14 @@ import msgspec
 import numpy as np
 
 from companion.calibration.batches import Batch
+from companion.calibration.estimates import Estimates, Found, Work
+from companion.calibration.outlook import Glance, Status
 from companion.calibration.pose_windows import HeadingWindow, TiltWindow, heading_window, tilt_window
 from companion.calibration.sources import Source, SourceStatus, compass_source, gradienter_source, imu_source
 from companion.calibration.stillness import ImuGate, Verdict
 from companion.calibration.stop import Settings, expected_s, is_enough
 from companion.calibration.stretch import Stretch
-from companion.calibration.windows import ImuEstimate, ImuInput, ImuWindow, Window, imu_estimates, integer_steps
+from companion.calibration.windows import ImuInput, ImuWindow, Window, integer_steps
 from companion.errors import CalibrationRefusedError
 from companion.samples import CompassSample, ImuSample, TiltSample
 
@@ -43,35 +45,6 @@ _GRACE_S: Final = 1.0
 """So long after its end a second waits for a source that has said nothing: the latency of a busy telemetry link."""
 _CLOSE_S: Final = 0.25
 _MARGIN: Final = 8
-
-
-class Status(msgspec.Struct, frozen=True, kw_only=True):
-    """Where the collector stands."""
-
-    still_s: float
-    """Good seconds, common to all sources, of the stretch under way."""
-    waiting_for: str | None
-    """One line for people; None when still long enough and nothing is in the way."""
-    enough: bool
-    """The stop rule is met: `window` gives a result that more seconds would not better."""
-    progress: float
-    """0..1 towards `enough`; falls to 0 when the stretch breaks."""
-    sources: tuple[SourceStatus, ...]
-    restarted_because: str
-    """Argument of the last reset; empty before any."""
-
-
-class Glance(msgspec.Struct, frozen=True, kw_only=True):
-    """What can be said of the stillness at once, without looking at the readings themselves."""
-
-    obstacle: str | None
-    """What is in the way at this moment, however long it has been still: it moves, or a source is silent or stuck."""
-    moving: bool
-    """Whether the obstacle is a movement, which a hand can end, and no fault."""
-    still_s: float
-    """As in `Status`."""
-    steady_s: float
-    """Good seconds without a bad one until now."""
 
 
 class RollingCollector:
@@ -106,7 +79,7 @@ class RollingCollector:
         self._now_s = -math.inf
         self._good: dict[int, bool] = {}
         self._best_progress = 0.0
-        self._estimated: tuple[int, list[ImuEstimate] | CalibrationRefusedError] | None = None
+        self._estimates = Estimates()
         self._restarted_because = ""
         self._restarts = 0
         self.unknown_samples = 0
@@ -202,15 +175,35 @@ class RollingCollector:
             steady_s=float(self._stretch.steady),
         )
 
+    def pending(self, now_s: float, *, since_s: float | None = None) -> Work | None:
+        """What `window` would have to work out now, for somebody who does it elsewhere; None when there is nothing.
+
+        It takes milliseconds, more on small boards, and what must be answered at once shall not wait for it.
+        """
+        self._advance(now_s)
+        if self._obstacle(now_s) is not None:
+            return None
+        slots = self._slots(since_s)
+        if not self._are_enough(slots, since_s) or self._estimates.known(slots[-1], since_s) is not None:
+            return None
+        return self._work(slots, since_s)
+
+    def accept(self, work: Work, found: Found) -> None:
+        """Take what a `Work` has found; too late, it is left."""
+        self._estimates.keep(work, found)
+
     def status(self, now_s: float) -> Status:
-        """Where it stands at `now_s` (the samples' clock); closes seconds that are over."""
+        """Where it stands at `now_s` (the samples' clock); closes seconds that are over.
+
+        Its figures may be those of the second before.
+        """
         self._advance(now_s)
         sources = self._sources()
         waiting = self._waiting_for(now_s)
         enough = False
         progress = 0.0
         if self._stretch.begun and waiting is None:
-            estimates = self._estimates()
+            estimates = self._estimate(self._slots(None), late=1)
             if isinstance(estimates, CalibrationRefusedError):
                 waiting = str(estimates)
             else:
@@ -247,16 +240,12 @@ class RollingCollector:
         if (reason := self._obstacle(now_s)) is not None:
             raise CalibrationRefusedError(reason)
         slots = self._slots(since_s)
-        needed = self._min_good if since_s is None else min(MIN_BATCHES, self._min_good)
-        # A stretch that has begun may have had up to a fifth rejected since.
-        if len(slots) < needed and not (since_s is None and self._stretch.begun):
+        if not self._are_enough(slots, since_s):
+            needed = self._min_good if since_s is None else min(MIN_BATCHES, self._min_good)
             raise CalibrationRefusedError(f"still for {len(slots)} s only, needs {needed} s")
-        if since_s is None:
-            estimates = self._estimates()
-            if isinstance(estimates, CalibrationRefusedError):
-                raise estimates
-        else:
-            estimates = self._estimate(slots)
+        estimates = self._estimate(slots, since_s)
+        if isinstance(estimates, CalibrationRefusedError):
+            raise estimates
         return Window(
             start_s=float(slots[0]),
             end_s=slots[-1] + 1.0,
@@ -273,7 +262,7 @@ class RollingCollector:
     def _break(self) -> None:
         self._stretch.clear()
         self._good.clear()
-        self._estimated = None
+        self._estimates.clear()
         self._best_progress = 0.0
         for source in self._sources():
             source.gate.new_stretch()
@@ -372,24 +361,28 @@ class RollingCollector:
             start = max(start, math.ceil(since_s))
         return [slot for slot in range(start, self._next) if self._good.get(slot, False)]
 
-    def _estimates(self) -> list[ImuEstimate] | CalibrationRefusedError:
-        """Of the whole window; computed once a second, however often it is asked for."""
-        slots = self._slots(None)
-        if self._estimated is None or self._estimated[0] != slots[-1]:
-            try:
-                self._estimated = (slots[-1], self._estimate(slots))
-            except CalibrationRefusedError as error:
-                self._estimated = (slots[-1], error)
-        return self._estimated[1]
+    def _are_enough(self, slots: list[int], since_s: float | None) -> bool:
+        if since_s is not None:
+            return len(slots) >= min(MIN_BATCHES, self._min_good)
+        # A stretch that has begun may have had up to a fifth rejected since.
+        return len(slots) >= self._min_good or (self._stretch.begun and bool(slots))
 
-    def _estimate(self, slots: list[int]) -> list[ImuEstimate]:
-        rejected = slots[-1] - slots[0] + 1 - len(slots)
-        return imu_estimates(
+    def _estimate(self, slots: list[int], since_s: float | None = None, late: int = 0) -> Found:
+        """Computed once a second, however often it is asked for."""
+        found = self._estimates.known(slots[-1] - late, since_s)
+        if found is None:
+            work = self._work(slots, since_s)
+            found = work.run()
+            self._estimates.keep(work, found)
+        return found
+
+    def _work(self, slots: list[int], since_s: float | None) -> Work:
+        return self._estimates.work(
             [self._inputs[name] for name in self._imus],
             [[source.batches.batches[slot] for slot in slots] for source in self._imus.values()],
-            end_s=slots[-1] + 1.0,
+            slots,
             horizon_s=self._settings.horizon_s,
-            rejected=rejected,
+            since_s=since_s,
         )
 
     def _pose_batches(self, source: Source, slots: list[int]) -> list[Batch]:

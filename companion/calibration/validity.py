@@ -43,7 +43,7 @@ class Why(enum.Enum):
     NEVER = "not calibrated yet"
     UNDONE = "calibration was undone"
     REBOOTED = "autopilot restarted"
-    REPLACED = "restart replaced gyro offsets"
+    REPLACED = "boot reset gyro offsets"
     CHANGED = "changed by someone else"
     FAILED = "last calibration failed"
     UNSEEN = "offsets written but not seen to work"

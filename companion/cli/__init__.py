@@ -60,8 +60,13 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
 
 def load_config(options: argparse.Namespace) -> config.Config:
     """The configuration that -c names, or the default one."""
+    return config.load(config_path(options))
+
+
+def config_path(options: argparse.Namespace) -> Path:
+    """The file that -c names, or the default one."""
     path: Path = getattr(options, "config", config.DEFAULT_PATH)
-    return config.load(path)
+    return path
 
 
 class _Parser(argparse.ArgumentParser):
@@ -71,7 +76,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser() -> argparse.ArgumentParser:
-    from companion.cli import client, local, recordings
+    from companion.cli import client, install, local, recordings
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = _Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -99,6 +104,7 @@ def _parser() -> argparse.ArgumentParser:
         local.lua,
         "print the arming script for ArduPilot (> APM/scripts/companion_arming.lua), and how to install it",
     )
+    install.add_commands(add)
     add("status", client.status, "what the daemon is doing")
     calibrate = add("calibrate", client.calibrate, "calibrate now (the aircraft must be disarmed and still)")
     what = calibrate.add_mutually_exclusive_group()

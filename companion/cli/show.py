@@ -87,6 +87,8 @@ def status_lines(status: Object) -> list[str]:
     lines += [f"warning: {warning}" for warning in status["warnings"]]
     if not status["ground_stations"]["good"]:
         lines.append(f"ground stations: {status['ground_stations']['summary']}")
+    if status["mqtt"] is not None:
+        lines.append(f"mqtt: {status['mqtt']['summary']}")
     arming = status["arming"]
     lines.append(
         f"at arming ({arming['at_arm']}): {_VERDICTS[arming['verdict']]}"

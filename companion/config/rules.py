@@ -6,6 +6,7 @@ import difflib
 import math
 import re
 
+from companion.config.mqtt_rules import check_mqtt
 from companion.config.sections import Config, Imu, Mounting
 from companion.config.words import allowed
 from companion.errors import ConfigError
@@ -51,6 +52,8 @@ def check_together(config: Config, name: str) -> None:
             _check_port(device.port, f"{section}.port", name)
     _check_ports_differ(config, name)
     _check_mavlink_url(config.mavlink.url, name)
+    if config.mqtt is not None:
+        check_mqtt(config.mqtt, name)
     if (config.vehicle.latitude_deg is None) != (config.vehicle.longitude_deg is None):
         raise ConfigError(
             f"{name}: 'vehicle': found only one of latitude_deg and longitude_deg; allowed: both or neither"

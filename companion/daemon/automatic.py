@@ -95,6 +95,8 @@ class Automatic:
         """Restarts of the autopilot seen, and automatic writes since the last one."""
         self._next_s = -math.inf
         self._failures = 0
+        self.on_beat: Callable[[], None] = lambda: None
+        """Called at every turn of `run`."""
         self.stopped: str | None = None
         """Why it waits for a request, for people; None while it works."""
 
@@ -113,7 +115,7 @@ class Automatic:
         if self._writes_today() >= PER_DAY or self._writes_this_boot() >= PER_BOOT:
             return "calibrate (flash spared)"
         if (wait_s := self._next_s - asyncio.get_running_loop().time()) > 0 and not self._is_urgent():
-            return f"by itself in {math.ceil(wait_s / 60)} min"
+            return f"again in {math.ceil(wait_s / 60)} min"
         return None
 
     def _is_urgent(self) -> bool:
@@ -136,6 +138,7 @@ class Automatic:
         """Calibrate whenever it is worth it, until cancelled."""
         self._writes = await self._offload(self._file.read)
         while True:
+            self.on_beat()
             await asyncio.sleep(POLL_S)
             try:
                 await self._keep()

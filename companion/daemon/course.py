@@ -24,7 +24,7 @@ from companion.calibration.site import Whereabouts
 from companion.calibration.solve import Solution, solve_at
 from companion.component.statustext import Severity, Weight
 from companion.config import Config
-from companion.daemon import models
+from companion.daemon import estimating, models
 from companion.daemon.autopilot_imu import AutopilotImu
 from companion.daemon.dither import Ditherer
 from companion.daemon.job import Job, JobCancelledError
@@ -239,6 +239,7 @@ class Course:
                 if imu.failures - failures[name] >= READ_ATTEMPTS:
                     # Patience is for what can change by itself; an autopilot that does not answer is a fault.
                     raise AutopilotError(f"imu {name}: {imu.problem}")
+            await estimating.catch_up(self._collector, self._offload)
             status = self._collector.status(now_s)
             waiting_for = self._not_ready() or status.waiting_for
             if waiting_for is not None:
@@ -255,7 +256,7 @@ class Course:
                 if status.enough:
                     self.machine.on(Event.ENOUGH)
                     job.progress(MEASURED_PERCENT, "working out the biases")
-                    return self._collector.window(now_s)
+                    return await estimating.window(self._collector, self._offload)
             if job.deadline_s is not None and now_s >= job.deadline_s:
                 raise CalibrationRefusedError(f"not finished in the time given: {job.words}")
             await job.pause(POLL_S)

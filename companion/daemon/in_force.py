@@ -37,7 +37,7 @@ from companion.calibration.validity import (
 )
 from companion.component.service import JobResult
 from companion.config import Config, Imu
-from companion.daemon import models
+from companion.daemon import estimating, models
 from companion.daemon.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.daemon.ledger import Offload
@@ -305,7 +305,7 @@ class InForce:
             return False
         self._looked_s = second
         try:
-            window = self._collector.window(now_s) if self.reading() is None else None
+            window = await estimating.window(self._collector, self._offload) if self.reading() is None else None
         except CalibrationRefusedError:
             window = None
         if window is None:

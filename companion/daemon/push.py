@@ -20,10 +20,11 @@ from companion.calibration.record import Outcome, WrittenParameter
 from companion.calibration.rolling import RollingCollector, Window
 from companion.calibration.solve import Solution
 from companion.config import Config
+from companion.daemon import estimating
 from companion.daemon.autopilot_imu import AutopilotImu
 from companion.daemon.effect import OnTheWay, Sides, in_short, judge_vectors, nearly_visible
 from companion.daemon.firmware_calibration import FirmwareCalibration, settles_within_s
-from companion.daemon.ledger import Ledger
+from companion.daemon.ledger import Ledger, Offload
 from companion.daemon.plan import Plan, Planner, Target
 from companion.daemon.px4_writes import Px4Writes, change_set, step_from_far
 from companion.daemon.report import Draft
@@ -59,7 +60,9 @@ class Pusher:
         px4: Px4Writes,
         planner: Planner,
         firmware: FirmwareCalibration,
+        offload: Offload,
     ) -> None:
+        self._offload = offload
         self._px4, self._planner, self._firmware = px4, planner, firmware
         self._vehicle, self._parameters = vehicle, parameters
         self._imus, self._collector = imus, collector
@@ -297,7 +300,7 @@ class Pusher:
                 words = f"checking the new offsets: {words}"
             else:
                 try:
-                    after = self._collector.window(loop.time(), since_s=since_s)
+                    after = await estimating.window(self._collector, self._offload, since_s=since_s)
                 except CalibrationRefusedError as error:
                     words = str(error)
                 else:

@@ -61,10 +61,14 @@ class Readiness:
         self._forecast = Forecast(vehicle, collector, conductor)
         self.why_not_by_itself: Callable[[], str | None] = lambda: "calibrate first"
         """Why no calibration will start by itself, and what to do, or None when one will."""
+        self.reboot_owed: Callable[[], str | None] = lambda: None
+        """Why the autopilot must be restarted first although its offsets are right; None when it need not."""
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
         self._has_gated = False
         self._woken = asyncio.Event()
+        self.on_beat: Callable[[], None] = lambda: None
+        """Called after every look that came to its end."""
 
     @property
     def at_arm(self) -> AtArm:
@@ -95,6 +99,7 @@ class Readiness:
                 # What a write under way makes of the output says nothing about what will be in force after it.
                 if not self._writing and await self.in_force.measure(loop.time()):
                     self.look()
+                self.on_beat()
             except Exception:
                 # Without a renewed answer the gate closes by itself.
                 logger.exception("looking whether it may arm failed")
@@ -145,6 +150,8 @@ class Readiness:
             if why_not is None:
                 return ArmAnswer("wait", f"hold still {self._until_calibrated_s(now_s):.0f} s")
             return ArmAnswer("refuse", f"{findings[0].words}: {why_not}")
+        if (owed := self.reboot_owed()) is not None:
+            return ArmAnswer("refuse", owed)
         if glance.moving or glance.steady_s < STEADY_S:
             return ArmAnswer("wait", f"hold still {max(1.0, STEADY_S - glance.steady_s):.0f} s")
         return ArmAnswer("accept", self.in_words(now_s))

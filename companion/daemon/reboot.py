@@ -10,7 +10,7 @@ from typing import Final
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.change import Change
-from companion.autopilot.firmwares import needs_reboot
+from companion.autopilot.firmwares import needs_reboot, stale_tilt_deg
 from companion.autopilot.float32 import same_float32
 from companion.autopilot.imu_calibration import ImuCalibration
 from companion.autopilot.parameters import ParameterClient
@@ -34,6 +34,9 @@ ANSWER_S: Final = 3.0
 BACK_WITHIN_S: Final = 60.0
 REBOOTING_PERCENT: Final = 95.0
 POLL_S: Final = 0.2
+GATED_TILT_DEG: Final = 0.3
+"""Tilt that an autopilot may have kept from before a write, above which the arm gate waits for its restart. A smaller
+one is within what an EKF shows after any start."""
 READ_ATTEMPTS: Final = 3
 
 
@@ -67,6 +70,15 @@ class Reboot:
 
     def __init__(self, vehicle: Vehicle, parameters: ParameterClient, pusher: Pusher, say: Say) -> None:
         self._vehicle, self._parameters, self._pusher, self._say = vehicle, parameters, pusher, say
+        self._stale: tuple[int, float] | None = None
+        """Boots seen when a write left a stale tilt behind, and its size in degrees."""
+
+    @property
+    def owed(self) -> str | None:
+        """Why it must be restarted before it may arm, in few words; None when it need not."""
+        if self._stale is None or self._stale[0] != self._vehicle.boots or self._stale[1] < GATED_TILT_DEG:
+            return None
+        return f"reboot first: tilt up to {self._stale[1]:.1f} deg off"
 
     async def conclude(self, job: Job, plan: Plan, before: Window, draft: Draft) -> None:
         """After a write that is done and stays: restart the autopilot if that was asked for, else say if it is needed.
@@ -91,6 +103,7 @@ class Reboot:
             draft.warnings.append(why_not)
             self._say(Severity.WARNING, why_not, Weight.NEWS)
         if needs_reboot(plan.changes):
+            self._stale = (self._vehicle.boots, stale_tilt_deg(plan.changes))
             draft.warnings.append(
                 "PX4's attitude stays wrong for minutes after new accelerometer offsets: reboot the autopilot before"
                 " flight (companion calibrate --reboot does)"

@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from companion.autopilot.ekf import EkfWatch
@@ -35,7 +34,9 @@ from companion.daemon.in_force import InForce
 from companion.daemon.job import Job
 from companion.daemon.ledger import Ledger, Offload
 from companion.daemon.mend import Mender
+from companion.daemon.mqtt.face import MqttFace
 from companion.daemon.plan import Planner
+from companion.daemon.pose_now import PoseNow
 from companion.daemon.push import Pusher
 from companion.daemon.px4_writes import Px4Writes
 from companion.daemon.reach import Reach
@@ -44,7 +45,6 @@ from companion.daemon.reboot import Reboot
 from companion.daemon.recorder import Recorder
 from companion.daemon.rivalry import Rivalry
 from companion.daemon.sensors import SerialSensor
-from companion.errors import CompanionError
 from companion.links.mavlink import MavlinkLink
 from companion.links.mavlink_transport import run_transport
 from companion.recording.collector import RecordedCollector
@@ -74,6 +74,8 @@ class Service:
         imu_rate_hz: float | None = None,
     ) -> None:
         self.config = config
+        self.on_ready: Callable[[], None] = lambda: None
+        """Called when it can be talked to."""
         self.link = link or MavlinkLink(
             system_id=config.vehicle.system_id or 1, component_id=config.mavlink.component_id
         )
@@ -111,8 +113,10 @@ class Service:
             px4,
             Planner(config, self.vehicle, self.parameters, self.imus, self.slots, self.rivalry),
             FirmwareCalibration(self.vehicle, self.parameters, writer, self.ledger, ekf),
+            offload,
         )
         self.mender = Mender(self.vehicle, self.parameters, writer, self.ledger, self._say, self._changing)
+        reboot = Reboot(self.vehicle, self.parameters, pusher, self._say)
         course = Course(
             config,
             self.vehicle,
@@ -121,7 +125,7 @@ class Service:
             pusher,
             self._say,
             offload,
-            Reboot(self.vehicle, self.parameters, pusher, self._say),
+            reboot,
             Ditherer(config, self.vehicle, self.parameters, self.imus, self.collector, writer, self.ledger),
         )
         self.conductor = Conductor(
@@ -132,6 +136,7 @@ class Service:
         self.reach = Reach(self.link, self.vehicle, self.parameters)
         self.in_force = InForce(config, self.vehicle, self.collector, self.imus, offload)
         self.readiness = Readiness(self.vehicle, self.collector, self.conductor, self.mender, self.in_force)
+        self.readiness.reboot_owed = lambda: reboot.owed
         self.automatic = Automatic(
             self.vehicle,
             self.collector,
@@ -165,6 +170,18 @@ class Service:
             automatic=self.automatic,
             recorder=self.recorder,
         )
+        self.pose = PoseNow(config, self.vehicle, self.collector, offload)
+        self.mqtt = self._mqtt_face(offload)
+
+    def _mqtt_face(self, offload: Offload) -> MqttFace | None:
+        if self.config.mqtt is None:
+            return None
+        wanted = self.config.vehicle.system_id
+        face = MqttFace(
+            self.config.mqtt, self.answers, self.conductor, self.vehicle, self.pose.look, offload, system_id=wanted
+        )
+        self.answers.mqtt = face.status
+        return face
 
     def _on_ended(self, job: Job, result: JobResult) -> None:
         self.in_force.on_ended(job, result)
@@ -248,6 +265,7 @@ class Service:
         return take
 
     def _take(self, sample: Sample) -> None:
+        self.pose.take(sample)
         if isinstance(sample, TiltSample):
             self.collector.add_tilt(sample)
         elif isinstance(sample, CompassSample):
@@ -261,8 +279,10 @@ class Service:
         """
         for words in models.not_in_this_version(self.config):
             logger.warning("%s", words)
-        async with ControlServer(self.config.control.path, self.answers.answer):
-            logger.info("ready: %s", self.config.control.path)
+        control = self.config.control
+        async with ControlServer(control.path, self.answers.answer, group=control.group_name):
+            logger.info("ready: %s", control.path)
+            self.on_ready()
             await self.serve()
 
     async def serve(self, *, mavlink: bool = True, ports: bool = True) -> None:
@@ -291,6 +311,8 @@ class Service:
                     group.create_task(self.automatic.run(), name="automatic")
                     group.create_task(self.gate_setup.run(), name="gate setup")
                     group.create_task(self.recorder.run(), name="recorder")
+                    if self.mqtt is not None:
+                        group.create_task(self.mqtt.run(), name="mqtt")
                     for imu in self.imus.values():
                         group.create_task(imu.run(), name=imu.name)
                     for sensor in self.sensors if ports else ():
@@ -309,6 +331,9 @@ class Service:
         running = [self.component.run(), run_transport(self.link, self.config.mavlink.url)]
         running += [self.reach.run(), self.gate_setup.run(), *(imu.run() for imu in self.imus.values())]
         running += [sensor.run() for sensor in self.sensors]
+        if self.mqtt is not None:
+            self.mqtt.only_listening = True
+            running.append(self.mqtt.run())
         tasks = [asyncio.get_running_loop().create_task(one) for one in running]
         try:
             await asyncio.sleep(seconds)
@@ -321,43 +346,3 @@ class Service:
     def status(self) -> Object:
         """What the daemon is doing, as JSON can hold it."""
         return self.answers.status()
-
-
-async def run(config: Config) -> None:
-    """Run the daemon until SIGTERM or SIGINT.
-
-    Raises:
-        CompanionError: it cannot start.
-    """
-    service = Service(config)
-    loop = asyncio.get_running_loop()
-    task = asyncio.current_task()
-    stopped = False
-
-    def stop() -> None:
-        nonlocal stopped
-        stopped = True
-        if task is not None:
-            task.cancel()
-
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop)
-    try:
-        await service.run()
-    except asyncio.CancelledError:
-        if not stopped:
-            raise
-        logger.info("stopped")
-    except BaseExceptionGroup as group:
-        known = group.subgroup(CompanionError)
-        if known is None:
-            raise
-        raise CompanionError("; ".join(str(error) for error in _leaves(known))) from group
-
-
-def _leaves(group: BaseExceptionGroup[Any]) -> Iterator[BaseException]:
-    for error in group.exceptions:
-        if isinstance(error, BaseExceptionGroup):
-            yield from _leaves(error)
-        else:
-            yield error

@@ -34,6 +34,8 @@ class MavlinkLink:
 
     def __init__(self, *, system_id: int = 1, component_id: int = 191) -> None:
         self.component_id = component_id
+        self.on_beat: Callable[[], None] = lambda: None
+        """Called again and again by whatever carries the link's bytes, as long as it works."""
         self.received: Counter[str] = Counter()
         """Messages by type, plus "bad" (failed checks), "unknown" (not in the dialect) and "handler error"."""
         self.sent = 0

@@ -7,7 +7,9 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from companion.calibration.rolling import Glance, ImuInput, RollingCollector, Settings, Status, Window
+from companion.calibration.estimates import Work
+from companion.calibration.outlook import Glance, Status
+from companion.calibration.rolling import ImuInput, RollingCollector, Settings, Window
 from companion.recording.journal import Journal
 from companion.samples import CompassSample, ImuSample, TiltSample
 
@@ -80,6 +82,10 @@ class RecordedCollector(RollingCollector):
         if self.journal.queues:
             self.journal.event(asyncio.get_running_loop().time(), "reset", (why, imu))
         super().reset(why, imu)
+
+    def pending(self, now_s: float, *, since_s: float | None = None) -> Work | None:  # noqa: D102
+        self.journal.event(now_s, "look")
+        return super().pending(now_s, since_s=since_s)
 
     def glance(self, now_s: float) -> Glance:  # noqa: D102
         self.journal.event(now_s, "look")

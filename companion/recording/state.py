@@ -22,6 +22,7 @@ from companion.autopilot.imu_calibration import FarStep, ImuCalibration, ImuPara
 from companion.autopilot.rivals import Rival
 from companion.calibration.allan import AllanModel, NoiseProfile
 from companion.calibration.batches import Batch, BatchSource, Counts
+from companion.calibration.estimates import Estimates
 from companion.calibration.pose_windows import HeadingWindow, TiltWindow
 from companion.calibration.rolling import RollingCollector
 from companion.calibration.site import Whereabouts
@@ -71,10 +72,10 @@ _VALUES: Final[dict[str, type]] = {
 }
 """Values that never change once made."""
 
-# What is only remembered to save work: (class, attribute) and what it begins with.
-_FORGOTTEN: Final[dict[tuple[str, str], Any]] = {
-    ("RollingCollector", "_estimated"): None,
-    ("VectorNavDecoder", "_layouts"): {},
+# What is only remembered to save work: (class, attribute) and what makes it anew.
+_FORGOTTEN: Final[dict[tuple[str, str], Callable[[], Any]]] = {
+    ("RollingCollector", "_estimates"): Estimates,
+    ("VectorNavDecoder", "_layouts"): dict,
 }
 _DEEPEST: Final = 40
 
@@ -206,7 +207,7 @@ def _made(plain: Any, depth: int) -> Any:
     made: Any = object.__new__(_CHANGING[name])
     for (owner, attribute), empty in _FORGOTTEN.items():
         if owner == name:
-            setattr(made, attribute, type(empty)() if empty is not None else None)
+            setattr(made, attribute, empty())
     for attribute, item in fields.items():
         setattr(made, attribute, item)
     return made

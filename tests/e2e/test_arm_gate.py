@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -63,6 +65,25 @@ def test_px4_arms_with_a_fresh_calibration_and_refuses_without_with_the_reason_o
             assert await try_to_arm(rig) == 0
             assert armed(rig)
             assert "Armed: calibrated" in texts(rig)
+
+    run_virtual(main())
+
+
+def test_after_a_large_accelerometer_step_px4_has_to_be_rebooted_before_the_gate_opens(tmp_path: Path) -> None:
+    """Its EKF2 keeps the tilt that the wrong offsets had given it (autopilots 9.3)."""
+
+    async def main() -> None:
+        async with px4(tmp_path, CAL_ACC0_XOFF=0.3).running() as rig:
+            readiness = rig.service.readiness
+            await rig.until(lambda: readiness.answer().words.startswith("reboot first"), 100.0)
+            assert float(np.degrees(np.hypot(*rig.px4.vehicle_imus[0].estimator.tilt_error_rad))) > 0.3
+            assert await try_to_arm(rig) == 1
+            assert re.search(r"Not armed: reboot first: tilt up to 1\.\d deg off", texts(rig))
+            assert all(len(words) <= 50 for words in rig.ground.texts())
+            rig.px4.reboot()
+            await rig.until(lambda: rig.service.vehicle.boots == 1, 20.0)
+            await ready(rig)
+            assert await try_to_arm(rig) == 0
 
     run_virtual(main())
 

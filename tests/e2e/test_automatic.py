@@ -117,7 +117,7 @@ def test_a_boot_with_ins_gyr_cal_1_throws_the_values_away_and_they_are_pushed_ag
             assert values(rig)["INS_GYROFFS_X"] != first["INS_GYROFFS_X"]
             rig.double.arm()  # what is said in between must not claim our calibration
             await rig.until(lambda: any("Armed" in text for text in rig.ground.texts()), 5.0)
-            assert rig.ground.texts()[-1].startswith("Armed UNCALIBRATED: restart replaced gyro offsets")
+            assert rig.ground.texts()[-1].startswith("Armed UNCALIBRATED: boot reset gyro offsets")
             rig.double.disarm()
             await calibrated_by_itself(rig, more=2)
             left = rig.double.residual(1, rig.now_s)

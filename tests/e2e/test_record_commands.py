@@ -25,7 +25,7 @@ def test_record_calibrate_pull_the_plug_replay(tmp_path: Path) -> None:
                 await recording.stderr.readuntil(b" MB")  # it says how it goes
             second = await companion("-c", config, "record")
             assert second.code == FAILED
-            assert f"already recording to {mine}" in second.err
+            assert f"already recording to {mine}" in second.err, second
             assert f"recording to {mine}" in (await companion("-c", config, "status")).out
 
             done = await companion("-c", config, "calibrate", "--wait", "--timeout", "60", "--json")

@@ -76,8 +76,36 @@ def test_silence_to_a_read_ends_in_a_timeout_after_all_tries() -> None:
             start_s = asyncio.get_running_loop().time()
             with pytest.raises(ParameterTimeoutError, match="INS_GYROFFS_X"):
                 await client.read(X)
+            assert asyncio.get_running_loop().time() - start_s == pytest.approx(8.0, abs=0.01)
+            assert sum(m.get_type() == "PARAM_REQUEST_READ" for m in autopilot.requests) == 8
+
+    run_virtual(main())
+
+
+def test_an_autopilot_whose_heartbeats_stop_too_is_given_up_sooner() -> None:
+    async def main() -> None:
+        async with aboard(ScriptedAutopilot(parameters=offsets())) as (client, _, wire):
+            wire.cut = True
+            start_s = asyncio.get_running_loop().time()
+            with pytest.raises(ParameterTimeoutError, match="4 requests"):
+                await client.read(X)
             assert asyncio.get_running_loop().time() - start_s == pytest.approx(4.0, abs=0.01)
-            assert sum(m.get_type() == "PARAM_REQUEST_READ" for m in autopilot.requests) == 4
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("optional", [False, True])
+def test_with_a_fifth_of_all_packets_lost_every_value_still_comes(*, optional: bool) -> None:
+    """With four tries some 17 of a thousand exchanges would fail, or names count as absent."""
+
+    async def main() -> None:
+        # Old firmware: it is silent on what it does not have, so silence means something.
+        autopilot = ScriptedAutopilot(parameters=offsets(), param_errors=False)
+        async with aboard(autopilot) as (client, _, wire):
+            wire.loss = 0.2
+            read = client.read_optional if optional else client.read
+            for _ in range(500):
+                assert await read(X) == f32(0.001)
 
     run_virtual(main())
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from companion.calibration import estimates
 from companion.calibration.allan import AllanModel, NoiseProfile
 from companion.calibration.rolling import RollingCollector, Settings
 from companion.errors import CalibrationRefusedError
@@ -497,3 +498,58 @@ def test_what_nobody_asked_for_is_not_waited_for() -> None:
     feed = feeder(settings(target_accel_sigma_m_s2=math.inf, target_gyro_sigma_rad_s=1.0))
     feed.run(11.0)
     assert feed.collector.status(feed.now_s).enough
+
+
+# -------------------------------------------------------------------------------------- worked out somewhere else
+
+
+def test_an_estimate_worked_out_elsewhere_is_the_window_that_would_have_been(monkeypatch: pytest.MonkeyPatch) -> None:
+    feeds = feeder(SILENT), feeder(SILENT)
+    for feed in feeds:
+        feed.run(20.0)
+    here, there = feeds
+    expected = here.collector.window(here.now_s)
+    work = there.collector.pending(there.now_s)
+    assert work is not None
+    found = work.run()
+    there.collector.accept(work, found)
+    assert there.collector.pending(there.now_s) is None
+    monkeypatch.setattr(estimates, "imu_estimates", lambda *_, **__: pytest.fail("worked out on the spot"))
+    assert there.collector.window(there.now_s) == expected
+    assert there.collector.status(there.now_s).waiting_for is None
+
+
+def test_while_the_next_estimate_is_worked_out_the_status_gives_the_one_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    feed = feeder(SILENT)
+    feed.run(20.0)
+    before = feed.collector.status(feed.now_s).progress
+    monkeypatch.setattr(estimates, "imu_estimates", lambda *_, **__: pytest.fail("worked out on the spot"))
+    feed.run(1.0)
+    assert feed.collector.pending(feed.now_s) is not None
+    assert before <= feed.collector.status(feed.now_s).progress < 1.0
+
+
+def test_an_estimate_of_a_stretch_that_has_ended_meanwhile_is_left() -> None:
+    feed = feeder(SILENT)
+    feed.run(20.0)
+    work = feed.collector.pending(feed.now_s)
+    assert work is not None
+    feed.collector.reset("offsets written")
+    step = np.array([0.5 * DEG, 0, 0, 0, 0, 0])
+    feed.change = lambda _name, _t, rows: rows - step
+    feed.run(20.0)
+    feed.collector.accept(work, work.run())
+    window = feed.collector.window(feed.now_s)
+    assert window.imus[0].gyro_rad_s[0] == pytest.approx(BIAS[0] - 0.5 * DEG, abs=0.02 * DEG)
+
+
+def test_nothing_is_pending_while_it_moves_or_has_not_been_still_for_long_enough() -> None:
+    feed = feeder(SILENT)
+    feed.run(6.0)
+    assert feed.collector.pending(feed.now_s) is None
+    feed.run(20.0)
+    feed.change = lambda _name, _t, rows: rows + np.array([5.0 * DEG, 0, 0, 0, 0, 0])
+    feed.run(2.0)
+    assert feed.collector.pending(feed.now_s) is None
