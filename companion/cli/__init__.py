@@ -76,7 +76,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser() -> argparse.ArgumentParser:
-    from companion.cli import client, install, local
+    from companion.cli import client, install, local, recordings
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = _Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -97,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     run = add("run", local.run, "run the daemon in the foreground")
     run.add_argument("-v", "--verbose", action="store_true", help="log what happens in detail")
     check = add("check", local.check, "check configuration, ports, sensors and autopilot; say what is wrong")
-    check.add_argument("--seconds", type=_seconds, default=3.0, metavar="S", help="how long to listen (default 3)")
+    check.add_argument("--seconds", type=seconds, default=3.0, metavar="S", help="how long to listen (default 3)")
     add("ports", local.ports, "list serial ports with their stable names")
     add(
         "lua",
@@ -112,7 +112,7 @@ def _parser() -> argparse.ArgumentParser:
     what.add_argument("--accelerometers", action="store_true", help="accelerometers only")
     calibrate.add_argument("--wait", action="store_true", help="wait for the end, show progress, print the record")
     calibrate.add_argument(
-        "--timeout", type=_seconds, metavar="S", help="cancel when it has not finished by then (default: no limit)"
+        "--timeout", type=seconds, metavar="S", help="cancel when it has not finished by then (default: no limit)"
     )
     calibrate.add_argument(
         "--reboot", action="store_true", help="restart the autopilot afterwards (PX4's attitude needs it)"
@@ -125,10 +125,16 @@ def _parser() -> argparse.ArgumentParser:
     history = add("history", client.history, "list past calibrations")
     history.add_argument("-n", "--limit", type=_count, default=20, metavar="N", help="the latest N (default 20)")
     add("monitor", client.monitor, "watch the daemon until Ctrl-C")
+    recordings.add_commands(add)
     return parser
 
 
-def _seconds(text: str) -> float:
+def seconds(text: str) -> float:
+    """An argument that is a time.
+
+    Raises:
+        argparse.ArgumentTypeError: it is none.
+    """
     try:
         value = float(text)
     except ValueError:

@@ -174,6 +174,8 @@ class Storage(Section, frozen=True):
     """Where records and the values for undo are kept."""
 
     directory: NonEmpty | None = None
+    recordings_mb: Annotated[int, Meta(ge=0, le=1_000_000)] | None = None
+    """Room for the ring of recordings; 0: none are kept; not said: a modest ring, where the means are installed."""
 
     @property
     def path(self) -> Path:

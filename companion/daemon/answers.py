@@ -23,6 +23,7 @@ from companion.daemon.ledger import Offload
 from companion.daemon.mend import Mender
 from companion.daemon.reach import Reach
 from companion.daemon.readiness import Readiness
+from companion.daemon.recorder import Recorder
 from companion.daemon.rivalry import Rivalry
 from companion.errors import CalibrationRefusedError
 from companion.storage.records import RecordStore
@@ -67,11 +68,13 @@ class Answers:
         armings: Armings,
         gate_setup: GateSetup,
         automatic: Automatic,
+        recorder: Recorder,
     ) -> None:
         self._conductor, self._vehicle, self._collector, self._devices = conductor, vehicle, collector, devices
         self._store, self._offload, self._mavlink_url = store, offload, mavlink_url
         self._rivalry, self._reach, self._mender, self._readiness = rivalry, reach, mender, readiness
         self._armings, self._gate_setup, self._automatic = armings, gate_setup, automatic
+        self._recorder = recorder
         self.mqtt: Callable[[], Object] = dict
         """How the broker is reached; empty where none is configured."""
 
@@ -105,6 +108,9 @@ class Answers:
             # A thousand records take longer to read than a ground station waits for an answer.
             records, armings = await self._offload(self._history, number)
             yield {"kind": "result", "records": records, "armings": armings}
+        elif command == "record":
+            async for reply in self._recorder.answer(request):
+                yield reply
         elif command == "monitor":
             while True:
                 yield {"kind": "progress", "status": self.status()}
@@ -170,6 +176,7 @@ class Answers:
                 "last": _plain(self._armings.last),
             },
             "automatic": self._automatic.status(),
+            "recording": self._recorder.status(),
             "mqtt": self.mqtt() or None,
             "last": _summary(conductor.last),
         }

@@ -14,7 +14,6 @@ from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.px4_slots import SlotMemory
 from companion.autopilot.vehicle import Vehicle
 from companion.autopilot.writer import ParameterWriter
-from companion.calibration.rolling import RollingCollector
 from companion.component.component import Component
 from companion.component.service import JobResult
 from companion.config import Config, Imu
@@ -43,10 +42,12 @@ from companion.daemon.px4_writes import Px4Writes
 from companion.daemon.reach import Reach
 from companion.daemon.readiness import Readiness
 from companion.daemon.reboot import Reboot
+from companion.daemon.recorder import Recorder
 from companion.daemon.rivalry import Rivalry
 from companion.daemon.sensors import SerialSensor
 from companion.links.mavlink import MavlinkLink
 from companion.links.mavlink_transport import run_transport
+from companion.recording.collector import RecordedCollector
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
 from companion.storage.changes import ChangeLog
 from companion.storage.records import RecordStore
@@ -80,16 +81,20 @@ class Service:
         )
         self.vehicle = Vehicle(self.link, system_id=config.vehicle.system_id)
         self.parameters = ParameterClient(self.link, self.vehicle)
-        self.collector = RollingCollector(
+        self.collector = RecordedCollector(
             models.settings(config),
             [models.imu_input(imu, None) for imu in config.imu],
             gradienter=config.gradienter is not None,
             compass=config.compass is not None,
+            message_of=self._message_of,
         )
         self.slots = SlotMemory()
         self._imu_rate_hz = models.imu_rate_hz(config) if imu_rate_hz is None else imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
         self.sensors = self._serial_sensors()
+        self.recorder = Recorder(
+            config, self.collector, self.link, self.vehicle, self.imus.values(), self.sensors, offload
+        )
         self.store = RecordStore(config.storage.path)
         self.ledger = Ledger(ChangeLog(config.storage.path), offload)
         writer = ParameterWriter(self.parameters, self.vehicle)
@@ -126,6 +131,8 @@ class Service:
         self.conductor = Conductor(
             config, self.vehicle, self.collector, course, pusher, self.mender, self.store, self._say, offload
         )
+        course.on_solved = self.recorder.on_solved
+        self.recorder.is_busy = lambda: self.conductor.state.busy
         self.reach = Reach(self.link, self.vehicle, self.parameters)
         self.in_force = InForce(config, self.vehicle, self.collector, self.imus, offload)
         self.readiness = Readiness(self.vehicle, self.collector, self.conductor, self.mender, self.in_force)
@@ -161,6 +168,7 @@ class Service:
             armings=self.armings,
             gate_setup=self.gate_setup,
             automatic=self.automatic,
+            recorder=self.recorder,
         )
         self.pose = PoseNow(config, self.vehicle, self.collector, offload)
         self.mqtt = self._mqtt_face(offload)
@@ -178,6 +186,12 @@ class Service:
     def _on_ended(self, job: Job, result: JobResult) -> None:
         self.in_force.on_ended(job, result)
         self.automatic.on_ended(job, result)
+        if job.record is not None:
+            self.recorder.on_record(job.record)
+
+    def _message_of(self, name: str) -> str | None:
+        imu = self.imus.get(name)
+        return imu.stream.kind.message if imu is not None and imu.stream.kind is not None else None
 
     def _say(self, *what: Any) -> object:
         return self.component.say(*what)
@@ -296,6 +310,7 @@ class Service:
                     group.create_task(self.armings.run(), name="armings")
                     group.create_task(self.automatic.run(), name="automatic")
                     group.create_task(self.gate_setup.run(), name="gate setup")
+                    group.create_task(self.recorder.run(), name="recorder")
                     if self.mqtt is not None:
                         group.create_task(self.mqtt.run(), name="mqtt")
                     for imu in self.imus.values():

@@ -92,6 +92,8 @@ bind = "127.0.0.1:8080"
         ("[vehicle]\nlatitude_deg = 3", ["vehicle", "both or neither"]),
         ("[calibration]\nmin_still_s = true", ["min_still_s", "found true", "2 to 600"]),
         ("[calibration]\nmax_s = 5", ["calibration.max_s", "found 5", "min_still_s (10)"]),
+        ("[storage]\nrecordings_mb = 3", ["storage.recordings_mb", "found 3", "0 (none) or at least 8"]),
+        ("[storage]\nrecordings_mb = -1", ["storage.recordings_mb", "found -1"]),
         ("[calibration]\ntarget_gyro_sigma_deg_h = 0", ["target_gyro_sigma_deg_h", "found 0", "above 0"]),
         ("[calibration]\nat_arm = 'always'", ["at_arm", "found 'always'", '"gate", "warn", "off"']),
         (
