@@ -25,8 +25,10 @@ NOT_FOR_PEOPLE = {
     "ValueError", "RuntimeError", "TypeError", "IllegalEventError", "exception",
     # What happens in the ordinary course of things, in the log.
     "debug", "info",
-    # Help of the command line, expressions and templates of other tools.
-    "add_argument", "add", "_Parser", "add_parser", "compile", "set_defaults", "Formatter", "JournalFormatter",
+    # Command lines that cannot be read are answered at once, with what is allowed.
+    "ArgumentTypeError",
+    # Expressions and templates of other tools.
+    "compile", "Formatter", "JournalFormatter",
     # Names of tasks.
     "create_task", "Thread",
 }  # fmt: skip
@@ -37,11 +39,14 @@ ELSEWHERE = {
     "companion/daemon/mqtt/payloads.py": "likewise, of a request's payload",
     "companion/daemon/mqtt/discovery.py": "names for Home Assistant",
     "companion/installation": "printed by commands that are run at home, with what to do",
-    "companion/cli/__init__.py": "help and mistakes of the command line",
     "companion/cli/install.py": "printed by commands that are run at home, with what to do",
     "companion/calibration/machine.py": "labels of the diagram in docs/calibration.md",
+    "companion/recording/topics.py": "names of fields in a recording",
 }
 """Rooms whose words need no row of their own, and why."""
+
+HELP = {"_parser", "add_commands", "error"}
+"""Functions that build the command line: their words are its help."""
 
 _WORD = re.compile(r"[A-Za-z]{2,}")
 _UNITS = {"deg", "mg", "min", "Hz", "imu", "gyro", "accel", "http", "IMU", "baud", "is"}
@@ -98,6 +103,14 @@ def _is_documentation(node: ast.AST, parents: dict[ast.AST, ast.AST]) -> bool:
     return isinstance(parents.get(node), ast.Expr)
 
 
+def _is_help(node: ast.AST, parents: dict[ast.AST, ast.AST]) -> bool:
+    while (parent := parents.get(node)) is not None:
+        if isinstance(parent, ast.FunctionDef) and parent.name in HELP:
+            return True
+        node = parent
+    return False
+
+
 def _counts(template: str, callers: list[str]) -> bool:
     if any(caller in NOT_FOR_PEOPLE for caller in callers):
         return False
@@ -115,6 +128,8 @@ def in_source(source: str, where: str) -> list[Message]:
     for node in ast.walk(tree):
         template = _text(node)
         if template is None or _is_documentation(node, parents) or isinstance(parents.get(node), ast.JoinedStr):
+            continue
+        if _is_help(node, parents):
             continue
         if _counts(template, list(_callers(node, parents))):
             # Backticks would end the code span that shows it.
