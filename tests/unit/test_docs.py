@@ -159,6 +159,14 @@ def test_targets_of_make_exist() -> None:
     assert named <= targets
 
 
+def test_every_room_is_in_the_diagram() -> None:
+    (diagram,) = re.findall(
+        r"## The rooms\n\n((?: {4}.*\n)+)", (ROOT / "docs/maintaining.md").read_text(encoding="utf-8")
+    )
+    rooms = {path.parent.name for path in (ROOT / "companion").glob("*/__init__.py")}
+    assert rooms - set(re.findall(r"\w+", diagram)) == set()
+
+
 def test_modules_and_files_that_are_named_exist() -> None:
     maintaining = (ROOT / "docs/maintaining.md").read_text(encoding="utf-8")
     rooms = [
