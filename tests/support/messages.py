@@ -1,0 +1,160 @@
+"""Every line that the companion's code can say to people, as templates: read from the source, not from a run.
+
+A template is a text of the program in which each value that is filled in is one `FILLED`. What counts is every text of
+at least two words, and whatever is handed to one of the functions that speak (`SPEAKERS`), save what `NOT_FOR_PEOPLE`
+and the rooms in `ELSEWHERE` take out. A new message is therefore found without being registered anywhere.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+FILLED = "\0"
+
+SPEAKERS = {"say", "_say", "_fault", "_words", "reset", "_void"}
+"""What is handed to these is said as it is, even if it is one word."""
+
+NOT_FOR_PEOPLE = {
+    # Mistakes of the program itself: they end in the row "internal error".
+    "ValueError", "RuntimeError", "TypeError", "IllegalEventError", "exception",
+    # What happens in the ordinary course of things, in the log.
+    "debug", "info",
+    # Command lines that cannot be read are answered at once, with what is allowed.
+    "ArgumentTypeError",
+    # Expressions and templates of other tools.
+    "compile", "Formatter", "JournalFormatter",
+    # Names of tasks.
+    "create_task", "Thread",
+}  # fmt: skip
+
+ELSEWHERE = {
+    "companion/config": "every line names file, key, what was found and what is allowed; one row tells so",
+    "companion/component/requests.py": "likewise, of a MAVLink command's parameters",
+    "companion/daemon/mqtt/payloads.py": "likewise, of a request's payload",
+    "companion/daemon/mqtt/discovery.py": "names for Home Assistant",
+    "companion/installation": "printed by commands that are run at home, with what to do",
+    "companion/cli/install.py": "printed by commands that are run at home, with what to do",
+    "companion/calibration/machine.py": "labels of the diagram in docs/calibration.md",
+    "companion/recording/topics.py": "names of fields in a recording",
+}
+"""Rooms whose words need no row of their own, and why."""
+
+HELP = {"_parser", "add_commands", "error"}
+"""Functions that build the command line: their words are its help."""
+
+_WORD = re.compile(r"[A-Za-z]{2,}")
+_UNITS = {"deg", "mg", "min", "Hz", "imu", "gyro", "accel", "http", "IMU", "baud", "is"}
+
+
+@dataclass(frozen=True)
+class Message:
+    """One template and where it stands."""
+
+    where: str
+    template: str
+
+    @functools.cached_property
+    def _parts(self) -> list[str]:
+        return re.split(rf"{FILLED}+", self.template)
+
+    @functools.cached_property
+    def _pattern(self) -> re.Pattern[str]:
+        return re.compile(".*?".join(map(re.escape, self._parts)))
+
+    def is_in(self, line: str) -> bool:
+        """Whether a line shows this message, with anything filled in."""
+        # Most lines lack most parts: finding that out first is 20 times as fast.
+        return all(part in line for part in self._parts) and self._pattern.search(line) is not None
+
+    def shown(self) -> str:
+        """The template as the documents may write it."""
+        return re.sub(rf"{FILLED}+", "…", self.template)
+
+
+def _parents(tree: ast.AST) -> dict[ast.AST, ast.AST]:
+    return {child: parent for parent in ast.walk(tree) for child in ast.iter_child_nodes(parent)}
+
+
+def _text(node: ast.AST) -> str | None:
+    """The template that a node is, with printf places and the parts of an f-string filled in."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return re.sub(r"%(?:\.\d+)?[sdrgf](?![a-z])", FILLED, node.value)
+    if isinstance(node, ast.JoinedStr):
+        return "".join(str(part.value) if isinstance(part, ast.Constant) else FILLED for part in node.values)
+    return None
+
+
+def _callers(node: ast.AST, parents: dict[ast.AST, ast.AST]) -> Iterator[str]:
+    """Names of the functions whose arguments a node is part of, innermost first."""
+    while (parent := parents.get(node)) is not None and not isinstance(parent, ast.stmt):
+        if isinstance(parent, ast.Call) and node is not parent.func:
+            function = parent.func
+            yield function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
+        node = parent
+
+
+def _is_documentation(node: ast.AST, parents: dict[ast.AST, ast.AST]) -> bool:
+    return isinstance(parents.get(node), ast.Expr)
+
+
+def _is_help(node: ast.AST, parents: dict[ast.AST, ast.AST]) -> bool:
+    while (parent := parents.get(node)) is not None:
+        if isinstance(parent, ast.FunctionDef) and parent.name in HELP:
+            return True
+        node = parent
+    return False
+
+
+def _counts(template: str, callers: list[str]) -> bool:
+    if any(caller in NOT_FOR_PEOPLE for caller in callers):
+        return False
+    words = [word for word in _WORD.findall(template) if word not in _UNITS]
+    if SPEAKERS & set(callers[:1]):
+        return bool(words)
+    return len(words) >= 2 and " " in template.strip()
+
+
+def in_source(source: str, where: str) -> list[Message]:
+    """All messages of one Python file."""
+    tree = ast.parse(source)
+    parents = _parents(tree)
+    found = []
+    for node in ast.walk(tree):
+        template = _text(node)
+        if template is None or _is_documentation(node, parents) or isinstance(parents.get(node), ast.JoinedStr):
+            continue
+        if _is_help(node, parents):
+            continue
+        if _counts(template, list(_callers(node, parents))):
+            # Backticks would end the code span that shows it.
+            found.append(Message(f"{where}:{getattr(node, 'lineno', 0)}", template.strip().replace("`", "")))
+    return found
+
+
+def in_lua(source: str, where: str) -> list[Message]:
+    """All messages of the arming script: texts of two words, outside of comments."""
+    found = []
+    for number, line in enumerate(source.splitlines(), 1):
+        for text in re.findall(r'"([^"]*)"', line.split("--", 1)[0]):
+            template = re.sub(r"%[-.\d]*[sdfg]", FILLED, text).strip()
+            if _counts(template, []):
+                found.append(Message(f"{where}:{number}", template))
+    return found
+
+
+def all_messages() -> list[Message]:
+    """Everything that may be said, in the order of the files."""
+    found: list[Message] = []
+    for path in sorted((ROOT / "companion").rglob("*.py")):
+        where = path.relative_to(ROOT).as_posix()
+        if not any(where == room or where.startswith(f"{room}/") for room in ELSEWHERE):
+            found += in_source(path.read_text(encoding="utf-8"), where)
+    script = ROOT / "companion/lua/companion_arming.lua"
+    found += in_lua(script.read_text(encoding="utf-8"), script.relative_to(ROOT).as_posix())
+    return found

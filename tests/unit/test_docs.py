@@ -1,0 +1,181 @@
+"""README.md and docs/*.md: links lead somewhere, configurations are taken, commands are understood.
+
+What is run instead of parsed: tests/e2e/test_docs_session.py. The conventions: docs/maintaining.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import re
+import shlex
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from companion import cli
+from companion.config import Config, parse
+from tests.support.documents import DOCUMENTS, README, ROOT, Block, blocks, commands_in, headings, prose
+
+MINIMAL = {"mavlink": '[mavlink]\nurl = "tcp:h:1"\n', "imu": '[[imu]]\nname = "a"\nsource = "autopilot"\n'}
+
+Words = tuple[Path, str]
+
+
+def everywhere() -> Iterator[Words]:
+    """Every command of ours in every document."""
+    for path in DOCUMENTS:
+        for command in commands_in(path):
+            yield path, command
+
+
+def identity(value: object) -> str:
+    return value.name if isinstance(value, Path) else re.sub(r"\W+", "-", str(value))[:40]
+
+
+# --- links
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=identity)
+def test_links_lead_somewhere(path: Path) -> None:
+    wrong = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose(path)):
+        if re.match(r"[a-z]+:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        there = (path.parent / name).resolve() if name else path
+        if not there.is_relative_to(ROOT) or not there.exists():
+            wrong.append(f"{target}: no such file")
+        elif anchor and anchor not in headings(there):
+            wrong.append(f"{target}: no such heading")
+    assert wrong == []
+
+
+def test_every_document_is_named_in_the_readme() -> None:
+    linked = {(ROOT / target.partition("#")[0]).resolve() for target in re.findall(r"\]\(([^)\s]+)\)", prose(README))}
+    assert set(DOCUMENTS) - linked == {README}
+
+
+def test_the_readme_can_be_read_on_a_phone() -> None:
+    lines = README.read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 95, "move it into docs/"
+
+
+# --- configuration
+
+
+def configurations() -> list[Block]:
+    return [block for path in DOCUMENTS for block in blocks(path) if block.language == "toml"]
+
+
+@pytest.mark.parametrize("block", configurations(), ids=lambda block: f"{block.path.name}:{block.line}")
+def test_configurations_are_taken(block: Block) -> None:
+    missing = [
+        text for section, text in MINIMAL.items() if not re.search(rf"^\[+{section}\]", block.text, re.MULTILINE)
+    ]
+    parse("\n".join([block.text, *missing]), f"{block.path.name}:{block.line}")
+
+
+def test_the_smallest_configuration_needs_nothing_added() -> None:
+    (block,) = [block for block in configurations() if block.path == README]
+    config = parse(block.text, "README.md")
+    assert None not in (config.gradienter, config.compass)
+
+
+def keys() -> set[str]:
+    """section.key of everything that can be configured."""
+
+    def inner(annotation: Any) -> type[msgspec.Struct] | None:
+        if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct):
+            return annotation
+        return next((found for each in typing.get_args(annotation) if (found := inner(each))), None)
+
+    sections = {name: inner(annotation) for name, annotation in typing.get_type_hints(Config).items()}
+    return {f"{name}.{key}" for name, section in sections.items() if section for key in section.__struct_fields__}
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=identity)
+def test_keys_in_the_text_exist(path: Path) -> None:
+    sections = "|".join(sorted({key.partition(".")[0] for key in keys()}))
+    named = re.findall(rf"`((?:{sections})\.[a-z_]+)(?: = [^`]*)?`", prose(path))
+    files = {name for name in named if name.endswith((".py", ".toml")) or name == "mqtt.password"}
+    assert set(named) - keys() - files == set()
+
+
+# --- commands
+
+
+def understood(command: str) -> str:
+    """Nothing when the real parser takes the command; else what it says."""
+    words = shlex.split(command, comments=True)
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+        try:
+            if words[0] == "companion":
+                cli._parser().parse_args(words[1:])
+            else:
+                sim_parser(words[3:]).parse_args(words[3:])
+        except SystemExit as end:
+            return said.getvalue() if end.code else ""
+    return ""
+
+
+def sim_parser(words: list[str]) -> argparse.ArgumentParser:
+    """Of `python -m sim`, as sim/__main__.py chooses it."""
+    from sim import serve
+    from sim.sitl import cli as firmware
+
+    return firmware.parser() if words[:1] and words[0] in serve.FIRMWARE_COMMANDS else serve.parser()
+
+
+@pytest.mark.parametrize(("path", "command"), sorted(set(everywhere())), ids=identity)
+def test_commands_are_understood(path: Path, command: str) -> None:
+    assert understood(command) == "", f"{path.name}: {command}"
+
+
+def test_there_are_many_commands_and_a_wrong_one_is_found() -> None:
+    assert len(set(everywhere())) > 40
+    for wrong in ("companion calibrate --now", "companion calibrat", "python -m sim all --firmware none"):
+        assert understood(wrong)
+
+
+def test_every_command_is_named_somewhere() -> None:
+    (commands,) = [action for action in cli._parser()._actions if isinstance(action, argparse._SubParsersAction)]
+    shown = {words[1] for _, command in everywhere() if len(words := command.split()) > 1 and words[0] == "companion"}
+    assert set(commands.choices) - shown == set()
+
+
+def test_targets_of_make_exist() -> None:
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    named = {
+        name for path in DOCUMENTS for name in re.findall(r"(?:^ {4}|`|PX4_SITL=\S+ )make ([a-z]+)", path.read_text())
+    }
+    assert named
+    assert named <= targets
+
+
+def test_every_room_is_in_the_diagram() -> None:
+    (diagram,) = re.findall(
+        r"## The rooms\n\n((?: {4}.*\n)+)", (ROOT / "docs/maintaining.md").read_text(encoding="utf-8")
+    )
+    rooms = {path.parent.name for path in (ROOT / "companion").glob("*/__init__.py")}
+    assert rooms - set(re.findall(r"\w+", diagram)) == set()
+
+
+def test_modules_and_files_that_are_named_exist() -> None:
+    maintaining = (ROOT / "docs/maintaining.md").read_text(encoding="utf-8")
+    rooms = [
+        ROOT,
+        *(ROOT / "companion" / room for room in ("", "calibration", "daemon", "autopilot", "protocols")),
+        ROOT / "tests" / "property",
+    ]
+    named = set(re.findall(r"`((?:[a-z0-9_]+/)*[a-z0-9_]+\.py)`", maintaining))
+    assert len(named) > 25
+    assert [name for name in sorted(named) if not any((room / name).exists() for room in rooms)] == []
+    for module in re.findall(r"python -m (tests\.[a-z_.]+)", "".join(path.read_text() for path in DOCUMENTS)):
+        assert (ROOT / f"{module.rstrip('.').replace('.', '/')}.py").exists(), module
