@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from companion.autopilot.ekf import EkfWatch
 from companion.autopilot.imu_stream import StreamKind
@@ -34,7 +34,6 @@ from companion.daemon.in_force import InForce
 from companion.daemon.job import Job
 from companion.daemon.ledger import Ledger, Offload
 from companion.daemon.mend import Mender
-from companion.daemon.mqtt.face import MqttFace
 from companion.daemon.plan import Planner
 from companion.daemon.pose_now import PoseNow
 from companion.daemon.push import Pusher
@@ -51,6 +50,9 @@ from companion.recording.collector import RecordedCollector
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
 from companion.storage.changes import ChangeLog
 from companion.storage.records import RecordStore
+
+if TYPE_CHECKING:
+    from companion.daemon.mqtt.face import MqttFace
 
 logger = logging.getLogger(__name__)
 
@@ -176,6 +178,9 @@ class Service:
     def _mqtt_face(self, offload: Offload) -> MqttFace | None:
         if self.config.mqtt is None:
             return None
+        # What nobody asked for costs the start nothing.
+        from companion.daemon.mqtt.face import MqttFace
+
         wanted = self.config.vehicle.system_id
         face = MqttFace(
             self.config.mqtt, self.answers, self.conductor, self.vehicle, self.pose.look, offload, system_id=wanted

@@ -69,7 +69,8 @@ class Machine:
         out, error = await process.communicate(stdin.encode())
         code = process.returncode or 0
         if check and code != 0:
-            raise RuntimeError(f"{' '.join(words)}: exit code {code}: {out.decode()} {error.decode()}")
+            _, said, _ = await self.run("journalctl", "--no-pager", "--lines=20", "--unit=companion", check=False)
+            raise RuntimeError(f"{' '.join(words)}: exit code {code}: {out.decode()} {error.decode()}\n{said}")
         return code, out.decode(), error.decode()
 
     async def write(self, path: str, text: str) -> None:
