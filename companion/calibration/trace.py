@@ -27,6 +27,7 @@ MAX_SECONDS: Final = 600
 some 1 MB in memory, 100 kB on disk with three IMUs."""
 
 MAX_WORDS: Final = 100
+_FARTHEST: Final = 100_000_000
 _DIGITS: Final = 7
 """Significant ones: 0.1 ug on 1 g."""
 
@@ -106,6 +107,8 @@ def from_json(data: bytes) -> Trace:
         columns += [imu.accel_m_s2, imu.accel_variance_m2_s4]
     if any(len(column) != length for column in columns):
         raise msgspec.ValidationError(f"not every column has {length} seconds")
+    if length > MAX_SECONDS or any(abs(second) > _FARTHEST for second in (*trace.second, *(trace.measured or ()))):
+        raise msgspec.ValidationError(f"more than {MAX_SECONDS} seconds, or seconds farther than {_FARTHEST}")
     if any(later <= earlier for earlier, later in zip(trace.second, trace.second[1:], strict=False)):
         raise msgspec.ValidationError("seconds do not ascend")
     return trace
