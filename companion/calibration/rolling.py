@@ -21,6 +21,7 @@ from companion.calibration.sources import Source, SourceStatus, compass_source, 
 from companion.calibration.stillness import ImuGate, Verdict
 from companion.calibration.stop import Settings, expected_s, is_enough
 from companion.calibration.stretch import Stretch
+from companion.calibration.trace import Snapshot, TraceLog
 from companion.calibration.windows import ImuInput, ImuWindow, Window, integer_steps
 from companion.errors import CalibrationRefusedError
 from companion.samples import CompassSample, ImuSample, TiltSample
@@ -80,6 +81,7 @@ class RollingCollector:
         self._good: dict[int, bool] = {}
         self._best_progress = 0.0
         self._estimates = Estimates()
+        self._trace = TraceLog()
         self._restarted_because = ""
         self._restarts = 0
         self.unknown_samples = 0
@@ -254,6 +256,10 @@ class RollingCollector:
             heading=heading_window(self._pose_batches(self._heading, slots)) if self._heading else None,
         )
 
+    def snapshot(self, started_s: float, measured_s: tuple[float, float] | None) -> Snapshot:
+        """What was seen since `started_s`, or since the window `measured_s` (start, end) began; cheap."""
+        return self._trace.snapshot(self._inputs, started_s, measured_s)
+
     # ------------------------------------------------------------------------------------------------- inside
 
     def _sources(self) -> list[Source]:
@@ -308,6 +314,7 @@ class RollingCollector:
         # Every gate sees every second: one that is skipped learns nothing.
         verdicts = [source.judge(slot) for source in sources]
         good = all(verdicts)
+        self._trace.add(slot, sources, good=good)
         if not self._stretch.add(slot, good=good):
             self._break()
         if not good and self._stretch.start is None:

@@ -20,6 +20,7 @@ from companion.calibration.machine import Event, State
 from companion.calibration.record import Record
 from companion.calibration.request import What
 from companion.calibration.rolling import RollingCollector, Settings
+from companion.calibration.trace import Snapshot
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.config import Config
@@ -275,15 +276,26 @@ class Conductor:
         else:
             outcome, reason, event = "done", "; ".join([in_words(draft.solution), *draft.notes]), None
         record = draft.record(outcome, reason, loop.time() - started_s)
+        seen = self._collector.snapshot(started_s, draft.measured_s)
         self._collector.retarget(self.settings)
         job.record = self.last = record
         self.on_result(record)
         try:
-            await self._offload(self._store.save, record)
+            await self._offload(self._keep, record, seen)
         except StorageError as error:
             logger.error("%s", error)  # noqa: TRY400 - the traceback tells nothing more
             self._say(Severity.WARNING, f"Record not kept: {error}", Weight.NEWS)
         self._end(job, event, JobResult(outcome, reason))
+
+    def _keep(self, record: Record, seen: Snapshot) -> None:
+        """Blocking: the record and what lies beside it."""
+        try:
+            trace = seen.trace(record.started_at)
+        except Exception:
+            # What is nice to look at later must not cost the record.
+            logger.exception("the readings of this calibration cannot be kept")
+            trace = None
+        self._store.save(record, trace)
 
     # --- an undo
 

@@ -147,7 +147,7 @@ class Course:
             models.compass_model(self._config.compass),
             job.what,
         )
-        draft.solution = solution
+        draft.solution, draft.measured_s = solution, (measured.start_s, measured.end_s)
         self.on_solved(measured, window, where, job.what)
         plan = await self._pusher.plan(solution, draft)
         job.check_cancelled()

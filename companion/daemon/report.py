@@ -25,6 +25,8 @@ class Draft:
     written: dict[str, dict[str, WrittenParameter]] = dataclasses.field(default_factory=dict)
     """By IMU: parameters."""
     warnings: list[str] = dataclasses.field(default_factory=list)
+    measured_s: tuple[float, float] | None = None
+    """Start and end of the window behind the solution, on the loop's clock."""
     notes: list[str] = dataclasses.field(default_factory=list)
     """What belongs into the reason besides the figures."""
     imu_warnings: dict[str, list[str]] = dataclasses.field(default_factory=dict)
@@ -37,7 +39,7 @@ class Draft:
 
     def begin_again(self, why: str) -> None:
         """Forget what was found and written, but not why."""
-        self.solution = None
+        self.solution = self.measured_s = None
         self.whole.clear()
         self.written.clear()
         self.imu_warnings.clear()

@@ -1,23 +1,45 @@
-"""The history of calibrations, one file a record."""
+"""The history of calibrations, one file a record, and beside it what was seen on the way."""
 
 from __future__ import annotations
 
 import logging
 import re
+import zlib
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
+from companion.calibration import trace as traces
 from companion.calibration.record import Record, from_json, to_json
+from companion.calibration.trace import Trace
 from companion.errors import StorageError
-from companion.storage.atomic import write_atomically
+from companion.storage.atomic import remove_durably, write_atomically
 
 logger = logging.getLogger(__name__)
 
 # A record is some 6 kB: the whole history stays below 6 MB.
 KEEP = 1000
 
+# A trace is some 10 kB for a minute and two IMUs and never more than some 100 kB: usually 2 MB in all.
+KEEP_TRACES = 200
+
+MAX_TRACE_BYTES: Final = 4_000_000
+"""Unpacked: more is none of ours."""
+
 _NAME = re.compile(r"(\d{6})\.json")
+_TRACE = re.compile(r"(\d{6})\.trace\.json\.gz")
+_GZIP: Final = 16 + zlib.MAX_WBITS
+
+
+class Entry(msgspec.Struct, frozen=True):
+    """One file of the history: its record, or why it cannot be read."""
+
+    number: int
+    path: Path
+    record: Record | None
+    problem: str = ""
 
 
 class RecordStore:
@@ -26,31 +48,81 @@ class RecordStore:
     def __init__(self, directory: Path) -> None:
         self._folder = directory / "records"
 
-    def save(self, record: Record) -> Path:
-        """Add a record; returns its file.
+    def save(self, record: Record, trace: Trace | None = None) -> Path:
+        """Add a record, and what was seen during it; returns its file.
+
+        The trace goes first and carries the record's `started_at`, so that after a power cut a record never stands
+        beside a trace of another one. That it cannot be written is logged: the record matters more.
 
         Raises:
-            StorageError: it could not be written; nothing is half written.
+            StorageError: the record could not be written; nothing is half written.
         """
         numbers = self._numbers()
-        path = self._folder / f"{(numbers[-1] + 1 if numbers else 1):06d}.json"
+        number = numbers[-1] + 1 if numbers else 1
+        path, trace_path = self._path(number), self._trace_path(number)
+        try:
+            if trace is not None:
+                write_atomically(trace_path, _packed(traces.to_json(trace)))
+            elif trace_path.exists():
+                # Left by a power cut before its record was written.
+                remove_durably(trace_path)
+        except StorageError as error:
+            logger.warning("%s; the record is kept without it", error)
         write_atomically(path, to_json(record) + b"\n")
-        for number in numbers[: max(0, len(numbers) + 1 - KEEP)]:
-            (self._folder / f"{number:06d}.json").unlink(missing_ok=True)
+        kept = [*numbers, number][-KEEP:]
+        for old in numbers:
+            if old < kept[0]:
+                self._path(old).unlink(missing_ok=True)
+        with_trace = set(kept[-KEEP_TRACES:])
+        for old in self._numbers(_TRACE):
+            if old not in with_trace:
+                self._trace_path(old).unlink(missing_ok=True)
         return path
+
+    def entries(self) -> Iterator[Entry]:
+        """All files of the history, newest first, read one by one.
+
+        Raises:
+            StorageError: the folder cannot be listed.
+        """
+        for number in reversed(self._numbers()):
+            path = self._path(number)
+            try:
+                yield Entry(number, path, from_json(path.read_bytes()))
+            except OSError as error:
+                yield Entry(number, path, None, error.strerror or str(error))
+            except (ValueError, msgspec.MsgspecError) as error:
+                yield Entry(number, path, None, f"not a readable record: {error}")
 
     def history(self, limit: int | None = None) -> list[Record]:
         """The latest records, newest first; a file that cannot be read is logged and passed over."""
         records: list[Record] = []
-        for number in reversed(self._numbers()):
-            if limit is not None and len(records) >= limit:
-                break
-            path = self._folder / f"{number:06d}.json"
-            try:
-                records.append(from_json(path.read_bytes()))
-            except (OSError, msgspec.MsgspecError) as error:
-                logger.warning("%s: not a readable record, passed over: %s", path, error)
+        entries = self.entries()
+        while (limit is None or len(records) < limit) and (entry := next(entries, None)) is not None:
+            if entry.record is not None:
+                records.append(entry.record)
+            else:
+                logger.warning("%s: %s, passed over", entry.path, entry.problem)
         return records
+
+    def trace(self, entry: Entry) -> Trace | None:
+        """What was seen during a calibration; None where nothing was kept.
+
+        Raises:
+            StorageError: it is there and cannot be read, or is another record's.
+        """
+        path = self._trace_path(entry.number)
+        try:
+            trace = traces.from_json(_unpacked(path.read_bytes()))
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from error
+        except (ValueError, zlib.error, msgspec.MsgspecError) as error:
+            raise StorageError(f"{path}: not a readable trace: {error}") from error
+        if entry.record is None or trace.started_at != entry.record.started_at:
+            raise StorageError(f"{path}: belongs to the calibration of {trace.started_at}")
+        return trace
 
     def mark_undone(self, system_id: int, undone_at: str) -> None:
         """Note in the latest record that has written to this vehicle that it was put back.
@@ -58,22 +130,39 @@ class RecordStore:
         Raises:
             StorageError: it could not be written.
         """
-        for number in reversed(self._numbers()):
-            path = self._folder / f"{number:06d}.json"
-            try:
-                record = from_json(path.read_bytes())
-            except (OSError, msgspec.MsgspecError):
+        for entry in self.entries():
+            record = entry.record
+            if record is None:
                 continue
             wrote = record.state == "done" and any(imu.written for imu in record.imus)
             if wrote and record.system_id == system_id:
-                write_atomically(path, to_json(msgspec.structs.replace(record, undone_at=undone_at)) + b"\n")
+                write_atomically(entry.path, to_json(msgspec.structs.replace(record, undone_at=undone_at)) + b"\n")
                 return
 
-    def _numbers(self) -> list[int]:
+    def _path(self, number: int) -> Path:
+        return self._folder / f"{number:06d}.json"
+
+    def _trace_path(self, number: int) -> Path:
+        return self._folder / f"{number:06d}.trace.json.gz"
+
+    def _numbers(self, kind: re.Pattern[str] = _NAME) -> list[int]:
         try:
             names = [entry.name for entry in self._folder.iterdir()]
         except FileNotFoundError:
             return []
         except OSError as error:
             raise StorageError(f"{self._folder}: cannot be listed: {error.strerror}") from error
-        return sorted(int(match[1]) for match in map(_NAME.fullmatch, names) if match)
+        return sorted(int(match[1]) for match in map(kind.fullmatch, names) if match)
+
+
+def _packed(data: bytes) -> bytes:
+    packer = zlib.compressobj(wbits=_GZIP)
+    return packer.compress(data) + packer.flush()
+
+
+def _unpacked(data: bytes) -> bytes:
+    unpacker = zlib.decompressobj(wbits=_GZIP)
+    found = unpacker.decompress(data, MAX_TRACE_BYTES)
+    if not unpacker.eof:
+        raise ValueError("cut off" if not unpacker.unconsumed_tail else "too long")
+    return found

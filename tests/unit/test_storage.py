@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import signal
 import subprocess
@@ -9,9 +10,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from companion.calibration.record import ImuRecord, Record, WrittenParameter
+from companion.calibration.trace import Trace
 from companion.errors import StorageError
 from companion.storage import records as records_module
 from companion.storage.atomic import remove_durably, write_atomically
@@ -135,6 +138,73 @@ def test_old_records_make_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         store.save(_record(str(n)))
     assert [record.reason for record in store.history()] == ["4", "3", "2"]
     assert len(list((tmp_path / "records").iterdir())) == 3
+
+
+def _trace(record: Record) -> Trace:
+    return Trace(
+        started_at=record.started_at, second=(-1, 0), good=(True, False), measured=None, cut=False, verdicts=(), imus=()
+    )
+
+
+def test_what_was_seen_lies_beside_its_record_and_goes_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(records_module, "KEEP", 4)
+    monkeypatch.setattr(records_module, "KEEP_TRACES", 2)
+    store = RecordStore(tmp_path)
+    for n in range(6):
+        record = _record(str(n))
+        store.save(record, _trace(record) if n != 4 else None)
+    entries = list(store.entries())
+    assert [entry.number for entry in entries] == [6, 5, 4, 3]
+    assert [store.trace(entry) for entry in entries] == [_trace(_record("5")), None, None, None]
+    assert len(list((tmp_path / "records").iterdir())) == 4 + 1
+    assert [record.reason for record in store.history()] == ["5", "4", "3", "2"]
+
+
+def test_a_trace_without_its_record_is_never_taken_for_the_next_ones(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path)
+    first = _record("first")
+    # The power went between the two files.
+    store.save(first, _trace(first)).unlink()
+    store.save(_record("second"))
+    (entry,) = store.entries()
+    assert store.trace(entry) is None
+
+    other = tmp_path / "records" / "000001.trace.json.gz"
+    assert not other.exists()
+    RecordStore(tmp_path / "elsewhere").save(first, msgspec.structs.replace(_trace(first), started_at="2020"))
+    other.write_bytes((tmp_path / "elsewhere/records/000001.trace.json.gz").read_bytes())
+    with pytest.raises(StorageError, match="belongs to the calibration of 2020"):
+        store.trace(entry)
+
+
+@pytest.mark.parametrize("damage", ["cut", "garbage", "empty", "bomb"])
+def test_a_damaged_trace_is_named(tmp_path: Path, damage: str) -> None:
+    store = RecordStore(tmp_path)
+    record = _record("good")
+    store.save(record, _trace(record))
+    path = tmp_path / "records" / "000001.trace.json.gz"
+    whole = path.read_bytes()
+    bomb = gzip.compress(b" " * (records_module.MAX_TRACE_BYTES + 1))
+    path.write_bytes({"cut": whole[:-20], "garbage": b"\x00\xff" * 40, "empty": b"", "bomb": bomb}[damage])
+    (entry,) = store.entries()
+    assert entry.record == record
+    with pytest.raises(StorageError, match=r"000001\.trace\.json\.gz: not a readable trace"):
+        store.trace(entry)
+
+
+def test_the_record_is_kept_where_its_trace_cannot_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(path: Path, data: bytes) -> None:
+        if "trace" in path.name:
+            raise StorageError(f"{path}: cannot be written: No space left on device")
+        write_atomically(path, data)
+
+    monkeypatch.setattr(records_module, "write_atomically", refuse)
+    store, record = RecordStore(tmp_path), _record("good")
+    store.save(record, _trace(record))
+    assert store.history() == [record]
+    assert "No space left on device; the record is kept without it" in caplog.text
 
 
 def test_journal_and_undo_outlive_the_process(tmp_path: Path) -> None:

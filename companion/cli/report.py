@@ -1,0 +1,109 @@
+"""`companion report`: a page about one calibration, or about all of an aircraft, in one file."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from companion.cli import DONE, FAILED, USAGE, Command, load_config, print_json
+from companion.errors import CompanionError, ConfigError, StorageError
+
+if TYPE_CHECKING:
+    from companion.calibration.allan import NoiseProfile
+
+
+def add_command(add: Callable[[str, Command, str], argparse.ArgumentParser], count: Callable[[str], int]) -> None:
+    """Add `report`; `add` makes a parser of name, command and help, `count` reads a number above 0."""
+    sub = add("report", report, "make a page (one HTML file) of a calibration, or of all: needs no daemon, no network")
+    sub.add_argument(
+        "record", nargs="?", metavar="RECORD", help="its number, or the beginning of its time (default: the latest)"
+    )
+    sub.add_argument("--history", action="store_true", help="all calibrations of an aircraft instead of one")
+    sub.add_argument("-o", "--output", metavar="FILE", help="default: companion-report-….html here; - is stdout")
+    sub.add_argument(
+        "--storage", type=Path, metavar="DIR", help="the folder with records/ (default: as in the configuration)"
+    )
+    sub.add_argument("--vehicle", type=count, metavar="ID", help="with --history: of this system id")
+    sub.add_argument("-n", "--limit", type=count, default=200, metavar="N", help="with --history: the latest N")
+
+
+async def report(options: argparse.Namespace) -> int:
+    """`companion report`."""
+    as_json = getattr(options, "json", False)
+    if options.history and options.record is not None:
+        print("companion report: RECORD and --history exclude one another", file=sys.stderr)
+        return USAGE
+    if options.output == "-" and as_json:
+        print("companion report: -o - and --json both want stdout", file=sys.stderr)
+        return USAGE
+    directory, profiles = _where(options)
+    try:
+        path, damaged = _make(options, directory, profiles)
+    except CompanionError as error:
+        print(f"companion: {error}", file=sys.stderr)
+        if as_json:
+            print_json({"state": "failed", "reason": str(error), "file": None})
+        return FAILED
+    skipped = f"skipped: {'; '.join(damaged)}" if damaged else ""
+    if skipped:
+        print(f"companion: {skipped}", file=sys.stderr)
+    if as_json:
+        print_json({"state": "done", "reason": skipped, "file": str(path)})
+    elif path is not None:
+        print(path)
+    return DONE
+
+
+def _where(options: argparse.Namespace) -> tuple[Path, dict[str, NoiseProfile]]:
+    """The storage folder, and the noise profiles that the configuration names.
+
+    Raises:
+        ConfigError: there is no configuration to say where, and no --storage.
+    """
+    from companion.calibration.allan import noise_profile
+
+    try:
+        config = load_config(options)
+    except ConfigError as error:
+        if options.storage is not None:
+            # A folder copied to another computer needs no configuration there.
+            return options.storage, {}
+        raise ConfigError(f"{error} (or name the folder with the records: --storage DIR)") from error
+    profiles = {imu.name: noise_profile(imu.profile) for imu in config.imu if imu.profile is not None}
+    return options.storage or config.storage.path, profiles
+
+
+def _make(
+    options: argparse.Namespace, directory: Path, profiles: dict[str, NoiseProfile]
+) -> tuple[Path | None, list[str]]:
+    from companion.report.calibration_page import calibration_page
+    from companion.report.history_page import history_page
+    from companion.report.source import Storage
+    from companion.storage.atomic import write_atomically
+
+    now = datetime.datetime.now(tz=datetime.UTC)
+    storage = Storage(directory)
+    if options.history:
+        material = storage.history(options.vehicle, options.limit)
+        content, damaged = history_page(material, now), list(material.damaged)
+        name = "companion-report-history.html"
+    else:
+        one = storage.calibration(options.record, profiles)
+        content, damaged = calibration_page(one, now), list(one.damaged)
+        name = f"companion-report-{one.number:06d}.html"
+    if options.output == "-":
+        # As the file says of itself, whatever the terminal speaks.
+        sys.stdout.buffer.write(content.encode("utf-8", "replace"))
+        sys.stdout.flush()
+        return None, damaged
+    path = Path(options.output or name).absolute()
+    if not path.parent.is_dir():
+        raise StorageError(f"{path}: there is no folder {path.parent}")
+    if path.is_dir():
+        path = path / name
+    write_atomically(path, content.encode("utf-8", "replace"), mode=0o644)
+    return path, damaged

@@ -1,0 +1,397 @@
+"""The page of one calibration."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+
+from companion.calibration.allan import AllanModel
+from companion.calibration.record import Arming, ImuRecord, Outcome, Record
+from companion.calibration.trace import Axes, Trace
+from companion.report import svg
+from companion.report.analysis import Triad, history
+from companion.report.markup import Child, Markup, join, number, tag
+from companion.report.page import (
+    AXES,
+    CLASSES,
+    MAX_IMUS,
+    MAX_WARNINGS,
+    NAMES,
+    TRIADS,
+    UNITS,
+    Profiles,
+    arming_items,
+    card,
+    damaged,
+    drift,
+    moment,
+    page,
+    with_advice,
+    with_sigma,
+    written_count,
+)
+from companion.report.seconds import allan_figure, stillness
+
+MAX_WRITTEN: Final = 60
+
+_OUTCOMES: Final[dict[Outcome, tuple[str, str]]] = {
+    "verified": ("ok", "read back, and seen in the telemetry"),
+    "stored": ("warn", "read back; its effect could not be seen"),
+    "failed": ("bad", "not set, or not put back"),
+    "rolled_back": ("warn", "the old value is in force again"),
+}
+
+
+class Material(msgspec.Struct, frozen=True, kw_only=True):
+    """Everything that the page of one calibration is made of."""
+
+    number: int
+    record: Record
+    trace: Trace | None
+    no_trace: str
+    """Why there is no trace; empty where there is one."""
+    earlier: Sequence[tuple[int, Record]]
+    """Of the same aircraft, oldest first, this one last."""
+    armings: Sequence[Arming]
+    """While it was in force, oldest first."""
+    profiles: Profiles
+    """Of today's configuration, for records whose trace does not say."""
+    damaged: Sequence[str]
+
+
+def calibration_page(material: Material, now: datetime.datetime) -> str:
+    """The file's content."""
+    record = material.record
+    imus = record.imus[:MAX_IMUS]
+    return page(
+        f"Calibration {material.number}, {moment(record.started_at)}",
+        now,
+        _headline(material),
+        damaged(material.damaged),
+        _warnings(record),
+        *(_imu(imu, material) for imu in imus),
+        card("caution", f"{len(record.imus) - MAX_IMUS} more IMUs are not shown.")
+        if len(record.imus) > MAX_IMUS
+        else None,
+        _written(record),
+        _armings(material),
+        _pose(record),
+        stillness(material.trace, material.no_trace),
+        _allan(material),
+        _drift(material),
+    )
+
+
+def _headline(material: Material) -> Markup:
+    record = material.record
+    vehicle = "vehicle not heard" if record.system_id is None else f"vehicle {record.system_id}"
+    undone = record.undone_at
+    return join(
+        tag("h1", f"Calibration {material.number}"),
+        tag("p", f"{moment(record.started_at)}, {vehicle}, took {record.duration_s:.0f} s"),
+        tag("p", tag("span", record.state.upper(), class_=f"state {record.state}")),
+        tag("p", _in_short(record), class_="lead"),
+        tag("p", record.reason) if record.state == "done" else with_advice(record.reason, "alarm"),
+        card("alarm", f"Undone {moment(undone)}: the values from before are in force again.") if undone else None,
+    )
+
+
+def _in_short(record: Record) -> str:
+    """What a pilot wants to know first."""
+    outcomes = [written.outcome for imu in record.imus for written in imu.written.values()]
+    found = ", ".join(imu.name for imu in record.imus)
+    words = f"Biases found of {found}. " if record.state == "done" and found else ""
+    if not outcomes:
+        return f"{words}Nothing was written to the autopilot."
+    if all(outcome == "verified" for outcome in outcomes):
+        return f"{words}{len(outcomes)} parameters written, all verified."
+    counts = ", ".join(f"{outcomes.count(kind)} {kind.replace('_', ' ')}" for kind in _OUTCOMES if kind in outcomes)
+    return f"{words}Parameters: {counts}."
+
+
+def _warnings(record: Record) -> Markup | None:
+    found = [*record.warnings, *(words for imu in record.imus for words in imu.warnings)]
+    if not found:
+        return join(tag("h2", "Warnings"), card("fine", "None.")) if record.state == "done" else None
+    more = len(found) - MAX_WARNINGS
+    return join(
+        tag("h2", "Warnings"),
+        *(with_advice(words, "caution") for words in found[:MAX_WARNINGS]),
+        card("caution", f"{more} more warnings are not shown.") if more > 0 else None,
+    )
+
+
+# ------------------------------------------------------------------------------------------------------- an IMU
+
+
+def noise_of(imu: str, triad: Triad, trace: Trace | None, profiles: Profiles) -> tuple[AllanModel | None, str]:
+    """The noise that a sensor is believed to have, and of which profile: the one used then, else today's."""
+    found = next((one for one in trace.imus if one.name == imu), None) if trace is not None else None
+    if found is not None:
+        return (found.gyro_noise if triad == "gyro" else found.accel_noise), found.profile
+    profile = profiles.get(imu)
+    if profile is None:
+        return None, ""
+    return (profile.gyro if triad == "gyro" else profile.accel), f"{profile.name}, by today's configuration"
+
+
+def _imu(imu: ImuRecord, material: Material) -> Markup:
+    temperature = "temperature unknown" if imu.temperature_degc is None else f"{imu.temperature_degc:.1f} degC"
+    return join(
+        tag("h2", f"IMU {imu.name}"),
+        tag("p", f"{imu.samples} samples, {temperature}", class_="soft"),
+        tag(
+            "p",
+            "σ use: one sigma for the next minutes. σ stat: what averaging left.",
+            " residual: error of its output before this write."
+            if imu.residual_gyro_rad_s or imu.residual_accel_m_s2
+            else None,
+            class_="soft",
+        ),
+        tag("div", *(_triad(imu, triad, material) for triad in TRIADS), class_="pairs"),
+    )
+
+
+def _triad(imu: ImuRecord, triad: Triad, material: Material) -> Markup:
+    unit, unit_name = UNITS[triad]
+    if triad == "gyro":
+        bias, stat, use = imu.gyro_bias_rad_s, imu.gyro_sigma_stat_rad_s, imu.gyro_sigma_use_rad_s
+        left = imu.residual_gyro_rad_s
+    else:
+        bias, stat, use = imu.accel_bias_m_s2, imu.accel_sigma_stat_m_s2, imu.accel_sigma_use_m_s2
+        left = imu.residual_accel_m_s2
+    title = tag("h3", f"{NAMES[triad]}, {unit_name}")
+    if bias is None or stat is None or use is None:
+        return tag("div", title, card("caution", "Not determined: not asked for, or a warning above says why."))
+    model, profile = noise_of(imu.name, triad, material.trace, material.profiles)
+    rows = []
+    for k in range(3):
+        value, sigma = with_sigma(bias[k], use[k], unit)
+        rows.append(
+            tag(
+                "tr",
+                tag("td", AXES[k]),
+                tag("td", value, data_key=f"{imu.name}.{triad}.bias.{AXES[k]}"),
+                tag("td", "±", sigma, data_key=f"{imu.name}.{triad}.sigma_use.{AXES[k]}"),
+                tag("td", with_sigma(0.0, stat[k], unit)[1], data_key=f"{imu.name}.{triad}.sigma_stat.{AXES[k]}"),
+                tag("td", with_sigma(left[k], use[k], unit)[0], data_key=f"{imu.name}.{triad}.residual.{AXES[k]}")
+                if left
+                else None,
+            )
+        )
+    heads = ["", "bias", "σ use", "σ stat", *(["residual"] if left else [])]
+    return tag(
+        "div",
+        title,
+        tag("table", tag("tr", *(tag("th", words) for words in heads)), *rows),
+        _sigmas(imu.name, triad, stat, use, model),
+        tag("p", _against_the_floor(stat, use, model, unit, unit_name, profile)),
+    )
+
+
+def _against_the_floor(
+    stat: Axes, use: Axes, model: AllanModel | None, unit: float, unit_name: str, profile: str
+) -> str:
+    if model is None:
+        return "What this sensor can hold is not known: neither the record nor the configuration names its profile."
+    floor = model.floor
+    words = f"The sensor's own floor is {floor / unit:.2g} {unit_name} ({profile}). "
+    if max(stat) < floor:
+        words += "Averaging has gone below it: measuring longer would gain little."
+    else:
+        words += f"Averaging left {max(stat) / unit:.2g}: measuring longer (min_still_s) would help."
+    if max(use) > 3.0 * max(floor, *stat):
+        words += " Most of sigma comes from elsewhere: the pose, the site, or a drift."
+    return words
+
+
+def _sigmas(name: str, triad: Triad, stat: Axes, use: Axes, model: AllanModel | None) -> Markup:
+    """A dumbbell an axis: what averaging left, and what the next minutes can expect, against the floor."""
+    unit, unit_name = UNITS[triad]
+    floor = [] if model is None else [model.floor / unit]
+    values = [value / unit for value in (*stat, *use)]
+    across = svg.logarithmic([*values, *floor])
+    rows = svg.Axis(-0.6, 2.6, tuple((2.0 - k, AXES[k]) for k in range(3)))
+    plot = svg.Plot(across, rows, name=f"{name} {triad}: sigmas", height=78.0, x_label=f"sigma, {unit_name}")
+    if floor:
+        plot.line([(floor[0], -0.6), (floor[0], 2.6)], "floor")
+    for k in range(3):
+        ends = [(stat[k] / unit, 2.0 - k), (use[k] / unit, 2.0 - k)]
+        plot.line(ends, "bar use")
+        plot.points(ends[1:], "use", size=1.3, shape="circle")
+        plot.points(ends[:1], "stat", size=1.3, shape="circle")
+    entries = [("use", "σ use"), ("stat", "σ stat")]
+    if floor:
+        entries.append(("floor", "sensor's floor"))
+    return tag("figure", plot.svg(), svg.legend(*entries))
+
+
+# ------------------------------------------------------------------------------------------------- what was written
+
+
+def _written(record: Record) -> Markup | None:
+    if not written_count(record):
+        return None
+    parts: list[Child] = [tag("h2", "Written to the autopilot")]
+    seen: set[Outcome] = set()
+    for imu in record.imus[:MAX_IMUS]:
+        if not imu.written:
+            continue
+        rows = []
+        for name, one in list(imu.written.items())[:MAX_WRITTEN]:
+            seen.add(one.outcome)
+            class_, _ = _OUTCOMES[one.outcome]
+            rows += [
+                tag("tr", tag("td", name, ": ", tag("strong", one.outcome, class_=class_), colspan="3"), class_="name"),
+                tag(
+                    "tr",
+                    tag("td", tag("small", "before"), _setting(one.before), data_key=f"{name}.before"),
+                    tag("td", tag("small", "after"), _setting(one.after), data_key=f"{name}.after"),
+                    tag("td", tag("small", "read back"), _setting(one.read_back), data_key=f"{name}.read_back"),
+                    class_="values",
+                ),
+            ]
+        more = len(imu.written) - MAX_WRITTEN
+        parts += [
+            tag("h3", f"IMU {imu.name}"),
+            tag("table", *rows, class_="setting"),
+            tag("p", f"{more} more are not shown.") if more > 0 else None,
+        ]
+    parts += [tag("p", f"{outcome}: {_OUTCOMES[outcome][1]}.", class_="soft") for outcome in sorted(seen)]
+    return tag("section", *parts)
+
+
+def _setting(value: float | None) -> Markup:
+    return tag("span", "unknown") if value is None else number(value, ".6g")
+
+
+def _armings(material: Material) -> Markup | None:
+    if not material.armings:
+        return None
+    return join(tag("h2", "Armed with it"), arming_items(material.armings))
+
+
+# ----------------------------------------------------------------------------------------------------------- pose
+
+
+def _pose(record: Record) -> Markup:
+    parts: list[Child] = [tag("h2", "Pose and place")]
+    pose, site = record.pose, record.site
+    if pose is None:
+        parts.append(card("", "Not determined."))
+    else:
+        rows = [
+            (words, key, value, sigma)
+            for words, key, value, sigma in (
+                ("pitch, nose up", "theta", pose.theta_deg, pose.sigma_deg.theta),
+                ("roll, right side down", "gamma", pose.gamma_deg, pose.sigma_deg.gamma),
+                ("heading, true", "psi", pose.psi_deg, pose.sigma_deg.psi),
+            )
+        ]
+        parts.append(
+            tag(
+                "table",
+                *(
+                    tag(
+                        "tr",
+                        tag("td", words),
+                        tag("td", _angle(value, sigma, "" if key == "psi" else "+"), data_key=f"pose.{key}"),
+                    )
+                    for words, key, value, sigma in rows
+                ),
+            )
+        )
+    if site is not None:
+        facts = (
+            ("latitude", "latitude", site.latitude_deg, ".4f", "deg"),
+            ("height", "height", site.height_m, ".0f", "m"),
+            ("gravity", "gravity", site.gravity_m_s2, ".5f", "m/s²"),
+            ("declination", "declination", site.declination_deg, "+.2f", "deg"),
+        )
+        rows_of_site = [
+            tag(
+                "tr",
+                tag("td", words),
+                tag(
+                    "td",
+                    *(["unknown"] if value is None else [number(value, form), f" {unit}"]),
+                    data_key=f"site.{key}",
+                ),
+            )
+            for words, key, value, form, unit in facts
+        ]
+        parts.append(tag("table", *rows_of_site))
+        parts.append(tag("p", f"Place from: {site.source or 'nobody'}.", class_="soft"))
+    return tag("section", *parts)
+
+
+def _angle(value: float | None, sigma: float | None, sign: str) -> Markup:
+    if value is None:
+        return join("unknown")
+    if sigma is None:
+        return join(number(value, f"{sign}.2f"), " deg")
+    shown, width = with_sigma(value, sigma, 1.0, sign)
+    return join(shown, " ± ", width, " deg")
+
+
+# ------------------------------------------------------------------------------------------ Allan deviation, drift
+
+
+def _allan(material: Material) -> Markup:
+    parts: list[Child] = [tag("h2", "Allan deviation")]
+    trace = material.trace
+    if trace is None:
+        parts.append(card("", f"Not shown: {material.no_trace}"))
+        return tag("section", *parts)
+    shown: list[Child] = []
+    parts.append(
+        tag(
+            "p",
+            "How much the mean over so many seconds still scatters. Along the dotted line it is white noise, which"
+            " averaging takes away; below the dashed floor the sensor's profile promises nothing.",
+            class_="soft",
+        )
+    )
+    for imu in trace.imus[:MAX_IMUS]:
+        figures = [figure for triad in TRIADS if (figure := allan_figure(trace, imu, triad)) is not None]
+        if figures:
+            shown.append(tag("div", *figures, class_="pairs"))
+        else:
+            shown.append(card("", f"IMU {imu.name}: too few still seconds."))
+    parts += shown
+    parts.append(svg.legend(*zip(CLASSES, AXES, strict=True), ("white", "white noise"), ("floor", "sensor's floor")))
+    return tag("section", *parts)
+
+
+def _drift(material: Material) -> Markup:
+    record = material.record
+    names = [imu.name for imu in record.imus[:MAX_IMUS]] or list(
+        dict.fromkeys(imu.name for _, one in material.earlier for imu in one.imus)
+    )[:MAX_IMUS]
+    parts: list[Child] = [tag("h2", "Biases up to now")]
+    for name in names:
+        figures: list[Child] = []
+        for triad in TRIADS:
+            points = history(material.earlier, name, triad)
+            if len(points) < 2:
+                continue
+            heading = f"{name} {NAMES[triad].lower()}"
+            figures += [
+                tag(
+                    "div",
+                    tag("h3", f"{NAMES[triad]} against {against}"),
+                    drift(points, triad, against, name=heading, this=material.number)
+                    or card("", f"No {against} is known of them."),
+                )
+                for against in ("time", "temperature")
+            ]
+        if figures:
+            parts += [tag("h3", f"IMU {name}"), tag("div", *figures, class_="pairs")]
+    if len(parts) == 1:
+        parts.append(card("", "Fewer than two finished calibrations: nothing to compare with yet."))
+    elif record.state == "done":
+        parts.append(tag("p", "The ring is this calibration.", class_="soft"))
+    return tag("section", *parts)

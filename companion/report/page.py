@@ -1,0 +1,234 @@
+"""The frame of every page: style, head, and parts that several pages share."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from companion import __version__
+from companion.calibration.allan import NoiseProfile
+from companion.calibration.record import Arming, Record
+from companion.physics.units import DEG_H, MG
+from companion.report import svg
+from companion.report.advice import advice
+from companion.report.analysis import Point, Triad, clock_is_sound, slope
+from companion.report.markup import Child, Markup, join, number, tag
+
+UNITS: Final[Mapping[Triad, tuple[float, str]]] = {"gyro": (DEG_H, "deg/h"), "accel": (MG, "mg")}
+NAMES: Final[Mapping[Triad, str]] = {"gyro": "Gyro", "accel": "Accelerometer"}
+TRIADS: Final[tuple[Triad, ...]] = ("gyro", "accel")
+AXES: Final = ("x", "y", "z")
+CLASSES: Final = ("sx", "sy", "sz")
+MAX_WARNINGS: Final = 40
+MAX_IMUS: Final = 4
+"""Three of an autopilot and our own; more are said, not shown: a page stays below half a megabyte."""
+
+Profiles = Mapping[str, NoiseProfile]
+"""By the name of the IMU."""
+
+# No script, nothing fetched, nothing sent: what is not inline does not exist.
+_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+
+_STYLE: Final = Markup("""
+:root{color-scheme:light dark;--bg:#fff;--fg:#000;--soft:#4a4a4a;--rule:#b0b0b0;--card:#f3f3f0;
+--x:#0060a8;--y:#c04a00;--z:#00724f;--bad:#b00020;--good:#00603c;--warn:#7a4b00;--band:#dfe8f2}
+@media(prefers-color-scheme:dark){:root{--bg:#0d0d0d;--fg:#fff;--soft:#c4c4c4;--rule:#5a5a5a;--card:#1d1d1f;
+--x:#6cc0ff;--y:#ffab4d;--z:#3fe0ad;--bad:#ff8a8a;--good:#5fe3a1;--warn:#ffcf70;--band:#22303f}}
+*{box-sizing:border-box}html{-webkit-text-size-adjust:100%}
+body{margin:0 auto;padding:12px;max-width:980px;background:var(--bg);color:var(--fg);
+font:16px/1.45 system-ui,sans-serif;overflow-wrap:anywhere}
+h1{font-size:1.45rem;margin:.2em 0}h2{font-size:1.2rem;margin:1.6em 0 .4em;border-bottom:2px solid var(--fg)}
+h3{font-size:1.05rem;margin:1.2em 0 .3em}p{margin:.4em 0}ul{margin:.3em 0;padding-left:1.2em}li{margin:.35em 0}
+.soft,figcaption{color:var(--soft);font-size:.92rem}
+.state{display:inline-block;padding:.1em .6em;border:3px solid;border-radius:6px;font-weight:800;letter-spacing:.04em}
+.done{color:var(--good)}.failed{color:var(--bad)}.cancelled{color:var(--warn)}
+.lead{font-size:1.1rem;font-weight:600}
+.card{background:var(--card);border-left:5px solid var(--rule);padding:.5em .8em;margin:.6em 0}
+.card.alarm{border-color:var(--bad)}.card.caution{border-color:var(--warn)}.card.fine{border-color:var(--good)}
+.todo{font-weight:600}
+.pairs h3{margin-top:.7em}.setting{table-layout:fixed}.setting .name td{border:0;text-align:left;padding-top:.6em}
+.setting .values td{padding-top:0;text-align:left}
+.no{white-space:nowrap;overflow-wrap:normal;width:3.5em}
+small{display:block;color:var(--soft);font-size:.82rem}.setting td{font-size:.97rem}
+.pairs{display:grid;
+grid-template-columns:repeat(auto-fit,minmax(min(100%,400px),1fr));gap:0 28px;align-items:start}
+figure{margin:.5em 0;max-width:560px}svg{display:block;width:100%;height:auto}
+svg.key{display:inline-block;width:24px;height:16px}
+table{border-collapse:collapse;width:100%;max-width:640px;font-variant-numeric:tabular-nums}
+th,td{padding:.32em .3em;border-bottom:1px solid var(--rule);text-align:right;vertical-align:top}
+th{font-size:.88rem;color:var(--soft);font-weight:600}th:first-child,td:first-child{text-align:left}
+td.left,th.left{text-align:left}.mono{font-family:ui-monospace,monospace;font-size:.92rem}
+.legend span{display:inline-flex;align-items:center;margin-right:1em;font-size:.92rem}
+text{font:13px system-ui,sans-serif;fill:var(--fg)}.mid{text-anchor:middle}.end{text-anchor:end}
+.label{font-weight:600}.halo{paint-order:stroke;stroke:var(--bg);stroke-width:4px}
+.note{font-size:12px;paint-order:stroke;stroke:var(--bg);stroke-width:4px}
+.frame{fill:none;stroke:var(--fg);stroke-width:1.2}.grid{stroke:var(--rule);stroke-width:.6;fill:none}
+.band{fill:var(--band)}.sx{color:var(--x)}.sy{color:var(--y)}.sz{color:var(--z)}
+.dot{fill:none;stroke:currentColor;stroke-width:7.2;stroke-linecap:round}
+.mark{fill:currentColor;stroke:none}.bar{fill:none;stroke:currentColor;stroke-width:1.6}
+.curve{fill:none;stroke:currentColor;stroke-width:1.4}.stroke{fill:none;stroke:currentColor;stroke-width:2.2}
+.bad{color:var(--bad)}.ok{color:var(--good)}.warn{color:var(--warn)}
+.use{color:var(--fg)}.mark.stat{color:var(--fg);fill:var(--bg);stroke:var(--fg);stroke-width:1.8}
+.ring{fill:none;stroke:var(--fg);stroke-width:2}
+.floor{fill:none;stroke:var(--fg);stroke-width:1.8;stroke-dasharray:7 4}
+.white{fill:none;stroke:var(--fg);stroke-width:1.4;stroke-dasharray:2 3}
+.fit{fill:none;stroke:var(--soft);stroke-width:1.6;stroke-dasharray:7 4}
+.still{fill:var(--good)}.moving{fill:var(--bad)}.fault{fill:none;stroke:var(--bad);stroke-width:2}
+.unknown{fill:var(--rule)}.used{fill:var(--fg)}
+@media print{:root{color-scheme:light;--bg:#fff;--fg:#000}body{max-width:none}figure,.card{break-inside:avoid}}
+""")
+
+
+def page(title: str, now: datetime.datetime, *body: Child) -> str:
+    """A whole file.
+
+    Args:
+        title: of the tab.
+        now: when it was made, for the foot.
+        body: the parts.
+    """
+    foot = tag(
+        "p",
+        f"Made {now:%Y-%m-%d %H:%M} UTC by companion {__version__} from the records on this computer. All axes:"
+        " x forward, y right, z down. Times: UTC by the companion's clock.",
+        class_="soft",
+    )
+    head = join(
+        Markup('<meta charset="utf-8">'),
+        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        tag("meta", http_equiv="Content-Security-Policy", content=_POLICY),
+        tag("meta", name="color-scheme", content="light dark"),
+        tag("title", title),
+        tag("style", _STYLE),
+    )
+    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>{join(*body, foot)}</body></html>\n'
+
+
+def card(kind: str, *children: Child) -> Markup:
+    """A box; kind "alarm", "caution", "fine" or ""."""
+    return tag("div", *children, class_=f"card {kind}".strip())
+
+
+def moment(iso: str) -> str:
+    """A time as people read it."""
+    return f"{iso[:10]} {iso[11:16]} UTC" if len(iso) >= 16 else iso
+
+
+def with_advice(words: str, kind: str) -> Markup:
+    """A warning or reason, and what to do about it."""
+    what = advice(words)
+    return card(kind, tag("p", words), tag("p", f"What to do: {what}", class_="todo") if what else None)
+
+
+def damaged(problems: Sequence[str]) -> Markup | None:
+    """What could not be read."""
+    if not problems:
+        return None
+    more = f" and {len(problems) - 10} more" if len(problems) > 10 else ""
+    return card(
+        "caution",
+        tag("p", "These files cannot be read and were skipped:"),
+        tag("ul", *(tag("li", problem) for problem in problems[:10])),
+        tag("p", f"{more.strip()}. " if more else "", "They can be removed; nothing else depends on them."),
+    )
+
+
+def with_sigma(value: float, sigma: float, unit: float, sign: str = "+") -> tuple[Markup, Markup]:
+    """A figure and its sigma, written to the second digit of sigma."""
+    shown = abs(sigma / unit)
+    digits = min(max(1 - math.floor(math.log10(shown)), 0), 5) if 0 < shown < 1e9 else 1
+    return number(value, f"{sign}.{digits}f", value / unit), number(sigma, f".{digits}f", sigma / unit)
+
+
+def drift(
+    points: Sequence[Point], triad: Triad, against: str, *, name: str, this: int | None = None, height: float = 84.0
+) -> Markup | None:
+    """Three plots, one an axis, of a bias against "time" or "temperature"; None where there is nothing to show."""
+    unit, unit_name = UNITS[triad]
+    by_time = against == "time"
+    numbered = by_time and not clock_is_sound(points)
+    if numbered:
+        shown = [(float(point.number), point) for point in points]
+    else:
+        given = [(point.unix_s if by_time else point.temperature_degc, point) for point in points]
+        shown = [(x, point) for x, point in given if x is not None]
+    if not shown:
+        return None
+    places = [x for x, _ in shown]
+    if not by_time:
+        across, label = svg.linear(places, least=1.0), "IMU temperature, degC"
+    elif numbered:
+        across, label = svg.linear(places, least=2.0), "number of the calibration (clock not sound)"
+    else:
+        across, label = svg.times(places), "time (UTC)"
+    plots: list[Markup] = []
+    for axis in range(3):
+        ends = [
+            ((point.bias[axis] - point.sigma_use[axis]) / unit, (point.bias[axis] + point.sigma_use[axis]) / unit)
+            for _, point in shown
+        ]
+        up = svg.linear([end for pair in ends for end in pair], ticks=3)
+        plot = svg.Plot(
+            across,
+            up,
+            name=f"{name} {AXES[axis]}: bias against {against}",
+            height=height,
+            x_label=label if axis == 2 else None,
+            y_label=f"{AXES[axis]}, {unit_name}",
+        )
+        fit = None if by_time else slope([point for _, point in shown], axis)
+        if fit is not None:
+            line = [(x, (fit.at_mean + fit.per_k * (x - fit.mean_degc)) / unit) for x in (min(places), max(places))]
+            plot.line(line, "fit")
+        plot.points([(x, point.bias[axis] / unit) for x, point in shown], CLASSES[axis], spans=ends)
+        for x, point in shown:
+            if point.number == this:
+                centre = plot.at(x, point.bias[axis] / unit)
+                plot.draw(tag("circle", cx=f"{centre[0]:.1f}", cy=f"{centre[1]:.1f}", r=8, class_="ring"))
+        plots.append(plot.svg())
+    return tag("figure", *plots, _caption(points, shown, triad, against))
+
+
+def _caption(points: Sequence[Point], shown: Sequence[tuple[float, Point]], triad: Triad, against: str) -> Markup:
+    unit, unit_name = UNITS[triad]
+    words: list[Child] = []
+    if against == "temperature":
+        fits = [slope([point for _, point in shown], axis) for axis in range(3)]
+        if all(fits):
+            per_k = ", ".join(
+                f"{axis} {fit.per_k / unit:+.2g} ± {fit.sigma_per_k / unit:.1g}"
+                for axis, fit in zip(AXES, fits, strict=True)
+                if fit is not None
+            )
+            words.append(f"Dashed: the best line, {unit_name} per K: {per_k}. ")
+        else:
+            words.append("A line is drawn from 5 calibrations over 5 K on. ")
+        if len(shown) < len(points):
+            words.append(f"{len(points) - len(shown)} without a temperature are left out. ")
+    elif not clock_is_sound(points):
+        words.append("The companion's clock went back in between, so these stand in their order, not by time. ")
+    return tag("figcaption", *words, "Bars: one sigma for the next minutes.")
+
+
+def arming_items(armings: Sequence[Arming]) -> Markup:
+    """Armings as a list, in the order given."""
+    items = []
+    for arming in armings:
+        bad = arming.state == "uncalibrated"
+        items.append(
+            tag(
+                "li",
+                tag("strong", f"{moment(arming.armed_at)}: "),
+                tag("strong", "UNCALIBRATED: ", class_="bad") if bad else None,
+                f"{arming.state}: " if arming.state == "checked" else None,
+                arming.reason,
+            )
+        )
+    return tag("ul", *items)
+
+
+def written_count(record: Record) -> int:
+    """How many parameters a calibration has changed."""
+    return sum(len(imu.written) for imu in record.imus)

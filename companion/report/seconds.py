@@ -1,0 +1,163 @@
+"""Figures from the seconds of a calibration: verdicts, and Allan deviation."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from companion.calibration.trace import ImuTrace, Trace
+from companion.report import svg
+from companion.report.analysis import Run, Triad, allan, runs
+from companion.report.markup import Child, Markup, tag
+from companion.report.page import AXES, CLASSES, NAMES, UNITS, card
+
+MAX_SOURCES: Final = 8
+MAX_RUNS: Final = 300
+MAX_EVENTS: Final = 15
+_ROW: Final = 26.0
+_DODGE: Final = (0.94, 1.0, 1.064)
+"""Factors on tau, so that the bars of three axes do not hide one another."""
+
+
+def stillness(trace: Trace | None, no_trace: str) -> Markup:
+    """Every second's verdict of every source."""
+    parts: list[Child] = [tag("h2", "Was it still?")]
+    if trace is None:
+        parts.append(card("", f"Not shown: {no_trace}"))
+        return tag("section", *parts)
+    if not trace.second:
+        parts.append(card("", "Not one second was judged: no sensor sent anything."))
+        return tag("section", *parts)
+    if trace.cut:
+        parts.append(card("caution", f"Only the last {len(trace.second)} s are kept; what came before is missing."))
+    sources = [(verdict, runs(trace, verdict)) for verdict in trace.verdicts[:MAX_SOURCES]]
+    across = svg.linear([float(trace.second[0]), trace.second[-1] + 1.0], least=5.0)
+    last = len(sources)
+    ticks = [(last - 1.0 - k, _short(verdict.name)) for k, (verdict, _) in enumerate(sources)]
+    plot = svg.Plot(
+        across,
+        svg.Axis(-0.6, last + 0.2, (*ticks, (float(last) - 0.15, "used"))),
+        name="stillness second by second",
+        height=_ROW * (last + 1),
+        x_label="seconds since it was asked for",
+        left=84.0,
+    )
+    if trace.measured is not None:
+        plot.band(trace.measured[0], trace.measured[1])
+        for first, end in _used(trace):
+            plot.draw(_block(plot, first, end, last - 0.15, 6.0, "used"))
+    for k, (_, found) in enumerate(sources):
+        for run in found[:MAX_RUNS]:
+            height = {"still": 5.0, "unknown": 2.0}.get(run.state, 18.0)
+            plot.draw(_block(plot, run.first, run.last + 1, last - 1.0 - k, height, run.state))
+    parts.append(
+        tag(
+            "figure",
+            plot.svg(),
+            svg.legend(("still", "still"), ("moving", "moved"), ("fault", "sensor fault"), ("unknown", "no verdict")),
+            tag("figcaption", _summary(trace)),
+        )
+    )
+    parts.append(_events([run for _, found in sources for run in found]))
+    return tag("section", *parts)
+
+
+def _block(plot: svg.Plot, first: float, end: float, row: float, height: float, class_: str) -> Markup:
+    left, middle = plot.at(first, row)
+    return svg.strip(left, plot.at(end, row)[0], middle, height, class_)
+
+
+def _used(trace: Trace) -> list[tuple[int, int]]:
+    """Seconds that the result is the mean of, joined; the second of each pair is not included."""
+    first, last = trace.measured or (0, 0)
+    found: list[tuple[int, int]] = []
+    for second, good in zip(trace.second, trace.good, strict=True):
+        if good and first <= second < last:
+            if found and found[-1][1] == second:
+                found[-1] = (found[-1][0], second + 1)
+            else:
+                found.append((second, second + 1))
+    return found
+
+
+def _summary(trace: Trace) -> str:
+    if trace.measured is None:
+        return f"{sum(trace.good)} of {len(trace.second)} s were still for all sensors. No result came of them."
+    used = sum(end - first for first, end in _used(trace))
+    first, last = trace.measured
+    rejected = last - first - used
+    words = f"The result is the mean of {used} still seconds, from {first} s to {last} s"
+    return words + (f"; {rejected} in between were left out." if rejected else ".")
+
+
+def _events(found: list[Run]) -> Markup | None:
+    events = sorted((run for run in found if run.state in {"moving", "fault"}), key=lambda run: run.first)
+    if not events:
+        return None
+    more = len(events) - MAX_EVENTS
+    return tag(
+        "ul",
+        *(tag("li", tag("strong", _when(run)), _said(run)) for run in events[:MAX_EVENTS]),
+        tag("li", f"and {more} more") if more > 0 else None,
+    )
+
+
+def _said(run: Run) -> str:
+    """What its first second said, without the length of a second where there were more."""
+    return run.words if run.first == run.last else run.words.replace(" was silent for a second", " was silent")
+
+
+def _when(run: Run) -> str:
+    return f"{run.first} s: " if run.first == run.last else f"{run.first} s to {run.last + 1} s: "
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= 10 else name[:9] + "…"
+
+
+def allan_figure(trace: Trace, imu: ImuTrace, triad: Triad) -> Markup | None:
+    """Allan deviation of one triad against the averaging time; None where too little was still."""
+    unit, unit_name = UNITS[triad]
+    title = tag("h3", f"{imu.name}: {NAMES[triad].lower()}, {unit_name}")
+    found = allan(trace, imu, triad)
+    if found is None or not found.points:
+        return None
+    model = imu.gyro_noise if triad == "gyro" else imu.accel_noise
+    step = imu.gyro_step_rad_s if triad == "gyro" else imu.accel_step_m_s2
+    points = [point for point in found.points if max(point.deviation) > 0.0]
+    if not points:
+        return tag("div", title, card("", "The readings never changed: too coarse for an Allan deviation."))
+    # White noise through the quadratic mean of the axes at 1 s.
+    first = points[0]
+    white = math.sqrt(sum(value**2 for value in first.deviation) / 3.0) * math.sqrt(first.tau_s)
+    longest = points[-1].tau_s
+    values = [value / unit for point in points for value in (*point.low, *point.high) if value > 0.0]
+    across = svg.logarithmic([0.9, float(max(longest, 2))])
+    up = svg.logarithmic([*values, model.floor / unit, white / math.sqrt(longest) / unit])
+    plot = svg.Plot(across, up, name=f"{imu.name} {triad}: Allan deviation", height=150.0, x_label="averaging time, s")
+    plot.level(model.floor / unit, "floor", "floor")
+    plot.line([(tau, white / math.sqrt(tau) / unit) for tau in (1.0, float(longest))], "white")
+    for axis, (class_, dodge) in enumerate(zip(CLASSES, _DODGE, strict=True)):
+        shown = [point for point in points if point.deviation[axis] > 0.0]
+        places = [(point.tau_s * dodge, point.deviation[axis] / unit) for point in shown]
+        spans = [(point.low[axis] / unit, point.high[axis] / unit) for point in shown]
+        plot.line(places, f"curve {class_}")
+        plot.points(places, class_, spans=spans)
+    words = f"{found.seconds} still seconds; N = {white / unit:.2g} {unit_name}·√s; bars: about one sigma."
+    if not found.of_result:
+        words += " There was no result: this is the longest still stretch."
+    if step > 0.0:
+        words += f" The telemetry comes in steps of {step / unit:.2g} {unit_name}: it adds noise of its own."
+    rows = [
+        tag(
+            "tr",
+            tag("td", f"{point.tau_s} s"),
+            *(
+                tag("td", f"{value / unit:.3g}", data_key=f"{imu.name}.{triad}.adev.{point.tau_s}.{axis}")
+                for axis, value in zip(AXES, point.deviation, strict=True)
+            ),
+        )
+        for point in points
+    ]
+    table = tag("details", tag("summary", "Figures"), tag("table", *rows))
+    return tag("figure", title, plot.svg(), tag("figcaption", words), table)

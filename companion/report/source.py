@@ -1,0 +1,147 @@
+"""What a page is made of, read from the storage folder; nothing is changed there, and no daemon is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from companion.calibration.record import Arming, Record
+from companion.errors import StorageError
+from companion.report import calibration_page, history_page
+from companion.report.page import Profiles
+from companion.storage.records import Entry, RecordStore
+
+MAX_EARLIER: Final = 60
+"""Calibrations in the drift plots of the page of one."""
+MAX_HISTORY: Final = 200
+"""On the page over the history: it stays below half a megabyte."""
+
+
+class Storage:
+    """One storage folder, read once.
+
+    Raises:
+        StorageError: there is nothing to make a page of, and why.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._store = RecordStore(directory)
+        records = directory / "records"
+        try:
+            # Else a folder that only root may enter looks like one that is not there.
+            next(iter(records.iterdir()), None)
+        except FileNotFoundError:
+            raise StorageError(f"no calibration yet: there is no {records}") from None
+        except OSError as error:
+            hint = "; run it with sudo" if isinstance(error, PermissionError) else ""
+            raise StorageError(f"{records}: cannot be read: {error.strerror}{hint}") from error
+        self.entries = list(self._store.entries())[::-1]
+        """Oldest first."""
+        self.damaged = [f"{entry.path.name}: {entry.problem}" for entry in self.entries if entry.record is None]
+        if not self.entries:
+            raise StorageError(f"no calibration yet: {records} is empty")
+        if not any(entry.record for entry in self.entries):
+            raise StorageError(f"no calibration can be read: {'; '.join(self.damaged[:3])}")
+        self._armings = self._read_armings(directory / "armings.json")
+
+    def _read_armings(self, path: Path) -> list[Arming]:
+        try:
+            return msgspec.json.decode(path.read_bytes(), type=list[Arming])
+        except FileNotFoundError:
+            return []
+        except (OSError, ValueError, msgspec.MsgspecError) as error:
+            self.damaged.append(f"{path.name}: {error}")
+            return []
+
+    def calibration(self, wanted: str | None, profiles: Profiles) -> calibration_page.Material:
+        """One calibration.
+
+        Args:
+            wanted: its number, or the beginning of its time; None: the latest.
+            profiles: of today's configuration.
+
+        Raises:
+            StorageError: there is none of that number or time, or it cannot be read.
+        """
+        entry, record = self._find(wanted)
+        trace, why = None, "this record has no trace of its seconds (it is older, or its trace made room)."
+        problems = list(self.damaged)
+        try:
+            trace = self._store.trace(entry)
+        except StorageError as error:
+            why = f"{error}."
+            problems.append(str(error))
+        earlier = [
+            (one.number, one.record)
+            for one in self.entries
+            if one.record is not None and one.number <= entry.number and one.record.system_id == record.system_id
+        ]
+        return calibration_page.Material(
+            number=entry.number,
+            record=record,
+            trace=trace,
+            no_trace="" if trace is not None else why,
+            earlier=earlier[-MAX_EARLIER:],
+            armings=[arming for arming in self._armings if arming.calibration == record.started_at],
+            profiles=profiles,
+            damaged=problems,
+        )
+
+    def history(self, vehicle: int | None, limit: int) -> history_page.Material:
+        """All calibrations of one aircraft, and those that failed before any was heard.
+
+        Args:
+            vehicle: its system id; None: that of the latest calibration that knew it.
+            limit: at most so many, the latest.
+
+        Raises:
+            StorageError: there is none of this aircraft.
+        """
+        readable = [(entry.number, entry.record) for entry in self.entries if entry.record is not None]
+        known = list(
+            dict.fromkeys(record.system_id for _, record in reversed(readable) if record.system_id is not None)
+        )
+        if vehicle is None:
+            vehicle = known[0] if known else None
+        elif vehicle not in known:
+            there = ", ".join(map(str, known)) or "none that was heard"
+            raise StorageError(f"no calibration of vehicle {vehicle} (there are: {there})")
+        own = [(number, record) for number, record in readable if record.system_id in (vehicle, None)]
+        shown = own[-min(limit, MAX_HISTORY) :]
+        return history_page.Material(
+            vehicle=vehicle,
+            records=shown,
+            left_out=len(own) - len(shown),
+            others=[other for other in known if other != vehicle],
+            armings=self._armings_of(vehicle, own, readable),
+            damaged=self.damaged,
+        )
+
+    def _armings_of(
+        self, vehicle: int | None, own: Sequence[tuple[int, Record]], every: Sequence[tuple[int, Record]]
+    ) -> list[Arming]:
+        """An arming names a calibration, not a vehicle: left out is what is known to be another's."""
+        ours = {record.started_at for _, record in own}
+        others = {record.started_at for _, record in every} - ours
+        return [arming for arming in self._armings if arming.calibration not in others]
+
+    def _find(self, wanted: str | None) -> tuple[Entry, Record]:
+        if wanted is None:
+            return next((entry, entry.record) for entry in reversed(self.entries) if entry.record is not None)
+        if wanted.isdecimal():
+            found = [entry for entry in self.entries if entry.number == int(wanted)]
+            if found and found[0].record is None:
+                raise StorageError(f"{found[0].path}: {found[0].problem}")
+        else:
+            begins = wanted.strip().replace(" ", "T", 1)
+            found = [entry for entry in self.entries if entry.record and entry.record.started_at.startswith(begins)]
+        if len(found) > 1:
+            numbers = ", ".join(str(entry.number) for entry in found[-5:])
+            raise StorageError(f"{len(found)} calibrations begin with {wanted!r}; the latest are number {numbers}")
+        if not found or found[0].record is None:
+            first, last = self.entries[0].number, self.entries[-1].number
+            raise StorageError(f"no calibration {wanted!r}; there are number {first} to {last} (companion history)")
+        return found[0], found[0].record

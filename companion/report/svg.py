@@ -1,0 +1,288 @@
+"""A small plotter: inline SVG, sized for a phone, coloured by the page's style sheet.
+
+Everything is drawn in classes (`sx`, `sy`, `sz`, ...), so that light, dark and print are the style sheet's business,
+and series differ by the shape of their markers as well, so that nobody depends on colours.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+
+from companion.report.markup import Markup, tag
+
+WIDTH: Final = 360.0
+LEFT: Final = 58.0
+_RIGHT, _TOP, _TITLE = 12.0, 8.0, 18.0
+_TICKS_HEIGHT, _LABEL_HEIGHT = 20.0, 16.0
+_MARK: Final = 3.6
+_MOST: Final = 1e12
+
+Pair = tuple[float, float]
+
+
+class Axis(msgspec.Struct, frozen=True):
+    """A range of values, linear or logarithmic, with the places that are written at it."""
+
+    low: float
+    high: float
+    ticks: tuple[tuple[float, str], ...]
+    log: bool = False
+
+    def share(self, value: float) -> float:
+        """0 at the low end, 1 at the high end; what lies outside is moved to the end."""
+        if self.log:
+            value, low, high = math.log(max(value, self.low)), math.log(self.low), math.log(self.high)
+        else:
+            low, high = self.low, self.high
+        return min(max((value - low) / (high - low), 0.0), 1.0)
+
+
+def linear(values: Sequence[float], *, ticks: int = 4, least: float = 0.0) -> Axis:
+    """A linear axis around the values.
+
+    Args:
+        values: what must fit.
+        ticks: about so many.
+        least: the range is at least this wide: a scatter of nothing is not blown up to fill the plot.
+    """
+    known = [value for value in values if abs(value) < _MOST] or [0.0]
+    low, high = min(known), max(known)
+    width = max(high - low, least, 1e-4 * max(abs(low), abs(high)), 1e-9)
+    middle = (low + high) / 2.0
+    low, high = middle - 0.56 * width, middle + 0.56 * width
+    step = _nice((high - low) / ticks)
+    digits = max(0, -math.floor(math.log10(step) + 1e-9))
+    first = math.ceil(low / step - 1e-9)
+    places = [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
+    return Axis(low, high, tuple((place, f"{place:.{digits}f}") for place in places))
+
+
+def logarithmic(values: Sequence[float]) -> Axis:
+    """A logarithmic axis around the positive values, marked at 1, 2 and 5 where there is room."""
+    known = [value for value in values if 1e-12 < value < _MOST] or [1.0]
+    low, high = min(known) / 1.25, max(known) * 1.25
+    decades = math.log10(high / low)
+    marks = (1.0, 2.0, 5.0) if decades < 2.2 else (1.0, 3.0) if decades < 3.2 else (1.0,)
+    places = [
+        mark * 10.0**k
+        for k in range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+        for mark in marks
+        if low <= mark * 10.0**k <= high
+    ]
+    return Axis(low, high, tuple((place, f"{place:g}") for place in places), log=True)
+
+
+def times(values: Sequence[float]) -> Axis:
+    """An axis of UTC times, in seconds since 1970."""
+    steps = [60, 120, 300, 600, 1800, 3600, 7200, 3 * 3600, 6 * 3600, 12 * 3600]
+    steps += [86400 * days for days in (1, 2, 4, 7, 14, 30, 61, 122, 365, 1461)]
+    plain = linear(values, least=60.0)
+    span = plain.high - plain.low
+    step = next((step for step in steps if span / step <= 4.6), math.ceil(span / 4))
+    form = "%H:%M" if step < 86400 else "%-d %b" if span < 300 * 86400 else "%b %Y"
+    first = math.ceil(plain.low / step)
+    places = [k * step for k in range(first, math.floor(plain.high / step) + 1)]
+    ticks = [(float(place), datetime.datetime.fromtimestamp(place, tz=datetime.UTC).strftime(form)) for place in places]
+    return Axis(plain.low, plain.high, tuple(ticks))
+
+
+def _nice(step: float) -> float:
+    power = 10.0 ** math.floor(math.log10(step))
+    return power * next(mark for mark in (1.0, 2.0, 5.0, 10.0) if step <= mark * power * 1.25)
+
+
+class Plot:
+    """One frame with axes; what is drawn first lies below.
+
+    Args:
+        x: the horizontal axis.
+        y: the vertical one.
+        name: what a screen reader says.
+        height: of the frame, in units of which the whole is 360 wide.
+        x_label: below the ticks; None: no ticks are written either, for a plot with another one below it.
+        y_label: above the frame.
+        left: room for what is written at the vertical axis.
+    """
+
+    def __init__(
+        self,
+        x: Axis,
+        y: Axis,
+        *,
+        name: str,
+        height: float = 96.0,
+        x_label: str | None = None,
+        y_label: str = "",
+        left: float = LEFT,
+    ) -> None:
+        self._left, self._top = left, _TOP + (_TITLE if y_label else 0.0)
+        self._x, self._y, self._name, self._height = x, y, name, height
+        self._x_label, self._y_label = x_label, y_label
+        self._below: list[Markup] = []
+        self._parts: list[Markup] = []
+
+    def at(self, x: float, y: float) -> Pair:
+        """Where a point lies."""
+        across = self._left + self._x.share(x) * (WIDTH - self._left - _RIGHT)
+        return across, self._top + (1.0 - self._y.share(y)) * self._height
+
+    def band(self, first: float, last: float, class_: str = "band") -> None:
+        """Shade what lies between two places of the horizontal axis."""
+        left, right = self.at(first, self._y.low)[0], self.at(last, self._y.low)[0]
+        self._below.append(
+            tag("rect", x=_n(left), y=_n(self._top), width=_n(right - left), height=_n(self._height), class_=class_)
+        )
+
+    def line(self, points: Sequence[Pair], class_: str) -> None:
+        """Join points."""
+        if len(points) > 1:
+            self._below.append(_path("M" + "L".join(_xy(*self.at(*point)) for point in points), class_))
+
+    def level(self, y: float, class_: str, words: str = "") -> None:
+        """A line across, with words at its left end."""
+        if not self._y.low <= y <= self._y.high:
+            return
+        _, height = self.at(self._x.low, y)
+        self._below.append(_path(f"M{_n(self._left)} {_n(height)}H{_n(WIDTH - _RIGHT)}", class_))
+        if words:
+            # Above the line, but never above the frame.
+            place = height - 4.0 if height > self._top + 16.0 else height + 13.0
+            self._parts.append(tag("text", words, x=_n(self._left + 4.0), y=_n(place), class_="note"))
+
+    def points(
+        self, points: Sequence[Pair], class_: str, *, spans: Sequence[Pair] = (), size: float = 1.0, shape: str = ""
+    ) -> None:
+        """Markers, each with an upright bar where `spans` gives its ends.
+
+        Args:
+            points: where.
+            class_: `sx`, `sy`, `sz` or another of the style sheet.
+            spans: lower and upper end of every point's bar.
+            size: over the usual one.
+            shape: "circle", "square", "triangle", "cross"; by the class if left out.
+        """
+        if not points:
+            return
+        shape = shape or {"sx": "circle", "sy": "square", "sz": "triangle"}.get(class_, "circle")
+        if spans:
+            bars: list[str] = []
+            for (x, _), (low, high) in zip(points, spans, strict=True):
+                across, bottom = self.at(x, low)
+                bars.append(f"M{_n(across)} {_n(bottom)}V{_n(self.at(x, high)[1])}")
+            self._parts.append(_path("".join(bars), f"bar {class_}"))
+        if shape == "circle" and size == 1.0:
+            # A round end of a line without length: a quarter of the characters that a circle takes.
+            self._parts.append(_path("".join(f"M{_xy(*self.at(*point))}h.01" for point in points), f"dot {class_}"))
+            return
+        marks = "".join(_marker(shape, *self.at(*point), _MARK * size) for point in points)
+        self._parts.append(_path(marks, f"{'stroke' if shape == 'cross' else 'mark'} {class_}"))
+
+    def words(self, x: float, y: float, words: str, class_: str = "note") -> None:
+        """Words at a place."""
+        across, height = self.at(x, y)
+        self._parts.append(tag("text", words, x=_n(across), y=_n(height), class_=class_))
+
+    def draw(self, *parts: Markup) -> None:
+        """Anything else, on top."""
+        self._parts += parts
+
+    def svg(self) -> Markup:
+        """The element."""
+        bottom = self._top + self._height
+        whole = bottom + (_TICKS_HEIGHT + _LABEL_HEIGHT if self._x_label is not None else 6.0)
+        grid: list[Markup] = []
+        for place, label in self._x.ticks:
+            across = self.at(place, self._y.low)[0]
+            grid.append(_path(f"M{_n(across)} {_n(self._top)}V{_n(bottom)}", "grid"))
+            if self._x_label is not None:
+                grid.append(tag("text", label, x=_n(across), y=_n(bottom + 15.0), class_="mid"))
+        for place, label in self._y.ticks:
+            height = self.at(self._x.low, place)[1]
+            grid.append(_path(f"M{_n(self._left)} {_n(height)}H{_n(WIDTH - _RIGHT)}", "grid"))
+            grid.append(tag("text", label, x=_n(self._left - 6.0), y=_n(height + 4.5), class_="end"))
+        frame = tag(
+            "rect",
+            x=_n(self._left),
+            y=_n(self._top),
+            width=_n(WIDTH - self._left - _RIGHT),
+            height=_n(self._height),
+            class_="frame",
+        )
+        labels: list[Markup] = []
+        if self._x_label:
+            middle = (self._left + WIDTH - _RIGHT) / 2.0
+            labels.append(tag("text", self._x_label, x=_n(middle), y=_n(bottom + 31.0), class_="mid label"))
+        if self._y_label:
+            labels.append(tag("text", self._y_label, x=_n(self._left), y=_n(self._top - 6.0), class_="label"))
+        return tag(
+            "svg",
+            tag("title", self._name),
+            *grid,
+            frame,
+            *self._below,
+            *self._parts,
+            *labels,
+            viewBox=f"0 0 {_n(WIDTH)} {_n(whole)}",
+            role="img",
+        )
+
+
+def strip(left: float, right: float, middle: float, height: float, class_: str) -> Markup:
+    """A block from `left` to `right`, upright around `middle`; all in the plot's units."""
+    return tag(
+        "rect",
+        x=_n(left),
+        y=_n(middle - height / 2.0),
+        width=_n(max(right - left, 0.6)),
+        height=_n(height),
+        class_=class_,
+    )
+
+
+def legend(*entries: tuple[str, str]) -> Markup:
+    """Markers with words, of (class, words)."""
+    shapes = {"sx": "circle", "sy": "square", "sz": "triangle", "bad": "cross"}
+    parts = []
+    for class_, words in entries:
+        if class_ in {"floor", "white", "fit"}:
+            picture = _path("M1 8H23", class_)
+        elif class_ in shapes:
+            kind = "stroke" if shapes[class_] == "cross" else "mark"
+            picture = _path(_marker(shapes[class_], 12.0, 8.0, 5.0), f"{kind} {class_}")
+        elif class_ in {"stat", "use"}:
+            picture = _path(_marker("circle", 12.0, 8.0, 5.0), f"mark {class_}")
+        else:
+            picture = strip(2.0, 22.0, 8.0, 4.0 if class_ == "still" else 14.0, class_)
+        parts.append(tag("span", tag("svg", picture, viewBox="0 0 24 16", class_="key"), words))
+    return tag("p", *parts, class_="legend")
+
+
+def _path(course: str, class_: str) -> Markup:
+    """A path; its course is numbers of our own, of any length."""
+    return tag("path", d=Markup(course), class_=class_)
+
+
+def _marker(shape: str, x: float, y: float, r: float) -> str:
+    if shape == "square":
+        side = 1.8 * r
+        return f"M{_xy(x - side / 2, y - side / 2)}h{_n(side)}v{_n(side)}h{_n(-side)}z"
+    if shape == "triangle":
+        return f"M{_xy(x, y - 1.25 * r)}l{_xy(1.15 * r, 2.1 * r)}h{_n(-2.3 * r)}z"
+    if shape == "cross":
+        return f"M{_xy(x - r, y - r)}l{_xy(2 * r, 2 * r)}m{_xy(-2 * r, 0.0)}l{_xy(2 * r, -2 * r)}"
+    return f"M{_xy(x - r, y)}a{_n(r)} {_n(r)} 0 1 0 {_n(2 * r)} 0a{_n(r)} {_n(r)} 0 1 0 {_n(-2 * r)} 0"
+
+
+def _xy(x: float, y: float) -> str:
+    return f"{_n(x)} {_n(y)}"
+
+
+def _n(value: float) -> str:
+    """A tenth of a unit is a tenth of a pixel."""
+    found = f"{value:.1f}"
+    return found.removesuffix(".0") if found != "-0.0" else "0"

@@ -1,0 +1,205 @@
+"""Records and traces of an aircraft whose biases are known: what pages are made of."""
+
+from __future__ import annotations
+
+import datetime
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from companion.calibration.allan import noise_profile
+from companion.calibration.record import (
+    Arming,
+    ImuRecord,
+    Pose,
+    PoseSigma,
+    Record,
+    Site,
+    WrittenParameter,
+)
+from companion.calibration.trace import Axes, ImuTrace, Trace, VerdictTrace
+from companion.physics.units import DEG_H, MG
+from companion.storage.atomic import write_atomically
+from companion.storage.records import RecordStore
+
+FIRST = datetime.datetime(2026, 5, 1, 6, 30, tzinfo=datetime.UTC)
+GYRO_DEG_H = (162.234, 169.563, -98.289)
+ACCEL_MG = (2.4125, -2.1596, 0.89809)
+PER_K_DEG_H = (1.5, -0.8, 0.3)
+
+
+def _axes(values: object) -> Axes:
+    x, y, z = np.asarray(values, dtype=np.float64).tolist()
+    return x, y, z
+
+
+def imu_record(
+    name: str = "fc", seed: int = 0, temperature_degc: float | None = 25.0, *, written: bool = True
+) -> ImuRecord:
+    """One IMU, its bias moved by the temperature and by chance."""
+    rng = np.random.default_rng(seed)
+    warmer = 0.0 if temperature_degc is None else temperature_degc - 25.0
+    gyro = (np.add(GYRO_DEG_H, np.multiply(PER_K_DEG_H, warmer)) + rng.normal(0.0, 3.0, 3)) * DEG_H
+    accel = (np.array(ACCEL_MG) + rng.normal(0.0, 0.05, 3)) * MG
+    changes = {
+        f"INS_GYROFFS_{axis}": WrittenParameter(
+            before=0.00012345, after=float(np.float32(value)), read_back=float(np.float32(value)), outcome="verified"
+        )
+        for axis, value in zip("XYZ", gyro, strict=True)
+    } | {
+        f"INS_ACCOFFS_{axis}": WrittenParameter(
+            before=None if axis == "Z" else -0.0123456,
+            after=float(np.float32(value)),
+            read_back=float(np.float32(value)),
+            outcome="stored" if axis == "Z" else "verified",
+        )
+        for axis, value in zip("XYZ", accel, strict=True)
+    }
+    sigma_gyro, sigma_accel = np.array([3.4, 3.6, 3.5]) * DEG_H, np.array([0.11, 0.12, 0.05]) * MG
+    return ImuRecord(
+        name=name,
+        samples=3000,
+        temperature_degc=temperature_degc,
+        gyro_bias_rad_s=_axes(gyro),
+        gyro_sigma_stat_rad_s=_axes(sigma_gyro * 0.3),
+        gyro_sigma_use_rad_s=_axes(sigma_gyro),
+        accel_bias_m_s2=_axes(accel),
+        accel_sigma_stat_m_s2=_axes(sigma_accel * 0.08),
+        accel_sigma_use_m_s2=_axes(sigma_accel),
+        covariance=None,
+        residual_gyro_rad_s=_axes(gyro * 0.1) if written else None,
+        residual_accel_m_s2=_axes(accel * 0.1) if written else None,
+        written=changes if written else {},
+    )
+
+
+def record(
+    number: int = 0,
+    *,
+    state: str = "done",
+    reason: str = "sigma 3.6 deg/h, 0.12 mg",
+    temperature_degc: float | None = 25.0,
+    imus: tuple[ImuRecord, ...] | None = None,
+    system_id: int | None = 1,
+    started_at: str | None = None,
+    warnings: tuple[str, ...] = (),
+) -> Record:
+    """One calibration; number k began 5 hours after number k - 1."""
+    known = state == "done"
+    if imus is None:
+        fc = imu_record("fc", number, temperature_degc)
+        own = imu_record("own", number + 1000, temperature_degc, written=False)
+        imus = (fc, own) if known else ()
+    began = (FIRST + number * datetime.timedelta(hours=5)).isoformat(timespec="milliseconds")
+    return Record(
+        state=state,  # type: ignore[arg-type]
+        reason=reason,
+        warnings=warnings,
+        started_at=started_at or began,
+        duration_s=41.3,
+        pose=Pose(theta_deg=5.02, gamma_deg=-2.98, psi_deg=40.3, sigma_deg=PoseSigma(theta=0.005, gamma=0.005, psi=1.1))
+        if known
+        else None,
+        site=Site(latitude_deg=40.0, height_m=50.0, gravity_m_s2=9.80154, declination_deg=-7.11, source="configuration")
+        if known
+        else None,
+        imus=imus,
+        system_id=system_id,
+    )
+
+
+def white_trace(
+    of: Record,
+    seconds: int = 40,
+    *,
+    gyro_deg_h: float = 7.0,
+    accel_mg: float = 0.05,
+    seed: int = 7,
+    moved: bool = False,
+) -> Trace:
+    """A trace of white noise of that density (deg/h*sqrt(s), mg*sqrt(s)); `moved`: it never stood still for long."""
+    rng = np.random.default_rng(seed)
+    second = tuple(range(-5, seconds + 5))
+    shaken = [moved and k % 9 in (3, 4) for k in range(len(second))]
+    words = tuple("gyro fc 0.31 deg/s > 0.10" if shake else None for shake in shaken)
+    names = [imu.name for imu in of.imus] or ["fc", "own"]
+    profile = noise_profile("icm42688p")
+    imus = []
+    for name in names:
+        gyro = rng.normal(0.0, gyro_deg_h * DEG_H, (len(second), 3)) + np.multiply(GYRO_DEG_H, DEG_H)
+        accel = rng.normal(0.0, accel_mg * MG, (len(second), 3)) + np.array([0.85, 0.5, -9.75])
+        imus.append(
+            ImuTrace(
+                name=name,
+                profile=profile.name,
+                gyro_noise=profile.gyro,
+                accel_noise=profile.accel,
+                gyro_step_rad_s=0.0,
+                accel_step_m_s2=0.0,
+                samples=(100,) * len(second),
+                temperature_degc=(25.0,) * len(second),
+                gyro_rad_s=tuple(_axes(row) for row in gyro),
+                gyro_variance_rad2_s2=tuple(_axes(np.full(3, (gyro_deg_h * DEG_H) ** 2 * 100)) for _ in second),
+                accel_m_s2=tuple(_axes(row) for row in accel),
+                accel_variance_m2_s4=tuple(_axes(np.full(3, (accel_mg * MG) ** 2 * 100)) for _ in second),
+            )
+        )
+    still: tuple[str | None, ...] = (None,) * len(second)
+    silent = tuple("no data from gradienter for 3 s" if moved and 20 < k < 26 else None for k in range(len(second)))
+    sources = [("imu", name, words if name == "fc" else still) for name in names]
+    sources += [("gradienter", "gradienter", silent), ("compass", "compass", still)]
+    return Trace(
+        started_at=of.started_at,
+        second=second,
+        good=tuple(not shake and hush is None for shake, hush in zip(shaken, silent, strict=True)),
+        measured=None if moved else (-4, seconds),
+        cut=False,
+        verdicts=tuple(
+            VerdictTrace(
+                kind=kind,  # type: ignore[arg-type]
+                name=name,
+                words=said,
+                fault=tuple(word is not None and word.startswith("no data") for word in said),
+            )
+            for kind, name, said in sources
+        ),
+        imus=tuple(imus),
+    )
+
+
+def arming(of: Record, *, good: bool = True) -> Arming:
+    """An arming three minutes after that calibration began."""
+    at = datetime.datetime.fromisoformat(of.started_at) + datetime.timedelta(minutes=3)
+    return Arming(
+        armed_at=at.isoformat(timespec="milliseconds"),
+        state="calibrated" if good else "uncalibrated",
+        reason="calibrated 3 min ago, sigma 3.6 deg/h, 0.12 mg" if good else "last calibration failed",
+        at_arm="warn",
+        calibration=of.started_at if good else None,
+        calibrated_ago_s=180.0 if good else None,
+        confirmed_ago_s=5.0 if good else None,
+        gyro_sigma_use_rad_s=3.6 * DEG_H if good else None,
+        accel_sigma_use_m_s2=0.12 * MG if good else None,
+    )
+
+
+def a_season(directory: Path, number: int = 30) -> list[Record]:
+    """Fill a storage folder: temperatures from 8 to 31 degC, every seventh one failed, some armings."""
+    store, records, armings = RecordStore(directory), [], []
+    rng = np.random.default_rng(3)
+    for k in range(number):
+        if k % 7 == 3:
+            made = record(
+                k, state="failed", reason="not finished in the time given: waiting for still: gyro fc 0.31 deg/s > 0.10"
+            )
+        elif k % 11 == 5:
+            made = record(k, state="cancelled", reason="cancelled by companion cancel")
+        else:
+            made = record(k, temperature_degc=round(float(rng.uniform(8.0, 31.0)), 2))
+        store.save(made, white_trace(made, moved=made.state != "done"))
+        records.append(made)
+        if k % 2 == 0:
+            armings.append(arming(made, good=made.state == "done"))
+    write_atomically(directory / "armings.json", msgspec.json.encode(armings))
+    return records
