@@ -71,7 +71,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser() -> argparse.ArgumentParser:
-    from companion.cli import client, local
+    from companion.cli import client, local, monitor
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = _Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -118,7 +118,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     history = add("history", client.history, "list past calibrations")
     history.add_argument("-n", "--limit", type=_count, default=20, metavar="N", help="the latest N (default 20)")
-    add("monitor", client.monitor, "watch the daemon until Ctrl-C")
+    add("monitor", monitor.monitor, "watch the daemon until Ctrl-C")
+    add("web-token", local.web_token, "where the page is, and the token that its buttons need")
     return parser
 
 

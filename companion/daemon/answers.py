@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from typing import Any, Final, Protocol
 
 import msgspec
@@ -18,13 +18,17 @@ from companion.daemon.automatic import Automatic
 from companion.daemon.conductor import Conductor
 from companion.daemon.control import Object
 from companion.daemon.gate_setup import GateSetup
+from companion.daemon.headline import Headlines
 from companion.daemon.job import Job
 from companion.daemon.ledger import Offload
+from companion.daemon.live_pose import LivePose
 from companion.daemon.mend import Mender
 from companion.daemon.reach import Reach
 from companion.daemon.readiness import Readiness
 from companion.daemon.rivalry import Rivalry
+from companion.daemon.shown_calibration import shown_calibration
 from companion.errors import CalibrationRefusedError
+from companion.links.mavlink import MavlinkLink
 from companion.storage.records import RecordStore
 
 MONITOR_EVERY_S: Final = 0.5
@@ -59,28 +63,40 @@ class Answers:
         armings: Armings,
         gate_setup: GateSetup,
         automatic: Automatic,
+        link: MavlinkLink,
+        live_pose: LivePose,
     ) -> None:
         self._conductor, self._vehicle, self._collector, self._devices = conductor, vehicle, collector, devices
         self._store, self._offload, self._mavlink_url = store, offload, mavlink_url
         self._rivalry, self._reach, self._mender, self._readiness = rivalry, reach, mender, readiness
         self._armings, self._gate_setup, self._automatic = armings, gate_setup, automatic
+        self._link, self._live_pose = link, live_pose
+        self._headlines = Headlines(vehicle, collector, conductor, mender, readiness, automatic, mavlink_url)
+        self.page: Callable[[], Object | None] = lambda: None
+        """What is to be said of the page."""
 
-    async def answer(self, request: Object) -> AsyncIterator[Object]:
-        """Answer one request of the control socket."""
+    async def answer(self, request: Object, asked_on: str | None = None) -> AsyncIterator[Object]:
+        """Answer one request of the control socket.
+
+        Args:
+            request: the command and its arguments.
+            asked_on: where it was asked, if not on the command line; "cancelled by ..." says it to people.
+        """
         command = request.get("command")
         if command == "status":
             yield {"kind": "result", "status": self.status()}
         elif command == "calibrate":
-            async for reply in self._answer_calibrate(request):
+            async for reply in self._answer_calibrate(request, asked_on or "companion calibrate"):
                 yield reply
         elif command == "cancel":
-            running = self._conductor.cancel("companion cancel")
+            running = self._conductor.cancel(asked_on or "companion cancel")
             if running and self._conductor.job is not None:
                 await asyncio.shield(self._conductor.job.finished)
             reason = self._conductor.reason if running else "nothing was running"
             yield {"kind": "result", "state": self._conductor.state.value, "reason": reason}
         elif command == "undo":
-            job = _accepted(self._conductor.start_undo("companion undo", force=request.get("force") is True))
+            forced = request.get("force") is True
+            job = _accepted(self._conductor.start_undo(asked_on or "companion undo", force=forced))
             result = await asyncio.shield(job.finished)
             written = {name: _plain(what) for name, what in job.written.items()}
             yield {"kind": "result", "state": result.outcome, "reason": result.reason, "written": written}
@@ -102,7 +118,7 @@ class Answers:
         records = with_armings(self._store.history(limit), armings)
         return [_plain(record) for record in records], [_plain(arming) for arming in armings[:limit]]
 
-    async def _answer_calibrate(self, request: Object) -> AsyncIterator[Object]:
+    async def _answer_calibrate(self, request: Object, requester: str) -> AsyncIterator[Object]:
         try:
             what = What[str(request.get("what", "both")).upper()]
             timeout_s = request.get("timeout_s")
@@ -110,7 +126,7 @@ class Answers:
         except (KeyError, TypeError, ValueError) as error:
             raise CalibrationRefusedError(f"calibrate: {error} is not understood") from None
         reboot = request.get("reboot") is True
-        job = _accepted(self._conductor.start_calibration(what, "companion calibrate", timeout_s, reboot=reboot))
+        job = _accepted(self._conductor.start_calibration(what, requester, timeout_s, reboot=reboot))
         if not request.get("wait"):
             yield {"kind": "result", "state": self._conductor.state.value, "reason": "calibration started"}
             return
@@ -130,7 +146,11 @@ class Answers:
         busy = job is not None and not job.finished.done()
         now_s = asyncio.get_running_loop().time()
         still = self._collector.status(now_s)
+        age_s = self._vehicle.heartbeat_age_s
+        received = self._link.received
+        site = conductor.last.site if conductor.last is not None else None
         return {
+            "headline": _plain(self._headlines.now()),
             "state": conductor.state.value,
             "reason": job.words if busy and job is not None else conductor.reason,
             "progress": job.progress_percent if busy and job is not None else None,
@@ -143,11 +163,17 @@ class Answers:
                 "summary": f"{self._vehicle.name}, {self._vehicle.arm_state.value}"
                 if self._vehicle.system_id is not None
                 else f"not heard yet on {self._mavlink_url}",
+                "heartbeat_age_s": None if age_s is None else round(age_s, 1),
+                "messages": received.total() - received["bad"],
+                "bad": received["bad"],
+                "not_sent": self._link.dropped,
             },
+            "pose": self._live_pose.now(site.declination_deg if site is not None else None),
             "warnings": self._rivalry.warnings,
             "ground_stations": dict(zip(("good", "summary"), self._reach.words(), strict=True)),
             "fault": self._mender.fault,
             "putting_back": self._mender.pending,
+            "why_no_undo": self._mender.why_no_undo(),
             "devices": [device.status() for device in self._devices],
             "arming": {
                 **self._readiness.status(),
@@ -155,7 +181,9 @@ class Answers:
                 "last": _plain(self._armings.last),
             },
             "automatic": self._automatic.status(),
+            "calibration": shown_calibration(self._readiness.in_force, conductor.last, now_s),
             "last": _summary(conductor.last),
+            "page": self.page(),
         }
 
 

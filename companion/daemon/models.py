@@ -60,7 +60,6 @@ def not_in_this_version(config: Config) -> list[str]:
     asked = (
         (config.push.attitude != "off", f'push.attitude = "{config.push.attitude}": attitude is not pushed yet'),
         (config.mqtt is not None, "[mqtt]: MQTT is not spoken yet"),
-        (config.web is not None, "[web]: there is no page yet"),
     )
     return [words for is_asked, words in asked if is_asked]
 

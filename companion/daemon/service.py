@@ -7,7 +7,7 @@ import contextlib
 import logging
 import signal
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from companion.autopilot.ekf import EkfWatch
 from companion.autopilot.imu_stream import StreamKind
@@ -35,6 +35,7 @@ from companion.daemon.gate_setup import GateSetup
 from companion.daemon.in_force import InForce
 from companion.daemon.job import Job
 from companion.daemon.ledger import Ledger, Offload
+from companion.daemon.live_pose import LivePose
 from companion.daemon.mend import Mender
 from companion.daemon.plan import Planner
 from companion.daemon.push import Pusher
@@ -50,6 +51,9 @@ from companion.links.mavlink_transport import run_transport
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
 from companion.storage.changes import ChangeLog
 from companion.storage.records import RecordStore
+
+if TYPE_CHECKING:
+    from companion.web.server import Page
 
 logger = logging.getLogger(__name__)
 
@@ -84,6 +88,7 @@ class Service:
             gradienter=config.gradienter is not None,
             compass=config.compass is not None,
         )
+        self.live_pose = LivePose(config)
         self.slots = SlotMemory()
         self._imu_rate_hz = models.imu_rate_hz(config) if imu_rate_hz is None else imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
@@ -159,7 +164,19 @@ class Service:
             armings=self.armings,
             gate_setup=self.gate_setup,
             automatic=self.automatic,
+            link=self.link,
+            live_pose=self.live_pose,
         )
+        self.page = self._page(offload)
+
+    def _page(self, offload: Offload) -> Page | None:
+        if self.config.web is None:
+            return None
+        from companion.web.server import Page
+
+        page = Page(self.config.web.bind, self.config.storage.path, self.answers.answer, self.answers.status, offload)
+        self.answers.page = page.status
+        return page
 
     def _on_ended(self, job: Job, result: JobResult) -> None:
         self.in_force.on_ended(job, result)
@@ -237,6 +254,8 @@ class Service:
         return take
 
     def _take(self, sample: Sample) -> None:
+        if isinstance(sample, TiltSample | CompassSample):
+            self.live_pose.add(sample)
         if isinstance(sample, TiltSample):
             self.collector.add_tilt(sample)
         elif isinstance(sample, CompassSample):
@@ -279,6 +298,8 @@ class Service:
                     group.create_task(self.armings.run(), name="armings")
                     group.create_task(self.automatic.run(), name="automatic")
                     group.create_task(self.gate_setup.run(), name="gate setup")
+                    if self.page is not None:
+                        group.create_task(self.page.run(), name="page")
                     for imu in self.imus.values():
                         group.create_task(imu.run(), name=imu.name)
                     for sensor in self.sensors if ports else ():
