@@ -13,6 +13,7 @@ import os
 import re
 import shutil
 import sys
+import textwrap
 import time
 from typing import Any, Final, Protocol
 
@@ -26,6 +27,8 @@ SILENT_S: Final = 5.0
 """A daemon that says nothing for so long stands still."""
 AGAIN_S: Final = 1.0
 
+_SAID_ABOVE: Final = ("state:", "in force:", "at arming")
+"""Lines of the status that the big word and its reason have said already."""
 _COLOURS: Final = {"good": "1;97;42", "wait": "1;30;103", "busy": "1;97;44", "bad": "1;97;41"}
 _SIGNS: Final = {"good": "OK ", "wait": "...", "busy": ">>>", "bad": "!!!"}
 
@@ -94,12 +97,12 @@ class _Lines:
         self._before: set[str] = set()
 
     def show(self, status: Object) -> None:
-        percent = status["progress"]
+        headline = show.headline_line(status)
         # Every tenth of the way is news; what only counts seconds or frames is not.
-        word = _without_figures(show.headline_line(status)) + (f"{percent // 10}" if percent is not None else "")
-        lines = {word: show.headline_line(status)}
+        tenth = status["progress"] // 10 if "%" in status["headline"]["word"] else ""
+        lines = {f"{_without_figures(headline)}{tenth}": headline}
         *others, last = show.status_lines(status)[1:]
-        lines |= {_without_figures(line): line for line in others if not line.startswith(("in force", "at arming"))}
+        lines |= {_without_figures(line): line for line in others if not line.startswith(_SAID_ABOVE)}
         lines[last] = last
         self._print([line for key, line in lines.items() if key not in self._before])
         self._before = set(lines)
@@ -143,18 +146,18 @@ class _Screen:
         if status is not None:
             lines += ["", *(part for line in show.monitor_lines(status) for part in _wrapped(line, width))]
         lines = lines[: height - 2]
-        sys.stdout.write("\x1b[H" + "".join(f"{line}\x1b[K\r\n" for line in lines))
+        sys.stdout.write("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in lines))
         sys.stdout.write(f"{time.strftime('%H:%M:%S')}  Ctrl-C ends this, nothing else"[:width] + "\x1b[K\x1b[J")
         sys.stdout.flush()
 
     def close(self) -> None:
-        sys.stdout.write("\x1b[?25h\r\n")
+        sys.stdout.write("\x1b[?25h\n")
         sys.stdout.flush()
 
 
 def _wrapped(line: str, width: int) -> list[str]:
-    import textwrap
-
+    """A line as the terminal holds it; what a wire may have slipped into it moves no cursor."""
+    line = "".join(letter if letter.isprintable() else "?" for letter in line)
     return textwrap.wrap(line, max(width, 20), subsequent_indent="    ", drop_whitespace=False) or [""]
 
 

@@ -135,7 +135,7 @@ def monitor_lines(status: Object) -> list[str]:
 def _bias_lines(calibration: Object | None) -> list[str]:
     lines = []
     for imu in calibration["imus"] if calibration is not None else ():
-        for words, unit, form in (("gyro", "deg_h", "+9.1f"), ("accel", "mg", "+9.3f")):
+        for words, unit, form in (("gyro", "deg_h", "+6.1f"), ("accel", "mg", "+6.2f")):
             biases, sigmas = imu[f"{words}_bias_{unit}"], imu[f"{words}_sigma_{unit}"]
             if biases is None:
                 continue

@@ -61,6 +61,7 @@ class Exchange:
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, always: tuple[tuple[str, str], ...]
     ) -> None:
         self._reader, self.writer, self._always = reader, writer, always
+        self._head_only = False
         self._http = h11.Connection(h11.SERVER, max_incomplete_event_size=MAX_HEAD)
 
     async def request(self) -> Request | None:
@@ -91,6 +92,7 @@ class Exchange:
                 self._http.receive_data(data)
             elif isinstance(event, h11.Request):
                 head = event
+                self._head_only = event.method == b"HEAD"
             elif isinstance(event, h11.Data):
                 body += event.data
                 if len(body) > MAX_BODY:
@@ -109,7 +111,8 @@ class Exchange:
             TimeoutError: the other side does not take it.
         """
         self._begin(response.status, response.content_type, len(response.body), response.headers)
-        self.send(response.body)
+        if not self._head_only:
+            self.send(response.body)
         self.writer.write(self._http.send(h11.EndOfMessage()) or b"")
         async with asyncio.timeout(SENT_WITHIN_S):
             await self.writer.drain()
