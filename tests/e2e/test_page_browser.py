@@ -187,8 +187,7 @@ def test_a_laptop_beyond_the_board_needs_the_token(tmp_path: Path) -> None:
             await tab.open(f"{here.url}#token={token}", DESKTOP)
             await tab.until(f"{WORD} === 'NOT CALIBRATED'")
             assert await tab.value("location.hash") == ""
-            await hold()
-            await tab.until(f"{SAID} === 'calibrate: calibration started'")
+            assert await tab.value("token") == await tab.value("localStorage.getItem('token')") == token
 
     asyncio.run(main())
 
