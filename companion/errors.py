@@ -23,6 +23,10 @@ class DaemonUnreachableError(CompanionError):
     """No daemon answers on the control socket."""
 
 
+class DaemonDeniedError(DaemonUnreachableError):
+    """A daemon is there, but this user may not use its control socket."""
+
+
 class StorageError(CompanionError):
     """A record could not be written or read."""
 

@@ -60,8 +60,13 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
 
 def load_config(options: argparse.Namespace) -> config.Config:
     """The configuration that -c names, or the default one."""
+    return config.load(config_path(options))
+
+
+def config_path(options: argparse.Namespace) -> Path:
+    """The file that -c names, or the default one."""
     path: Path = getattr(options, "config", config.DEFAULT_PATH)
-    return config.load(path)
+    return path
 
 
 class _Parser(argparse.ArgumentParser):
@@ -71,7 +76,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser() -> argparse.ArgumentParser:
-    from companion.cli import client, local, monitor
+    from companion.cli import client, install, local, monitor, recordings
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = _Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -92,13 +97,14 @@ def _parser() -> argparse.ArgumentParser:
     run = add("run", local.run, "run the daemon in the foreground")
     run.add_argument("-v", "--verbose", action="store_true", help="log what happens in detail")
     check = add("check", local.check, "check configuration, ports, sensors and autopilot; say what is wrong")
-    check.add_argument("--seconds", type=_seconds, default=3.0, metavar="S", help="how long to listen (default 3)")
+    check.add_argument("--seconds", type=seconds, default=3.0, metavar="S", help="how long to listen (default 3)")
     add("ports", local.ports, "list serial ports with their stable names")
     add(
         "lua",
         local.lua,
         "print the arming script for ArduPilot (> APM/scripts/companion_arming.lua), and how to install it",
     )
+    install.add_commands(add)
     add("status", client.status, "what the daemon is doing")
     calibrate = add("calibrate", client.calibrate, "calibrate now (the aircraft must be disarmed and still)")
     what = calibrate.add_mutually_exclusive_group()
@@ -106,7 +112,7 @@ def _parser() -> argparse.ArgumentParser:
     what.add_argument("--accelerometers", action="store_true", help="accelerometers only")
     calibrate.add_argument("--wait", action="store_true", help="wait for the end, show progress, print the record")
     calibrate.add_argument(
-        "--timeout", type=_seconds, metavar="S", help="cancel when it has not finished by then (default: no limit)"
+        "--timeout", type=seconds, metavar="S", help="cancel when it has not finished by then (default: no limit)"
     )
     calibrate.add_argument(
         "--reboot", action="store_true", help="restart the autopilot afterwards (PX4's attitude needs it)"
@@ -120,10 +126,16 @@ def _parser() -> argparse.ArgumentParser:
     history.add_argument("-n", "--limit", type=_count, default=20, metavar="N", help="the latest N (default 20)")
     add("monitor", monitor.monitor, "watch the daemon until Ctrl-C")
     add("web-token", local.web_token, "where the page is, and the token that its buttons need")
+    recordings.add_commands(add)
     return parser
 
 
-def _seconds(text: str) -> float:
+def seconds(text: str) -> float:
+    """An argument that is a time.
+
+    Raises:
+        argparse.ArgumentTypeError: it is none.
+    """
     try:
         value = float(text)
     except ValueError:

@@ -21,10 +21,11 @@ from companion.daemon.gate_setup import GateSetup
 from companion.daemon.headline import Headlines
 from companion.daemon.job import Job
 from companion.daemon.ledger import Offload
-from companion.daemon.live_pose import LivePose
 from companion.daemon.mend import Mender
+from companion.daemon.pose_now import PoseNow
 from companion.daemon.reach import Reach
 from companion.daemon.readiness import Readiness
+from companion.daemon.recorder import Recorder
 from companion.daemon.rivalry import Rivalry
 from companion.daemon.shown_calibration import shown_calibration
 from companion.errors import CalibrationRefusedError
@@ -33,6 +34,14 @@ from companion.storage.records import RecordStore
 
 MONITOR_EVERY_S: Final = 0.5
 PROGRESS_EVERY_S: Final = 0.2
+
+
+class RequestRefusedError(CalibrationRefusedError):
+    """A request was not taken; `kind` as in `Refusal`."""
+
+    def __init__(self, refusal: Refusal) -> None:
+        super().__init__(refusal.reason)
+        self.kind = refusal.kind
 
 
 class Device(Protocol):
@@ -63,40 +72,42 @@ class Answers:
         armings: Armings,
         gate_setup: GateSetup,
         automatic: Automatic,
+        recorder: Recorder,
         link: MavlinkLink,
-        live_pose: LivePose,
+        pose: PoseNow,
     ) -> None:
         self._conductor, self._vehicle, self._collector, self._devices = conductor, vehicle, collector, devices
         self._store, self._offload, self._mavlink_url = store, offload, mavlink_url
         self._rivalry, self._reach, self._mender, self._readiness = rivalry, reach, mender, readiness
         self._armings, self._gate_setup, self._automatic = armings, gate_setup, automatic
-        self._link, self._live_pose = link, live_pose
+        self._recorder, self._link, self._pose = recorder, link, pose
         self._headlines = Headlines(vehicle, collector, conductor, mender, readiness, automatic, mavlink_url)
         self.page: Callable[[], Object | None] = lambda: None
-        """What is to be said of the page."""
+        """What is to be said of the page; None where none is configured."""
+        self.mqtt: Callable[[], Object] = dict
+        """How the broker is reached; empty where none is configured."""
 
-    async def answer(self, request: Object, asked_on: str | None = None) -> AsyncIterator[Object]:
-        """Answer one request of the control socket.
+    async def answer(self, request: Object, face: str = "companion") -> AsyncIterator[Object]:
+        """Answer one request of the control socket, or of another face that speaks its words.
 
-        Args:
-            request: the command and its arguments.
-            asked_on: where it was asked, if not on the command line; "cancelled by ..." says it to people.
+        Raises:
+            RequestRefusedError: it is not taken, and why.
+            CompanionError: it could not be carried out.
         """
         command = request.get("command")
         if command == "status":
-            yield {"kind": "result", "status": self.status()}
+            yield {"kind": "result", "status": await self.look()}
         elif command == "calibrate":
-            async for reply in self._answer_calibrate(request, asked_on or "companion calibrate"):
+            async for reply in self._answer_calibrate(request, face):
                 yield reply
         elif command == "cancel":
-            running = self._conductor.cancel(asked_on or "companion cancel")
+            running = self._conductor.cancel(f"{face} cancel")
             if running and self._conductor.job is not None:
                 await asyncio.shield(self._conductor.job.finished)
             reason = self._conductor.reason if running else "nothing was running"
             yield {"kind": "result", "state": self._conductor.state.value, "reason": reason}
         elif command == "undo":
-            forced = request.get("force") is True
-            job = _accepted(self._conductor.start_undo(asked_on or "companion undo", force=forced))
+            job = _accepted(self._conductor.start_undo(f"{face} undo", force=request.get("force") is True))
             result = await asyncio.shield(job.finished)
             written = {name: _plain(what) for name, what in job.written.items()}
             yield {"kind": "result", "state": result.outcome, "reason": result.reason, "written": written}
@@ -106,9 +117,12 @@ class Answers:
             # A thousand records take longer to read than a ground station waits for an answer.
             records, armings = await self._offload(self._history, number)
             yield {"kind": "result", "records": records, "armings": armings}
+        elif command == "record":
+            async for reply in self._recorder.answer(request):
+                yield reply
         elif command == "monitor":
             while True:
-                yield {"kind": "progress", "status": self.status()}
+                yield {"kind": "progress", "status": await self.look()}
                 await asyncio.sleep(MONITOR_EVERY_S)
         else:
             yield {"kind": "error", "reason": f"unknown command {command!r}"}
@@ -118,7 +132,7 @@ class Answers:
         records = with_armings(self._store.history(limit), armings)
         return [_plain(record) for record in records], [_plain(arming) for arming in armings[:limit]]
 
-    async def _answer_calibrate(self, request: Object, requester: str) -> AsyncIterator[Object]:
+    async def _answer_calibrate(self, request: Object, face: str) -> AsyncIterator[Object]:
         try:
             what = What[str(request.get("what", "both")).upper()]
             timeout_s = request.get("timeout_s")
@@ -126,7 +140,7 @@ class Answers:
         except (KeyError, TypeError, ValueError) as error:
             raise CalibrationRefusedError(f"calibrate: {error} is not understood") from None
         reboot = request.get("reboot") is True
-        job = _accepted(self._conductor.start_calibration(what, requester, timeout_s, reboot=reboot))
+        job = _accepted(self._conductor.start_calibration(what, f"{face} calibrate", timeout_s, reboot=reboot))
         if not request.get("wait"):
             yield {"kind": "result", "state": self._conductor.state.value, "reason": "calibration started"}
             return
@@ -140,6 +154,11 @@ class Answers:
             await asyncio.wait([job.finished], timeout=PROGRESS_EVERY_S)
         yield {"kind": "result", "record": _plain(job.record)}
 
+    async def look(self) -> Object:
+        """`status`, with the declination of the place looked up when it is time to."""
+        await self._pose.look()
+        return self.status()
+
     def status(self) -> Object:
         """What the daemon is doing, as JSON can hold it."""
         conductor, job = self._conductor, self._conductor.job
@@ -148,7 +167,6 @@ class Answers:
         still = self._collector.status(now_s)
         age_s = self._vehicle.heartbeat_age_s
         received = self._link.received
-        site = conductor.last.site if conductor.last is not None else None
         return {
             "headline": _plain(self._headlines.now()),
             "state": conductor.state.value,
@@ -168,7 +186,7 @@ class Answers:
                 "bad": received["bad"],
                 "not_sent": self._link.dropped,
             },
-            "pose": self._live_pose.now(site.declination_deg if site is not None else None),
+            "pose": self._pose.now(),
             "warnings": self._rivalry.warnings,
             "ground_stations": dict(zip(("good", "summary"), self._reach.words(), strict=True)),
             "fault": self._mender.fault,
@@ -181,6 +199,8 @@ class Answers:
                 "last": _plain(self._armings.last),
             },
             "automatic": self._automatic.status(),
+            "recording": self._recorder.status(),
+            "mqtt": self.mqtt() or None,
             "calibration": shown_calibration(self._readiness.in_force, conductor.last, now_s),
             "last": _summary(conductor.last),
             "page": self.page(),
@@ -189,7 +209,7 @@ class Answers:
 
 def _accepted(answer: Job | Refusal) -> Job:
     if isinstance(answer, Refusal):
-        raise CalibrationRefusedError(answer.reason)
+        raise RequestRefusedError(answer)
     return answer
 
 

@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 
 Object = dict[str, Any]
 Answer = Callable[[Object, str], AsyncIterator[Object]]
-"""A request as on the control socket, and where it was asked: its replies."""
+"""A request as on the control socket, and which face it came by: its replies."""
 Offload = Callable[..., Awaitable[Any]]
 
 PAGE: Final = Path(__file__).with_name("page.html")
@@ -45,7 +45,8 @@ UNHEARD_MS: Final = 10_000
 """So long the kernel waits for a viewer who acknowledges nothing: gone out of range, or asleep."""
 ACTION_WITHIN_S: Final = 10.0
 RECORDS: Final = 10
-ASKED_ON: Final = "the page"
+FACE: Final = "the page's"
+"""As in "cancelled by the page's cancel"."""
 
 
 class Page:
@@ -60,7 +61,7 @@ class Page:
     """
 
     def __init__(
-        self, bind: str, directory: Path, answer: Answer, status: Callable[[], Object], offload: Offload
+        self, bind: str, directory: Path, answer: Answer, status: Callable[[], Awaitable[Object]], offload: Offload
     ) -> None:
         self._host, self._port = split_address(bind)
         self._directory, self._answer, self._status, self._offload = directory, answer, status, offload
@@ -218,7 +219,7 @@ class Page:
         """The last reply; an action that takes longer than a person waits goes on, and the events tell of it."""
         try:
             async with asyncio.timeout(ACTION_WITHIN_S):
-                async for reply in self._answer(asked, ASKED_ON):
+                async for reply in self._answer(asked, FACE):
                     if reply.get("kind") in ("result", "error"):
                         return reply
         except TimeoutError:
@@ -257,7 +258,7 @@ class Page:
                 await self._wake.wait()
             self._wake.clear()
             try:
-                event = _event(self._status())
+                event = _event(await self._status())
             except Exception:
                 logger.exception("the page has no state to show")
             else:

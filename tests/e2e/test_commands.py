@@ -299,5 +299,16 @@ def test_the_daemon_stays_light() -> None:
 
     modules = set(asyncio.run(main()).decode().split())
     assert "companion.daemon.service" in modules
-    for heavy in ("pymavlink.mavutil", "lxml", "mavsdk", "rich", "matplotlib", "aiomqtt", "h11", "hypothesis", "sim"):
+    for heavy in (
+        "pymavlink.mavutil",
+        "lxml",
+        "mavsdk",
+        "rich",
+        "matplotlib",
+        "aiomqtt",
+        "mcap",
+        "h11",
+        "hypothesis",
+        "sim",
+    ):
         assert heavy not in modules, heavy

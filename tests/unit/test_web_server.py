@@ -43,8 +43,11 @@ class Daemon:
         self.status: Callable[[], Object] = lambda: {"state": "idle"}
         self.refuses: str | None = None
 
-    async def answer(self, request: Object, asked_on: str) -> AsyncIterator[Object]:
-        self.asked.append((request, asked_on))
+    async def look(self) -> Object:
+        return self.status()
+
+    async def answer(self, request: Object, face: str) -> AsyncIterator[Object]:
+        self.asked.append((request, face))
         if self.refuses is not None:
             raise CalibrationRefusedError(self.refuses)
         if request["command"] == "history":
@@ -67,7 +70,7 @@ def no_fault_in_it(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
 
 @contextlib.asynccontextmanager
 async def page(daemon: Daemon, folder: Path, bind: str = "127.0.0.1:0") -> AsyncIterator[Page]:
-    served = Page(bind, folder, daemon.answer, lambda: daemon.status(), on_the_spot)
+    served = Page(bind, folder, daemon.answer, daemon.look, on_the_spot)
     task = asyncio.create_task(served.run())
     try:
         async with asyncio.timeout(5.0):
@@ -218,7 +221,7 @@ def test_an_action_is_asked_for_with_the_token(tmp_path: Path) -> None:
         said = await ask(served, "POST", "/calibrate", body, Origin=own, **good_headers(served))
         assert (said.status, said.json) == (200, {"state": "waiting", "reason": "calibration started"})
         # Of what was sent only what a button may say goes on.
-        assert daemon.asked == [({"command": "calibrate", "what": "gyros"}, "the page")]
+        assert daemon.asked == [({"command": "calibrate", "what": "gyros"}, "the page's")]
         typed = served.access.token.upper().replace("-", " ")
         assert (
             await ask(served, "POST", "/cancel", b"", **good_headers(served) | {"X_Companion_Token": typed})
@@ -504,7 +507,7 @@ def test_an_address_in_use_is_said_and_waited_for(tmp_path: Path, monkeypatch: p
         daemon = Daemon()
         other = await asyncio.start_server(lambda _r, w: w.close(), "127.0.0.1", 0)
         port = other.sockets[0].getsockname()[1]
-        served = Page(f"127.0.0.1:{port}", tmp_path, daemon.answer, lambda: daemon.status(), on_the_spot)
+        served = Page(f"127.0.0.1:{port}", tmp_path, daemon.answer, daemon.look, on_the_spot)
         task = asyncio.create_task(served.run())
         async with asyncio.timeout(3.0):
             while "in use" not in (served.problem or ""):
