@@ -130,6 +130,10 @@ def monitor_lines(status: Object) -> list[str]:
     links += [(device["good"], device["name"], device["summary"]) for device in status["devices"]]
     if not status["ground_stations"]["good"]:
         links.append((False, "ground stations", status["ground_stations"]["summary"]))
+    if status["mqtt"] is not None:
+        links.append((status["mqtt"]["good"], "mqtt", status["mqtt"]["summary"]))
+    if status["recording"]["fault"] is not None:
+        links.append((False, "recordings", status["recording"]["fault"]))
     links += [(False, "warning", words) for words in status["warnings"]]
     width = max(len(name) for _, name, _ in links)
     lines += ["", *(f"{'ok ' if good else 'BAD'}  {name:{width}}  {words}" for good, name, words in links), ""]
