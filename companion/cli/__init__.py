@@ -76,7 +76,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser() -> argparse.ArgumentParser:
-    from companion.cli import client, install, local, recordings, report
+    from companion.cli import client, install, local, monitor, recordings, report
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = _Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -125,7 +125,8 @@ def _parser() -> argparse.ArgumentParser:
     history = add("history", client.history, "list past calibrations")
     history.add_argument("-n", "--limit", type=_count, default=20, metavar="N", help="the latest N (default 20)")
     report.add_command(add, _count)
-    add("monitor", client.monitor, "watch the daemon until Ctrl-C")
+    add("monitor", monitor.monitor, "watch the daemon until Ctrl-C")
+    add("web-token", local.web_token, "where the page is, and the token that its buttons need")
     recordings.add_commands(add)
     return parser
 

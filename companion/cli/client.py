@@ -82,22 +82,3 @@ async def history(options: argparse.Namespace) -> int:
     armings = reply.get("armings", [])
     answer = {"records": records, "armings": armings}
     return _finish(options, reply, answer, show.history_lines(records, armings), good=True)
-
-
-async def monitor(options: argparse.Namespace) -> int:
-    """`companion monitor`: a line whenever something changes, until Ctrl-C."""
-    before: list[str] = []
-    as_json = getattr(options, "json", False)
-    async for reply in ask(load_config(options).control.path, {"command": "monitor"}):
-        if reply["kind"] != "progress":
-            break
-        if as_json:
-            print_json(reply["status"])
-            sys.stdout.flush()
-            continue
-        lines = show.status_lines(reply["status"])
-        for line in lines:
-            if line not in before:
-                print(line, flush=True)
-        before = lines
-    return DONE

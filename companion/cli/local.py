@@ -8,6 +8,7 @@ import faulthandler
 import sys
 
 from companion.cli import DONE, FAILED, config_path, load_config, logs, print_json, show
+from companion.errors import CompanionError
 
 
 async def run(options: argparse.Namespace) -> int:
@@ -46,6 +47,25 @@ async def lua(options: argparse.Namespace) -> int:
     print(script, end="")
     for number, step in enumerate(INSTALLATION, 1):
         print(f"{number}. {step}", file=sys.stderr)
+    return DONE
+
+
+async def web_token(options: argparse.Namespace) -> int:
+    """`companion web-token`: an address that brings the token along; made if there is none yet."""
+    from companion.web.access import is_loopback, kept_token, page_url, split_address
+
+    config = load_config(options)
+    if config.web is None:
+        raise CompanionError('there is no page: the configuration needs [web] with bind = "127.0.0.1:8191"')
+    host, port = split_address(config.web.bind)
+    url = page_url(host, port)
+    token = None if is_loopback(host) else kept_token(config.storage.path)
+    if getattr(options, "json", False):
+        print_json({"url": url, "token": token})
+    elif token is None:
+        print(f"{url} needs no token: only this board can reach it")
+    else:
+        print(f"token: {token}\nopen once on the phone: {url}#token={token}")
     return DONE
 
 

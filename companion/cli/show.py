@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 Object = dict[str, Any]
 
+_BAR = 40
+_HEARTBEAT_S = 2.0
 _VERDICTS = {"accept": "ready", "wait": "not yet", "refuse": "NOT ready"}
 
 
@@ -68,7 +70,8 @@ def _number(value: float | None, form: str) -> str:
 
 def status_lines(status: Object) -> list[str]:
     """The daemon's state as a person reads it."""
-    lines = [f"state: {status['state']}" + (f" - {status['reason']}" if status["reason"] else "")]
+    lines = [headline_line(status)]
+    lines += [f"state: {status['state']}" + (f" - {status['reason']}" if status["reason"] else "")]
     if status["fault"] is not None:
         lines.append(f"FAULT: {status['fault']}")
     if status["putting_back"]:
@@ -95,11 +98,65 @@ def status_lines(status: Object) -> list[str]:
         + (f", {arming['words']}" if arming["verdict"] != "accept" else "")
     )
     lines.append(f"in force: {arming['in_force']}")
+    if status["page"] is not None:
+        lines.append(f"page: {'' if status['page']['good'] else 'none: '}{status['page']['summary']}")
+    lines.append(_last_line(status))
+    return lines
+
+
+def headline_line(status: Object) -> str:
+    """The big word and its reason."""
+    headline = status["headline"]
+    return f"{headline['word']}: {headline['reason']}"
+
+
+def _last_line(status: Object) -> str:
     last = status["last"]
-    lines.append(
-        "last calibration: "
-        + (f"{last['state']} at {last['started_at']}: {last['reason']}" if last is not None else "none yet")
-    )
+    found = f"{last['state']} at {last['started_at']}: {last['reason']}" if last is not None else "none yet"
+    return f"last calibration: {found}"
+
+
+def monitor_lines(status: Object) -> list[str]:
+    """What stands below the big word and its reason on a terminal that is drawn anew every half second."""
+    lines = []
+    if (percent := status["progress"]) is not None:
+        lines += [f"[{'#' * (percent * _BAR // 100):.<{_BAR}}] {percent} %", ""]
+    pose, vehicle = status["pose"], status["vehicle"]
+    if pose is not None:
+        heading = f"{_number(pose['heading_deg'], '.1f')} {pose['north'] or ''}"
+        lines.append(f"pitch {pose['pitch_deg']:+.2f}  roll {pose['roll_deg']:+.2f}  heading {heading}")
+    heartbeat_s = vehicle["heartbeat_age_s"]
+    links = [(heartbeat_s is not None and heartbeat_s < _HEARTBEAT_S, "autopilot", vehicle["summary"])]
+    links += [(device["good"], device["name"], device["summary"]) for device in status["devices"]]
+    if not status["ground_stations"]["good"]:
+        links.append((False, "ground stations", status["ground_stations"]["summary"]))
+    if status["mqtt"] is not None:
+        links.append((status["mqtt"]["good"], "mqtt", status["mqtt"]["summary"]))
+    if status["recording"]["fault"] is not None:
+        links.append((False, "recordings", status["recording"]["fault"]))
+    links += [(False, "warning", words) for words in status["warnings"]]
+    width = max(len(name) for _, name, _ in links)
+    lines += ["", *(f"{'ok ' if good else 'BAD'}  {name:{width}}  {words}" for good, name, words in links), ""]
+    lines += _bias_lines(status["calibration"])
+    lines.append(f"in force: {status['arming']['in_force']}")
+    if status["page"] is not None:
+        lines.append(f"page: {'' if status['page']['good'] else 'none: '}{status['page']['summary']}")
+    lines.append(_last_line(status))
+    return lines
+
+
+def _bias_lines(calibration: Object | None) -> list[str]:
+    lines = []
+    for imu in calibration["imus"] if calibration is not None else ():
+        for words, unit, form in (("gyro", "deg_h", "+6.1f"), ("accel", "mg", "+6.2f")):
+            biases, sigmas = imu[f"{words}_bias_{unit}"], imu[f"{words}_sigma_{unit}"]
+            if biases is None:
+                continue
+            axes = "  ".join(
+                f"{axis} {bias:{form}} +- {sigma:.{form[-2]}f}"
+                for axis, bias, sigma in zip("xyz", biases, sigmas, strict=True)
+            )
+            lines.append(f"{imu['name']:8} {words:5} {unit.replace('_', '/'):5} {axes}")
     return lines
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import ipaddress
 import math
 import re
 
@@ -52,6 +53,8 @@ def check_together(config: Config, name: str) -> None:
             _check_port(device.port, f"{section}.port", name)
     _check_ports_differ(config, name)
     _check_mavlink_url(config.mavlink.url, name)
+    if config.web is not None:
+        _check_bind(config.web.bind, name)
     if config.mqtt is not None:
         check_mqtt(config.mqtt, name)
     if (config.vehicle.latitude_deg is None) != (config.vehicle.longitude_deg is None):
@@ -131,6 +134,29 @@ def _check_mavlink_url(url: str, name: str) -> None:
             f"{name}: 'mavlink.url': found {url!r}; allowed: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT"
             " or serial:PATH:BAUD, with ports from 1 to 65535"
         )
+
+
+_BIND = re.compile(r"(?:\[(?P<six>[0-9a-fA-F:.]+)\]|(?P<host>[^:\[\]]+)):(?P<port>\d{1,5})")
+
+
+def _check_bind(bind: str, name: str) -> None:
+    """Numbers only: what a name stands for may change with the network, and with it who can reach the page."""
+    match = _BIND.fullmatch(bind)
+    host = (match["six"] or match["host"]) if match else ""
+    if match and int(match["port"]) <= LAST_PORT and (host == "localhost" or _is_address(host)):
+        return
+    raise ConfigError(
+        f"{name}: 'web.bind': found {bind!r}; allowed: ADDRESS:PORT, such as 127.0.0.1:8191 (this board only),"
+        " 192.168.4.1:8191 or [::1]:8191"
+    )
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
 
 
 def _check_mounting(mounting: Mounting, here: str, name: str) -> None:

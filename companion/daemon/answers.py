@@ -18,14 +18,18 @@ from companion.daemon.automatic import Automatic
 from companion.daemon.conductor import Conductor
 from companion.daemon.control import Object
 from companion.daemon.gate_setup import GateSetup
+from companion.daemon.headline import Headlines
 from companion.daemon.job import Job
 from companion.daemon.ledger import Offload
 from companion.daemon.mend import Mender
+from companion.daemon.pose_now import PoseNow
 from companion.daemon.reach import Reach
 from companion.daemon.readiness import Readiness
 from companion.daemon.recorder import Recorder
 from companion.daemon.rivalry import Rivalry
+from companion.daemon.shown_calibration import shown_calibration
 from companion.errors import CalibrationRefusedError
+from companion.links.mavlink import MavlinkLink
 from companion.storage.records import RecordStore
 
 MONITOR_EVERY_S: Final = 0.5
@@ -69,12 +73,17 @@ class Answers:
         gate_setup: GateSetup,
         automatic: Automatic,
         recorder: Recorder,
+        link: MavlinkLink,
+        pose: PoseNow,
     ) -> None:
         self._conductor, self._vehicle, self._collector, self._devices = conductor, vehicle, collector, devices
         self._store, self._offload, self._mavlink_url = store, offload, mavlink_url
         self._rivalry, self._reach, self._mender, self._readiness = rivalry, reach, mender, readiness
         self._armings, self._gate_setup, self._automatic = armings, gate_setup, automatic
-        self._recorder = recorder
+        self._recorder, self._link, self._pose = recorder, link, pose
+        self._headlines = Headlines(vehicle, collector, conductor, mender, readiness, automatic, mavlink_url)
+        self.page: Callable[[], Object | None] = lambda: None
+        """What is to be said of the page; None where none is configured."""
         self.mqtt: Callable[[], Object] = dict
         """How the broker is reached; empty where none is configured."""
 
@@ -87,7 +96,7 @@ class Answers:
         """
         command = request.get("command")
         if command == "status":
-            yield {"kind": "result", "status": self.status()}
+            yield {"kind": "result", "status": await self.look()}
         elif command == "calibrate":
             async for reply in self._answer_calibrate(request, face):
                 yield reply
@@ -113,7 +122,7 @@ class Answers:
                 yield reply
         elif command == "monitor":
             while True:
-                yield {"kind": "progress", "status": self.status()}
+                yield {"kind": "progress", "status": await self.look()}
                 await asyncio.sleep(MONITOR_EVERY_S)
         else:
             yield {"kind": "error", "reason": f"unknown command {command!r}"}
@@ -145,13 +154,21 @@ class Answers:
             await asyncio.wait([job.finished], timeout=PROGRESS_EVERY_S)
         yield {"kind": "result", "record": _plain(job.record)}
 
+    async def look(self) -> Object:
+        """`status`, with the declination of the place looked up when it is time to."""
+        await self._pose.look()
+        return self.status()
+
     def status(self) -> Object:
         """What the daemon is doing, as JSON can hold it."""
         conductor, job = self._conductor, self._conductor.job
         busy = job is not None and not job.finished.done()
         now_s = asyncio.get_running_loop().time()
         still = self._collector.status(now_s)
+        age_s = self._vehicle.heartbeat_age_s
+        received = self._link.received
         return {
+            "headline": _plain(self._headlines.now()),
             "state": conductor.state.value,
             "reason": job.words if busy and job is not None else conductor.reason,
             "progress": job.progress_percent if busy and job is not None else None,
@@ -164,11 +181,17 @@ class Answers:
                 "summary": f"{self._vehicle.name}, {self._vehicle.arm_state.value}"
                 if self._vehicle.system_id is not None
                 else f"not heard yet on {self._mavlink_url}",
+                "heartbeat_age_s": None if age_s is None else round(age_s, 1),
+                "messages": received.total() - received["bad"],
+                "bad": received["bad"],
+                "not_sent": self._link.dropped,
             },
+            "pose": self._pose.now(),
             "warnings": self._rivalry.warnings,
             "ground_stations": dict(zip(("good", "summary"), self._reach.words(), strict=True)),
             "fault": self._mender.fault,
             "putting_back": self._mender.pending,
+            "why_no_undo": self._mender.why_no_undo(),
             "devices": [device.status() for device in self._devices],
             "arming": {
                 **self._readiness.status(),
@@ -178,7 +201,9 @@ class Answers:
             "automatic": self._automatic.status(),
             "recording": self._recorder.status(),
             "mqtt": self.mqtt() or None,
+            "calibration": shown_calibration(self._readiness.in_force, conductor.last, now_s),
             "last": _summary(conductor.last),
+            "page": self.page(),
         }
 
 

@@ -175,6 +175,10 @@ class InForce:
         sigmas = [max(held.sigma_use) for (_, of), held in self._held.items() if of == triad and isinstance(held, Held)]
         return max(sigmas, default=None)
 
+    def temperature_degc(self, name: str) -> float | None:
+        """The temperature of an IMU when its output was last looked at; None where it tells none."""
+        return self._temperatures.get(name)
+
     def reading(self) -> str | None:
         """An autopilot IMU whose offsets are not known at this moment, and why, in one line."""
         for name, imu in self._imus.items():

@@ -57,10 +57,7 @@ def imu_rate_hz(config: Config) -> float:
 
 def not_in_this_version(config: Config) -> list[str]:
     """What the configuration may ask for that this version does not do: said at start, never silently ignored."""
-    asked = (
-        (config.push.attitude != "off", f'push.attitude = "{config.push.attitude}": attitude is not pushed yet'),
-        (config.web is not None, "[web]: there is no page yet"),
-    )
+    asked = ((config.push.attitude != "off", f'push.attitude = "{config.push.attitude}": attitude is not pushed yet'),)
     return [words for is_asked, words in asked if is_asked]
 
 

@@ -46,7 +46,16 @@ class PoseNow:
             self._heading = sample
 
     async def look(self) -> dict[str, Any] | None:
-        """The pose as JSON can hold it; None without a fresh reading of the gradienter."""
+        """As `now`, with the declination of the place looked up when it is time to."""
+        if self._compass is not None and self._compass.magnetic:
+            await self._look_up(asyncio.get_running_loop().time())
+        return self.now()
+
+    def now(self) -> dict[str, Any] | None:
+        """The pose as JSON can hold it; None without a fresh reading of the gradienter.
+
+        The heading is magnetic as long as the declination has not been looked up.
+        """
         now_s = asyncio.get_running_loop().time()
         tilt, heading = self._tilt, self._heading
         if self._gradienter is None or tilt is None or now_s - tilt.t_s > OLDEST_S:
@@ -68,9 +77,8 @@ class PoseNow:
             heading_deg = vehicle_heading_rad(self._compass, heading.heading_deg, up) / DEG
             north = "true"
             if self._compass.magnetic:
-                declination_deg = await self._declination(now_s)
-                north = "true" if declination_deg is not None else "magnetic"
-                heading_deg += declination_deg or 0.0
+                north = "true" if self._declination_deg is not None else "magnetic"
+                heading_deg += self._declination_deg or 0.0
             pose |= {
                 "heading_deg": round(heading_deg % 360.0, 2) % 360.0,
                 "north": north,
@@ -78,11 +86,10 @@ class PoseNow:
             }
         return pose
 
-    async def _declination(self, now_s: float) -> float | None:
+    async def _look_up(self, now_s: float) -> None:
         """Looked up rarely: the aircraft does not get far in a minute, and the magnetic model takes its time."""
         if now_s - self._looked_up_s >= DECLINATION_EVERY_S or self._declination_deg is None:
             where: Whereabouts = models.whereabouts(self._config, self._vehicle)
             if where.latitude_deg is not None:
                 self._looked_up_s = now_s
                 self._declination_deg = (await self._offload(local_earth, where)).site.declination_deg
-        return self._declination_deg

@@ -148,7 +148,7 @@ class Readiness:
         if findings:
             why_not = self.why_not_by_itself()
             if why_not is None:
-                return ArmAnswer("wait", f"hold still {self._until_calibrated_s(now_s):.0f} s")
+                return ArmAnswer("wait", f"hold still {self.until_calibrated_s(now_s):.0f} s")
             return ArmAnswer("refuse", f"{findings[0].words}: {why_not}")
         if (owed := self.reboot_owed()) is not None:
             return ArmAnswer("refuse", owed)
@@ -156,7 +156,7 @@ class Readiness:
             return ArmAnswer("wait", f"hold still {max(1.0, STEADY_S - glance.steady_s):.0f} s")
         return ArmAnswer("accept", self.in_words(now_s))
 
-    def _until_calibrated_s(self, now_s: float) -> float:
+    def until_calibrated_s(self, now_s: float) -> float:
         """Seconds of holding still until a calibration by itself would be in force."""
         status = self._collector.status(now_s)
         if status.enough:

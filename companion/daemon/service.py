@@ -53,6 +53,7 @@ from companion.storage.records import RecordStore
 
 if TYPE_CHECKING:
     from companion.daemon.mqtt.face import MqttFace
+    from companion.web.server import Page
 
 logger = logging.getLogger(__name__)
 
@@ -155,6 +156,7 @@ class Service:
         self.gate_setup = GateSetup(self.vehicle, self.parameters, self.readiness, self._say)
         self.component = Component(self.link, self.vehicle, self.conductor, self.readiness)
         define_parameters(self.component.parameters, config, self.conductor)
+        self.pose = PoseNow(config, self.vehicle, self.collector, offload)
         self.answers = Answers(
             self.conductor,
             self.vehicle,
@@ -171,9 +173,11 @@ class Service:
             gate_setup=self.gate_setup,
             automatic=self.automatic,
             recorder=self.recorder,
+            link=self.link,
+            pose=self.pose,
         )
-        self.pose = PoseNow(config, self.vehicle, self.collector, offload)
         self.mqtt = self._mqtt_face(offload)
+        self.page = self._page(offload)
 
     def _mqtt_face(self, offload: Offload) -> MqttFace | None:
         if self.config.mqtt is None:
@@ -187,6 +191,15 @@ class Service:
         )
         self.answers.mqtt = face.status
         return face
+
+    def _page(self, offload: Offload) -> Page | None:
+        if self.config.web is None:
+            return None
+        from companion.web.server import Page
+
+        page = Page(self.config.web.bind, self.config.storage.path, self.answers.answer, self.answers.look, offload)
+        self.answers.page = page.status
+        return page
 
     def _on_ended(self, job: Job, result: JobResult) -> None:
         self.in_force.on_ended(job, result)
@@ -316,6 +329,8 @@ class Service:
                     group.create_task(self.automatic.run(), name="automatic")
                     group.create_task(self.gate_setup.run(), name="gate setup")
                     group.create_task(self.recorder.run(), name="recorder")
+                    if self.page is not None:
+                        group.create_task(self.page.run(), name="page")
                     if self.mqtt is not None:
                         group.create_task(self.mqtt.run(), name="mqtt")
                     for imu in self.imus.values():

@@ -51,8 +51,8 @@ class FlightLine(NamedTuple):
 
 
 @contextlib.asynccontextmanager
-async def flight_line(folder: Path, *, daemon: bool = True) -> AsyncIterator[FlightLine]:
-    """A virtual aircraft on ptys and UDP, its configuration, and the daemon as a process."""
+async def flight_line(folder: Path, *, daemon: bool = True, more: str = "") -> AsyncIterator[FlightLine]:
+    """A virtual aircraft on ptys and UDP, its configuration (and `more` of it), and the daemon as a process."""
     scenario = demo(seed=25)
     async with contextlib.AsyncExitStack() as stack:
         scenario.aircraft.begin(asyncio.get_running_loop().time())
@@ -64,7 +64,7 @@ async def flight_line(folder: Path, *, daemon: bool = True) -> AsyncIterator[Fli
         autopilot = asyncio.create_task(scenario.autopilot.run())
         stack.callback(autopilot.cancel)
         text = configuration(scenario, directory=folder, udp=link.local).replace("udpin:", "udpout:")
-        text += '[calibration]\nmin_still_s = 3\nmax_s = 4\nat_arm = "off"\n'
+        text += '[calibration]\nmin_still_s = 3\nmax_s = 4\nat_arm = "off"\n' + more
         config = folder / "companion.toml"
         config.write_text(text)
         process = None
@@ -299,5 +299,16 @@ def test_the_daemon_stays_light() -> None:
 
     modules = set(asyncio.run(main()).decode().split())
     assert "companion.daemon.service" in modules
-    for heavy in ("pymavlink.mavutil", "lxml", "mavsdk", "rich", "matplotlib", "aiomqtt", "mcap", "hypothesis", "sim"):
+    for heavy in (
+        "pymavlink.mavutil",
+        "lxml",
+        "mavsdk",
+        "rich",
+        "matplotlib",
+        "aiomqtt",
+        "mcap",
+        "h11",
+        "hypothesis",
+        "sim",
+    ):
         assert heavy not in modules, heavy

@@ -158,6 +158,34 @@ def test_a_mistake_is_one_line_that_says_it_all(text: str, words: list[str]) -> 
 
 
 @pytest.mark.parametrize(
+    ("bind", "good"),
+    [
+        ("127.0.0.1:8191", True),
+        ("localhost:8191", True),
+        ("0.0.0.0:80", True),
+        ("[::1]:8191", True),
+        ("192.168.4.1", False),
+        ("8191", False),
+        (":8191", False),
+        ("::1:8191", False),
+        ("board.local:8191", False),
+        ("127.0.0.1:65536", False),
+        ("[127.0.0.1:1", False),
+        ("http://127.0.0.1:8191", False),
+    ],
+)
+def test_addresses_of_the_page(bind: str, good: bool) -> None:
+    text = GOOD + f'[web]\nbind = "{bind}"\n'
+    if good:
+        web = parse(text, "x.toml").web
+        assert web is not None
+        assert web.bind == bind
+        return
+    with pytest.raises(ConfigError, match=r"x\.toml: 'web\.bind': found .*allowed: ADDRESS:PORT, such as 127"):
+        parse(text, "x.toml")
+
+
+@pytest.mark.parametrize(
     ("url", "good"),
     [
         ("serial:/dev/serial/by-path/pci-0000:00:14.0-usb-0:2:1.0:57600", True),

@@ -1,0 +1,165 @@
+"""`companion monitor`: the big word, its reason, the devices and the last result, until Ctrl-C.
+
+A terminal is redrawn in place with a handful of escape sequences that every terminal since the VT100 knows: neither
+curses nor a library is needed for that. Where there is no such terminal (TERM=dumb, a pipe) a line is printed
+whenever something changes that is more than a figure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import re
+import shutil
+import sys
+import textwrap
+import time
+from typing import Any, Final, Protocol
+
+from companion.cli import DONE, load_config, print_json, show
+from companion.daemon.control import ask
+from companion.errors import DaemonUnreachableError
+
+Object = dict[str, Any]
+
+SILENT_S: Final = 5.0
+"""A daemon that says nothing for so long stands still."""
+AGAIN_S: Final = 1.0
+
+_SAID_ABOVE: Final = ("state:", "in force:", "at arming")
+"""Lines of the status that the big word and its reason have said already."""
+_COLOURS: Final = {"good": "1;97;42", "wait": "1;30;103", "busy": "1;97;44", "bad": "1;97;41"}
+_SIGNS: Final = {"good": "OK ", "wait": "...", "busy": ">>>", "bad": "!!!"}
+
+
+class _View(Protocol):
+    def show(self, status: Object) -> None: ...
+
+    def gone(self, why: str) -> None: ...
+
+    def close(self) -> None: ...
+
+
+async def monitor(options: argparse.Namespace) -> int:
+    """Watch until Ctrl-C; a daemon that goes away is waited for."""
+    path = load_config(options).control.path
+    view: _View
+    if getattr(options, "json", False):
+        view = _Json()
+    else:
+        view = _Screen() if sys.stdout.isatty() and os.environ.get("TERM", "dumb") != "dumb" else _Lines()
+    heard = False
+    try:
+        while True:
+            replies = ask(path, {"command": "monitor"})
+            try:
+                while True:
+                    async with asyncio.timeout(SILENT_S):
+                        reply = await anext(replies)
+                    if reply["kind"] != "progress":
+                        view.gone(str(reply["reason"]))
+                        break
+                    heard = True
+                    view.show(reply["status"])
+            except DaemonUnreachableError as error:
+                if not heard:
+                    raise
+                view.gone(str(error))
+            except TimeoutError:
+                view.gone(f"the daemon has said nothing for {SILENT_S:g} s")
+            await asyncio.sleep(AGAIN_S)
+    except asyncio.CancelledError:
+        return DONE  # Ctrl-C is how one leaves
+    finally:
+        view.close()
+
+
+class _Json:
+    """One JSON object a line."""
+
+    def show(self, status: Object) -> None:
+        print_json(status)
+        sys.stdout.flush()
+
+    def gone(self, why: str) -> None:
+        print_json({"state": "unreachable", "reason": why})
+        sys.stdout.flush()
+
+    def close(self) -> None:
+        pass
+
+
+class _Lines:
+    """A line whenever something changes, each with the time of day."""
+
+    def __init__(self) -> None:
+        self._before: set[str] = set()
+
+    def show(self, status: Object) -> None:
+        headline = show.headline_line(status)
+        # Every tenth of the way is news; what only counts seconds or frames is not.
+        tenth = status["progress"] // 10 if "%" in status["headline"]["word"] else ""
+        lines = {f"{_without_figures(headline)}{tenth}": headline}
+        *others, last = show.status_lines(status)[1:]
+        lines |= {_without_figures(line): line for line in others if not line.startswith(_SAID_ABOVE)}
+        lines[last] = last
+        self._print([line for key, line in lines.items() if key not in self._before])
+        self._before = set(lines)
+
+    def gone(self, why: str) -> None:
+        if self._before != {why}:
+            self._print([f"NO DAEMON: {why}; waiting for it"])
+        self._before = {why}
+
+    def _print(self, lines: list[str]) -> None:
+        now = time.strftime("%H:%M:%S")
+        for line in lines:
+            print(f"{now} {line}", flush=True)
+
+    def close(self) -> None:
+        pass
+
+
+class _Screen:
+    """The whole terminal, redrawn in place."""
+
+    def __init__(self) -> None:
+        self._colours = "NO_COLOR" not in os.environ
+        self._last: Object | None = None
+        sys.stdout.write("\x1b[2J\x1b[?25l")
+
+    def show(self, status: Object) -> None:
+        self._last = status
+        headline = status["headline"]
+        self._draw(headline["tone"], headline["word"], headline["reason"], status)
+
+    def gone(self, why: str) -> None:
+        self._draw("bad", "NO DAEMON", f"{why}; waiting for it", self._last)
+
+    def _draw(self, tone: str, word: str, reason: str, status: Object | None) -> None:
+        width, height = shutil.get_terminal_size()
+        look = _COLOURS[tone] if self._colours else "1;7"
+        head = [" ", f"  {_SIGNS[tone]}  {' '.join(word)}", " "]
+        lines = [f"\x1b[{look}m{line[:width].ljust(width)}\x1b[0m" for line in head]
+        lines += [f"\x1b[1m{part}\x1b[0m" for part in _wrapped(reason, width)]
+        if status is not None:
+            lines += ["", *(part for line in show.monitor_lines(status) for part in _wrapped(line, width))]
+        lines = lines[: height - 2]
+        sys.stdout.write("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in lines))
+        sys.stdout.write(f"{time.strftime('%H:%M:%S')}  Ctrl-C ends this, nothing else"[:width] + "\x1b[K\x1b[J")
+        sys.stdout.flush()
+
+    def close(self) -> None:
+        sys.stdout.write("\x1b[?25h\n")
+        sys.stdout.flush()
+
+
+def _wrapped(line: str, width: int) -> list[str]:
+    """A line as the terminal holds it; what a wire may have slipped into it moves no cursor."""
+    line = "".join(letter if letter.isprintable() else "?" for letter in line)
+    return textwrap.wrap(line, max(width, 20), subsequent_indent="    ", drop_whitespace=False) or [""]
+
+
+def _without_figures(line: str) -> str:
+    return re.sub(r"\d+(\.\d+)?", "#", line)

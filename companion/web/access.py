@@ -1,0 +1,129 @@
+"""Who may look, and who may press a button.
+
+Looking is open to whoever reaches the address. An action needs a token in a header that a foreign site cannot set:
+on the board itself the page is handed one that lives as long as the daemon; from anywhere else a person types the one
+in the storage folder, once. A foreign site that turns its own name into our address (DNS rebinding) is met by
+looking at the Host header: only addresses, "localhost" and the board's own names are ours.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import secrets
+import socket
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from companion.errors import StorageError
+from companion.storage.atomic import write_atomically
+
+TOKEN_HEADER: Final = "x-companion-token"  # noqa: S105 - a name
+TOKEN_FILE: Final = "web-token"  # noqa: S105 - a name
+# Without letters and digits that look alike on a phone in the sun; 12 of them are 59 bits.
+_ALPHABET: Final = "23456789abcdefghjkmnpqrstuvwxyz"
+_GROUPS, _GROUP = 3, 4
+_LEAST_TOKEN: Final = 8
+_OWN_ENDINGS: Final = ("", ".local", ".lan", ".home.arpa", ".internal")
+"""Of names that nobody can register: what a hotspot or a router makes of the board's name."""
+
+
+def split_address(bind: str) -> tuple[str, int]:
+    """HOST and PORT of "HOST:PORT" or "[HOST]:PORT", as the configuration has been checked to be."""
+    host, _, port = bind.rpartition(":")
+    return host.strip("[]"), int(port)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only programs on this board can reach it."""
+    return host == "localhost" or ipaddress.ip_address(host).is_loopback
+
+
+def page_url(host: str, port: int) -> str:
+    """Where to look; with an address for all networks, by the board's name."""
+    if host in ("0.0.0.0", "::"):  # noqa: S104 - compared, not bound
+        host = f"{socket.gethostname().partition('.')[0]}.local"
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
+
+
+def new_token() -> str:
+    """Such as "k7xm-p2qd-9rtw"."""
+    return "-".join("".join(secrets.choice(_ALPHABET) for _ in range(_GROUP)) for _ in range(_GROUPS))
+
+
+def kept_token(directory: Path) -> str:
+    """The token of the storage folder; made, readable by the owner alone, where there is none yet.
+
+    Raises:
+        StorageError: it can be neither read nor made.
+    """
+    path = directory / TOKEN_FILE
+    try:
+        token = path.read_text(encoding="ascii").strip()
+    except FileNotFoundError:
+        token = new_token()
+        write_atomically(path, f"{token}\n".encode())  # a temporary file's mode is 0600, and stays
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "not a text"
+        raise StorageError(f"{path}: cannot be read: {why}; as the daemon's user, or with sudo?") from None
+    if len(_bare(token)) < _LEAST_TOKEN:
+        raise StorageError(f"{path}: found {len(token)} characters; allowed: at least {_LEAST_TOKEN}, or no such file")
+    return token
+
+
+def _bare(token: str) -> str:
+    """As it counts: gaps, dashes and capitals are a matter of keyboards."""
+    return re.sub(r"[\s-]", "", token).lower()
+
+
+class Access:
+    """The rules for one address.
+
+    Args:
+        token: that an action needs.
+        handed_out: whether the page gets it by itself.
+    """
+
+    def __init__(self, token: str, *, handed_out: bool) -> None:
+        self.token, self.handed_out = token, handed_out
+        name = socket.gethostname().lower().partition(".")[0]
+        self._names = {"localhost", *(name + ending for ending in _OWN_ENDINGS if name)}
+
+    def refuses_host(self, headers: Mapping[str, str]) -> str | None:
+        """Why a request is not meant for us, in one line; None when it is."""
+        host = headers.get("host", "")
+        match = re.fullmatch(r"(\[[0-9a-f:.]+\]|[^:\[\]/@\s]+)(?::\d{1,5})?", host.lower())
+        if match is not None:
+            bare = match[1].strip("[]").removesuffix(".")
+            if bare in self._names or _is_address(bare):
+                return None
+        return f"not known here as {host[:80]!r}: use the board's address in numbers, or its own name"
+
+    def refuses_stranger(self, headers: Mapping[str, str]) -> str | None:
+        """Why a request that another site makes a browser send is not answered; None when it is our page's own."""
+        if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
+            return "asked by another site"
+        origin, host = headers.get("origin"), headers.get("host", "")
+        if origin is not None and origin.lower() not in (f"http://{host}".lower(), f"https://{host}".lower()):
+            return "asked by another site"
+        return None
+
+    def refuses_token(self, headers: Mapping[str, str]) -> str | None:
+        """Why no action may be started; None when one may."""
+        given = _bare(headers.get(TOKEN_HEADER, ""))
+        if not given:
+            return "needs the token: companion web-token, on the board, shows it"
+        if not secrets.compare_digest(given.encode(), _bare(self.token).encode()):
+            if self.handed_out:
+                return "the companion was restarted: try again"
+            return "wrong token: companion web-token, on the board, shows the right one"
+        return None
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,325 @@
+"""The page's server: one static page, the state as server-sent events, the last records, and three actions.
+
+It holds no state but who looks. Everything is bounded, and whatever goes wrong here ends here: the daemon's work is
+not to notice that anybody looks at it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import hashlib
+import logging
+import re
+import socket
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from companion import __version__
+from companion.errors import CompanionError
+from companion.links.backoff import Backoff
+from companion.web.access import Access, is_loopback, kept_token, new_token, page_url, split_address
+from companion.web.exchange import BadRequestError, Exchange, Request, Response
+
+logger = logging.getLogger(__name__)
+
+Object = dict[str, Any]
+Answer = Callable[[Object, str], AsyncIterator[Object]]
+"""A request as on the control socket, and which face it came by: its replies."""
+Offload = Callable[..., Awaitable[Any]]
+
+PAGE: Final = Path(__file__).with_name("page.html")
+EVERY_S: Final = 0.5
+LEAST_S: Final = 0.1
+"""Between two events, whatever wakes them."""
+MAX_CONNECTIONS: Final = 48
+MAX_VIEWERS: Final = 16
+MAX_WAITING_BYTES: Final = 128 * 1024
+"""For one viewer, beyond what the kernel holds: ten seconds of events. Who is further behind begins anew."""
+KERNEL_BYTES: Final = 64 * 1024
+UNHEARD_MS: Final = 10_000
+"""So long the kernel waits for a viewer who acknowledges nothing: gone out of range, or asleep."""
+ACTION_WITHIN_S: Final = 10.0
+RECORDS: Final = 10
+FACE: Final = "the page's"
+"""As in "cancelled by the page's cancel"."""
+
+
+class Page:
+    """Serves the page; `run` it as a task of its own.
+
+    Args:
+        bind: HOST:PORT.
+        directory: the storage; the token is kept there when others than this board can reach the page.
+        answer: does what is asked.
+        status: the state to show.
+        offload: for the disk.
+    """
+
+    def __init__(
+        self, bind: str, directory: Path, answer: Answer, status: Callable[[], Awaitable[Object]], offload: Offload
+    ) -> None:
+        self._host, self._port = split_address(bind)
+        self._directory, self._answer, self._status, self._offload = directory, answer, status, offload
+        self.local = is_loopback(self._host)
+        self.access = Access(new_token(), handed_out=self.local)
+        self.problem: str | None = "not open yet"
+        """Why nobody can look, in one line; None while the page is there."""
+        html = PAGE.read_bytes()
+        self._html, self._tag = html, hashlib.sha256(html).hexdigest()[:16]
+        self._always = _security_headers(html)
+        self._clients: set[asyncio.Task[None]] = set()
+        self._viewers: set[Exchange] = set()
+        self._wake = asyncio.Event()
+
+    # --- open, and open again
+
+    async def run(self) -> None:
+        """Serve until cancelled; an address that is not there yet is waited for."""
+        backoff = Backoff(first_s=1.0, cap_s=30.0)
+        while True:
+            try:
+                if not self.local:
+                    self.access = Access(await self._offload(kept_token, self._directory), handed_out=False)
+                await self._serve(backoff)
+            except (OSError, CompanionError) as error:
+                words = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
+                self._failed(f"{self._host}:{self._port}: {words}")
+            except Exception:
+                logger.exception("the page met a fault of the program")
+                self._failed("internal error; the log has the details")
+            await asyncio.sleep(backoff.next_s())
+
+    def _failed(self, words: str) -> None:
+        if words != self.problem:
+            logger.warning("no page: %s; trying again", words)
+        self.problem = words
+
+    async def _serve(self, backoff: Backoff) -> None:
+        server = await asyncio.start_server(self._accept, self._host, self._port, limit=KERNEL_BYTES)
+        try:
+            self._port = server.sockets[0].getsockname()[1]
+            self.problem = None
+            backoff.reset()
+            logger.info("page: %s", self.url)
+            await self._broadcast()
+        finally:
+            server.close()
+            for client in list(self._clients):
+                client.cancel()
+            await asyncio.gather(*self._clients, return_exceptions=True)
+
+    @property
+    def url(self) -> str:
+        """Where to look."""
+        return page_url(self._host, self._port)
+
+    def status(self) -> Object:
+        """For `companion status`."""
+        return {
+            "good": self.problem is None,
+            "summary": self.problem or self.url + ("" if self.local else " (buttons: companion web-token)"),
+            "url": None if self.problem else self.url,
+            "viewers": len(self._viewers),
+        }
+
+    # --- one connection
+
+    def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if len(self._clients) >= MAX_CONNECTIONS:
+            writer.transport.abort()
+            return
+        client = asyncio.get_running_loop().create_task(self._connection(reader, writer), name="page client")
+        self._clients.add(client)
+        client.add_done_callback(self._clients.discard)
+
+    async def _connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        connection = writer.get_extra_info("socket")
+        try:
+            if connection is not None:
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, KERNEL_BYTES)
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNHEARD_MS)
+            await self._exchange(Exchange(reader, writer, self._always))
+            writer.close()
+            async with asyncio.timeout(UNHEARD_MS / 1000):
+                await writer.wait_closed()
+        except (OSError, TimeoutError):
+            pass  # gone, or too slow; what was asked for goes on
+        except Exception:
+            logger.exception("a request of the page failed")
+        finally:
+            writer.transport.abort()
+
+    async def _exchange(self, exchange: Exchange) -> None:
+        try:
+            request = await exchange.request()
+        except BadRequestError as error:
+            await exchange.respond(_refusal(error.status, str(error)))
+            return
+        if request is None:
+            return
+        response = await self.respond(request)
+        if response is None:
+            await self._view(exchange)
+        else:
+            await exchange.respond(response)
+
+    # --- what is asked
+
+    async def respond(self, request: Request) -> Response | None:
+        """The answer to a request; None: the stream of events."""
+        if (why := self.access.refuses_host(request.headers)) is not None:
+            return _refusal(421, why)
+        if request.path in _ACTIONS:
+            if request.method != "POST":
+                return _refusal(405, "an action is a POST", ("Allow", "POST"))
+            return await self._act(request)
+        if request.method != "GET":
+            return _refusal(405, "only GET is known here", ("Allow", "GET"))
+        if request.path == "/":
+            return Response(200, self._html, "text/html; charset=utf-8")
+        if (why := self.access.refuses_stranger(request.headers)) is not None:
+            return _refusal(403, why)
+        if request.path == "/events":
+            return None if len(self._viewers) < MAX_VIEWERS else _refusal(503, f"{MAX_VIEWERS} are looking already")
+        if request.path == "/records.json":
+            found = await self._records()
+            return _json(200, {"records": [{"file": file_name(record), "record": record} for record in found]})
+        if (match := _RECORD.fullmatch(request.path)) is not None:
+            return await self._record(match[1])
+        return _refusal(404, "nothing is here")
+
+    async def _act(self, request: Request) -> Response:
+        why = self.access.refuses_stranger(request.headers) or self.access.refuses_token(request.headers)
+        if why is not None:
+            return _refusal(403, why)
+        if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+            return _refusal(415, "an action is asked for in application/json")
+        try:
+            wanted = msgspec.json.decode(request.body or b"{}", type=Object)
+        except (msgspec.MsgspecError, ValueError):
+            return _refusal(400, "not a JSON object")
+        asked: Object = {"command": request.path.removeprefix("/")}
+        asked |= {key: wanted[key] for key in _ACTIONS[request.path] if key in wanted}
+        try:
+            reply = await self._result(asked)
+        except CompanionError as error:
+            return _refusal(409, str(error))
+        finally:
+            self._wake.set()
+        if reply.get("kind") == "error":
+            return _refusal(409, str(reply["reason"]))
+        return _json(200, {key: value for key, value in reply.items() if key != "kind"})
+
+    async def _result(self, asked: Object) -> Object:
+        """The last reply; an action that takes longer than a person waits goes on, and the events tell of it."""
+        try:
+            async with asyncio.timeout(ACTION_WITHIN_S):
+                async for reply in self._answer(asked, FACE):
+                    if reply.get("kind") in ("result", "error"):
+                        return reply
+        except TimeoutError:
+            pass
+        return {"kind": "result", "reason": "under way"}
+
+    async def _records(self) -> list[Object]:
+        reply = await self._result({"command": "history", "limit": RECORDS})
+        records: list[Object] = reply.get("records", [])
+        return records
+
+    async def _record(self, name: str) -> Response:
+        for record in await self._records():
+            if file_name(record) == name:
+                body = msgspec.json.format(msgspec.json.encode(record), indent=1)
+                return Response(200, body, headers=(("Content-Disposition", f'attachment; filename="{name}"'),))
+        return _refusal(404, f"not among the last {RECORDS} records")
+
+    # --- those who look
+
+    async def _view(self, exchange: Exchange) -> None:
+        exchange.begin_stream("text/event-stream")
+        token = self.access.token if self.access.handed_out else None
+        exchange.send(_event({"version": __version__, "page": self._tag, "token": token}, "hello"))
+        if not self._viewers:
+            self._wake.set()
+        self._viewers.add(exchange)
+        try:
+            await exchange.left()
+        finally:
+            self._viewers.discard(exchange)
+
+    async def _broadcast(self) -> None:
+        while True:
+            if not self._viewers:
+                await self._wake.wait()
+            self._wake.clear()
+            try:
+                event = _event(await self._status())
+            except Exception:
+                logger.exception("the page has no state to show")
+            else:
+                for viewer in tuple(self._viewers):
+                    self._send(viewer, event)
+            await asyncio.sleep(LEAST_S)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(EVERY_S - LEAST_S):
+                    await self._wake.wait()
+
+    def _send(self, viewer: Exchange, event: bytes) -> None:
+        transport = viewer.writer.transport
+        if transport.is_closing():
+            return
+        if transport.get_write_buffer_size() > MAX_WAITING_BYTES:
+            transport.abort()
+            return
+        viewer.send(event)
+
+
+_ACTIONS: Final[dict[str, tuple[str, ...]]] = {"/calibrate": ("what",), "/cancel": (), "/undo": ("force",)}
+"""By path, what of the body counts."""
+_RECORD: Final = re.compile(r"/records/([\w.-]{1,80})")
+
+
+def file_name(record: Object) -> str:
+    """Under which a record is downloaded: its time, without what file systems dislike."""
+    return f"companion-{re.sub(r'[^0-9T]+', '-', str(record.get('started_at')))}.json"
+
+
+def _event(value: Object, name: str | None = None) -> bytes:
+    head = f"event: {name}\n".encode() if name else b""
+    return head + b"data: " + msgspec.json.encode(value) + b"\n\n"
+
+
+def _json(status: int, value: Object) -> Response:
+    return Response(status, msgspec.json.encode(value))
+
+
+def _refusal(status: int, reason: str, *headers: tuple[str, str]) -> Response:
+    return Response(status, msgspec.json.encode({"reason": reason}), headers=headers)
+
+
+def _security_headers(html: bytes) -> tuple[tuple[str, str], ...]:
+    """Nothing but the page's own style and script runs in it, and it speaks to nobody but us."""
+
+    def hashes(tag: bytes) -> str:
+        found = re.findall(b"<" + tag + b">(.*?)</" + tag + b">", html, re.DOTALL)
+        digests = (base64.b64encode(hashlib.sha256(text).digest()).decode() for text in found)
+        return " ".join(f"'sha256-{digest}'" for digest in digests)
+
+    policy = (
+        f"default-src 'none'; script-src {hashes(b'script')}; style-src {hashes(b'style')}; connect-src 'self'; "
+        "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    )
+    return (
+        ("Content-Security-Policy", policy),
+        ("X-Content-Type-Options", "nosniff"),
+        ("X-Frame-Options", "DENY"),
+        ("Referrer-Policy", "no-referrer"),
+        ("Cross-Origin-Resource-Policy", "same-origin"),
+        ("Cross-Origin-Opener-Policy", "same-origin"),
+        ("Cache-Control", "no-store"),
+    )

@@ -1,0 +1,236 @@
+"""The page's answers and the big word, on the whole daemon: the same words and refusals as everywhere else."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.calibration.request import What
+from companion.web.exchange import Request
+from sim.motions import Handling
+from tests.e2e.test_calibration import calibrated, started
+from tests.support.rig import POSE, Rig
+from tests.support.virtual_time import run_virtual
+
+WEB = '[web]\nbind = "127.0.0.1:0"\n'
+
+
+async def press(rig: Rig, action: str, **body: Any) -> tuple[int, str]:
+    """What somebody is told who presses a button."""
+    page = rig.service.page
+    assert page is not None
+    headers = {
+        "host": "127.0.0.1",
+        "content-type": "application/json",
+        "x-companion-token": page.access.token,
+    }
+    response = await page.respond(Request("POST", f"/{action}", headers, json.dumps(body).encode()))
+    assert response is not None
+    return response.status, json.loads(response.body)["reason"]
+
+
+async def at_the_socket(rig: Rig, command: str) -> str:
+    """The reason that the control socket gives for the same."""
+    try:
+        replies = [reply async for reply in rig.service.answers.answer({"command": command})]
+    except Exception as error:  # noqa: BLE001 - refusals are exceptions there
+        return str(error)
+    return str(replies[-1]["reason"])
+
+
+def headline(rig: Rig) -> tuple[str, str, str]:
+    found = rig.service.status()["headline"]
+    return found["tone"], found["word"], found["reason"]
+
+
+class Watch:
+    """Every big word in its order, without figures."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.words: list[str] = []
+        self.seconds: list[int] = []
+        self._rig = rig
+        self._task = asyncio.create_task(self._look())
+
+    async def _look(self) -> None:
+        while True:
+            word = headline(self._rig)[1]
+            if word.startswith("HOLD STILL") and (match := re.search(r"\d+", word)):
+                self.seconds.append(int(match[0]))
+            short = re.sub(r" \d+ (%|s)$", "", word)
+            if self.words[-1:] != [short]:
+                self.words.append(short)
+            await asyncio.sleep(0.1)
+
+    async def stop(self) -> list[str]:
+        await asyncio.sleep(0.3)
+        self._task.cancel()
+        return self.words
+
+
+def test_buttons_do_what_the_command_line_does_and_are_refused_in_the_same_words(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0, more=WEB).running() as rig:
+            await rig.ready()
+            assert rig.service.status()["why_no_undo"] is not None
+            assert await press(rig, "undo") == (409, await at_the_socket(rig, "undo"))
+            assert await press(rig, "cancel") == (200, "nothing was running")
+
+            rig.double.arm()
+            await rig.until(lambda: rig.service.vehicle.arm_state.value == "armed", 3.0)
+            status, words = await press(rig, "calibrate")
+            assert (status, words) == (409, await at_the_socket(rig, "calibrate"))
+            assert "armed" in words
+            rig.double.disarm()
+            await rig.until(lambda: rig.service.vehicle.arm_state.value == "disarmed", 3.0)
+
+            assert await press(rig, "calibrate", what="nothing") == (409, "calibrate: 'NOTHING' is not understood")
+            assert await press(rig, "calibrate") == (200, "calibration started")
+            job = rig.service.conductor.job
+            assert job is not None
+            assert job.what is What.BOTH
+            busy = await press(rig, "calibrate")
+            assert busy[0] == 409
+            assert "running" in busy[1]
+            assert await press(rig, "cancel") == (200, "cancelled by the page's cancel")
+            assert (await job.finished).outcome == "cancelled"
+
+            before = rig.double.parameter("INS_GYROFFS_X")
+            assert await press(rig, "calibrate", what="gyros") == (200, "calibration started")
+            job = rig.service.conductor.job
+            assert job is not None
+            assert job.what is What.GYROS
+            assert (await job.finished).outcome == "done"
+            assert rig.double.parameter("INS_GYROFFS_X") != before
+            assert rig.service.status()["why_no_undo"] is None
+            status, words = await press(rig, "undo")
+            assert status == 200
+            assert "old values back" in words
+            assert rig.double.parameter("INS_GYROFFS_X") == before
+
+    run_virtual(main())
+
+
+def test_the_big_word_through_a_calibration_with_nervous_hands(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            await rig.until(lambda: headline(rig)[1] == "NOT CALIBRATED", 5.0)
+            assert headline(rig) == ("bad", "NOT CALIBRATED", "not calibrated yet: calibrate")
+            watch = Watch(rig)
+            rig.aircraft.add(Handling(start_s=rig.aircraft.time_at(rig.now_s) + 1.0, duration_s=8.0, seed=3))
+            result, record = await calibrated(rig)
+            await rig.until(lambda: headline(rig)[1] == "READY", 5.0)
+            assert result.outcome == "done"
+            words = await watch.stop()
+            assert words[-5:] == ["HOLD STILL", "MEASURING", "WRITING", "CHECKING", "READY"] or words[-6:] == [
+                "HOLD STILL", "MEASURING", "WRITING", "CHECKING", "SETTLING", "READY",
+            ], words  # fmt: skip
+            tone, _, reason = headline(rig)
+            assert tone == "good"
+            assert re.match(r"calibrated \d+ s ago, \d+\.\d deg/h, \d\.\d\d mg", reason)
+
+            rig.double.arm()
+            await rig.until(lambda: headline(rig)[1] == "ARMED", 3.0)
+            assert headline(rig)[0] == "good"
+            rig.double.disarm()
+            await rig.until(lambda: headline(rig)[1] == "READY", 3.0)
+
+            job = started(rig.service.conductor.start_undo("test"))
+            await rig.until(lambda: headline(rig)[1] == "PUTTING BACK", 3.0)
+            assert (await job.finished).outcome == "done"
+            await rig.until(lambda: headline(rig)[1] == "NOT CALIBRATED", 3.0)
+            assert rig.service.status()["calibration"] is None
+            assert record.state == "done"
+
+            rig.double.arm()
+            await rig.until(lambda: headline(rig)[:2] == ("bad", "ARMED"), 3.0)
+            assert "not calibrated" in headline(rig)[2]
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("at_arm", ["gate", "warn"])
+def test_left_alone_it_says_how_long_to_hold_still_until_it_is_ready(tmp_path: Path, at_arm: str) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=15.0, at_arm=at_arm).running() as rig:
+            watch = Watch(rig)
+            await rig.until(lambda: headline(rig)[1] == "READY", 120.0)
+            words = await watch.stop()
+            assert {"HOLD STILL", "WRITING", "READY"} <= set(words)
+            # In the first second devices have said nothing yet; from then on nobody has to do anything.
+            assert not {"NOT CALIBRATED", "NOT READY", "FAILED"} & set(words[words.index("HOLD STILL") :]), words
+            counted = watch.seconds
+            assert len(set(counted)) > 5
+            if at_arm == "gate":
+                assert counted == sorted(counted, reverse=True)
+
+    run_virtual(main())
+
+
+def test_a_silent_autopilot_and_a_failure_are_bad_news_with_their_reason(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            rig.double.faults.echo_without_effect = True
+            result, _ = await calibrated(rig)
+            assert result.outcome == "failed"
+            await rig.until(lambda: headline(rig) == ("bad", "FAILED", result.reason), 3.0)
+            rig.wire.unplug()
+            await rig.until(lambda: headline(rig)[1] == "NO AUTOPILOT", 5.0)
+            await asyncio.sleep(3.0)
+            assert re.match(r"no heartbeat for [567] s", headline(rig)[2]), headline(rig)
+
+    run_virtual(main())
+
+
+def test_the_attitude_and_the_biases_that_are_shown_are_the_true_ones(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0, own_imu=True).running() as rig:
+            await rig.ready()
+            magnetic = rig.service.status()["pose"]
+            assert magnetic["north"] == "magnetic"
+            await rig.until(lambda: rig.service.vehicle.position is not None, 10.0)
+            true_north = (await rig.service.answers.look())["pose"]
+            assert magnetic["pitch_deg"] == pytest.approx(POSE.pitch_deg, abs=0.05)
+            assert magnetic["roll_deg"] == pytest.approx(POSE.roll_deg, abs=0.05)
+            assert magnetic["heading_deg"] == pytest.approx(POSE.heading_deg - rig.site.declination_deg, abs=2.0)
+            assert true_north["north"] == "true"
+            assert true_north["heading_deg"] == pytest.approx(POSE.heading_deg, abs=2.0)
+            await calibrated(rig)
+            shown = rig.service.status()["calibration"]
+            assert shown["in_force"]
+            assert shown["calibrated_ago_s"] < 5.0
+            for imu, model in zip(shown["imus"], (rig.model, rig.own_model), strict=True):
+                true = model.true_bias(rig.aircraft.time_at(rig.now_s))
+                for axis in range(3):
+                    gyro, accel = imu["gyro_sigma_deg_h"][axis], imu["accel_sigma_mg"][axis]
+                    true_deg_h = true.gyro_rad_s[axis] * 206264.806247
+                    true_mg = true.accel_m_s2[axis] / 9.80665e-3
+                    assert imu["gyro_bias_deg_h"][axis] == pytest.approx(true_deg_h, abs=3.5 * gyro)
+                    assert imu["accel_bias_mg"][axis] == pytest.approx(true_mg, abs=3.5 * accel)
+            rig.unplugged = {"gradienter", "compass"}
+            await asyncio.sleep(3.0)
+            assert rig.service.status()["pose"] is None
+
+    run_virtual(main())
+
+
+def test_after_a_restart_the_last_result_is_shown_and_not_called_in_force(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            _, record = await calibrated(rig)
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            shown = rig.service.status()["calibration"]
+            assert shown["started_at"] == record.started_at
+            assert not shown["in_force"]
+            assert shown["calibrated_ago_s"] is None
+
+    run_virtual(main())

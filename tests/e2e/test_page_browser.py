@@ -1,0 +1,237 @@
+"""The page in a real browser, with the real daemon as a process: what a finger in a glove does to it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import os
+import re
+import stat
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from companion.calibration.record import Record, from_json
+from companion.storage.records import RecordStore
+from tests.e2e.test_calibration import calibrated
+from tests.e2e.test_commands import DONE, FAILED, FlightLine, _end, _until_disarmed, companion, flight_line
+from tests.support.browser import DESKTOP, PHONE, Tab, chromium, find
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+pytestmark = pytest.mark.skipif(find() is None, reason="chromium is not installed: apt-get install chromium")
+
+WORD = "document.querySelector('#word span').textContent"
+SAID = "(document.querySelector('#said').hidden ? '' : document.querySelector('#said').textContent)"
+PICTURES = os.environ.get("PAGE_PICTURES")
+"""A folder for pictures of what the tests see, for people."""
+
+
+class Scene(NamedTuple):
+    line: FlightLine
+    tab: Tab
+    url: str
+
+    async def status(self) -> Any:
+        said = await companion("-c", str(self.line.config), "status", "--json")
+        return said.json
+
+    async def picture(self, name: str) -> None:
+        if PICTURES:
+            await self.tab.picture(Path(PICTURES) / f"{name}.png")
+
+
+@contextlib.asynccontextmanager
+async def scene(folder: Path, bind: str, size: tuple[int, int]) -> AsyncIterator[Scene]:
+    async with (
+        flight_line(folder, more=f'[web]\nbind = "{bind}"\n') as line,
+        chromium(folder / "profile") as browser,
+    ):
+        status = await companion("-c", str(line.config), "status", "--json")
+        port = re.search(r":(\d+)/$", status.json["page"]["url"])
+        assert port is not None
+        # The same port again after a restart: the one that the kernel has picked.
+        line.config.write_text(line.config.read_text().replace(f'"{bind}"', f'"{bind.removesuffix("0")}{port[1]}"'))
+        url = f"http://127.0.0.1:{port[1]}/"
+        tab = await browser.tab()
+        await tab.open(url, size)
+        await tab.until(f"{WORD} === 'NOT CALIBRATED'")
+        yield Scene(line, tab, url)
+
+
+async def pixels_needed(tab: Tab) -> int:
+    """How much wider than the screen the page is."""
+    return int(await tab.value("document.documentElement.scrollWidth - document.documentElement.clientWidth"))
+
+
+async def read_the_record(here: Scene, record: Record) -> None:
+    """Bars of the last calibration, and its download."""
+    tab = here.tab
+    await tab.until("document.querySelectorAll('#records details').length === 1")
+    assert await tab.value("document.querySelectorAll('.scale').length") == 12
+    assert "before this start" in await tab.value("document.querySelector('#age').textContent")
+    shown = await tab.value("document.querySelector('.axis b:last-child').textContent")
+    gyro = [record.imus[0].gyro_bias_rad_s, record.imus[0].gyro_sigma_use_rad_s]
+    x_deg_h, sigma_deg_h = (math.degrees(axes[0]) * 3600.0 for axes in gyro if axes is not None)
+    assert shown == f"{x_deg_h:+.1f} ± {sigma_deg_h:.1f}"
+    await here.picture("phone_bars")
+    await tab.value("document.querySelector('#records details').open = true")
+    await tab.value("document.querySelector('#records').scrollIntoView()")
+    await here.picture("phone_records")
+    assert await pixels_needed(tab) == 0
+    link = await tab.value("document.querySelector('#records details a').href")
+    text = await tab.value(f"fetch({link!r}).then(answer => answer.text())")
+    assert from_json(text.encode()) == record
+    await tab.value("scrollTo(0, 0)")
+
+
+def test_a_phone_on_the_field(tmp_path: Path) -> None:
+    async def on_the_bench() -> Record:
+        async with Rig(tmp_path / "bench", own_imu=True, max_s=12.0).running() as rig:
+            await rig.ready()
+            return (await calibrated(rig))[1]
+
+    record = run_virtual(on_the_bench())
+    RecordStore(tmp_path / "state").save(record)
+
+    async def main() -> None:
+        async with scene(tmp_path, "127.0.0.1:0", PHONE) as here:
+            tab = here.tab
+            assert await tab.value("document.querySelector('#reason').textContent") == "not calibrated yet: calibrate"
+            assert await tab.value("document.querySelector('#pitch').textContent") == "5.00°"
+            assert await tab.value("document.querySelector('#roll').textContent") == "−3.00°"
+            assert await tab.value("document.querySelectorAll('.link').length") == 5
+            assert await tab.value("document.querySelectorAll('.link.bad').length") == 0
+            assert await pixels_needed(tab) == 0
+            for button in ("calibrate", "cancel", "undo"):
+                box = f"document.querySelector('#{button}').getBoundingClientRect()"
+                assert await tab.value(f"{box}.height >= 80 && {box}.width >= 90 && {box}.bottom <= innerHeight")
+            await here.picture("phone_not_calibrated")
+            await read_the_record(here, record)
+
+            # A short tap is no order, and says why.
+            await tab.touch("#calibrate")
+            await tab.lift()
+            assert await tab.until(SAID) == "hold calibrate for 1.5 s"
+            # Neither is a finger that goes away before the time.
+            await tab.touch("#calibrate")
+            await tab.roll("#calibrate", 200.0)
+            assert await tab.value("document.querySelectorAll('button.held').length") == 0
+            await tab.lift()
+            assert (await here.status())["state"] == "idle"
+
+            # Held for 1.5 s, with a glove that rolls a little.
+            await tab.touch("#calibrate")
+            await tab.roll("#calibrate", 25.0)
+            await tab.until("document.querySelector('#calibrate.held')")
+            await here.picture("phone_held")
+            began_s = asyncio.get_running_loop().time()
+            await tab.until(f"{WORD}.startsWith('MEASURING') || {WORD}.startsWith('HOLD STILL')")
+            assert asyncio.get_running_loop().time() - began_s > 1.2
+            await tab.lift()
+            assert await tab.value("document.querySelector('#calibrate').disabled")
+            await here.picture("phone_measuring")
+            await tab.touch("#cancel")
+            await tab.lift()
+            await tab.until(f'{SAID} === "cancel: cancelled by the page\'s cancel"')
+            await tab.until("document.querySelector('#last').textContent.includes('cancelled by the page')")
+            assert (await here.status())["last"]["state"] == "cancelled"
+            await here.picture("phone_cancelled")
+
+            # The daemon goes away, is noticed, and comes back; the page's old token is none any more.
+            assert here.line.daemon is not None
+            here.line.daemon.kill()
+            await here.line.daemon.communicate()
+            await tab.until(f"{WORD} === 'NO LINK'")
+            assert await tab.value("document.querySelectorAll('button:disabled').length") == 3
+            await here.picture("phone_no_link")
+            again = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "companion", "-c", str(here.line.config), "run", stderr=asyncio.subprocess.PIPE
+            )
+            try:
+                await _until_disarmed(here.line.config)
+                await tab.until(f"{WORD} === 'NOT CALIBRATED'")
+                await tab.touch("#calibrate")
+                await tab.until(f"{WORD}.startsWith('MEASURING')")
+                await tab.lift()
+            finally:
+                await _end(again)
+
+    asyncio.run(main())
+
+
+def test_a_laptop_beyond_the_board_needs_the_token(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with scene(tmp_path, "0.0.0.0:0", DESKTOP) as here:
+            tab = here.tab
+            kept = await companion("-c", str(here.line.config), "web-token", "--json")
+            token = kept.json["token"]
+            assert kept.json["url"].endswith(here.url.rpartition(":")[2])
+            (file,) = tmp_path.rglob("web-token")  # noqa: ASYNC240 - a local folder
+            assert stat.S_IMODE(file.stat().st_mode) == 0o600
+            shown = await companion("-c", str(here.line.config), "web-token")
+            assert f"#token={token}" in shown.out
+            assert await pixels_needed(tab) == 0
+
+            async def hold() -> None:
+                await tab.mouse("#calibrate", "mousePressed")
+                await asyncio.sleep(1.6)
+                await tab.mouse("#calibrate", "mouseReleased")
+
+            await hold()
+            await tab.until("!document.querySelector('#ask').hidden")
+            assert "companion web-token" in await tab.value(SAID)
+            await here.picture("desktop_token")
+            for typed in ("2222-2222-2222", token):
+                await tab.value("document.querySelector('#token').value = ''; document.querySelector('#token').focus()")
+                await tab.call("Input.insertText", text=typed)
+                await tab.value("document.querySelector('#ask').requestSubmit()")
+                await tab.until(f"{SAID} === 'token kept: press again'")
+                await hold()
+                await tab.until(f"{SAID} !== 'token kept: press again' && !{SAID}.endsWith('asked for')")
+                said = await tab.value(SAID)
+                if typed != token:
+                    assert said == "calibrate: wrong token: companion web-token, on the board, shows the right one"
+                    await here.picture("desktop_wrong_token")
+                    assert (await here.status())["state"] == "idle"
+            assert said == "calibrate: calibration started"
+            assert (await here.status())["state"] != "idle"
+            await here.picture("desktop_measuring")
+            await tab.mouse("#cancel", "mousePressed")
+            await tab.mouse("#cancel", "mouseReleased")
+            await tab.until(f'{SAID} === "cancel: cancelled by the page\'s cancel"')
+
+            # An address that brings the token along: nothing has to be typed.
+            await tab.value("localStorage.clear()")
+            await tab.open("about:blank", DESKTOP)
+            await tab.open(f"{here.url}#token={token}", DESKTOP)
+            await tab.until(f"{WORD} === 'NOT CALIBRATED'")
+            assert await tab.value("location.hash") == ""
+            assert await tab.value("token") == await tab.value("localStorage.getItem('token')") == token
+
+    asyncio.run(main())
+
+
+def test_without_a_page_there_is_no_token_and_the_board_itself_needs_none(tmp_path: Path) -> None:
+    config = tmp_path / "companion.toml"
+    text = '[mavlink]\nurl = "udpin:127.0.0.1:1"\n[[imu]]\nname = "fc"\nsource = "autopilot"\n'
+    text += f'[storage]\ndirectory = "{tmp_path}"\n'
+
+    async def main() -> None:
+        config.write_text(text)
+        none = await companion("-c", str(config), "web-token", "--json")
+        assert none.code == FAILED
+        assert "[web]" in none.json["reason"]
+        config.write_text(text + '[web]\nbind = "127.0.0.1:8191"\n')
+        local = await companion("-c", str(config), "web-token")
+        assert (local.code, local.out) == (
+            DONE,
+            "http://127.0.0.1:8191/ needs no token: only this board can reach it\n",
+        )
+        assert not (tmp_path / "web-token").exists()
+
+    asyncio.run(main())
