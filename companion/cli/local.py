@@ -65,7 +65,8 @@ async def web_token(options: argparse.Namespace) -> int:
     elif token is None:
         print(f"{url} needs no token: only this board can reach it")
     else:
-        print(f"token: {token}\nopen once on the phone: {url}#token={token}")
+        print(f"token: {token}")
+        print(f"open once on the phone: {url}#token={token}")
     return DONE
 
 

@@ -42,10 +42,14 @@ ELSEWHERE = {
     "companion/cli/install.py": "printed by commands that are run at home, with what to do",
     "companion/calibration/machine.py": "labels of the diagram in docs/calibration.md",
     "companion/recording/topics.py": "names of fields in a recording",
+    "companion/daemon/headline.py": "the big word of page and monitor: docs/page.md has each",
+    "companion/cli/monitor.py": "the frame of the monitor: docs/page.md",
+    "companion/report": "labels of pages, and advice that stands beside what it is about",
+    "companion/web": "answers to browsers that ask for the wrong thing; what people see is the page",
 }
 """Rooms whose words need no row of their own, and why."""
 
-HELP = {"_parser", "add_commands", "error"}
+HELP = {"_parser", "add_command", "add_commands", "error"}
 """Functions that build the command line: their words are its help."""
 
 _WORD = re.compile(r"[A-Za-z]{2,}")
