@@ -1,7 +1,8 @@
 """The command line.
 
 Exit codes of every command: 0 done, 1 failed or refused (the reason in `reason`), 2 usage or configuration error
-(one line on stderr), 3 no daemon answers. With --json stdout holds exactly one JSON object; words go to stderr.
+(one line on stderr), 3 no daemon answers (from the
+ground: no vehicle or no companion is heard). With --json stdout holds exactly one JSON object; words go to stderr.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from companion import __version__, config
-from companion.errors import CompanionError, ConfigError, DaemonUnreachableError
+from companion.errors import CompanionError, ConfigError, DaemonUnreachableError, NobodyHeardError
 
 DONE: Final = 0
 FAILED: Final = 1
@@ -33,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         print(error, file=sys.stderr)
         return USAGE
-    except DaemonUnreachableError as error:
+    except (DaemonUnreachableError, NobodyHeardError) as error:
         _fail(options, "unreachable", str(error))
         return NO_DAEMON
     except CompanionError as error:
@@ -64,27 +65,29 @@ def load_config(options: argparse.Namespace) -> config.Config:
     return config.load(path)
 
 
-class _Parser(argparse.ArgumentParser):
+class Parser(argparse.ArgumentParser):
+    """Says a usage error in one line."""
+
     def error(self, message: str) -> NoReturn:
         """Say a usage error in one line."""
         self.exit(USAGE, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
-def _parser() -> argparse.ArgumentParser:
-    from companion.cli import client, local
+def _parser() -> Parser:
+    from companion.cli import client, ground, local
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
-    common = _Parser(add_help=False, argument_default=argparse.SUPPRESS)
+    common = Parser(add_help=False, argument_default=argparse.SUPPRESS)
     common.add_argument("-c", "--config", type=Path, metavar="FILE", help=f"default: {config.DEFAULT_PATH}")
     common.add_argument("--json", action="store_true", help="print one JSON object on stdout")
 
-    parser = _Parser(
+    parser = Parser(
         prog="companion", parents=[common], description="Field self-calibration of gyro and accelerometer biases."
     )
     parser.add_argument("--version", action="version", version=f"companion {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    def add(name: str, command: Command, words: str) -> argparse.ArgumentParser:
+    def add(name: str, command: Command, words: str) -> Parser:
         sub = commands.add_parser(name, parents=[common], help=words, description=words)
         sub.set_defaults(command=command)
         return sub
@@ -92,7 +95,7 @@ def _parser() -> argparse.ArgumentParser:
     run = add("run", local.run, "run the daemon in the foreground")
     run.add_argument("-v", "--verbose", action="store_true", help="log what happens in detail")
     check = add("check", local.check, "check configuration, ports, sensors and autopilot; say what is wrong")
-    check.add_argument("--seconds", type=_seconds, default=3.0, metavar="S", help="how long to listen (default 3)")
+    check.add_argument("--seconds", type=seconds, default=3.0, metavar="S", help="how long to listen (default 3)")
     add("ports", local.ports, "list serial ports with their stable names")
     add(
         "lua",
@@ -106,7 +109,7 @@ def _parser() -> argparse.ArgumentParser:
     what.add_argument("--accelerometers", action="store_true", help="accelerometers only")
     calibrate.add_argument("--wait", action="store_true", help="wait for the end, show progress, print the record")
     calibrate.add_argument(
-        "--timeout", type=_seconds, metavar="S", help="cancel when it has not finished by then (default: no limit)"
+        "--timeout", type=seconds, metavar="S", help="cancel when it has not finished by then (default: no limit)"
     )
     calibrate.add_argument(
         "--reboot", action="store_true", help="restart the autopilot afterwards (PX4's attitude needs it)"
@@ -119,10 +122,12 @@ def _parser() -> argparse.ArgumentParser:
     history = add("history", client.history, "list past calibrations")
     history.add_argument("-n", "--limit", type=_count, default=20, metavar="N", help="the latest N (default 20)")
     add("monitor", client.monitor, "watch the daemon until Ctrl-C")
+    ground.add_commands(commands, common)
     return parser
 
 
-def _seconds(text: str) -> float:
+def seconds(text: str) -> float:
+    """An argument that is a time."""
     try:
         value = float(text)
     except ValueError:
