@@ -17,13 +17,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.component.commands import REMEMBER_FINAL_S
 from companion.ground.heard import Target
 
-ANSWER_WITHIN_S: Final = 1.0
-"""The companion answers within 0.3 s; the rest is for the radio."""
-ATTEMPTS: Final = 5
-REPEAT_AFTER_S: Final = (1.2, 1.7, 2.2)
+ANSWER_WITHIN_S: Final = (0.6, 0.6, 0.6, 0.6, 1.6)
+"""Of each attempt. The companion answers within 0.3 s, the rest is for the radio; all attempts are made while it would
+remember the end of the first, or else the last could start the same once more."""
+REPEAT_AFTER_S: Final = (1.2, 1.5, 1.8, 2.1, 2.4)
 """Seconds without an answer after which progress is asked for again: two ACKs may be lost in a row before. The last
 leaves the radio the rest of the time for which the companion remembers its final answer."""
-assert REPEAT_AFTER_S[-1] < REMEMBER_FINAL_S
+assert max(REPEAT_AFTER_S[-1], sum(ANSWER_WITHIN_S[:-1])) < REMEMBER_FINAL_S - 0.5
 ENDED_AFTER_S: Final = 5.0
 """So long without an answer while the heartbeat shows no work: the end came and was not heard."""
 LOST_AFTER_S: Final = 20.0
@@ -95,9 +95,9 @@ class Exchange:
             stop_watching()
 
     async def _begin(self) -> bool:
-        for _ in range(ATTEMPTS):
+        for within_s in ANSWER_WITHIN_S:
             self._send()
-            if await self._hears(ANSWER_WITHIN_S):
+            if await self._hears(within_s):
                 return True
         return False
 

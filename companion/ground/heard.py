@@ -132,7 +132,7 @@ class Heard:
         if text_id != 0:
             key = (system_id, text_id)
             chunks = self._unfinished.setdefault(key, {})
-            chunks[_whole(fields, "chunk_seq")] = words
+            chunks[_whole(fields, "chunk_seq") & 0xFF] = words
             if len(words) == CHUNK_BYTES:
                 if len(self._unfinished) > _MAX_UNFINISHED:
                     del self._unfinished[next(iter(self._unfinished))]

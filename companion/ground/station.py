@@ -109,7 +109,9 @@ class Station:
         while True:
             wanted = [found for found in self._heard.companions() if system_id in (None, found)]
             first_s = self._heard.first_s
-            if wanted and first_s is not None and loop.time() - first_s >= EVERYBODY_WITHIN_S:
+            waited_s = 0.0 if first_s is None else loop.time() - first_s
+            certain = system_id is not None and self._heard.vehicle(system_id, loop.time()).firmware is not None
+            if wanted and (certain or waited_s >= EVERYBODY_WITHIN_S):
                 break
             if loop.time() - begun_s >= within_s and not wanted:
                 raise NobodyHeardError(words.nobody_heard(self._heard, self._url, system_id, within_s))
