@@ -15,7 +15,7 @@ from companion.calibration.request import What
 from companion.component.commands import MAV_RESULT_CANCELLED
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity
-from companion.errors import AutopilotError, ConfigError, NobodyHeardError
+from companion.errors import ConfigError, NobodyHeardError
 from companion.ground import words
 from companion.ground.exchange import Answer, Exchange
 from companion.ground.heard import FRESH_S, Heard, Target, Text, Vehicle
@@ -102,7 +102,7 @@ class Station:
 
         Raises:
             NobodyHeardError: none came in time; says what was heard and what to try.
-            AutopilotError: several vehicles have a companion, and nobody has said which is meant.
+            ConfigError: several vehicles have a companion, and nobody has said which is meant.
         """
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
@@ -117,7 +117,7 @@ class Station:
                 raise NobodyHeardError(words.nobody_heard(self._heard, self._url, system_id, within_s))
             await asyncio.sleep(_POLL_S)
         if len(wanted) > 1:
-            raise AutopilotError(
+            raise ConfigError(
                 f"companions of systems {', '.join(map(str, wanted))} are heard: say which with --system N"
             )
         self._target = Target(wanted[0], self._heard.component_id)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.service import Refusal
 from companion.ground.exchange import Ack, Answer, Exchange
-from companion.ground.heard import Target
 from tests.support.component import (
     ACCEPTED,
     CALIBRATE,
@@ -19,57 +17,14 @@ from tests.support.component import (
     FAILED,
     UNDO,
     Bench,
-    Ground,
     bench,
-    command_message,
 )
+from tests.support.ground_wire import COMPANION, StationOnTheWire, is_final
 from tests.support.virtual_time import run_virtual
-
-COMPANION = Target(1, 191)
-
-
-class StationOnTheWire(Ground):
-    """pymavlink's packer and parser under an exchange."""
-
-    def __init__(self) -> None:
-        super().__init__(245, 190)
-        self.handlers: list[Callable[[Ack], None]] = []
-        self.confirmations: list[int] = []
-        self.deaf_to: Callable[[mavlink.MAVLink_message], bool] = lambda message: False
-        self.beats: list[tuple[float, int]] = []
-
-    def receive(self, data: bytes, t_s: float) -> None:
-        known = len(self.received)
-        super().receive(data, t_s)
-        for _, message in self.received[known:]:
-            if self.deaf_to(message):
-                continue
-            source = Target(message.get_srcSystem(), message.get_srcComponent())
-            if isinstance(message, mavlink.MAVLink_heartbeat_message):
-                self.beats.append((t_s, message.system_status))
-            if isinstance(message, mavlink.MAVLink_command_ack_message):
-                for handler in [*self.handlers]:
-                    handler(Ack(source, message.command, message.result, message.progress))
-
-    def send_command(self, target: Target, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
-        self.confirmations.append(confirmation)
-        self.send(command_message(command, *parameters, target=target, confirmation=confirmation))
-
-    def watch_acks(self, handler: Callable[[Ack], None]) -> Callable[[], None]:
-        self.handlers.append(handler)
-        return lambda: self.handlers.remove(handler)
-
-    def busy(self, since_s: float) -> bool | None:
-        later = [state for at_s, state in self.beats if at_s > since_s]
-        return later[-1] == mavlink.MAV_STATE_CALIBRATING if later else None
 
 
 def exchange(station: StationOnTheWire, command: int = CALIBRATE, *parameters: float) -> Exchange:
-    return Exchange(station, COMPANION, command, *parameters, busy=station.busy)
-
-
-def is_final(message: mavlink.MAVLink_message) -> bool:
-    return isinstance(message, mavlink.MAVLink_command_ack_message) and message.result != mavlink.MAV_RESULT_IN_PROGRESS
+    return Exchange(station, COMPANION, command, *parameters, busy=lambda since_s: station.heard.busy(1, since_s))
 
 
 def test_progress_is_shown_and_the_end_is_the_companions() -> None:
@@ -216,7 +171,11 @@ def test_answers_to_others_and_of_others_are_not_ours() -> None:
         async with bench(ground=station) as b:
             asking = asyncio.create_task(exchange(station).run())
             await asyncio.sleep(0.5)
-            for source, command in ((Target(1, 1), CALIBRATE), (Target(2, 191), CALIBRATE), (COMPANION, UNDO)):
+            for source, command in (
+                (COMPANION._replace(component_id=1), CALIBRATE),
+                (COMPANION._replace(system_id=2), CALIBRATE),
+                (COMPANION, UNDO),
+            ):
                 for handler in [*station.handlers]:
                     handler(Ack(source, command, mavlink.MAV_RESULT_DENIED, 0))
             await asyncio.sleep(0.5)
