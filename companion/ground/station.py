@@ -28,7 +28,7 @@ WORDS_WITHIN_S: Final = 3.0
 """For how long the words that belong to a result may follow it: two lines a second pass, results first."""
 CANCELLED_WITHIN_S: Final = 30.0
 """A cancel waits for a safe point, and old values may have to be put back."""
-SILENCE_WORTH_A_WORD_S: Final = 2.5
+SILENCE_WORTH_A_WORD_S: Final = 3.0
 _POLL_S: Final = 0.05
 
 State = Literal["done", "failed", "cancelled", "refused", "lost", "idle", "busy", "fault", "unknown"]
@@ -319,8 +319,13 @@ class Station:
             )
         elif busy:
             reason = "not waited for; the companion is still at work"
+        elif self.vehicle.armed != "unknown":
+            reason = (
+                "the companion fell silent, its autopilot did not: has it stopped?"
+                " If it was writing, it puts the old values back when it starts again"
+            )
         else:
-            reason = "nothing is heard of the companion any more; it goes on by itself: `companion ground status` later"
+            reason = "nothing is heard of the vehicle any more; it goes on by itself: `companion ground status` later"
         return Outcome("lost", reason, good=False, lines=self._warnings(begun_s, None), more=self._more(begun_s))
 
     async def _wait_for_text(
@@ -364,7 +369,7 @@ class Station:
 
     def _show_progress(self, percent: int, silent_s: float) -> None:
         if silent_s >= SILENCE_WORTH_A_WORD_S:
-            stage = f"nothing heard for {silent_s:.0f} s"
+            stage = f"nothing heard for {max(silent_s // 5 * 5, SILENCE_WORTH_A_WORD_S):.0f} s"
         elif percent < MEASURED_PERCENT:
             stage = self._waiting_for or "measuring: keep the aircraft still"
         elif percent < WRITTEN_PERCENT:

@@ -132,7 +132,10 @@ def test_an_end_that_was_not_heard_is_no_success(value: float | None, words: str
     run_virtual(main())
 
 
-def test_a_companion_that_is_gone_is_given_up_with_words() -> None:
+@pytest.mark.parametrize(
+    ("autopilot", "words"), [(False, "companion ground status"), (True, "puts the old values back")]
+)
+def test_a_companion_that_is_gone_is_given_up_with_words(autopilot: bool, words: str) -> None:
     async def main() -> None:
         wire, notes = StationOnTheWire(), Notes()
         async with bench(ground=wire) as b:
@@ -141,9 +144,13 @@ def test_a_companion_that_is_gone_is_given_up_with_words() -> None:
             asking = asyncio.create_task(station.calibrate(What.BOTH, None, reboot=False))
             await until_started(b)
             b.wire.cut = True
+            while not asking.done():
+                if autopilot:
+                    beat(wire, 1, 1, mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4)
+                await asyncio.sleep(1.0)
             outcome = await asking
             assert (outcome.state, outcome.good) == ("lost", False)
-            assert "companion ground status" in outcome.reason
+            assert words in outcome.reason
             assert "nothing heard for 10 s" in notes.stages
 
     run_virtual(main())
