@@ -7,7 +7,7 @@ from typing import Final, Literal, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.component.statustext import CHUNK_BYTES
+from companion.component.statustext import CHUNK_BYTES, to_ascii
 
 FIRMWARES: Final = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot", mavlink.MAV_AUTOPILOT_PX4: "PX4"}
 _NO_VEHICLES: Final = frozenset({mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ONBOARD_CONTROLLER})
@@ -139,7 +139,8 @@ class Heard:
                 return
             del self._unfinished[key]
             words = "".join(chunks.get(number, "...") for number in range(max(chunks) + 1))
-        text = Text(_whole(fields, "severity"), words, now_s)
+        # Whatever it was: on a terminal it can do nothing but be read.
+        text = Text(_whole(fields, "severity"), to_ascii(words), now_s)
         self.texts.append((system_id, text))
         del self.texts[:-MAX_TEXTS]
         self.on_text(system_id, text)

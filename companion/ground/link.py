@@ -15,7 +15,7 @@ import json
 import logging
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from companion.errors import AutopilotError, ConfigError, LinkError
 from companion.ground.exchange import Ack
@@ -125,6 +125,34 @@ class GroundLink:
                 handler(ack)
 
 
+class _Log:
+    """Takes MAVSDK's log, which would go to the terminal otherwise.
+
+    Not by `mavsdk.log_subscribe`: that fails on a text that is not UTF-8, as any component's STATUSTEXT may be (MAVSDK
+    logs them all), and the text then does go to the terminal, with a complaint about itself.
+    """
+
+    def __init__(self) -> None:
+        from mavsdk.cmavsdk_loader import _cmavsdk_lib
+        from mavsdk.logging import LogCallback, LogLevel
+
+        self.last_error = ""
+        self._error = LogLevel.ERROR
+        # Kept as long as the library may call it: for as long as it is loaded.
+        _Log.callback = LogCallback(self._take)
+        _cmavsdk_lib.mavsdk_log_subscribe(_Log.callback, None)
+
+    callback: ClassVar[Any] = None
+
+    def _take(self, level: int, message: bytes | None, *_: object) -> bool:
+        """In one of MAVSDK's threads; True: it is not to print this itself."""
+        words = (message or b"").decode(errors="replace")
+        logger.debug("MAVSDK: %s", words)
+        if level == self._error:
+            self.last_error = words.partition(": ")[2] or words
+        return True
+
+
 @asynccontextmanager
 async def open_link(url: str, heard: Heard) -> AsyncIterator[GroundLink]:
     """Be a ground station on a link; `heard` learns what comes.
@@ -139,17 +167,7 @@ async def open_link(url: str, heard: Heard) -> AsyncIterator[GroundLink]:
     except (ImportError, OSError) as error:
         raise ConfigError(f"companion ground needs MAVSDK 4.1: {error}; {INSTALL}") from None
     kind, where, number = parse_url(url)
-    problem = ""
-
-    def log(level: int, words: str, *_: object) -> bool:
-        """Runs in MAVSDK's threads; True keeps its log off stdout."""
-        nonlocal problem
-        logger.debug("MAVSDK: %s", words)
-        if level == mavsdk.LogLevel.ERROR:
-            problem = words
-        return True
-
-    mavsdk.log_subscribe(log)
+    log = _Log()
     configuration = mavsdk.Configuration.create_with_component_type(mavsdk.ComponentType.GROUND_STATION)
     own = Target(configuration.system_id, configuration.component_id)
     with mavsdk.Mavsdk(configuration) as sdk:
@@ -158,5 +176,5 @@ async def open_link(url: str, heard: Heard) -> AsyncIterator[GroundLink]:
         try:
             await asyncio.to_thread(sdk.add_any_connection_with_handle, f"{_SCHEMES[kind]}://{where}:{number}")
         except mavsdk.MavsdkError as error:
-            raise LinkError(f"{url} cannot be opened: {problem.partition(': ')[2] or problem or error}") from None
+            raise LinkError(f"{url} cannot be opened: {log.last_error or error}") from None
         yield link

@@ -181,7 +181,6 @@ class Station:
 
     async def status(self) -> Outcome:
         """What the companion is doing, its settings and its last result."""
-        loop = asyncio.get_running_loop()
         beat = self._heard.heartbeats[self._target]
         state: State = {
             mavlink.MAV_STATE_CALIBRATING: "busy",
@@ -216,8 +215,7 @@ class Station:
                 f"at arming: {words.AT_ARM[int(at_arm)] if at_arm in (0.0, 1.0, 2.0) else 'unknown'};"
                 f" results are {'written to the autopilot' if found.get('CMP_PUSH') else 'NOT written (CMP_PUSH = 0)'}"
             )
-        lines += [f"said: {text.words}" for text in self._heard.texts_of(self._target.system_id, 0.0)]
-        more = {**self._more(loop.time()), "last": last, **sigma, "parameters": found}
+        more = {**self._more(0.0), "last": last, **sigma, "parameters": found}
         return Outcome(state, reason, good=True, lines=lines, more=more)
 
     async def parameters(self, wanted: dict[str, float]) -> Outcome:
@@ -353,6 +351,9 @@ class Station:
         return said.words if said is not None else f"{name} not set: {problem}"
 
     async def _own_parameters(self) -> dict[str, float]:
+        # MAVSDK's list waits over 10 s for its first answer, and tells nobody; one parameter is given up after 3 s.
+        if await self._link.get_parameter(self._target, "CMP_STATE") is None:
+            return {}
         found = await self._link.parameters(self._target)
         return {name: value for name, value in sorted(found.items()) if name.startswith("CMP_")}
 

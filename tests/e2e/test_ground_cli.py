@@ -10,8 +10,10 @@ import os
 import signal
 import sys
 from pathlib import Path
+from typing import cast
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.motions import Handling
 from sim.scenario import Firmware
@@ -71,83 +73,88 @@ def test_calibrated_and_undone_from_the_ground(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-def test_while_the_aircraft_is_handled(tmp_path: Path) -> None:
+def test_cancelled_refused_and_set(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with asyncio.TaskGroup() as group:
+            for one in (while_the_aircraft_is_handled, armed_and_its_own_parameters):
+                folder = tmp_path / one.__name__
+                folder.mkdir()
+                group.create_task(one(folder), name=one.__name__)
+
+    asyncio.run(main())
+
+
+async def while_the_aircraft_is_handled(folder: Path) -> None:
     """It waits and says for what; cancelled by the time given, by Ctrl-C, and by somebody on board."""
+    async with ground_line(folder, "ardupilot", motions=[Handling(start_s=0.0, duration_s=600.0)]) as line:
+        late = await line.ground("calibrate", "--timeout", "2", "--json")
+        assert late.code == FAILED, late
+        assert late.json["state"] == "cancelled"
+        assert "not finished within 2 s" in late.json["reason"]
+        assert "still" in late.err
 
-    async def main() -> None:
-        async with ground_line(tmp_path, "ardupilot", motions=[Handling(start_s=0.0, duration_s=600.0)]) as line:
-            late = await line.ground("calibrate", "--timeout", "2", "--json")
-            assert late.code == FAILED, late
-            assert late.json["state"] == "cancelled"
-            assert "not finished within 2 s" in late.json["reason"]
-            assert "still" in late.err
+        process = await line.start("calibrate")
+        await _until_said(process, "Calibration started")
+        process.send_signal(signal.SIGINT)
+        interrupted = await finish(process, 10.0)
+        assert interrupted.code == FAILED
+        assert "Ctrl-C: cancelling" in interrupted.err
+        assert "CANCELLED after" in interrupted.out
+        assert "Traceback" not in interrupted.err
 
-            process = await line.start("calibrate")
-            await _until_said(process, "Calibration started")
-            process.send_signal(signal.SIGINT)
-            interrupted = await finish(process, 10.0)
-            assert interrupted.code == FAILED
-            assert "Ctrl-C: cancelling" in interrupted.err
-            assert "CANCELLED after" in interrupted.out
-            assert "Traceback" not in interrupted.err
+        process = await line.start("calibrate", "--json")
+        await _until_said(process, "Calibration started")
+        busy = await line.daemon.status()
+        assert busy is not None
+        assert busy["state"] == "waiting"
+        await line.daemon.cancel()
+        cancelled = await finish(process, 10.0)
+        assert cancelled.code == FAILED
+        assert cancelled.json["state"] == "cancelled"
+        assert cancelled.json["reason"] == "cancelled by companion cancel"
 
-            process = await line.start("calibrate", "--json")
-            await _until_said(process, "Calibration started")
-            busy = await line.daemon.status()
-            assert busy is not None
-            assert busy["state"] == "waiting"
-            await line.daemon.cancel()
-            cancelled = await finish(process, 10.0)
-            assert cancelled.code == FAILED
-            assert cancelled.json["state"] == "cancelled"
-            assert cancelled.json["reason"] == "cancelled by companion cancel"
-
-            idle = await line.ground("cancel", "--json")
-            assert idle.code == DONE
-            assert idle.json["reason"] == "nothing was running"
-            await line.daemon.start_calibration()
-            running = await line.ground("cancel", "--json")
-            assert running.code == DONE
-            assert running.json["state"] == "cancelled"
-            assert running.json["reason"].startswith("Calibration cancelled by mavlink 245/190")
-            assert line.scenario.autopilot.writes == []
-
-    asyncio.run(main())
+        idle = await line.ground("cancel", "--json")
+        assert idle.code == DONE
+        assert idle.json["reason"] == "nothing was running"
+        await line.daemon.start_calibration()
+        running = await line.ground("cancel", "--json")
+        assert running.code == DONE
+        assert running.json["state"] == "cancelled"
+        assert running.json["reason"].startswith("Calibration cancelled by mavlink 245/190")
+        assert line.scenario.autopilot.writes == []
 
 
-def test_armed_and_its_own_parameters(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with ground_line(tmp_path, "px4") as line:
-            listed = await line.ground("params", "--json")
-            assert listed.code == DONE, listed
-            assert listed.json["parameters"]["CMP_PUSH"] == 1.0
-            assert all(name.startswith("CMP_") for name in listed.json["parameters"])
+async def armed_and_its_own_parameters(folder: Path) -> None:
+    """What is not allowed is refused with the reason, and what is allowed is set."""
+    async with ground_line(folder, "px4") as line:
+        listed = await line.ground("params", "--json")
+        assert listed.code == DONE, listed
+        assert listed.json["parameters"]["CMP_PUSH"] == 1.0
+        assert all(name.startswith("CMP_") for name in listed.json["parameters"])
 
-            changed = await line.ground("params", "CMP_PUSH=0", "cmp_gyr_tgt=2.5")
-            assert changed.code == DONE, changed
-            assert "until the companion restarts" in changed.out
-            refused = await line.ground("params", "CMP_AT_ARM=7", "--json")
-            assert refused.code == FAILED
-            assert refused.json["reason"] == "CMP_AT_ARM not set: 7 is not in 0 .. 2"
-            values = refused.json["parameters"]
-            assert (values["CMP_PUSH"], values["CMP_GYR_TGT"], values["CMP_AT_ARM"]) == (0.0, 2.5, 0.0)
-            unknown = await line.ground("params", "CMP_PSH=1")
-            assert unknown.code == USAGE
-            assert "nearest: CMP_PUSH" in unknown.err
-            assert unknown.err.count("\n") == 1
+        changed = await line.ground("params", "CMP_PUSH=0", "cmp_gyr_tgt=2.5")
+        assert changed.code == DONE, changed
+        assert "until the companion restarts" in changed.out
+        refused = await line.ground("params", "CMP_AT_ARM=7", "--json")
+        assert refused.code == FAILED
+        assert refused.json["reason"] == "CMP_AT_ARM not set: 7 is not in 0 .. 2"
+        values = refused.json["parameters"]
+        assert (values["CMP_PUSH"], values["CMP_GYR_TGT"], values["CMP_AT_ARM"]) == (0.0, 2.5, 0.0)
+        unknown = await line.ground("params", "CMP_PSH=1")
+        assert unknown.code == USAGE
+        assert "nearest: CMP_PUSH" in unknown.err
+        assert unknown.err.count("\n") == 1
 
-            autopilot = line.scenario.autopilot
-            autopilot.arm()
-            await asyncio.sleep(1.5)  # until the heartbeat says so
-            armed = await line.ground("calibrate", "--json")
-            assert armed.code == FAILED
-            assert (armed.json["state"], armed.json["reason"]) == ("refused", "armed: disarm first")
-            assert armed.json["vehicle"]["armed"] == "armed"
-            words = await line.ground("undo")
-            assert words.code == FAILED
-            assert words.out == "REFUSED: armed: disarm first\n"
-
-    asyncio.run(main())
+        autopilot = line.scenario.autopilot
+        autopilot.arm()
+        await asyncio.sleep(1.5)  # until the heartbeat says so
+        armed = await line.ground("calibrate", "--json")
+        assert armed.code == FAILED
+        assert (armed.json["state"], armed.json["reason"]) == ("refused", "armed: disarm first")
+        assert armed.json["vehicle"]["armed"] == "armed"
+        words = await line.ground("undo")
+        assert words.code == FAILED
+        assert words.out == "REFUSED: armed: disarm first\n"
 
 
 @pytest.mark.parametrize(("firmware", "hint"), [("ardupilot", "another port"), ("px4", "MAV_1_FORWARD")])
@@ -229,3 +236,40 @@ async def _until_said(process: asyncio.subprocess.Process, words: str) -> None:
     async with asyncio.timeout(15.0):
         while words not in (line := await process.stderr.readline()).decode():
             assert line, f"{words!r} was never said"
+
+
+class _Chatterbox(asyncio.DatagramProtocol):
+    """A vehicle on UDP whose components speak in bytes that are no UTF-8, with noise between the packets."""
+
+    def __init__(self) -> None:
+        self._codecs = [mavlink.MAVLink(None, 1, 1), mavlink.MAVLink(None, 1, 191)]
+        self._transport: asyncio.DatagramTransport
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast("asyncio.DatagramTransport", transport)
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        for codec, kind, autopilot in zip(self._codecs, (2, 18), (3, 8), strict=True):
+            for message in (
+                mavlink.MAVLink_statustext_message(4, b"\xff\xfe \xb2\xe2\xca\xd4 \x1b[31m", 0, 0),
+                mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, mavlink.MAV_STATE_STANDBY, 3),
+            ):
+                self._transport.sendto(message.pack(codec), addr)
+                codec.seq = (codec.seq + 1) % 256
+        self._transport.sendto(b"\x00\xff noise", addr)
+
+
+def test_texts_that_are_no_utf_8_spoil_nothing() -> None:
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        transport, _ = await loop.create_datagram_endpoint(_Chatterbox, local_addr=("127.0.0.1", 0))
+        port = transport.get_extra_info("sockname")[1]
+        try:
+            said = await finish(await ground("status", "--url", f"udpout:127.0.0.1:{port}", "--json"))
+        finally:
+            transport.close()
+        assert said.code == DONE, said
+        assert set(said.json["texts"]) == {"?? ???? ?[31m"}
+        assert set(said.err.splitlines()) == {"?? ???? ?[31m"}, "what the companion says, and nothing of MAVSDK's"
+
+    asyncio.run(main())

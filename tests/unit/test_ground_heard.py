@@ -71,6 +71,12 @@ def test_a_text_of_full_chunks_ends_with_an_empty_one_and_a_gap_shows() -> None:
     assert said(heard) == ["a" * 50, "b" * 50 + "..." + "end"]
 
 
+def test_what_a_terminal_would_obey_is_not_passed_on() -> None:
+    heard = Heard(191)
+    say(heard, "calm \x1b[31mred\x07 \ufffd 5\u00b0")
+    assert said(heard) == ["calm ?[31mred? ? 5 deg"]
+
+
 def test_what_never_ends_is_forgotten() -> None:
     heard = Heard(191)
     for text_id in range(1, 1000):
