@@ -176,5 +176,6 @@ async def open_link(url: str, heard: Heard) -> AsyncIterator[GroundLink]:
         try:
             await asyncio.to_thread(sdk.add_any_connection_with_handle, f"{_SCHEMES[kind]}://{where}:{number}")
         except mavsdk.MavsdkError as error:
-            raise LinkError(f"{url} cannot be opened: {log.last_error or error}") from None
+            hint = "; another ground station has it: docs/ground_stations.md" if "in use" in log.last_error else ""
+            raise LinkError(f"{url} cannot be opened: {log.last_error or error}{hint}") from None
         yield link

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import socket
 import sys
 from pathlib import Path
 from typing import cast
@@ -209,6 +210,16 @@ def test_a_port_that_cannot_be_opened_is_one_line(tmp_path: Path) -> None:
     assert said.code == FAILED
     assert said.err.count("\n") == 1
     assert "radio:57600 cannot be opened: No such file" in said.err
+
+
+def test_a_port_that_another_ground_station_has_is_named() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        port = other.getsockname()[1]
+        said = asyncio.run(_run("status", "--url", f"udpin:127.0.0.1:{port}"))
+    assert said.code == FAILED
+    assert said.err.count("\n") == 1
+    assert f"{port} cannot be opened: Address already in use; another ground station has it" in said.err
 
 
 @pytest.mark.parametrize("missing", ["mavsdk", "rich", "rich.progress"])
