@@ -23,6 +23,10 @@ class DaemonUnreachableError(CompanionError):
     """No daemon answers on the control socket."""
 
 
+class DaemonDeniedError(DaemonUnreachableError):
+    """A daemon is there, but this user may not use its control socket."""
+
+
 class NobodyHeardError(CompanionError):
     """From the ground: no vehicle, or no companion, was heard or answers on the link."""
 

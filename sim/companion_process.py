@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
+import signal
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -18,15 +21,22 @@ class CompanionProcess:
     """`companion run` with the `companion.toml` of a folder; its log becomes `daemon.log` there.
 
     An async context manager: starts on entering, and is stopped in order on leaving.
+
+    Args:
+        folder: of the configuration and the log.
+        environment: variables beside our own.
+        entry: what Python is given to run, in place of `-m companion`.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(
+        self, folder: Path, *, environment: Mapping[str, str] | None = None, entry: Sequence[str] = ("-m", "companion")
+    ) -> None:
+        self.folder, self._environment, self._entry = folder, {**os.environ, **(environment or {})}, entry
         self._process: asyncio.subprocess.Process | None = None
 
     def command(self, *words: str) -> list[str]:
         """A command line of the companion with this configuration."""
-        return [sys.executable, "-m", "companion", "-c", str(self.folder / "companion.toml"), *words]
+        return [sys.executable, *self._entry, "-c", str(self.folder / "companion.toml"), *words]
 
     def log(self) -> str:
         """What it has logged."""
@@ -34,7 +44,9 @@ class CompanionProcess:
 
     async def __aenter__(self) -> Self:
         with (self.folder / "daemon.log").open("wb") as log:
-            self._process = await asyncio.create_subprocess_exec(*self.command("run"), stderr=log)
+            self._process = await asyncio.create_subprocess_exec(
+                *self.command("run"), stderr=log, env=self._environment
+            )
         return self
 
     async def __aexit__(
@@ -47,8 +59,22 @@ class CompanionProcess:
 
     def kill(self) -> None:
         """SIGKILL, as a crash."""
+        self.signal(signal.SIGKILL)
+
+    def signal(self, number: int) -> None:
+        """Send it a signal."""
         assert self._process is not None
-        self._process.kill()
+        self._process.send_signal(number)
+
+    async def ended(self, within_s: float) -> int:
+        """Wait for its end; the exit code, negative if a signal killed it.
+
+        Raises:
+            TimeoutError: it goes on.
+        """
+        assert self._process is not None
+        async with asyncio.timeout(within_s):
+            return await self._process.wait()
 
     async def status(self) -> Record | None:
         """`companion status --json`; None while it does not answer."""

@@ -39,6 +39,9 @@ _BETTER_AGAIN_S: Final = 30.0
 """How often a better message that merely never came is asked for again."""
 
 _LOOK_S: Final = 0.25
+_TURN_S: Final = 1.0
+BEAT_WITHIN_S: Final = 20.0
+"""A request may wait behind fifteen others, each of which goes unanswered (`autopilot.commands`)."""
 _REFUSED: Final = -1
 _ABSENT_AFTER: Final = 10
 _TEMPERATURE_RATE_HZ: Final = 2.0
@@ -103,6 +106,8 @@ class ImuStream:
         self.samples = 0
         self.problem = f"waiting for the autopilot to start IMU {instance}"
         """Why there are no samples, one line; empty while there are."""
+        self.on_beat: Callable[[], None] = lambda: None
+        """Called at every turn of `run`: at least every `BEAT_WITHIN_S`, whether samples come or not."""
         self.rejected: Counter[str] = Counter()
         """Messages that gave no sample, by reason."""
         self._vehicle, self._instance = vehicle, instance
@@ -143,7 +148,7 @@ class ImuStream:
         """From finding the autopilot to losing it."""
         if not self._vehicle.alive:
             self._lose("no heartbeat from the autopilot")
-        await self._vehicle.wait_found()
+        await self._until_found()
         self._restart.clear()
         if self._vehicle.firmware == "ardupilot":
             messages = imu_messages.ARDUPILOT[self._instance]
@@ -165,6 +170,16 @@ class ImuStream:
             else:
                 await self._keep(found)
 
+    async def _until_found(self) -> None:
+        while True:
+            self.on_beat()
+            try:
+                async with asyncio.timeout(_TURN_S):
+                    await self._vehicle.wait_found()
+            except TimeoutError:
+                continue
+            return
+
     async def _find(self) -> _Source | None:
         """The first source, best first, that sends."""
         for source in self._sources:
@@ -183,6 +198,7 @@ class ImuStream:
     async def _ask(self, source: _Source) -> int | None:
         """Ask for a message at the fastest rate that is not denied: the last answer, None when none came in time."""
         while True:
+            self.on_beat()
             rate_hz = source.rates_hz[source.rate]
             result = await self._vehicle.commands.request_message_interval(source.message.message.id, rate_hz)
             if result == mavlink.MAV_RESULT_DENIED and not self._restart.is_set():
@@ -274,11 +290,17 @@ class ImuStream:
 
     async def _pause(self, seconds: float) -> bool:
         """Wait, but not beyond the loss or restart of the autopilot; True when that came."""
-        try:
-            async with asyncio.timeout(seconds):
-                await self._restart.wait()
-        except TimeoutError:
-            return False
+        deadline_s = asyncio.get_running_loop().time() + seconds
+        while not self._restart.is_set():
+            self.on_beat()
+            left_s = deadline_s - asyncio.get_running_loop().time()
+            if left_s <= 0.0:
+                return False
+            try:
+                async with asyncio.timeout(min(left_s, _TURN_S)):
+                    await self._restart.wait()
+            except TimeoutError:
+                continue
         return True
 
     # --- what arrives

@@ -195,11 +195,33 @@ def _truth(
     return Truth(up, covariance, heading, heading_sigma, gradienter is not None, tilt_sigma)
 
 
+def up_in_vehicle(model: GradienterModel, x_deg: float, y_deg: float) -> Array:
+    """Up in the vehicle's axes, shape (3,), from the gradienter's two readings.
+
+    Raises:
+        ValueError: the readings cannot belong together.
+    """
+    x_deg, y_deg = x_deg - model.offset_deg[0], y_deg - model.offset_deg[1]
+    return model.vehicle_from_sensor @ up_in_sensor(model.law, x_deg, y_deg)
+
+
+def vehicle_heading_rad(compass: CompassModel, heading_deg: float, up: Array) -> float:
+    """Heading of the vehicle, from the compass' own north (magnetic or true), not wrapped.
+
+    A compass gives the azimuth of its own forward axis. The azimuth that this axis has when the vehicle heads
+    north, at the tilt it has, is what the mounting adds.
+    """
+    gamma, theta = roll_pitch_from_up(up)
+    forward_ned = body_from_ned(gamma, theta, 0.0).T @ compass.vehicle_from_sensor[:, 0]
+    mounted_rad = math.atan2(forward_ned[1], forward_ned[0])
+    return (heading_deg + compass.offset_deg) * DEG - mounted_rad
+
+
 def _up(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix]:
     """Up in the vehicle's axes and its covariance (3x3, radian squared)."""
     x_deg, y_deg = tilt.x_deg - model.offset_deg[0], tilt.y_deg - model.offset_deg[1]
     try:
-        up = model.vehicle_from_sensor @ up_in_sensor(model.law, x_deg, y_deg)
+        up = up_in_vehicle(model, tilt.x_deg, tilt.y_deg)
         jacobian = model.vehicle_from_sensor @ up_jacobian(model.law, x_deg, y_deg)
     except ValueError as error:
         raise CalibrationRefusedError(str(error)) from None
@@ -208,20 +230,13 @@ def _up(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix]:
 
 
 def _heading(window: HeadingWindow, compass: CompassModel, up: Array, local: LocalEarth) -> tuple[float, float]:
-    """True heading of the vehicle and its sigma, radians.
-
-    A compass gives the azimuth of its own forward axis. The azimuth that this axis has when the vehicle heads
-    north, at the tilt it has, is what the mounting adds.
-    """
-    gamma, theta = roll_pitch_from_up(up)
-    forward_ned = body_from_ned(gamma, theta, 0.0).T @ compass.vehicle_from_sensor[:, 0]
-    mounted_rad = math.atan2(forward_ned[1], forward_ned[0])
+    """True heading of the vehicle and its sigma, radians."""
     sigma_deg = math.hypot(compass.sigma_deg, window.sigma_deg)
-    heading_deg = window.heading_deg + compass.offset_deg
+    heading_rad = vehicle_heading_rad(compass, window.heading_deg, up)
     if compass.magnetic:
-        heading_deg += local.declination_deg
+        heading_rad += local.declination_deg * DEG
         sigma_deg = math.hypot(sigma_deg, local.declination_sigma_deg)
-    return heading_deg * DEG - mounted_rad, sigma_deg * DEG
+    return heading_rad, sigma_deg * DEG
 
 
 def _pose(truth: Truth) -> Pose:

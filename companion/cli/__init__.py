@@ -61,8 +61,13 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
 
 def load_config(options: argparse.Namespace) -> config.Config:
     """The configuration that -c names, or the default one."""
+    return config.load(config_path(options))
+
+
+def config_path(options: argparse.Namespace) -> Path:
+    """The file that -c names, or the default one."""
     path: Path = getattr(options, "config", config.DEFAULT_PATH)
-    return config.load(path)
+    return path
 
 
 class Parser(argparse.ArgumentParser):
@@ -74,7 +79,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _parser() -> Parser:
-    from companion.cli import client, ground, local
+    from companion.cli import client, ground, install, local, recordings
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -102,6 +107,7 @@ def _parser() -> Parser:
         local.lua,
         "print the arming script for ArduPilot (> APM/scripts/companion_arming.lua), and how to install it",
     )
+    install.add_commands(add)
     add("status", client.status, "what the daemon is doing")
     calibrate = add("calibrate", client.calibrate, "calibrate now (the aircraft must be disarmed and still)")
     what = calibrate.add_mutually_exclusive_group()
@@ -122,12 +128,17 @@ def _parser() -> Parser:
     history = add("history", client.history, "list past calibrations")
     history.add_argument("-n", "--limit", type=_count, default=20, metavar="N", help="the latest N (default 20)")
     add("monitor", client.monitor, "watch the daemon until Ctrl-C")
+    recordings.add_commands(add)
     ground.add_commands(commands, common)
     return parser
 
 
 def seconds(text: str) -> float:
-    """An argument that is a time."""
+    """An argument that is a time.
+
+    Raises:
+        argparse.ArgumentTypeError: it is none.
+    """
     try:
         value = float(text)
     except ValueError:

@@ -4,27 +4,21 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import logging
-import os
+import faulthandler
 import sys
 
-from companion.cli import DONE, FAILED, load_config, print_json, show
+from companion.cli import DONE, FAILED, config_path, load_config, logs, print_json, show
 
 
 async def run(options: argparse.Namespace) -> int:
     """`companion run`."""
     config = load_config(options)
-    logging.basicConfig(
-        level=logging.DEBUG if options.verbose else logging.INFO,
-        # Under systemd the journal stamps the time itself.
-        format="%(levelname)s %(message)s"
-        if "JOURNAL_STREAM" in os.environ
-        else "%(asctime)s %(levelname)s %(message)s",
-        stream=sys.stderr,
-    )
-    from companion.daemon import service
+    # Where the whole process stands still the watchdog's SIGABRT is the only witness: let it say where that was.
+    faulthandler.enable()
+    logs.set_up("debug" if options.verbose else config.log.level)
+    from companion.daemon import process
 
-    await service.run(config)
+    await process.run(config, config_path(options))
     return DONE
 
 

@@ -73,12 +73,22 @@ def status_lines(status: Object) -> list[str]:
         lines.append(f"FAULT: {status['fault']}")
     if status["putting_back"]:
         lines.append("an interrupted write is being put back (needs the autopilot, disarmed)")
+    recording = status["recording"]
+    if recording["fault"] is not None:
+        lines.append(f"recordings: none at present: {recording['fault']}")
+    if recording["lost"]:
+        lines.append(f"recordings: {recording['lost']} messages lost so far, the disk is too slow")
+    if recording["file"] is not None:
+        file = recording["file"]
+        lines.append(f"recording to {file['path']}: {file['seconds']:.0f} s, {file['bytes'] / 1e6:.1f} MB")
     vehicle = status["vehicle"]
     lines.append(f"autopilot: {vehicle['summary']}")
     lines += [f"{device['name']}: {device['summary']}" for device in status["devices"]]
     lines += [f"warning: {warning}" for warning in status["warnings"]]
     if not status["ground_stations"]["good"]:
         lines.append(f"ground stations: {status['ground_stations']['summary']}")
+    if status["mqtt"] is not None:
+        lines.append(f"mqtt: {status['mqtt']['summary']}")
     arming = status["arming"]
     lines.append(
         f"at arming ({arming['at_arm']}): {_VERDICTS[arming['verdict']]}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -35,6 +36,8 @@ class Component:
         self._known_as = link.system_id
         """The system id under which we were heard last."""
         self._next_heartbeat_s = -math.inf
+        self.on_beat: Callable[[], None] = lambda: None
+        """Called at every turn of the working loop."""
         self.texts = StatusText(link, self._woken.set)
         self.parameters = OwnParameters(link, self.texts.say, self._woken.set)
         self._commands = CommandServer(link, service, self.texts.say, self._woken.set)
@@ -53,6 +56,7 @@ class Component:
             while True:
                 self._woken.clear()
                 due_s = self._step(loop.time())
+                self.on_beat()
                 timer = loop.call_at(due_s, self._woken.set)
                 try:
                     await self._woken.wait()

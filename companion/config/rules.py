@@ -6,6 +6,7 @@ import difflib
 import math
 import re
 
+from companion.config.mqtt_rules import check_mqtt
 from companion.config.sections import Config, Imu, Mounting
 from companion.config.words import allowed
 from companion.errors import ConfigError
@@ -13,6 +14,7 @@ from companion.rotations import ROTATIONS_DEG
 
 UPRIGHT_COSINE = 0.5
 LAST_PORT = 65535
+LEAST_RECORDINGS_MB = 8
 PORT_WORDS = "a device path (/dev/...) or tcp://HOST:PORT"
 
 
@@ -50,9 +52,16 @@ def check_together(config: Config, name: str) -> None:
             _check_port(device.port, f"{section}.port", name)
     _check_ports_differ(config, name)
     _check_mavlink_url(config.mavlink.url, name)
+    if config.mqtt is not None:
+        check_mqtt(config.mqtt, name)
     if (config.vehicle.latitude_deg is None) != (config.vehicle.longitude_deg is None):
         raise ConfigError(
             f"{name}: 'vehicle': found only one of latitude_deg and longitude_deg; allowed: both or neither"
+        )
+    room_mb = config.storage.recordings_mb
+    if room_mb is not None and 0 < room_mb < LEAST_RECORDINGS_MB:
+        raise ConfigError(
+            f"{name}: 'storage.recordings_mb': found {room_mb}; allowed: 0 (none) or at least {LEAST_RECORDINGS_MB}"
         )
     if config.calibration.max_s < config.calibration.min_still_s:
         raise ConfigError(

@@ -16,6 +16,7 @@ CompassProtocol = Literal["hmr3300"]
 Law = Literal["axis", "slope", "euler"]
 Parity = Literal["none", "even", "odd"]
 AtArm = Literal["gate", "warn", "off"]
+LogLevel = Literal["debug", "info", "warning", "error"]
 
 Latitude = Annotated[float, Meta(ge=-90, le=90)]
 Longitude = Annotated[float, Meta(ge=-180, le=180)]
@@ -119,18 +120,47 @@ class Mqtt(Section, frozen=True):
     """A broker to speak to; the section absent means no MQTT."""
 
     host: NonEmpty
-    port: Annotated[int, Meta(ge=1, le=65535)] = 1883
-    base_topic: NonEmpty = "companion"
+    port: Annotated[int, Meta(ge=1, le=65535)] | None = None
+    """8883 with TLS, else 1883, where it is not said."""
+    base_topic: NonEmpty | None = None
+    """What all topics begin with; "companion/" and the vehicle's system id where it is not said."""
+    client_id: NonEmpty | None = None
+    """The base topic with "-" for "/" where it is not said."""
     username: NonEmpty | None = None
     password_file: NonEmpty | None = None
     tls: bool = False
-    tls_ca_file: NonEmpty | None = None
+    ca_file: NonEmpty | None = None
+    """Who is trusted to sign the broker's certificate; the system's authorities where it is not said."""
+    cert_file: NonEmpty | None = None
+    key_file: NonEmpty | None = None
+    keepalive_s: Annotated[int, Meta(ge=5, le=600)] = 15
+    discovery: NonEmpty | None = None
+    """Home Assistant's discovery prefix (its default is "homeassistant"); absent: no discovery messages."""
+
+    @property
+    def broker_port(self) -> int:
+        """The port: as configured, else that of the protocol."""
+        return self.port or (8883 if self.tls else 1883)
+
+    @property
+    def password_path(self) -> Path | None:
+        """The password's file; one without a folder is looked for among systemd's credentials."""
+        if self.password_file is None:
+            return None
+        return Path(os.environ.get("CREDENTIALS_DIRECTORY", "/")) / self.password_file
 
 
 class Control(Section, frozen=True):
-    """The socket on which `companion status`, `calibrate`, ... find the daemon."""
+    """The socket on which `companion status`, `calibrate`, ... find the daemon, and who may use it."""
 
     socket: NonEmpty | None = None
+    group: NonEmpty | None = None
+    """Whose members may use it, besides the daemon's own user and root."""
+
+    @property
+    def group_name(self) -> str | None:
+        """The group: as configured, else the one that the service's unit names, else None."""
+        return self.group or os.environ.get("COMPANION_CONTROL_GROUP") or None
 
     @property
     def path(self) -> Path:
@@ -144,6 +174,8 @@ class Storage(Section, frozen=True):
     """Where records and the values for undo are kept."""
 
     directory: NonEmpty | None = None
+    recordings_mb: Annotated[int, Meta(ge=0, le=1_000_000)] | None = None
+    """Room for the ring of recordings; 0: none are kept; not said: a modest ring, where the means are installed."""
 
     @property
     def path(self) -> Path:
@@ -151,6 +183,12 @@ class Storage(Section, frozen=True):
         if self.directory is not None:
             return Path(self.directory)
         return Path(os.environ.get("STATE_DIRECTORY", "/var/lib/companion"))
+
+
+class Log(Section, frozen=True):
+    """How much is told on stderr, which under systemd is the journal."""
+
+    level: LogLevel = "info"
 
 
 class Web(Section, frozen=True):
@@ -172,4 +210,5 @@ class Config(Section, frozen=True):
     mqtt: Mqtt | None = None
     control: Control = Control()
     storage: Storage = Storage()
+    log: Log = Log()
     web: Web | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from typing import Any, Final, Protocol
 
 import msgspec
@@ -23,12 +23,21 @@ from companion.daemon.ledger import Offload
 from companion.daemon.mend import Mender
 from companion.daemon.reach import Reach
 from companion.daemon.readiness import Readiness
+from companion.daemon.recorder import Recorder
 from companion.daemon.rivalry import Rivalry
 from companion.errors import CalibrationRefusedError
 from companion.storage.records import RecordStore
 
 MONITOR_EVERY_S: Final = 0.5
 PROGRESS_EVERY_S: Final = 0.2
+
+
+class RequestRefusedError(CalibrationRefusedError):
+    """A request was not taken; `kind` as in `Refusal`."""
+
+    def __init__(self, refusal: Refusal) -> None:
+        super().__init__(refusal.reason)
+        self.kind = refusal.kind
 
 
 class Device(Protocol):
@@ -59,28 +68,37 @@ class Answers:
         armings: Armings,
         gate_setup: GateSetup,
         automatic: Automatic,
+        recorder: Recorder,
     ) -> None:
         self._conductor, self._vehicle, self._collector, self._devices = conductor, vehicle, collector, devices
         self._store, self._offload, self._mavlink_url = store, offload, mavlink_url
         self._rivalry, self._reach, self._mender, self._readiness = rivalry, reach, mender, readiness
         self._armings, self._gate_setup, self._automatic = armings, gate_setup, automatic
+        self._recorder = recorder
+        self.mqtt: Callable[[], Object] = dict
+        """How the broker is reached; empty where none is configured."""
 
-    async def answer(self, request: Object) -> AsyncIterator[Object]:
-        """Answer one request of the control socket."""
+    async def answer(self, request: Object, face: str = "companion") -> AsyncIterator[Object]:
+        """Answer one request of the control socket, or of another face that speaks its words.
+
+        Raises:
+            RequestRefusedError: it is not taken, and why.
+            CompanionError: it could not be carried out.
+        """
         command = request.get("command")
         if command == "status":
             yield {"kind": "result", "status": self.status()}
         elif command == "calibrate":
-            async for reply in self._answer_calibrate(request):
+            async for reply in self._answer_calibrate(request, face):
                 yield reply
         elif command == "cancel":
-            running = self._conductor.cancel("companion cancel")
+            running = self._conductor.cancel(f"{face} cancel")
             if running and self._conductor.job is not None:
                 await asyncio.shield(self._conductor.job.finished)
             reason = self._conductor.reason if running else "nothing was running"
             yield {"kind": "result", "state": self._conductor.state.value, "reason": reason}
         elif command == "undo":
-            job = _accepted(self._conductor.start_undo("companion undo", force=request.get("force") is True))
+            job = _accepted(self._conductor.start_undo(f"{face} undo", force=request.get("force") is True))
             result = await asyncio.shield(job.finished)
             written = {name: _plain(what) for name, what in job.written.items()}
             yield {"kind": "result", "state": result.outcome, "reason": result.reason, "written": written}
@@ -90,6 +108,9 @@ class Answers:
             # A thousand records take longer to read than a ground station waits for an answer.
             records, armings = await self._offload(self._history, number)
             yield {"kind": "result", "records": records, "armings": armings}
+        elif command == "record":
+            async for reply in self._recorder.answer(request):
+                yield reply
         elif command == "monitor":
             while True:
                 yield {"kind": "progress", "status": self.status()}
@@ -102,7 +123,7 @@ class Answers:
         records = with_armings(self._store.history(limit), armings)
         return [_plain(record) for record in records], [_plain(arming) for arming in armings[:limit]]
 
-    async def _answer_calibrate(self, request: Object) -> AsyncIterator[Object]:
+    async def _answer_calibrate(self, request: Object, face: str) -> AsyncIterator[Object]:
         try:
             what = What[str(request.get("what", "both")).upper()]
             timeout_s = request.get("timeout_s")
@@ -110,7 +131,7 @@ class Answers:
         except (KeyError, TypeError, ValueError) as error:
             raise CalibrationRefusedError(f"calibrate: {error} is not understood") from None
         reboot = request.get("reboot") is True
-        job = _accepted(self._conductor.start_calibration(what, "companion calibrate", timeout_s, reboot=reboot))
+        job = _accepted(self._conductor.start_calibration(what, f"{face} calibrate", timeout_s, reboot=reboot))
         if not request.get("wait"):
             yield {"kind": "result", "state": self._conductor.state.value, "reason": "calibration started"}
             return
@@ -155,13 +176,15 @@ class Answers:
                 "last": _plain(self._armings.last),
             },
             "automatic": self._automatic.status(),
+            "recording": self._recorder.status(),
+            "mqtt": self.mqtt() or None,
             "last": _summary(conductor.last),
         }
 
 
 def _accepted(answer: Job | Refusal) -> Job:
     if isinstance(answer, Refusal):
-        raise CalibrationRefusedError(answer.reason)
+        raise RequestRefusedError(answer)
     return answer
 
 

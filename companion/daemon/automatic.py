@@ -95,6 +95,8 @@ class Automatic:
         """Restarts of the autopilot seen, and automatic writes since the last one."""
         self._next_s = -math.inf
         self._failures = 0
+        self.on_beat: Callable[[], None] = lambda: None
+        """Called at every turn of `run`."""
         self.stopped: str | None = None
         """Why it waits for a request, for people; None while it works."""
 
@@ -136,6 +138,7 @@ class Automatic:
         """Calibrate whenever it is worth it, until cancelled."""
         self._writes = await self._offload(self._file.read)
         while True:
+            self.on_beat()
             await asyncio.sleep(POLL_S)
             try:
                 await self._keep()

@@ -5,7 +5,6 @@ With a daemon running the ports are its, so it is asked; otherwise every port is
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import os
 from pathlib import Path
@@ -14,7 +13,7 @@ from companion.config import Config
 from companion.daemon.control import Object, ask
 from companion.daemon.models import not_in_this_version
 from companion.daemon.service import Service
-from companion.errors import DaemonUnreachableError
+from companion.errors import DaemonDeniedError, DaemonUnreachableError
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -34,9 +33,13 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
     """
     findings = [Finding("configuration", good=True, words="understood")]
     status: Object | None = None
-    with contextlib.suppress(DaemonUnreachableError):
+    try:
         async for reply in ask(config.control.path, {"command": "status"}):
             status = reply.get("status")
+    except DaemonDeniedError:
+        raise  # its ports are in use: opening them would only find that
+    except DaemonUnreachableError:
+        pass
     if status is not None:
         fault = status["fault"]
         findings.append(Finding("daemon", good=fault is None, words=fault or f"running, {status['state']}"))
@@ -51,6 +54,8 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
     findings += [Finding("warning", good=True, words=words) for words in status["warnings"]]
     ground = status["ground_stations"]
     findings.append(Finding("ground stations", good=ground["good"], words=ground["summary"]))
+    if (mqtt := status["mqtt"]) is not None:
+        findings.append(Finding("mqtt", good=mqtt["good"], words=mqtt["summary"]))
     if config.calibration.at_arm == "gate":
         findings.append(_gate(config, status["arming"]["setup"]))
     for kind in ("gradienter", "compass"):

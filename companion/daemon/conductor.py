@@ -291,7 +291,7 @@ class Conductor:
         """An undo that came while a calibration ran by itself: what that has written goes first."""
         await asyncio.wait([before])
         record = taken.record
-        taken_back = record is not None and record.state == "cancelled" and any(imu.written for imu in record.imus)
+        taken_back = record is not None and record.state == "cancelled" and _has_written(record)
         self._machine.on(Event.UNDO)
         if taken_back:
             self._end(job, Event.RESTORED, JobResult("done", "auto calibration taken back"))
@@ -311,8 +311,15 @@ class Conductor:
         else:
             if self._vehicle.system_id is not None:
                 now = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
+                last = self.last
+                if last is not None and last.state == "done" and last.system_id == self._vehicle.system_id:
+                    self.last = msgspec.structs.replace(last, undone_at=now) if _has_written(last) else last
                 try:
                     await self._offload(self._store.mark_undone, self._vehicle.system_id, now)
                 except StorageError as error:
                     logger.error("the history does not show the undo: %s", error)  # noqa: TRY400 - one line
             self._end(job, Event.RESTORED, JobResult("done", f"{len(job.written)} old values back"))
+
+
+def _has_written(record: Record) -> bool:
+    return any(imu.written for imu in record.imus)

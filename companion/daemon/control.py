@@ -1,9 +1,9 @@
 """The control socket: how the command line talks to the running daemon.
 
-A Unix stream socket (mode 0600). One request a connection, one JSON object a line: the client sends
-{"command": ..., ...}; the daemon answers with any number of {"kind": "progress", ...} and one last line
-{"kind": "result", ...} or {"kind": "error", "reason": ...}. A client that goes away stops nothing: what it started
-goes on, and another client can watch or cancel it.
+A Unix stream socket, for the daemon's own user alone (mode 0600) or for a group too (0660). One request a connection,
+one JSON object a line: the client sends {"command": ..., ...}; the daemon answers with any number of
+{"kind": "progress", ...} and one last line {"kind": "result", ...} or {"kind": "error", "reason": ...}. A client that
+goes away stops nothing: what it started goes on, and another client can watch or cancel it.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import grp
 import json
 import logging
 import os
@@ -22,7 +23,7 @@ from typing import Any, Final, Self
 
 import msgspec
 
-from companion.errors import CompanionError, DaemonUnreachableError, LinkError
+from companion.errors import CompanionError, DaemonDeniedError, DaemonUnreachableError, LinkError
 
 logger = logging.getLogger(__name__)
 
@@ -39,8 +40,8 @@ MAX_CLIENTS: Final = 16
 class ControlServer:
     """Serves the control socket; `async with` it."""
 
-    def __init__(self, path: Path, handler: Handler) -> None:
-        self._path = path
+    def __init__(self, path: Path, handler: Handler, *, group: str | None = None) -> None:
+        self._path, self._group = path, group
         self._handler = handler
         self._server: asyncio.Server | None = None
         self._clients: set[asyncio.Task[None]] = set()
@@ -52,6 +53,8 @@ class ControlServer:
             LinkError: another daemon answers there, or the path cannot be bound.
         """
         listener = _bind(self._path)
+        if self._group is not None:
+            _open_to(self._path, self._group)
         self._server = await asyncio.start_unix_server(self._accept, sock=listener, limit=REQUEST_LIMIT)
         return self
 
@@ -127,6 +130,30 @@ def _bind(path: Path) -> socket.socket:
     return listener
 
 
+def _open_to(path: Path, group: str) -> None:
+    """Let the members of a group use the socket; where that is not to be had it stays closed to them, and it is said.
+
+    No privilege is needed: one may give a file of one's own to any group that one is a member of.
+    """
+    try:
+        os.chown(path, -1, grp.getgrnam(group).gr_gid)
+        path.chmod(0o660)
+    except (KeyError, OSError) as error:
+        why = "there is no such group" if isinstance(error, KeyError) else error.strerror or str(error)
+        logger.warning("control socket: group %s may not use it: %s", group, why)
+
+
+def _who_may(path: Path) -> str:
+    """Who may use a socket that refused us."""
+    try:
+        found = path.stat()
+        if found.st_mode & stat.S_IWGRP:
+            return f"only group {grp.getgrgid(found.st_gid).gr_name} and root may: usermod -aG, log in again; or sudo"
+    except (OSError, KeyError):
+        pass
+    return "permission denied, try with sudo"
+
+
 def _remove_stale(path: Path) -> None:
     """Remove a socket that nobody listens on any more.
 
@@ -162,8 +189,9 @@ async def ask(path: Path, request: Object) -> AsyncIterator[Object]:
         why = {
             errno.ENOENT: "no such socket",
             errno.ECONNREFUSED: "nobody listens there",
-            errno.EACCES: "permission denied, try with sudo",
         }.get(error.errno or 0, str(error))
+        if error.errno == errno.EACCES:
+            raise DaemonDeniedError(f"the daemon at {path} may not be asked: {_who_may(path)}") from None
         raise DaemonUnreachableError(f"no daemon answers at {path} ({why}); start it with: companion run") from None
     try:
         await _write(writer, request)

@@ -20,6 +20,7 @@ from companion.autopilot.vehicle import ArmState, Vehicle
 from companion.calibration.machine import Event, Machine, State
 from companion.calibration.request import What
 from companion.calibration.rolling import RollingCollector, Settings, Window
+from companion.calibration.site import Whereabouts
 from companion.calibration.solve import Solution, solve_at
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity, Weight
@@ -72,6 +73,8 @@ class Course:
         """Where it stands."""
         self.settings = models.settings(config)
         """How good is good enough."""
+        self.on_solved: Callable[[Window, Window, Whereabouts, What], None] = lambda *of_what: None
+        """Told of every solution: the window measured, the one used, the place, and what was asked for."""
         self._late: Stage = "checking"
         """Of State.VERIFYING."""
         self._settled_by_s = 0.0
@@ -133,15 +136,17 @@ class Course:
                     break
             # The window holds telemetry under other offsets than those now in force.
             self.machine.on(Event.MOVED)
+        where = models.whereabouts(self._config, self._vehicle)
         solution: Solution = await self._offload(
             solve_at,
             window,
-            models.whereabouts(self._config, self._vehicle),
+            where,
             models.gradienter_model(self._config.gradienter),
             models.compass_model(self._config.compass),
             job.what,
         )
         draft.solution = solution
+        self.on_solved(measured, window, where, job.what)
         plan = await self._pusher.plan(solution, draft)
         job.check_cancelled()
         if not plan.changes:

@@ -59,7 +59,6 @@ def not_in_this_version(config: Config) -> list[str]:
     """What the configuration may ask for that this version does not do: said at start, never silently ignored."""
     asked = (
         (config.push.attitude != "off", f'push.attitude = "{config.push.attitude}": attitude is not pushed yet'),
-        (config.mqtt is not None, "[mqtt]: MQTT is not spoken yet"),
         (config.web is not None, "[web]: there is no page yet"),
     )
     return [words for is_asked, words in asked if is_asked]

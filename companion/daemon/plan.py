@@ -105,7 +105,7 @@ class Planner:
             imu, source = self._imus.get(found.name), self._sources[found.name]
             if imu is not None:
                 calibration = imu.in_force
-                draft.whole[found.name] = _whole(calibration, found)
+                draft.whole[found.name] = whole_of(calibration, found)
                 gyro, accel = found.gyro_rad_s, found.accel_m_s2
             elif source.autopilot_instance is not None:
                 calibration = await read_calibration(self._parameters, source.autopilot_instance, self._memory)
@@ -147,7 +147,8 @@ class Planner:
                     )
 
 
-def _whole(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:
+def whole_of(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:
+    """Whole gyro and accelerometer bias of an IMU whose owner subtracts offsets already."""
     gyro, accel = whole_bias(calibration, _vector(found.gyro_rad_s) or _ZERO, _vector(found.accel_m_s2) or _ZERO)
     return (
         np.array(gyro) if found.gyro_rad_s is not None else None,

@@ -67,6 +67,8 @@ class Readiness:
         self._answered_s = -math.inf
         self._has_gated = False
         self._woken = asyncio.Event()
+        self.on_beat: Callable[[], None] = lambda: None
+        """Called after every look that came to its end."""
 
     @property
     def at_arm(self) -> AtArm:
@@ -97,6 +99,7 @@ class Readiness:
                 # What a write under way makes of the output says nothing about what will be in force after it.
                 if not self._writing and await self.in_force.measure(loop.time()):
                     self.look()
+                self.on_beat()
             except Exception:
                 # Without a renewed answer the gate closes by itself.
                 logger.exception("looking whether it may arm failed")

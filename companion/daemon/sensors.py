@@ -33,6 +33,8 @@ class SerialSensor:
         self.name, self.kind, self.protocol = name, kind, protocol
         self.decoder = make_decoder(kind, protocol, settings.seconds_per_byte)
         self.link = ByteLink(settings, self.receive, name=name, on_state=self._on_state)
+        self.tap: Callable[[str, bytes | None, float], object] | None = None
+        """Called with (name, bytes, time) before they are decoded; without bytes: some are missing."""
         self._take = take
         self._last_sample_s: float | None = None
         self._counted = (0.0, 0)
@@ -45,10 +47,14 @@ class SerialSensor:
     def _on_state(self, connected: bool, reason: str) -> None:  # noqa: FBT001 - ByteLink's signature
         del reason
         if connected:
+            if self.tap is not None:
+                self.tap(self.name, None, asyncio.get_running_loop().time())
             self.decoder.interrupted()
 
     def receive(self, data: bytes, t_s: float) -> None:
         """Take bytes that were read at `t_s`."""
+        if self.tap is not None:
+            self.tap(self.name, data, t_s)
         samples = self.decoder.feed(data, t_s)
         if not samples:
             return

@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from companion.autopilot.ekf import EkfWatch
@@ -15,7 +14,6 @@ from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.px4_slots import SlotMemory
 from companion.autopilot.vehicle import Vehicle
 from companion.autopilot.writer import ParameterWriter
-from companion.calibration.rolling import RollingCollector
 from companion.component.component import Component
 from companion.component.service import JobResult
 from companion.config import Config, Imu
@@ -36,17 +34,20 @@ from companion.daemon.in_force import InForce
 from companion.daemon.job import Job
 from companion.daemon.ledger import Ledger, Offload
 from companion.daemon.mend import Mender
+from companion.daemon.mqtt.face import MqttFace
 from companion.daemon.plan import Planner
+from companion.daemon.pose_now import PoseNow
 from companion.daemon.push import Pusher
 from companion.daemon.px4_writes import Px4Writes
 from companion.daemon.reach import Reach
 from companion.daemon.readiness import Readiness
 from companion.daemon.reboot import Reboot
+from companion.daemon.recorder import Recorder
 from companion.daemon.rivalry import Rivalry
 from companion.daemon.sensors import SerialSensor
-from companion.errors import CompanionError
 from companion.links.mavlink import MavlinkLink
 from companion.links.mavlink_transport import run_transport
+from companion.recording.collector import RecordedCollector
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
 from companion.storage.changes import ChangeLog
 from companion.storage.records import RecordStore
@@ -73,21 +74,27 @@ class Service:
         imu_rate_hz: float | None = None,
     ) -> None:
         self.config = config
+        self.on_ready: Callable[[], None] = lambda: None
+        """Called when it can be talked to."""
         self.link = link or MavlinkLink(
             system_id=config.vehicle.system_id or 1, component_id=config.mavlink.component_id
         )
         self.vehicle = Vehicle(self.link, system_id=config.vehicle.system_id)
         self.parameters = ParameterClient(self.link, self.vehicle)
-        self.collector = RollingCollector(
+        self.collector = RecordedCollector(
             models.settings(config),
             [models.imu_input(imu, None) for imu in config.imu],
             gradienter=config.gradienter is not None,
             compass=config.compass is not None,
+            message_of=self._message_of,
         )
         self.slots = SlotMemory()
         self._imu_rate_hz = models.imu_rate_hz(config) if imu_rate_hz is None else imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
         self.sensors = self._serial_sensors()
+        self.recorder = Recorder(
+            config, self.collector, self.link, self.vehicle, self.imus.values(), self.sensors, offload
+        )
         self.store = RecordStore(config.storage.path)
         self.ledger = Ledger(ChangeLog(config.storage.path), offload)
         writer = ParameterWriter(self.parameters, self.vehicle)
@@ -124,6 +131,8 @@ class Service:
         self.conductor = Conductor(
             config, self.vehicle, self.collector, course, pusher, self.mender, self.store, self._say, offload
         )
+        course.on_solved = self.recorder.on_solved
+        self.recorder.is_busy = lambda: self.conductor.state.busy
         self.reach = Reach(self.link, self.vehicle, self.parameters)
         self.in_force = InForce(config, self.vehicle, self.collector, self.imus, offload)
         self.readiness = Readiness(self.vehicle, self.collector, self.conductor, self.mender, self.in_force)
@@ -159,11 +168,30 @@ class Service:
             armings=self.armings,
             gate_setup=self.gate_setup,
             automatic=self.automatic,
+            recorder=self.recorder,
         )
+        self.pose = PoseNow(config, self.vehicle, self.collector, offload)
+        self.mqtt = self._mqtt_face(offload)
+
+    def _mqtt_face(self, offload: Offload) -> MqttFace | None:
+        if self.config.mqtt is None:
+            return None
+        wanted = self.config.vehicle.system_id
+        face = MqttFace(
+            self.config.mqtt, self.answers, self.conductor, self.vehicle, self.pose.look, offload, system_id=wanted
+        )
+        self.answers.mqtt = face.status
+        return face
 
     def _on_ended(self, job: Job, result: JobResult) -> None:
         self.in_force.on_ended(job, result)
         self.automatic.on_ended(job, result)
+        if job.record is not None:
+            self.recorder.on_record(job.record)
+
+    def _message_of(self, name: str) -> str | None:
+        imu = self.imus.get(name)
+        return imu.stream.kind.message if imu is not None and imu.stream.kind is not None else None
 
     def _say(self, *what: Any) -> object:
         return self.component.say(*what)
@@ -237,6 +265,7 @@ class Service:
         return take
 
     def _take(self, sample: Sample) -> None:
+        self.pose.take(sample)
         if isinstance(sample, TiltSample):
             self.collector.add_tilt(sample)
         elif isinstance(sample, CompassSample):
@@ -250,8 +279,10 @@ class Service:
         """
         for words in models.not_in_this_version(self.config):
             logger.warning("%s", words)
-        async with ControlServer(self.config.control.path, self.answers.answer):
-            logger.info("ready: %s", self.config.control.path)
+        control = self.config.control
+        async with ControlServer(control.path, self.answers.answer, group=control.group_name):
+            logger.info("ready: %s", control.path)
+            self.on_ready()
             await self.serve()
 
     async def serve(self, *, mavlink: bool = True, ports: bool = True) -> None:
@@ -279,6 +310,9 @@ class Service:
                     group.create_task(self.armings.run(), name="armings")
                     group.create_task(self.automatic.run(), name="automatic")
                     group.create_task(self.gate_setup.run(), name="gate setup")
+                    group.create_task(self.recorder.run(), name="recorder")
+                    if self.mqtt is not None:
+                        group.create_task(self.mqtt.run(), name="mqtt")
                     for imu in self.imus.values():
                         group.create_task(imu.run(), name=imu.name)
                     for sensor in self.sensors if ports else ():
@@ -297,6 +331,9 @@ class Service:
         running = [self.component.run(), run_transport(self.link, self.config.mavlink.url)]
         running += [self.reach.run(), self.gate_setup.run(), *(imu.run() for imu in self.imus.values())]
         running += [sensor.run() for sensor in self.sensors]
+        if self.mqtt is not None:
+            self.mqtt.only_listening = True
+            running.append(self.mqtt.run())
         tasks = [asyncio.get_running_loop().create_task(one) for one in running]
         try:
             await asyncio.sleep(seconds)
@@ -309,43 +346,3 @@ class Service:
     def status(self) -> Object:
         """What the daemon is doing, as JSON can hold it."""
         return self.answers.status()
-
-
-async def run(config: Config) -> None:
-    """Run the daemon until SIGTERM or SIGINT.
-
-    Raises:
-        CompanionError: it cannot start.
-    """
-    service = Service(config)
-    loop = asyncio.get_running_loop()
-    task = asyncio.current_task()
-    stopped = False
-
-    def stop() -> None:
-        nonlocal stopped
-        stopped = True
-        if task is not None:
-            task.cancel()
-
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, stop)
-    try:
-        await service.run()
-    except asyncio.CancelledError:
-        if not stopped:
-            raise
-        logger.info("stopped")
-    except BaseExceptionGroup as group:
-        known = group.subgroup(CompanionError)
-        if known is None:
-            raise
-        raise CompanionError("; ".join(str(error) for error in _leaves(known))) from group
-
-
-def _leaves(group: BaseExceptionGroup[Any]) -> Iterator[BaseException]:
-    for error in group.exceptions:
-        if isinstance(error, BaseExceptionGroup):
-            yield from _leaves(error)
-        else:
-            yield error

@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 
 from companion.errors import LinkError
 from companion.links.backoff import Backoff
-from companion.links.serial_port import SerialOpener
+from companion.links.serial_port import SerialOpener, close_serial
 
 logger = logging.getLogger(__name__)
 
@@ -27,6 +27,9 @@ READ_BYTES = 4096
 OUT_BUFFER_BYTES = 16384
 """Over a second at 115200 baud; what waits longer than that is better dropped than sent."""
 CONNECT_DEADLINE_S = 5.0
+BEAT_S = 1.0
+BEAT_WITHIN_S = 8.0
+"""An open that takes all the time it may, and the longest pause after it."""
 WORTH_S = 2.0
 """A connection that lived this long, or that brought bytes, starts the back-off afresh."""
 
@@ -92,6 +95,8 @@ class ByteLink:
         """Bytes that `write` refused because the port was closed or the out-buffer full."""
         self.reconnects = 0
         """How often the port was opened again after it had been open."""
+        self.on_beat: Callable[[], None] = lambda: None
+        """Called at every turn of `run`: at least every `BEAT_WITHIN_S`, whether bytes come or not."""
         self.last_byte_s: float | None = None
         """The loop's time of the last read that brought bytes."""
         self._on_bytes, self._on_state = on_bytes, on_state
@@ -114,6 +119,7 @@ class ByteLink:
         loop = asyncio.get_running_loop()
         try:
             while True:
+                self.on_beat()
                 try:
                     descriptor = await self._open()
                 except LinkError as error:
@@ -122,7 +128,7 @@ class ByteLink:
                     since_s, before = loop.time(), self.bytes_received
                     self._lost = loop.create_future()
                     self._attach(loop, descriptor)
-                    reason = await self._lost
+                    reason = await self._until_lost(self._lost)
                     if self.bytes_received > before or loop.time() - since_s >= WORTH_S:
                         self._backoff.reset()
                     self._report_down(reason)
@@ -142,6 +148,12 @@ class ByteLink:
         if not waiting:
             self._flush()
         return self._descriptor is not None
+
+    async def _until_lost(self, lost: asyncio.Future[str]) -> str:
+        while not lost.done():
+            self.on_beat()
+            await asyncio.wait([lost], timeout=BEAT_S)
+        return lost.result()
 
     async def _open(self) -> int:
         if self.settings.is_tcp:
@@ -215,7 +227,7 @@ class ByteLink:
         loop = asyncio.get_running_loop()
         loop.remove_reader(descriptor)
         loop.remove_writer(descriptor)
-        os.close(descriptor)
+        close_serial(descriptor)
 
     def _report_down(self, reason: str) -> None:
         self.last_error = reason

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -20,6 +20,7 @@ Message = mavlink.MAVLink_message
 M = TypeVar("M", bound=mavlink.MAVLink_message)
 Handler = Callable[[M, float], None]
 Unsubscribe = Callable[[], None]
+Direction = Literal["in", "out"]
 
 _COMPACT_BYTES = 4096
 
@@ -33,12 +34,16 @@ class MavlinkLink:
 
     def __init__(self, *, system_id: int = 1, component_id: int = 191) -> None:
         self.component_id = component_id
+        self.on_beat: Callable[[], None] = lambda: None
+        """Called again and again by whatever carries the link's bytes, as long as it works."""
         self.received: Counter[str] = Counter()
         """Messages by type, plus "bad" (failed checks), "unknown" (not in the dialect) and "handler error"."""
         self.sent = 0
         self.dropped = 0
         """Messages that could not be sent: no transport was attached, or its buffer was full."""
         self.last_received_s: float | None = None
+        self.tap: Callable[[Direction, bytes | None, float | None], object] | None = None
+        """Called with (direction, bytes, time of arrival); without bytes: some are missing here."""
         self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._codec.robust_parsing = True
         self._transmit: Callable[[bytes], object] | None = None
@@ -54,6 +59,11 @@ class MavlinkLink:
         self._codec.srcSystem = value
 
     @property
+    def half_received(self) -> bytes:
+        """What may be the beginning of a message."""
+        return bytes(self._codec.buf[self._codec.buf_index :])
+
+    @property
     def connected(self) -> bool:
         """Whether a transport is attached; says nothing of a peer behind it."""
         return self._transmit is not None
@@ -65,6 +75,8 @@ class MavlinkLink:
         """
         self._transmit = transmit
         self._forget_received()
+        if self.tap is not None:
+            self.tap("in", None, None)
 
     def send(self, message: mavlink.MAVLink_message) -> bool:
         """Send a message now; False (and counted) when no transport is attached or its buffer is full."""
@@ -73,6 +85,8 @@ class MavlinkLink:
             return False
         data = message.pack(self._codec)
         self._codec.seq = (self._codec.seq + 1) % 256
+        if self.tap is not None:
+            self.tap("out", data, None)
         if self._transmit(data) is False:
             self.dropped += 1
             return False
@@ -92,6 +106,8 @@ class MavlinkLink:
 
     def receive(self, data: bytes, t_s: float) -> None:
         """Take bytes that arrived at `t_s` (monotonic); never raises, whatever they are."""
+        if self.tap is not None:
+            self.tap("in", data, t_s)
         message = self._next_message(data)
         while message is not None:
             self._dispatch(message, t_s)

@@ -25,7 +25,9 @@ PEER_SILENCE_S = 10.0
 MAX_PEERS = 8
 """Newcomers beyond these are heard but not answered: a scan of our port must not push out the autopilot."""
 OUT_BUFFER_BYTES = 65536
-_PRUNE_S = 1.0
+RESOLVE_DEADLINE_S = 5.0
+"""For the host's name; without a network a resolver takes its time."""
+_TURN_S = 1.0
 _URL = re.compile(r"(?P<kind>udpin|udpout|tcp|serial):(?P<where>.+):(?P<number>\d+)")
 # The target's host is up but nobody listens yet (or it restarts): keep sending, it will come.
 _PASSING_ERRORS = frozenset({errno.ECONNREFUSED, errno.ENOBUFS, errno.EAGAIN})
@@ -53,6 +55,7 @@ async def run_transport(link: MavlinkLink, url: str, *, on_state: OnState | None
             on_state(connected, words)
 
     stream = ByteLink(settings, link.receive, name="mavlink", on_state=state)
+    stream.on_beat = link.on_beat
     await stream.run()
 
 
@@ -89,11 +92,15 @@ async def _run_udp(
         return _Listener(link) if listen else _Speaker(link)
 
     while True:
+        link.on_beat()
         try:
-            if listen:
-                transport, udp = await loop.create_datagram_endpoint(factory, local_addr=address)
-            else:
-                transport, udp = await loop.create_datagram_endpoint(factory, remote_addr=address)
+            async with asyncio.timeout(RESOLVE_DEADLINE_S):
+                if listen:
+                    transport, udp = await loop.create_datagram_endpoint(factory, local_addr=address)
+                else:
+                    transport, udp = await loop.create_datagram_endpoint(factory, remote_addr=address)
+        except TimeoutError:
+            reason = f"{url}: the name is not resolved within {RESOLVE_DEADLINE_S:g} s"
         except (OSError, UnicodeError) as error:
             reason = f"{url}: {getattr(error, 'strerror', None) or error}"
         else:
@@ -108,7 +115,7 @@ async def _run_udp(
                 transport.abort()
                 link.attach(None)
                 await udp.closed
-            if loop.time() - since_s > _PRUNE_S:
+            if loop.time() - since_s > _TURN_S:
                 backoff.reset()
         logger.log(logging.DEBUG if warned else logging.WARNING, "mavlink: %s", reason)
         warned = True
@@ -137,7 +144,14 @@ class _Udp(asyncio.DatagramProtocol):
 
     async def run(self) -> str:
         """Serve until the socket fails; returns why."""
-        return await self._failed
+        while not self._failed.done():
+            self.link.on_beat()
+            await asyncio.wait([self._failed], timeout=_TURN_S)
+            self._turn()
+        return self._failed.result()
+
+    def _turn(self) -> None:
+        """What is due once a second."""
 
     def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
         self._transport = cast("_DatagramOut", transport)
@@ -184,13 +198,6 @@ class _Listener(_Udp):
         super().__init__(link)
         self._heard_s: dict[tuple[Any, ...], float] = {}
 
-    async def run(self) -> str:
-        while True:
-            done, _ = await asyncio.wait([self._failed], timeout=_PRUNE_S)
-            if done:
-                return self._failed.result()
-            self._prune()
-
     def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
         now_s = self.now_s()
         if addr in self._heard_s or len(self._heard_s) < MAX_PEERS:
@@ -207,7 +214,7 @@ class _Listener(_Udp):
         sent = [self.send_to(data, peer) for peer in self._heard_s]
         return any(sent)
 
-    def _prune(self) -> None:
+    def _turn(self) -> None:
         now_s = self.now_s()
         self._heard_s = {peer: heard_s for peer, heard_s in self._heard_s.items() if now_s - heard_s <= PEER_SILENCE_S}
         if not self._heard_s:

@@ -41,6 +41,10 @@ class SerialPort:
     vendor_id: int | None
     product_id: int | None
     serial_number: str | None
+    usb_interface: str | None
+    """The kernel's name of the USB interface, such as 1-1.3:1.0: where it is plugged in."""
+    interface_number: str | None
+    """Of the USB interface, two digits: a bridge with several ports has one each."""
     latency_timer_ms: int | None
     """FTDI only; above 1 ms the samples of a fast sensor arrive in bunches."""
     holders: tuple[Holder, ...]
@@ -71,7 +75,8 @@ def _describe(
     root: Path, entry: Path, links: list[str], holders: tuple[Holder, ...], *, is_console: bool
 ) -> SerialPort:
     hardware = (entry / "device").resolve()
-    usb = _usb_device(root, hardware)
+    usb = _node_with(root, hardware, "idVendor")
+    interface = _node_with(root, hardware, "bInterfaceNumber") if usb else None
     serial_number = _read(usb / "serial") if usb else None
     by_id = tuple(link for link in links if link.startswith("/dev/serial/by-id/"))
     by_path = tuple(link for link in links if link.startswith("/dev/serial/by-path/"))
@@ -89,6 +94,8 @@ def _describe(
         vendor_id=_number(usb / "idVendor", 16) if usb else None,
         product_id=_number(usb / "idProduct", 16) if usb else None,
         serial_number=serial_number,
+        usb_interface=interface.name if interface else None,
+        interface_number=_read(interface / "bInterfaceNumber") if interface else None,
         latency_timer_ms=_number(hardware / "latency_timer", 10),
         holders=holders,
         is_console=is_console,
@@ -109,11 +116,12 @@ def _driver(hardware: Path) -> str | None:
     return None
 
 
-def _usb_device(root: Path, hardware: Path) -> Path | None:
+def _node_with(root: Path, hardware: Path, attribute: str) -> Path | None:
+    """The nearest node on the way up that has an attribute: the USB device has idVendor."""
     for node in (hardware, *hardware.parents):
         if node == root.resolve():
             return None
-        if (node / "idVendor").exists():
+        if (node / attribute).exists():
             return node
     return None
 

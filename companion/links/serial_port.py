@@ -7,6 +7,7 @@ checking, and VMIN = 1. Its object is dropped at once and only the file descript
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import fcntl
 import grp
@@ -58,6 +59,16 @@ def open_serial(path: str, baud: int, parity: Parity) -> int:
     return descriptor
 
 
+def close_serial(descriptor: int) -> None:
+    """Close a port so that it can be opened again.
+
+    A pseudo-terminal (socat, a simulator) lives on while its other end is open, and TIOCEXCL with it.
+    """
+    with contextlib.suppress(OSError):  # gone already, or a socket
+        fcntl.ioctl(descriptor, termios.TIOCNXCL)
+    os.close(descriptor)
+
+
 def _finish_settings(descriptor: int, parity: Parity) -> None:
     settings = termios.tcgetattr(descriptor)
     # A byte that fails its parity or its stop bit is then read as NUL, so a decoder can tell it from data.
@@ -75,7 +86,10 @@ def explain(path: str, baud: int, error: Exception) -> str:
     number = _errno_of(error)
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
         return f"{path}: no such device; is it plugged in? (`companion ports` lists what is there)"
-    if number in (errno.EACCES, errno.EPERM):
+    if number == errno.EPERM:
+        # Not the file's mode: systemd's device control, which knows the classes of the drivers loaded at its start.
+        return f"{path}: not permitted: the service's unit does not allow this kind of port (docs/service.md)"
+    if number == errno.EACCES:
         return f"{path}: permission denied; {_who_may(path)}"
     if number in (errno.EBUSY, errno.EAGAIN):
         holders = ", ".join(f"{holder.name}, process {holder.pid}" for holder in find_holders(path))
@@ -187,7 +201,7 @@ class _Attempt:
         with self._lock:
             if self._abandoned:
                 if descriptor is not None:
-                    os.close(descriptor)
+                    close_serial(descriptor)
                 return
             self._descriptor, self._error = descriptor, error
         try:
@@ -214,4 +228,4 @@ class _Attempt:
             self._abandoned = True
             descriptor, self._descriptor = self._descriptor, None
         if descriptor is not None:
-            os.close(descriptor)
+            close_serial(descriptor)

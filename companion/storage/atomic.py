@@ -10,10 +10,15 @@ from pathlib import Path
 from companion.errors import StorageError
 
 
-def write_atomically(path: Path, data: bytes) -> None:
+def write_atomically(path: Path, data: bytes, *, mode: int = 0o600) -> None:
     """Replace a file's content so that a power cut at any byte leaves the old or the new content.
 
     Temporary file in the same folder, fsync, rename, fsync of the folder.
+
+    Args:
+        path: of the file.
+        data: its new content.
+        mode: its permissions.
 
     Raises:
         StorageError: one line that names the file and the operating system's reason.
@@ -23,6 +28,7 @@ def write_atomically(path: Path, data: bytes) -> None:
         descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
         try:
             with os.fdopen(descriptor, "wb") as file:
+                os.fchmod(file.fileno(), mode)
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())

@@ -299,5 +299,5 @@ def test_the_daemon_stays_light() -> None:
 
     modules = set(asyncio.run(main()).decode().split())
     assert "companion.daemon.service" in modules
-    for heavy in ("pymavlink.mavutil", "lxml", "mavsdk", "rich", "matplotlib", "aiomqtt", "hypothesis", "sim"):
+    for heavy in ("pymavlink.mavutil", "lxml", "mavsdk", "rich", "matplotlib", "aiomqtt", "mcap", "hypothesis", "sim"):
         assert heavy not in modules, heavy

@@ -77,8 +77,8 @@ def test_calibrated_and_undone_from_the_ground(tmp_path: Path) -> None:
 def test_cancelled_refused_and_set(tmp_path: Path) -> None:
     async def main() -> None:
         async with asyncio.TaskGroup() as group:
-            for one in (while_the_aircraft_is_handled, armed_and_its_own_parameters):
-                folder = tmp_path / one.__name__
+            for number, one in enumerate((while_the_aircraft_is_handled, armed_and_its_own_parameters)):
+                folder = tmp_path / str(number)  # short: a socket's path has 107 bytes
                 folder.mkdir()
                 group.create_task(one(folder), name=one.__name__)
 

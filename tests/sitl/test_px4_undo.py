@@ -6,61 +6,16 @@ Some minutes of real time each.
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import os
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sim.companion_process import CompanionProcess
-from sim.scenario import DEMO_POSE, demo
 from sim.sitl.daemon import companion_daemon
-from sim.sitl.ground import GroundStation
-from sim.sitl.px4 import Px4Sitl
-from sim.sitl.residuals import CALIBRATE_WITHIN_S, ground_station
-from tests.sitl.craft import BINARIES, missing
+from sim.sitl.residuals import CALIBRATE_WITHIN_S
+from tests.sitl.px4_bench import QUICK, SAVED_S, calibrate, changed, flying
 
 pytestmark = pytest.mark.sitl
-
-ITS_OWN = frozenset(
-    {"_HASH_CHECK", "LND_FLIGHT_T_HI", "LND_FLIGHT_T_LO", "COM_FLIGHT_UUID", "SDLOG_MODE", "SDLOG_BACKEND"}
-)
-"""What PX4 itself may change meanwhile; those of the log are put back to their defaults by its start scripts."""
-GYRO_DEG_H = (500.0, -700.0, 1000.0)
-"""Case D: integers tell it without dither."""
-ACCEL_MG = (1.0, -2.0, 3.0)
-QUICK = "\n[calibration]\nmin_still_s = 20\nmax_s = 40\n"
-SAVED_S = 4.0
-
-
-@contextlib.asynccontextmanager
-async def flying(folder: Path) -> AsyncIterator[tuple[Px4Sitl, GroundStation]]:
-    """PX4 as it comes, its own background calibration on."""
-    reason = missing("px4-sitl")
-    if reason is not None:
-        pytest.skip(reason)
-    scenario = demo(pose=DEMO_POSE, part="white_only", gyro_deg_h=GYRO_DEG_H, accel_mg=ACCEL_MG, seed=1)
-    vehicle = Px4Sitl(Path(os.environ[BINARIES["px4-sitl"]]), scenario, folder)
-    async with vehicle, ground_station(vehicle) as ground:
-        await ground.wait_for(lambda: bool(ground.vehicle_heartbeats()), 60.0, "a heartbeat")
-        await vehicle.sleep(30.0)
-        yield vehicle, ground
-
-
-async def calibrate(daemon: CompanionProcess) -> dict[str, float]:
-    """One that succeeds; the values that it wrote, by parameter."""
-    record = await daemon.calibrate(CALIBRATE_WITHIN_S)
-    assert record["state"] == "done", (record["reason"], daemon.log())
-    return {name: one["after"] for imu in record["imus"] for name, one in imu["written"].items()}
-
-
-def changed(one: dict[str, float], other: dict[str, float]) -> set[str]:
-    """Names of other values; PX4 lists what somebody aboard has used since the boot, so each boot lists others."""
-    both = one.keys() & other.keys()
-    assert len(both) > 800
-    return {name for name in both if one[name] != other[name]} - ITS_OWN
 
 
 def test_undo_leaves_every_parameter_of_px4_as_it_was_also_after_a_power_cycle_and_with_others_writing(

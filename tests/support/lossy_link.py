@@ -20,11 +20,12 @@ class LossyLink:
     Args:
         loss: share of the datagrams of either direction that get lost, 0..1; may be changed at any time.
         seed: of the losses.
+        near_port: where the firmware sends to; None: any that is free.
     """
 
-    def __init__(self, *, loss: float = 0.0, seed: int = 1) -> None:
+    def __init__(self, *, loss: float = 0.0, seed: int = 1, near_port: int | None = None) -> None:
         self.loss = loss
-        self.near = (LOOPBACK, free_udp_port())
+        self.near = (LOOPBACK, free_udp_port() if near_port is None else near_port)
         """For the firmware's `udpclient`."""
         self.far = (LOOPBACK, free_udp_port())
         """Where the companion listens."""

@@ -52,6 +52,7 @@ max_s = {max_s}
 at_arm = "{at_arm}"
 [storage]
 directory = "{folder}"
+recordings_mb = {recordings_mb}
 {more}
 """
 OWN = """
@@ -106,6 +107,7 @@ class Rig:
         imu_rate_hz: float = 100.0,
         device_rate_hz: float | None = None,
         feed_s: float = 0.05,
+        recordings_mb: int = 0,
         **autopilot: Any,
     ) -> None:
         self.imu_rate_hz, self.feed_s = imu_rate_hz if baud is None else None, feed_s
@@ -137,6 +139,7 @@ class Rig:
             max_s=max_s,
             at_arm=at_arm,
             folder=folder,
+            recordings_mb=recordings_mb,
             more=more,
         )
         if baud is not None:

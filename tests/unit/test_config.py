@@ -19,6 +19,7 @@ url = "udpout:127.0.0.1:14550"
 name = "fc"
 source = "autopilot"
 """
+MQTT = "[mqtt]\nhost = 'localhost'\n"
 SERIAL = '[[imu]]\nname = "own"\nsource = "serial"\nport = "/dev/ttyUSB0"\nprotocol = "vectornav"\n'
 
 
@@ -91,6 +92,8 @@ bind = "127.0.0.1:8080"
         ("[vehicle]\nlatitude_deg = 3", ["vehicle", "both or neither"]),
         ("[calibration]\nmin_still_s = true", ["min_still_s", "found true", "2 to 600"]),
         ("[calibration]\nmax_s = 5", ["calibration.max_s", "found 5", "min_still_s (10)"]),
+        ("[storage]\nrecordings_mb = 3", ["storage.recordings_mb", "found 3", "0 (none) or at least 8"]),
+        ("[storage]\nrecordings_mb = -1", ["storage.recordings_mb", "found -1"]),
         ("[calibration]\ntarget_gyro_sigma_deg_h = 0", ["target_gyro_sigma_deg_h", "found 0", "above 0"]),
         ("[calibration]\nat_arm = 'always'", ["at_arm", "found 'always'", '"gate", "warn", "off"']),
         (
@@ -117,6 +120,20 @@ bind = "127.0.0.1:8080"
             ["gradienter.mounting", "ROTATION_ROLL_180", "upside down", "upright"],
         ),
         ("[mqtt]\nhost = ''", ["mqtt.host", "found ''", "not empty"]),
+        ("[mqtt]\nport = 1883", ["mqtt.host", "missing", "not empty"]),
+        (MQTT + "prot = 1883", ["mqtt.prot", "did you mean 'port'"]),
+        (MQTT + "port = 0", ["mqtt.port", "found 0", "1 to 65535"]),
+        (MQTT + "keepalive_s = 1", ["mqtt.keepalive_s", "found 1", "5 to 600"]),
+        (MQTT + "tls = 'yes'", ["mqtt.tls", "found 'yes'", "true or false"]),
+        (MQTT + "base_topic = 'field/#'", ["mqtt.base_topic", "found 'field/#'", "without + #"]),
+        (MQTT + "base_topic = '/field'", ["mqtt.base_topic", "words with / between them"]),
+        (MQTT + "discovery = 'home assistant'", ["mqtt.discovery", "found 'home assistant'"]),
+        (MQTT + "client_id = 'a\\nb'".replace("'", '"'), ["mqtt.client_id", "printable"]),
+        (MQTT + "password_file = '/etc/p'", ["mqtt.username", "missing", "needed by password_file"]),
+        (MQTT + "username = 'u'\npassword_file = 'a/b'", ["mqtt.password_file", "begins with /", "credential"]),
+        (MQTT + "ca_file = '/etc/ca.pem'", ["mqtt.ca_file", "only with tls = true"]),
+        (MQTT + "tls = true\nca_file = 'ca.pem'", ["mqtt.ca_file", "found 'ca.pem'", "begins with /"]),
+        (MQTT + "tls = true\nkey_file = '/etc/key.pem'", ["mqtt.cert_file", "missing", "needed by key_file"]),
         (
             "[[imu]]\nname = 'b'\nsource = 'autopilot'\ninstance = 2\nprofile = 'xyz'",
             ["imu[1].profile", "'xyz'", "bmi088"],
@@ -199,3 +216,14 @@ def test_systemds_folders_are_the_defaults(monkeypatch: pytest.MonkeyPatch) -> N
     config = parse(GOOD, "x.toml")
     assert str(config.control.path) == "/run/here/control.sock"
     assert str(config.storage.path) == "/state/here"
+
+
+def test_the_broker_by_default_and_with_tls(monkeypatch: pytest.MonkeyPatch) -> None:
+    mqtt = parse(GOOD + MQTT, "x.toml").mqtt
+    assert mqtt is not None
+    assert (mqtt.broker_port, mqtt.base_topic, mqtt.password_path, mqtt.discovery) == (1883, None, None, None)
+    mqtt = parse(GOOD + MQTT + "tls = true\nusername = 'u'\npassword_file = 'mqtt.password'", "x.toml").mqtt
+    assert mqtt is not None
+    assert mqtt.broker_port == 8883
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", "/run/credentials/companion")
+    assert mqtt.password_path == Path("/run/credentials/companion/mqtt.password")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import grp
 import os
 import socket
 import stat
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from companion.config import Control
 from companion.daemon.control import ControlServer, Object, ask
 from companion.errors import CalibrationRefusedError, DaemonUnreachableError, LinkError
 
@@ -43,6 +45,39 @@ def test_request_progress_result_and_errors(tmp_path: Path) -> None:
         assert not path.exists()
 
     asyncio.run(main())
+
+
+def test_a_group_may_use_it_too(tmp_path: Path) -> None:
+    path = tmp_path / "control.sock"
+    ours = grp.getgrgid(os.getgid()).gr_name
+
+    async def main() -> None:
+        async with ControlServer(path, _echo, group=ours):
+            assert stat.S_IMODE(path.stat().st_mode) == 0o660
+            assert path.stat().st_gid == os.getgid()
+
+    asyncio.run(main())
+
+
+def test_a_group_that_does_not_exist_is_said_and_opens_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "control.sock"
+
+    async def main() -> None:
+        async with ControlServer(path, _echo, group="no-such-group"):
+            assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+    asyncio.run(main())
+    assert "group no-such-group may not use it: there is no such group" in caplog.text
+
+
+def test_the_group_is_the_configurations_else_that_of_the_unit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("COMPANION_CONTROL_GROUP", raising=False)
+    assert Control().group_name is None
+    monkeypatch.setenv("COMPANION_CONTROL_GROUP", "dialout")
+    assert Control().group_name == "dialout"
+    assert Control(group="pilots").group_name == "pilots"
 
 
 def test_a_stale_socket_is_replaced_and_a_live_one_refused(tmp_path: Path) -> None:

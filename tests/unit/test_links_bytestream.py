@@ -242,6 +242,21 @@ def test_even_a_reader_that_asks_for_no_lock_is_kept_out(path: Path) -> None:
             os.close(descriptor)
 
 
+@needs_root
+def test_a_port_that_was_given_back_can_be_opened_by_others(path: Path) -> None:
+    """A pseudo-terminal whose other end stays open would keep the lock for ever."""
+
+    async def main() -> None:
+        with plugged(path) as pty:
+            async with running(path) as port:
+                await port.state(connected=True)
+            os.chown(pty.name, NOBODY, NOBODY)
+            code = f"os.close(os.open({pty.name!r}, os.O_RDWR | os.O_NOCTTY))\nprint('open')\n"
+            assert await asyncio.to_thread(run_as_nobody, code) == "open"
+
+    asyncio.run(main())
+
+
 def test_what_is_no_port_is_said_to_be_none(tmp_path: Path) -> None:
     plain = tmp_path / "file"
     plain.write_text("not a tty")
@@ -586,3 +601,8 @@ def test_explanations_name_the_mode_of_a_device() -> None:
     mode = stat.S_IMODE(os.stat("/dev/null").st_mode)
     assert said.startswith("/dev/null: permission denied; user ")
     assert said.endswith(f"mode {mode:04o})")
+
+
+def test_what_the_units_device_control_forbids_is_not_taken_for_a_missing_group() -> None:
+    said = serial_port.explain("/dev/null", 9600, PermissionError(1, "Operation not permitted"))
+    assert said.startswith("/dev/null: not permitted: the service's unit does not allow this kind of port")

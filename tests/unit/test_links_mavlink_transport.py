@@ -117,7 +117,7 @@ class TestUdpIn:
 
     def test_forgets_peers_that_went_silent(self, peer: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(mavlink_transport, "PEER_SILENCE_S", 0.2)
-        monkeypatch.setattr(mavlink_transport, "_PRUNE_S", 0.02)
+        monkeypatch.setattr(mavlink_transport, "_TURN_S", 0.02)
 
         async def main() -> None:
             link = MavlinkLink()

@@ -1,0 +1,46 @@
+"""How the daemon's log looks: for people on a terminal, with priorities in the journal."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from typing import Final, TextIO
+
+# The journal reads the level from "<N>" at the beginning of a line, so that `journalctl -p warning` finds it.
+_PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
+
+
+class JournalFormatter(logging.Formatter):
+    """Lines as journald wants them; it stamps the time itself."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Every line of a traceback gets the priority too."""
+        prefix = f"<{_PRIORITIES.get(record.levelno, 6)}>"
+        return "\n".join(prefix + line for line in super().format(record).splitlines() or [""])
+
+
+def set_up(level: str) -> None:
+    """Log to stderr from a level on.
+
+    Args:
+        level: debug, info, warning or error.
+    """
+    handler = logging.StreamHandler(sys.stderr)
+    if goes_to_journal(sys.stderr):
+        handler.setFormatter(JournalFormatter("%(levelname)s %(message)s"))
+    else:
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    logging.basicConfig(level=level.upper(), handlers=[handler])
+
+
+def goes_to_journal(stream: TextIO) -> bool:
+    """Whether a stream is the one that JOURNAL_STREAM names; the variable alone is inherited by whoever redirects."""
+    named = os.environ.get("JOURNAL_STREAM")
+    if named is None:
+        return False
+    try:
+        status = os.fstat(stream.fileno())
+    except (OSError, ValueError):
+        return False
+    return named == f"{status.st_dev}:{status.st_ino}"

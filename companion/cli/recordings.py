@@ -1,0 +1,199 @@
+"""`companion record` and `companion replay`."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import sys
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from companion.cli import DONE, FAILED, load_config, print_json, seconds, show
+from companion.daemon.control import ask
+from companion.errors import ConfigError
+
+if TYPE_CHECKING:
+    from companion.calibration.record import Record
+    from companion.replay.engine import Result
+
+Object = dict[str, Any]
+MOST_LINES = 20
+"""Of differences, for people; --json has them all."""
+
+
+def add_commands(
+    add: Callable[[str, Callable[[argparse.Namespace], Awaitable[int]], str], argparse.ArgumentParser],
+) -> None:
+    """Add both to the parser of the command line."""
+    recorder = add("record", record, "record everything to a file until Ctrl-C (the last half hour is kept anyway)")
+    recorder.add_argument("file", nargs="?", type=Path, metavar="FILE", help="default: one beside the daemon's own")
+    recorder.add_argument("--seconds", type=seconds, metavar="S", help="end by itself (default: Ctrl-C or --stop)")
+    recorder.add_argument("--stop", action="store_true", help="end a recording that runs")
+    player = add("replay", replay, "run a recording, or a CSV log of an IMU at rest, through the same estimator")
+    player.add_argument("file", type=Path, metavar="FILE", help="a recording (.mcap) or a CSV file")
+    csv = player.add_argument_group("for a CSV file (docs/recording.md)")
+    csv.add_argument("--columns", metavar="NAMES", help="such as t_s,gx_deg_s,gy_deg_s,gz_deg_s,ax_g,ay_g,az_g")
+    for name, least, most, words in (
+        ("--pitch-deg", -84.0, 84.0, "nose up"),
+        ("--roll-deg", -180.0, 180.0, "right side down"),
+        ("--heading-deg", -360.0, 360.0, "clockwise from true north"),
+        ("--latitude-deg", -90.0, 90.0, "north is positive"),
+        ("--height-m", -500.0, 9000.0, "above mean sea level"),
+    ):
+        csv.add_argument(name, type=_number(least, most), metavar="M" if name.endswith("-m") else "DEG", help=words)
+    csv.add_argument(
+        "--sigma-deg", type=_number(1e-4, 45.0), default=0.05, metavar="DEG", help="of pitch and roll (default 0.05)"
+    )
+    csv.add_argument("--heading-sigma-deg", type=_number(1e-3, 180.0), default=3.0, metavar="DEG", help="default 3")
+    csv.add_argument("--mounting", default="ROTATION_NONE", metavar="ROTATION", help="sensor to vehicle")
+    csv.add_argument("--profile", metavar="PART", help="the sensor's model, such as icm42688p")
+
+
+def _number(least: float, most: float) -> Callable[[str], float]:
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"found {text!r}; allowed: a number from {least:g} to {most:g}")
+        return value
+
+    return number
+
+
+async def record(options: argparse.Namespace) -> int:
+    """`companion record`."""
+    path = load_config(options).control.path
+    if options.stop:
+        return await _end(options, {})
+    file = None if options.file is None else str(options.file.absolute())
+    reply: Object = {}
+    try:
+        async for reply in ask(path, {"command": "record", "file": file, "seconds": options.seconds}):
+            if reply["kind"] == "progress":
+                print(f"\r{reply['text']}", end="", file=sys.stderr, flush=True)
+    except asyncio.CancelledError:  # Ctrl-C
+        print(file=sys.stderr)
+        return await _end(options, {})
+    print(file=sys.stderr)
+    return await _end(options, reply)
+
+
+async def _end(options: argparse.Namespace, reply: Object) -> int:
+    """Say how a recording ended; without a reply of its own, end it."""
+    if not reply:
+        async for answer in ask(load_config(options).control.path, {"command": "record", "stop": True}):
+            reply = answer
+    if reply["kind"] == "error":
+        reply = {"state": "refused", "reason": reply["reason"]}
+        print(f"companion: {reply['reason']}", file=sys.stderr)
+    answer = {key: item for key, item in reply.items() if key != "kind"}
+    if getattr(options, "json", False):
+        print_json(answer)
+    elif "file" in answer:
+        lost = f", {answer['lost']} messages lost" if answer["lost"] else ""
+        print(f"{answer['file']}: {answer['seconds']:.0f} s, {answer['bytes'] / 1e6:.1f} MB{lost}; {answer['reason']}")
+    return DONE if answer["state"] == "done" else FAILED
+
+
+async def replay(options: argparse.Namespace) -> int:
+    """`companion replay`."""
+    from companion.recording.walk import MAGIC
+
+    try:
+        with options.file.open("rb") as file:
+            head = file.read(len(MAGIC))
+    except OSError as error:
+        raise ConfigError(f"companion replay: {options.file}: {error.strerror or error}") from None
+    if head and not MAGIC.startswith(head) and b"\0" not in head:
+        return _replay_csv(options)
+    return _replay_recording(options)
+
+
+def _replay_recording(options: argparse.Namespace) -> int:
+    from companion.recording.walk import Recording
+    from companion.replay.engine import Replay
+
+    began_s = time.monotonic()
+    result = Replay(Recording(options.file)).run()
+    took_s = time.monotonic() - began_s
+    different = [difference for each in result.calibrations for difference in each.differences]
+    lines = _lines(result)
+    reason = lines[-1]
+    good = not different and (result.estimate is None or result.estimate.state == "done")
+    state = "different" if different else "done" if good else "failed"
+    print(
+        f"replayed {result.seconds:.0f} s in {took_s:.1f} s"
+        + (f"; the recording ends early: {result.cut_short}" if result.cut_short else ""),
+        file=sys.stderr,
+    )
+    for note in result.notes:
+        print(f"note: {note}", file=sys.stderr)
+    if getattr(options, "json", False):
+        print_json({"state": state, "reason": reason, **msgspec.to_builtins(result)})
+    else:
+        for line in lines:
+            print(line)
+    return DONE if good else FAILED
+
+
+def _lines(result: Result) -> list[str]:
+    """For people; the last line is the verdict."""
+    lines: list[str] = []
+    different = recomputed = 0
+    for each in result.calibrations:
+        lines.append(f"calibration of {each.record.started_at}")
+        lines += show.record_lines(msgspec.to_builtins(each.record))
+        if each.not_recomputed is not None:
+            lines.append(f"not recomputed: {each.not_recomputed}")
+        else:
+            recomputed += 1
+        different += bool(each.differences)
+        lines += [f"DIFFERENT {difference}" for difference in each.differences[:MOST_LINES]]
+        if len(each.differences) > MOST_LINES:
+            lines.append(f"... and {len(each.differences) - MOST_LINES} more (--json has them all)")
+    if result.estimate is not None:
+        lines.append("no calibration in the recording; what one would have found at its end:")
+        lines += show.record_lines(msgspec.to_builtins(result.estimate))
+        lines.append(result.estimate.reason)
+    elif different:
+        lines.append(f"{different} of {len(result.calibrations)} calibrations came out different")
+    else:
+        lines.append(f"{recomputed} of {len(result.calibrations)} calibrations recomputed, the same to the last bit")
+    return lines
+
+
+def _replay_csv(options: argparse.Namespace) -> int:
+    from companion.config.sections import Profile
+    from companion.replay.csv_log import PoseGiven, estimate, read
+    from companion.rotations import ROTATIONS_DEG
+
+    if options.mounting not in ROTATIONS_DEG:
+        raise ConfigError(f"--mounting: found {options.mounting}; allowed: a MAVLink rotation such as ROTATION_YAW_90")
+    if options.profile is not None and options.profile not in (known := Profile.__args__):  # type: ignore[attr-defined]
+        raise ConfigError(f"--profile: found {options.profile}; allowed: {', '.join(known)}")
+    if (options.pitch_deg is None) != (options.roll_deg is None):
+        raise ConfigError("found only one of --pitch-deg and --roll-deg; allowed: both or neither")
+    pose = PoseGiven(
+        pitch_deg=options.pitch_deg,
+        roll_deg=options.roll_deg,
+        heading_deg=options.heading_deg,
+        sigma_deg=options.sigma_deg,
+        heading_sigma_deg=options.heading_sigma_deg,
+        latitude_deg=options.latitude_deg,
+        height_m=options.height_m,
+    )
+    found: Record = estimate(
+        read(options.file, options.columns), pose, mounting=options.mounting, profile=options.profile
+    )
+    if getattr(options, "json", False):
+        print_json(msgspec.to_builtins(found))
+    else:
+        for line in show.record_lines(msgspec.to_builtins(found)):
+            print(line)
+    return DONE if found.state == "done" else FAILED

@@ -1,0 +1,88 @@
+"""How the aircraft stands at this moment, from the latest readings of gradienter and compass.
+
+Right while it stands still: a gradienter in motion shows accelerations too. So `still` goes with it; it is false, too,
+where no IMU tells.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import Any, Final
+
+from companion.autopilot.vehicle import Vehicle
+from companion.calibration.rolling import RollingCollector
+from companion.calibration.site import Whereabouts, local_earth
+from companion.calibration.solve import up_in_vehicle, vehicle_heading_rad
+from companion.config import Config
+from companion.daemon import models
+from companion.daemon.ledger import Offload
+from companion.physics.frames import roll_pitch_from_up
+from companion.physics.units import DEG
+from companion.samples import CompassSample, Sample, TiltSample
+
+OLDEST_S: Final = 1.0
+"""A reading older than this is none."""
+DECLINATION_EVERY_S: Final = 60.0
+
+
+class PoseNow:
+    """Takes samples, tells the pose."""
+
+    def __init__(self, config: Config, vehicle: Vehicle, collector: RollingCollector, offload: Offload) -> None:
+        self._config, self._vehicle, self._collector, self._offload = config, vehicle, collector, offload
+        self._gradienter = models.gradienter_model(config.gradienter)
+        self._compass = models.compass_model(config.compass)
+        self._tilt: TiltSample | None = None
+        self._heading: CompassSample | None = None
+        self._declination_deg: float | None = None
+        self._looked_up_s = -math.inf
+
+    def take(self, sample: Sample) -> None:
+        """Take a reading of gradienter or compass."""
+        if isinstance(sample, TiltSample):
+            self._tilt = sample
+        elif isinstance(sample, CompassSample):
+            self._heading = sample
+
+    async def look(self) -> dict[str, Any] | None:
+        """The pose as JSON can hold it; None without a fresh reading of the gradienter."""
+        now_s = asyncio.get_running_loop().time()
+        tilt, heading = self._tilt, self._heading
+        if self._gradienter is None or tilt is None or now_s - tilt.t_s > OLDEST_S:
+            return None
+        try:
+            up = up_in_vehicle(self._gradienter, tilt.x_deg, tilt.y_deg)
+        except ValueError:
+            return None
+        roll, pitch = roll_pitch_from_up(up)
+        pose: dict[str, Any] = {
+            "roll_deg": round(roll / DEG, 3),
+            "pitch_deg": round(pitch / DEG, 3),
+            "heading_deg": None,
+            "north": None,
+            "source": "gradienter",
+            "still": self._collector.glance(now_s).obstacle is None,
+        }
+        if self._compass is not None and heading is not None and now_s - heading.t_s <= OLDEST_S:
+            heading_deg = vehicle_heading_rad(self._compass, heading.heading_deg, up) / DEG
+            north = "true"
+            if self._compass.magnetic:
+                declination_deg = await self._declination(now_s)
+                north = "true" if declination_deg is not None else "magnetic"
+                heading_deg += declination_deg or 0.0
+            pose |= {
+                "heading_deg": round(heading_deg % 360.0, 2) % 360.0,
+                "north": north,
+                "source": "gradienter and compass",
+            }
+        return pose
+
+    async def _declination(self, now_s: float) -> float | None:
+        """Looked up rarely: the aircraft does not get far in a minute, and the magnetic model takes its time."""
+        if now_s - self._looked_up_s >= DECLINATION_EVERY_S or self._declination_deg is None:
+            where: Whereabouts = models.whereabouts(self._config, self._vehicle)
+            if where.latitude_deg is not None:
+                self._looked_up_s = now_s
+                self._declination_deg = (await self._offload(local_earth, where)).site.declination_deg
+        return self._declination_deg

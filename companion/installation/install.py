@@ -1,0 +1,263 @@
+"""Puts the files of the service in place and takes them away again, and says of each what it did.
+
+What is there already and as it should be is left alone; what its owner has changed is never overwritten; everything
+can be done again and again.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+import companion
+from companion.errors import CompanionError
+from companion.installation import files
+from companion.installation.files import Place, Shipped
+from companion.storage.atomic import remove_durably, write_atomically
+
+MODE: Final = 0o644
+"""Anybody may read them; passwords have files of their own."""
+COMMAND_TIMEOUT_S: Final = 120.0
+HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - named, not used
+"""What the unit hides from the service: ProtectHome and PrivateTmp."""
+SERIAL_GROUPS: Final = ("dialout", "uucp")
+"""Of Debian and Fedora; of Arch."""
+
+UDEV_RUNS: Final = Path("/run/udev/control")
+
+Outcome = Literal["written", "updated", "unchanged", "kept", "removed", "absent", "done", "failed", "skipped"]
+Run = Callable[[Sequence[str]], str | None]
+"""Runs a command; None when it succeeded, else why it did not."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One thing that was, or with a dry run would be, done."""
+
+    what: str
+    outcome: Outcome
+    words: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """Where to install.
+
+    Args:
+        root: the machine's, or a folder that is to become one.
+        prefix: whose `lib` takes what is ours.
+        executable: the companion, as the machine will have it.
+        dry_run: change nothing, only tell.
+    """
+
+    root: Path
+    prefix: Path
+    executable: str
+    dry_run: bool = False
+
+    @property
+    def is_this_machine(self) -> bool:
+        """Whether what runs here is meant."""
+        return self.root == Path("/")
+
+    def path(self, shipped: Shipped) -> Path:
+        """Where a file goes."""
+        base = "etc/companion" if shipped.place is Place.CONFIGURATION else f"{str(self.prefix).lstrip('/')}/lib"
+        return self.root / base / shipped.target
+
+    def serial_group(self) -> str:
+        """Who may open serial ports there."""
+        try:
+            lines = (self.root / "etc/group").read_text(encoding="utf-8", errors="replace").splitlines()
+        except OSError:
+            lines = []
+        groups = {line.partition(":")[0] for line in lines}
+        return next((group for group in SERIAL_GROUPS if group in groups), files.SERIAL_GROUP)
+
+
+def own_executable() -> str:
+    """The companion that is running, beside its Python."""
+    return str(Path(sys.executable).with_name("companion"))
+
+
+def install(target: Target, run: Run | None = None) -> Iterator[Step]:
+    """Put everything in place; each step as it is done.
+
+    Raises:
+        CompanionError: it cannot be installed from here, or not by this user.
+    """
+    if target.is_this_machine:
+        _check_user(target, "install-service")
+        _check_reach(target.executable)
+    group = target.serial_group()
+    sample = files.content(files.CONFIGURATION)
+    before = _read(target.path(files.SAMPLE))
+    samples = [sample] if before is None else [sample, files.without_stamp(before)]
+    for shipped in files.OURS:
+        wanted = files.stamped(files.content(shipped, executable=target.executable, serial_group=group))
+        yield _put(target, target.path(shipped), wanted)
+    configuration = target.path(files.CONFIGURATION)
+    found = _read(configuration)
+    edited = found is not None and found not in samples
+    if edited:
+        yield Step(str(configuration), "kept", "yours; what is new is in companion.toml.sample")
+    elif found == sample:
+        yield Step(str(configuration), "unchanged", "still the sample: it has to be edited")
+    else:
+        outcome: Outcome = "written" if found is None else "updated"
+        yield _write(target, configuration, sample, outcome, "the sample: it has to be edited")
+    if target.is_this_machine:
+        yield from _activate(target, run or _run, edited=edited)
+
+
+def uninstall(target: Target, run: Run | None = None) -> Iterator[Step]:
+    """Take away what `install` has put there; the owner's configuration and the records stay.
+
+    Raises:
+        CompanionError: not by this user.
+    """
+    if target.is_this_machine:
+        _check_user(target, "uninstall-service")
+        if _systemd_runs():
+            yield _command(target, run or _run, "systemctl", "disable", "--now", "companion.service")
+    for shipped in files.OURS:
+        yield _take(target, target.path(shipped), files.is_untouched, "changed by hand")
+    sample = files.content(files.CONFIGURATION)
+    yield _take(target, target.path(files.CONFIGURATION), lambda data: data == sample, "yours")
+    if target.is_this_machine:
+        yield from _reload(target, run or _run)
+    state = target.root / "var/lib/private/companion"
+    if state.is_dir():
+        yield Step(str(state), "kept", "records and values for undo; remove it if they are not wanted any more")
+
+
+def _put(target: Target, path: Path, wanted: bytes) -> Step:
+    found = _read(path)
+    if found == wanted:
+        return Step(str(path), "unchanged")
+    if found is None:
+        return _write(target, path, wanted, "written")
+    if files.is_untouched(found):
+        return _write(target, path, wanted, "updated")
+    return Step(str(path), "kept", "changed by hand; remove it to get the new one")
+
+
+def _write(target: Target, path: Path, data: bytes, outcome: Outcome, words: str = "") -> Step:
+    if not target.dry_run:
+        write_atomically(path, data, mode=MODE)
+    return Step(str(path), outcome, words)
+
+
+def _take(target: Target, path: Path, is_ours: Callable[[bytes], bool], whose: str) -> Step:
+    found = _read(path)
+    if found is None:
+        return Step(str(path), "absent")
+    if not is_ours(found):
+        return Step(str(path), "kept", whose)
+    if not target.dry_run:
+        remove_durably(path)
+    return Step(str(path), "removed")
+
+
+def _read(path: Path) -> bytes | None:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise CompanionError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+# --- this machine
+
+
+def _check_user(target: Target, command: str) -> None:
+    if os.geteuid() != 0 and not target.dry_run:
+        raise CompanionError(f"this needs root: sudo {own_executable()} {command}")
+
+
+def _check_reach(executable: str) -> None:
+    """Refuse an installation that the service, which is nobody's account, could not run.
+
+    Raises:
+        CompanionError: what it could not reach, and what to do.
+    """
+    package = Path(companion.__file__).parent
+    for path in (Path(executable), package, Path(sys.base_prefix)):
+        why = unreachable(path)
+        if why is not None:
+            raise CompanionError(
+                f"{why}; install the companion where everybody may look, for example:"
+                " sudo python3 -m venv /opt/companion && sudo /opt/companion/bin/pip install ."
+            )
+    if not os.access(executable, os.X_OK):
+        raise CompanionError(f"{executable}: no such program; name it with --executable")
+
+
+def unreachable(path: Path) -> str | None:
+    """Why the service could not reach a path, in one line; None when it can."""
+    resolved = path.resolve()
+    for hidden in HIDDEN:
+        if resolved.is_relative_to(hidden):
+            return f"{resolved} is below {hidden}, where the service may not look"
+    for node in (resolved, *resolved.parents):
+        try:
+            mode = node.stat().st_mode
+        except OSError:
+            continue
+        if not mode & 0o001 or (node == resolved and not mode & 0o004):
+            return f"{node} is closed to everybody but its owner (mode {mode & 0o7777:04o})"
+    return None
+
+
+def _activate(target: Target, run: Run, *, edited: bool) -> Iterator[Step]:
+    if not _systemd_runs():
+        yield Step("systemd", "skipped", "does not run here: nothing was started")
+        return
+    yield from _reload(target, run)
+    if edited:
+        yield _command(target, run, "systemctl", "enable", "companion.service")
+        yield _command(target, run, "systemctl", "restart", "companion.service")
+    else:
+        words = "edit /etc/companion/companion.toml, then: sudo systemctl enable --now companion"
+        yield Step("companion.service", "skipped", f"not started: {words}")
+
+
+def _reload(target: Target, run: Run) -> Iterator[Step]:
+    if not _systemd_runs():
+        return
+    yield _command(target, run, "systemctl", "daemon-reload")
+    yield _command(target, run, "systemctl", "restart", "systemd-modules-load.service")
+    if not UDEV_RUNS.exists():
+        yield Step("udev", "skipped", "does not run here: its rules hold from the next start on")
+    else:
+        yield _command(target, run, "udevadm", "control", "--reload")
+        subsystems = ("--subsystem-match=tty", "--subsystem-match=usb-serial")
+        yield _command(target, run, "udevadm", "trigger", *subsystems)
+
+
+def _systemd_runs() -> bool:
+    return Path("/run/systemd/system").is_dir()
+
+
+def _command(target: Target, run: Run, *words: str) -> Step:
+    line = " ".join(words)
+    if target.dry_run:
+        return Step(line, "done")
+    why = run(words)
+    return Step(line, "done") if why is None else Step(line, "failed", why)
+
+
+def _run(words: Sequence[str]) -> str | None:
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=COMMAND_TIMEOUT_S, check=False)  # noqa: S603
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return str(error)
+    if done.returncode == 0:
+        return None
+    return " ".join((done.stderr or done.stdout).split()) or f"exit code {done.returncode}"

@@ -1,0 +1,137 @@
+"""What waits for the broker: bounded, whatever the broker does."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from typing import Final, Literal, NamedTuple
+
+MAX_ANSWERS: Final = 64
+
+Kind = Literal["kept", "answer", "passing"]
+
+
+class Parcel(NamedTuple):
+    """One message on its way."""
+
+    kind: Kind
+    topic: str
+    payload: bytes
+    droppable: bool = False
+
+    @property
+    def qos(self) -> int:
+        """Whether the broker's receipt is waited for."""
+        return 0 if self.kind == "passing" else 1
+
+    @property
+    def retain(self) -> bool:
+        """Whether the broker keeps it for those who come later."""
+        return self.kind == "kept"
+
+
+class Outbox:
+    """Three kinds of messages, each with its own way of staying small.
+
+    - kept: retained at the broker. Of each topic only the latest value counts; it is remembered after it was sent,
+      as a broker that has restarted may have lost it. Their topics are few and our own.
+    - answers: each is sent, in order, also after the connection was lost in between. At most 64: then the oldest that
+      may be dropped (a refusal) goes, and where none may, the oldest of all.
+    - passing: telemetry. Of each topic only the latest value, and none without a connection.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[str, bytes] = {}
+        self._unsent: dict[str, None] = {}
+        self._answers: deque[Parcel] = deque()
+        self._passing: dict[str, bytes] = {}
+        self._filled = asyncio.Event()
+        self._empty = asyncio.Event()
+        self._empty.set()
+        self._open = False
+        self.dropped = 0
+        """Answers that nobody will get."""
+
+    def __len__(self) -> int:
+        return len(self._unsent) + len(self._answers) + len(self._passing)
+
+    def keep(self, topic: str, payload: bytes) -> None:
+        """Have the broker keep this; an empty payload has it forget the topic."""
+        if self._kept.get(topic) != payload:
+            self._kept[topic] = payload
+            self._unsent[topic] = None
+            self._tell()
+
+    def kept(self, topic: str) -> bytes | None:
+        """What the broker is to keep under a topic."""
+        return self._kept.get(topic)
+
+    def send_again(self, topic: str) -> None:
+        """Send what is kept under a topic once more, as somebody else has overwritten it."""
+        if topic in self._kept:
+            self._unsent[topic] = None
+            self._tell()
+
+    def answer(self, topic: str, payload: bytes, *, droppable: bool) -> None:
+        """Send this once."""
+        parcel = Parcel("answer", topic, payload, droppable)
+        if len(self._answers) >= MAX_ANSWERS:
+            self.dropped += 1
+            oldest = next((index for index, old in enumerate(self._answers) if old.droppable), None)
+            if oldest is None and droppable:
+                return
+            del self._answers[oldest or 0]
+        self._answers.append(parcel)
+        self._tell()
+
+    def pass_on(self, topic: str, payload: bytes) -> None:
+        """Send this if it can be sent now."""
+        if self._open:
+            self._passing[topic] = payload
+            self._tell()
+
+    def opened(self) -> None:
+        """There is a connection: what is kept has to be said anew."""
+        self._open = True
+        self._unsent = dict.fromkeys(self._kept)
+        self._tell()
+
+    def closed(self) -> None:
+        """The connection is gone, and telemetry with it."""
+        self._open = False
+        self._passing.clear()
+        self._tell()
+
+    async def next(self) -> Parcel:
+        """The next to send; it stays (telemetry apart) until `sent`."""
+        while True:
+            if self._unsent:
+                topic = next(iter(self._unsent))
+                return Parcel("kept", topic, self._kept[topic])
+            if self._answers:
+                return self._answers[0]
+            if self._passing:
+                topic = next(iter(self._passing))
+                return Parcel("passing", topic, self._passing.pop(topic))
+            self._filled.clear()
+            await self._filled.wait()
+
+    def sent(self, parcel: Parcel) -> None:
+        """The broker has it."""
+        if parcel.kind == "kept":
+            if self._kept[parcel.topic] == parcel.payload:
+                self._unsent.pop(parcel.topic, None)
+        elif parcel.kind == "answer" and self._answers and self._answers[0] is parcel:
+            self._answers.popleft()
+        self._tell()
+
+    async def empty(self) -> None:
+        """Wait until everything was sent."""
+        await self._empty.wait()
+
+    def _tell(self) -> None:
+        if len(self):
+            self._filled.set()
+            self._empty.clear()
+        else:
+            self._empty.set()

@@ -1,0 +1,106 @@
+"""What the service manager is told: ready, what is being done, still alive, stopping. The sd_notify(3) protocol.
+
+Our own few lines and no library: PyPI's sdnotify has slept since 2016 and swallows every error, libsystemd's binding
+needs a compiler, and the protocol is one datagram of text lines.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import time
+from collections.abc import Mapping
+from typing import Self
+
+logger = logging.getLogger(__name__)
+
+
+class ServiceManager:
+    """Tells whoever started us; does nothing where nobody wants to be told.
+
+    Args:
+        address: of the manager's datagram socket, a path or "@" and an abstract name; None: nobody listens.
+        watchdog_s: within so many seconds of the last `alive` we are taken for hung; None: nobody looks.
+    """
+
+    def __init__(self, address: str | None, watchdog_s: float | None = None) -> None:
+        self._address = address
+        self.watchdog_s = watchdog_s if address is not None else None
+        self._socket: socket.socket | None = None
+        self._status = ""
+        self._warned = False
+        if address is not None:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+            # A manager that does not read must not stop us.
+            self._socket.settimeout(0.0)
+
+    @classmethod
+    def from_environment(cls, environment: Mapping[str, str] = os.environ, process_id: int | None = None) -> Self:
+        """The manager that NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID name; what they get wrong is logged."""
+        address = environment.get("NOTIFY_SOCKET") or None
+        if address is not None and address[0] not in "/@":
+            logger.warning("NOTIFY_SOCKET: found %r; allowed: a path or @NAME; nobody is told", address)
+            address = None
+        try:
+            watchdog_us = int(environment.get("WATCHDOG_USEC") or 0)
+            for_us = int(environment.get("WATCHDOG_PID") or 0) in (0, process_id or os.getpid())
+        except ValueError:
+            logger.warning("WATCHDOG_USEC or WATCHDOG_PID is not a whole number; the watchdog is not fed")
+            return cls(address)
+        return cls(address, watchdog_us * 1e-6 if for_us and watchdog_us > 0 else None)
+
+    @property
+    def listens(self) -> bool:
+        """Whether there is anybody to tell."""
+        return self._socket is not None
+
+    def ready(self) -> bool:
+        """Started, or started again after a reload."""
+        return self._send("READY=1")
+
+    def reloading(self) -> bool:
+        """A reload begins; `ready` ends it. The time is what Type=notify-reload (systemd 253) wants with it."""
+        return self._send("RELOADING=1", f"MONOTONIC_USEC={time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000}")
+
+    def stopping(self) -> bool:
+        """The end begins."""
+        return self._send("STOPPING=1")
+
+    def alive(self) -> bool:
+        """Everything that matters goes on."""
+        return self._send("WATCHDOG=1")
+
+    def status(self, words: str) -> bool:
+        """What is being done, in one line; nothing is sent while it stays the same."""
+        line = " ".join(words.split())
+        if line == self._status:
+            return True
+        sent = self._send(f"STATUS={line}")
+        if sent:
+            self._status = line
+        return sent
+
+    def close(self) -> None:
+        """Tell nothing any more."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _send(self, *lines: str) -> bool:
+        """One datagram; False when it could not be delivered (said once) or nobody is there."""
+        if self._socket is None or self._address is None:
+            return False
+        address = self._address if self._address[0] == "/" else "\0" + self._address[1:]
+        try:
+            self._socket.sendto("\n".join(lines).encode(), address)
+        except OSError as error:
+            logger.log(
+                logging.DEBUG if self._warned else logging.WARNING,
+                "the service manager cannot be told at %s: %s",
+                self._address,
+                error.strerror or error,
+            )
+            self._warned = True
+            return False
+        return True

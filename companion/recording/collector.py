@@ -1,0 +1,108 @@
+"""A rolling collector that says what is done with it, in the order in which it is."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from companion.calibration.estimates import Work
+from companion.calibration.outlook import Glance, Status
+from companion.calibration.rolling import ImuInput, RollingCollector, Settings, Window
+from companion.recording.journal import Journal
+from companion.samples import CompassSample, ImuSample, TiltSample
+
+WINDOWS_KEPT: Final = 240
+"""Between a measurement and its solution a dither may lie, while others look at the readings once a second."""
+
+
+class RecordedCollector(RollingCollector):
+    """`RollingCollector`, every call of which goes into a journal first.
+
+    Args:
+        settings: as the base class.
+        imus: likewise.
+        gradienter: likewise.
+        compass: likewise.
+        message_of: the autopilot's message that an IMU's samples come in at present; None for one of our own.
+    """
+
+    not_state: Final = frozenset({"journal", "windows", "_message_of", "_windows_made"})
+
+    def __init__(
+        self,
+        settings: Settings,
+        imus: Sequence[ImuInput],
+        *,
+        gradienter: bool,
+        compass: bool,
+        message_of: Callable[[str], str | None],
+    ) -> None:
+        self.journal = Journal()
+        self.windows: deque[tuple[int, Window]] = deque(maxlen=WINDOWS_KEPT)
+        """The latest windows of whole stretches, with their numbers."""
+        self._message_of = message_of
+        self._windows_made = 0
+        super().__init__(settings, imus, gradienter=gradienter, compass=compass)
+
+    def number_of(self, window: Window) -> int | None:
+        """The number of a window that was made lately."""
+        return next((number for number, each in self.windows if each is window), None)
+
+    def add_imu(self, name: str, sample: ImuSample) -> None:  # noqa: D102 - as in the base class
+        if self.journal.queues:
+            self.journal.imu(name, sample, self._message_of(name), sample.t_s)
+        super().add_imu(name, sample)
+
+    def add_tilt(self, sample: TiltSample) -> None:  # noqa: D102
+        self.journal.tilt(sample)
+        super().add_tilt(sample)
+
+    def add_compass(self, sample: CompassSample) -> None:  # noqa: D102
+        self.journal.compass(sample)
+        super().add_compass(sample)
+
+    def set_imu(self, imu: ImuInput) -> None:  # noqa: D102
+        if self.journal.queues:
+            self.journal.event(asyncio.get_running_loop().time(), "imu", imu)
+        super().set_imu(imu)
+
+    def retarget(self, settings: Settings) -> None:  # noqa: D102
+        if self.journal.queues:
+            self.journal.event(asyncio.get_running_loop().time(), "retarget", settings)
+        super().retarget(settings)
+
+    def expect(self, *, gradienter: bool, compass: bool) -> None:  # noqa: D102
+        if self.journal.queues:
+            self.journal.event(asyncio.get_running_loop().time(), "expect", (gradienter, compass))
+        super().expect(gradienter=gradienter, compass=compass)
+
+    def reset(self, why: str, imu: str | None = None) -> None:  # noqa: D102
+        if self.journal.queues:
+            self.journal.event(asyncio.get_running_loop().time(), "reset", (why, imu))
+        super().reset(why, imu)
+
+    def pending(self, now_s: float, *, since_s: float | None = None) -> Work | None:  # noqa: D102
+        self.journal.event(now_s, "look")
+        return super().pending(now_s, since_s=since_s)
+
+    def glance(self, now_s: float) -> Glance:  # noqa: D102
+        self.journal.event(now_s, "look")
+        return super().glance(now_s)
+
+    def status(self, now_s: float) -> Status:  # noqa: D102
+        self.journal.event(now_s, "look")
+        return super().status(now_s)
+
+    def window(self, now_s: float, *, since_s: float | None = None) -> Window:  # noqa: D102
+        if since_s is not None:
+            # A look at what a write has done: nothing is estimated from it.
+            self.journal.event(now_s, "look")
+            return super().window(now_s, since_s=since_s)
+        self._windows_made += 1
+        number = self._windows_made
+        self.journal.event(now_s, "window", number)
+        window = super().window(now_s)
+        self.windows.append((number, window))
+        return window

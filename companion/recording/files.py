@@ -1,0 +1,327 @@
+"""The thread's side of recording: MCAP files, one or a ring of them.
+
+MCAP because every tool for looking at robots' data opens it, and because it can be cut anywhere: chunks are compressed
+each for itself, and one is finished and handed to the disk at every `write`, once a second. Nothing here is called on
+the event loop.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import re
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import IO, Any, Final
+
+import msgspec
+
+from companion.errors import StorageError
+from companion.recording import topics
+from companion.recording.journal import Beginning, Entry
+from companion.recording.state import to_json
+
+logger = logging.getLogger(__name__)
+
+CHUNK_BYTES: Final = 256 * 1024
+"""A second of a busy aircraft has less."""
+BREATH: Final = 64
+"""So many messages are made before the event loop gets a chance, should it wait for the interpreter's lock."""
+BREATH_S: Final = 2e-4
+"""Not zero: who lets go of the lock for no time at all gets it back before anybody else wakes up."""
+RESERVE_BYTES: Final = 32 * 1024 * 1024
+"""Left free on the disk: the values for undo and the records are worth more than any recording."""
+PARTS: Final = 8
+"""A ring's files are at most this part of it, so that the oldest can go without taking much along."""
+
+_NAME = re.compile(r"(\d{6,})\.mcap")
+
+Opener = Callable[[Path], IO[bytes]]
+FreeBytes = Callable[[Path], int]
+
+
+def _free_bytes(folder: Path) -> int:
+    return shutil.disk_usage(folder).free
+
+
+def open_new(path: Path) -> IO[bytes]:
+    """Create a file that does not exist yet.
+
+    Raises:
+        OSError: it does, or it cannot be created.
+    """
+    return path.open("xb")
+
+
+def is_available() -> bool:
+    """Whether what recording needs is installed; without loading it."""
+    from importlib.util import find_spec
+
+    return find_spec("mcap") is not None and find_spec("zstandard") is not None
+
+
+class RecordingFile:
+    """One MCAP file in the making.
+
+    Args:
+        path: where.
+        opener: opens it.
+        free_bytes: what is left on the disk of a folder.
+
+    Raises:
+        StorageError: it cannot be created.
+    """
+
+    def __init__(self, path: Path, opener: Opener = open_new, free_bytes: FreeBytes = _free_bytes) -> None:
+        from mcap.writer import CompressionType, IndexType, Writer
+
+        self.path = path
+        self.messages = 0
+        self._free_bytes = free_bytes
+        self._file: IO[bytes] | None = None
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = opener(path)
+        except FileExistsError:
+            raise StorageError(f"{path}: exists already; nothing is overwritten") from None
+        except OSError as error:
+            raise StorageError(f"{path}: cannot be created by the companion: {error.strerror or error}") from None
+        # Without an index of messages, whose size would grow with the file's and not with what is looked for.
+        self._writer: Any = Writer(
+            self._file,
+            chunk_size=CHUNK_BYTES,
+            compression=CompressionType.ZSTD,
+            index_types=IndexType.CHUNK | IndexType.ATTACHMENT | IndexType.METADATA,
+        )
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._begun: Beginning | None = None
+
+    @property
+    def bytes_written(self) -> int:
+        """Its size so far."""
+        return 0 if self._file is None else int(self._file.tell())
+
+    def write(self, items: Sequence[Entry | Beginning]) -> None:
+        """Add messages, finish the chunk and bring it to the disk.
+
+        Raises:
+            StorageError: the disk refuses; the file ends here, and what it has can be replayed.
+        """
+        if self._file is None:
+            return
+        try:
+            if self._free_bytes(self.path.parent) < RESERVE_BYTES:
+                raise OSError(errno.ENOSPC, f"less than {RESERVE_BYTES >> 20} MB free on the disk")
+            for number, item in enumerate(items):
+                if isinstance(item, Beginning):
+                    self._begin(item)
+                elif self._begun is not None:
+                    topic, t_s, function, arguments = item
+                    self._add(topic, t_s, function(*arguments))
+                if number % BREATH == BREATH - 1:
+                    time.sleep(BREATH_S)
+            self._writer.flush()
+            self._sync()
+        except OSError as error:
+            self._abandon()
+            raise StorageError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+        except BaseException:
+            self._abandon()
+            raise
+
+    def close(self) -> None:
+        """Finish the file.
+
+        Raises:
+            StorageError: the disk refuses; all but the index is there.
+        """
+        if self._file is None:
+            return
+        try:
+            self._writer.finish()
+            self._sync()
+        except OSError as error:
+            raise StorageError(f"{self.path}: cannot be finished: {error.strerror or error}") from error
+        finally:
+            self._abandon()
+
+    def _begin(self, beginning: Beginning) -> None:
+        if self._begun is None:
+            self._begun = beginning
+            self._writer.start(profile="", library=f"companion {beginning.versions['companion']}")
+            started_ns = self._ns(beginning.t_s)
+            versions = {**beginning.versions, "t_s": repr(beginning.t_s), "unix_s": repr(beginning.unix_s)}
+            self._writer.add_metadata(topics.METADATA, versions)
+            self._writer.add_attachment(started_ns, started_ns, topics.CONFIG, "application/json", beginning.config)
+        entry = topics.StateEntry(beginning.t_s, beginning.lost, to_json(beginning.state).decode())
+        self._add(topics.STATE, beginning.t_s, msgspec.json.encode(entry))
+
+    def _ns(self, t_s: float) -> int:
+        """UTC in nanoseconds of a time on the loop's clock; a host's clock that is set meanwhile changes nothing."""
+        if self._begun is None:
+            return 0
+        return max(0, int((self._begun.unix_s + (t_s - self._begun.t_s)) * 1e9))
+
+    def _add(self, topic: str, t_s: float, data: bytes) -> None:
+        channel = self._channels.get(topic)
+        if channel is None:
+            channel = self._channels[topic] = self._register(topic)
+        at_ns = self._ns(t_s)
+        self.messages += 1
+        self._writer.add_message(channel, at_ns, data, at_ns, self.messages & 0xFFFFFFFF)
+
+    def _register(self, topic: str) -> int:
+        name = topics.schema_of(topic)
+        if name not in self._schemas:
+            data = msgspec.json.encode(topics.SCHEMAS[name])
+            self._schemas[name] = self._writer.register_schema(name, "jsonschema", data)
+        channel: int = self._writer.register_channel(topic, "json", self._schemas[name])
+        return channel
+
+    def _sync(self) -> None:
+        if self._file is not None:
+            self._file.flush()
+            try:
+                os.fdatasync(self._file.fileno())
+            except OSError as error:
+                if error.errno != errno.EINVAL:  # a pipe has nothing to sync
+                    raise
+
+    def _abandon(self) -> None:
+        file, self._file = self._file, None
+        if file is not None:
+            with contextlib.suppress(OSError):
+                file.close()
+
+
+class Ring:
+    """Files of limited size in all; the oldest go first.
+
+    Args:
+        folder: where; files are numbered, as the wall clock may be wrong in the field.
+        most_bytes: all of them together.
+        opener: opens each.
+        free_bytes: what is left on the disk of a folder.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        most_bytes: int,
+        opener: Opener = open_new,
+        free_bytes: FreeBytes = _free_bytes,
+    ) -> None:
+        self.folder, self.most_bytes = folder, most_bytes
+        self.bytes_in_all = 0
+        self._opener, self._free_bytes = opener, free_bytes
+        self._current: RecordingFile | None = None
+        self._head_bytes = 0
+
+    @property
+    def path(self) -> Path | None:
+        """The file being written."""
+        return None if self._current is None else self._current.path
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the present file has had its share, beside the state that it begins with."""
+        if self._current is None:
+            return False
+        return self._current.bytes_written - self._head_bytes >= self.most_bytes // PARTS
+
+    def write(self, items: Sequence[Entry | Beginning]) -> None:
+        """Add messages; every `Beginning` begins a file.
+
+        Raises:
+            StorageError: the disk refuses; the file ends here.
+        """
+        part: list[Entry | Beginning] = []
+        try:
+            if self._current is not None:
+                self._make_room()
+            for item in items:
+                if isinstance(item, Beginning):
+                    self._put(part)
+                    part = []
+                    self._next()
+                part.append(item)
+            self._put(part)
+            self._make_room()
+        except StorageError:
+            self._current = None
+            raise
+        except OSError as error:
+            with contextlib.suppress(StorageError):
+                self.close()
+            raise StorageError(f"{self.folder}: {error.strerror or error}") from error
+
+    def close(self) -> None:
+        """Finish the present file.
+
+        Raises:
+            StorageError: the disk refuses.
+        """
+        current, self._current = self._current, None
+        if current is not None:
+            current.close()
+
+    def _put(self, items: Sequence[Entry | Beginning]) -> None:
+        if self._current is not None and items:
+            self._current.write(items)
+            if isinstance(items[0], Beginning):
+                self._head_bytes = self._current.bytes_written
+
+    def _next(self) -> None:
+        self.close()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._make_room()
+        numbers = [number for number, _, _ in self._files()]
+        self._current = RecordingFile(
+            self.folder / f"{max(numbers, default=0) + 1:06d}.mcap", self._opener, self._free_bytes
+        )
+
+    def _files(self) -> list[tuple[int, Path, int]]:
+        """Number, path and size of every file, oldest first."""
+        found = []
+        for entry in os.scandir(self.folder):
+            match = _NAME.fullmatch(entry.name)
+            if match is not None:
+                with contextlib.suppress(FileNotFoundError):
+                    found.append((int(match[1]), Path(entry.path), entry.stat().st_size))
+        return sorted(found)
+
+    def _make_room(self) -> None:
+        files = self._files()
+        in_all = sum(size for _, _, size in files)
+        present = self.path
+        # A file that is yet to be written needs its share too.
+        limit = self.most_bytes - (self.most_bytes // PARTS if present is None else 0)
+        for _, path, size in files:
+            if (in_all <= limit and self._free_bytes(self.folder) >= RESERVE_BYTES) or path == present:
+                break
+            path.unlink(missing_ok=True)
+            in_all -= size
+        self.bytes_in_all = in_all
+
+
+def versions() -> dict[str, str]:
+    """What a replay has to be the same in for the last bit to be the same."""
+    import platform
+    import sys
+
+    import numpy
+
+    from companion import __version__
+
+    return {
+        "format": topics.FORMAT_VERSION,
+        "companion": __version__,
+        "python": ".".join(map(str, sys.version_info[:3])),
+        "numpy": numpy.__version__,
+        "machine": platform.machine(),
+    }

@@ -1,0 +1,405 @@
+"""A recording through the same decoders, collector and estimator, in the recorded order and at the recorded times.
+
+Recomputed: every sample from its raw bytes, every batch, verdict of stillness and mean, pose, biases, sigmas and
+covariances. Taken from the recording: when somebody looked at the collector or reset it, which of the autopilot's
+messages counted (its offsets had to be known), place and date, the offsets in force, means found by a dither, and all
+that only the autopilot can tell: what was written and read back, and with which outcome.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any, Final
+
+import msgspec
+
+from companion.autopilot import imu_messages
+from companion.autopilot.imu_calibration import ImuCalibration
+from companion.autopilot.imu_messages import ImuMessage, Reading
+from companion.calibration.record import ImuRecord, Record, from_json
+from companion.calibration.request import What
+from companion.calibration.rolling import RollingCollector, Window
+from companion.calibration.site import Whereabouts
+from companion.calibration.solve import Solution, solve_at
+from companion.config import Config
+from companion.daemon import models
+from companion.daemon.course import in_words
+from companion.daemon.plan import whole_of
+from companion.daemon.report import Draft
+from companion.errors import CalibrationRefusedError, StorageError
+from companion.links.mavlink import MavlinkLink
+from companion.protocols.base import Decoder
+from companion.recording import state, topics
+from companion.recording.files import versions
+from companion.recording.walk import Attachment, Message, Metadata, Recording
+from companion.replay.compare import Difference, differences
+from companion.samples import CompassSample, ImuSample, Sample, TiltSample
+
+PENDING: Final = 4000
+"""Telemetry that nobody has counted yet is remembered so long."""
+
+
+class Replayed(msgspec.Struct, frozen=True):
+    """One calibration again."""
+
+    record: Record
+    differences: list[Difference]
+    not_recomputed: str | None
+    """Why its estimates were taken from the recording, if so."""
+
+
+class Result(msgspec.Struct, frozen=True):
+    """What a recording gave."""
+
+    calibrations: list[Replayed]
+    estimate: Record | None
+    """Of the last still stretch, where no calibration is in the recording."""
+    seconds: float
+    """Of recorded time."""
+    cut_short: str | None
+    notes: list[str]
+    """What a reader should know: other versions, samples that do not decode as they did."""
+
+
+class _State(msgspec.Struct, frozen=True):
+    """What `StateEntry.state` holds."""
+
+    collector: RollingCollector
+    decoders: dict[str, Decoder]
+    mavlink: bytes
+    windows: list[tuple[int, Window]]
+    where: Whereabouts
+    offsets: dict[str, ImuCalibration | None]
+    solved: dict[str, Any] | None
+
+
+class Replay:
+    """One pass over one recording.
+
+    Args:
+        recording: the file.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._config: Config | None = None
+        self._versions: dict[str, str] = {}
+        self._collector: RollingCollector | None = None
+        self._decoders: dict[str, Decoder] = {}
+        self._link = MavlinkLink()
+        self._pending: dict[str, deque[tuple[float, Reading]]] = {}
+        self._windows: dict[int, Window | CalibrationRefusedError] = {}
+        self._where = Whereabouts()
+        self._offsets: dict[str, ImuCalibration | None] = {}
+        self._solution: Solution | None = None
+        self._solved_with: dict[str, ImuCalibration | None] = {}
+        """The offsets in force when that was measured; by now others may have been written."""
+        self._no_solution = ""
+        self._handlers: dict[str, Callable[[bytes], None] | None] = {}
+        self._calibrations: list[Replayed] = []
+        self._notes: list[str] = []
+        self._strange: Counter[str] = Counter()
+        self._first_s: float | None = None
+        self._now_s = 0.0
+
+    def run(self) -> Result:
+        """Replay it to its end or to where it is cut.
+
+        Raises:
+            StorageError: one line: it is not one of ours, or it was made by a version whose state is not known here.
+        """
+        for item in self._recording:
+            if isinstance(item, Message):
+                self._message(item)
+            elif isinstance(item, Metadata) and item.name == topics.METADATA:
+                self._versions = item.table
+                if (found := item.table.get("format")) != topics.FORMAT_VERSION:
+                    raise StorageError(
+                        f"{self._recording.path}: found format {found}; allowed: {topics.FORMAT_VERSION} (recorded by"
+                        f" companion {item.table.get('companion')})"
+                    )
+            elif isinstance(item, Attachment) and item.name == topics.CONFIG:
+                self._configure(item.data)
+        if self._collector is None:
+            cut = self._recording.cut_short
+            whose = f"{cut}, before anything was recorded" if cut else "an MCAP file, but not a recording of companion"
+            raise StorageError(f"{self._recording.path}: {whose}; nothing to replay")
+        notes = [*self._version_notes(), *self._notes, *(f"{words}: {n} times" for words, n in self._strange.items())]
+        return Result(
+            calibrations=self._calibrations,
+            estimate=None if self._calibrations else self._estimate(),
+            seconds=0.0 if self._first_s is None else self._now_s - self._first_s,
+            cut_short=self._recording.cut_short,
+            notes=notes,
+        )
+
+    def _version_notes(self) -> list[str]:
+        ours = versions()
+        others = [
+            f"{name} {self._versions.get(name)}, here {ours[name]}"
+            for name in ("companion", "numpy", "machine")
+            if self._versions.get(name) != ours[name]
+        ]
+        return [f"recorded with {'; '.join(others)}: the last digits may differ"] if others else []
+
+    def _configure(self, data: bytes) -> None:
+        try:
+            self._config = msgspec.json.decode(data, type=Config)
+        except msgspec.MsgspecError as error:
+            raise StorageError(f"{self._recording.path}: its configuration is of another version: {error}") from None
+
+    # --- what comes, in its order
+
+    def _message(self, message: Message) -> None:
+        topic = message.topic
+        try:
+            handler = self._handlers[topic]
+        except KeyError:
+            handler = self._handlers[topic] = self._handler_of(topic)
+        if handler is None or (self._collector is None and topic != topics.STATE):
+            return
+        try:
+            handler(message.data)
+        except (msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            raise StorageError(
+                f"{self._recording.path}: a message on {topic} cannot be used by this version ({error})"
+            ) from None
+
+    def _handler_of(self, topic: str) -> Callable[[bytes], None] | None:
+        known: dict[str, Callable[[bytes], None]] = {
+            topics.STATE: self._take_state,
+            topics.JOURNAL: self._take_event,
+            topics.RECORD: self._take_record,
+            topics.MAVLINK_IN: self._take_mavlink,
+        }
+        if topic in known:
+            return known[topic]
+        if topic.startswith(topics.SERIAL):
+            name = topic.removeprefix(topics.SERIAL)
+            return lambda data: self._take_serial(name, data)
+        if topic.startswith(topics.IMU) and self._config is not None:
+            name = topic.removeprefix(topics.IMU)
+            if any(imu.name == name and imu.source == "autopilot" for imu in self._config.imu):
+                return lambda data: self._take_telemetry(name, data)
+        # Samples of serial devices come from their bytes.
+        return None
+
+    def _at(self, t_s: float) -> None:
+        if self._first_s is None:
+            self._first_s = t_s
+        self._now_s = t_s
+
+    def _take_state(self, data: bytes) -> None:
+        if self._config is None:
+            return
+        entry = msgspec.json.decode(data, type=topics.StateEntry)
+        self._at(entry.t_s)
+        if entry.lost:
+            self._notes.append(f"{entry.lost} messages were lost in recording; replayed from behind the gap")
+        plain = state.from_json(entry.state)
+        known = _State(**plain)
+        self._collector, self._decoders = known.collector, known.decoders
+        self._windows.update(known.windows)
+        self._where, self._offsets = known.where, known.offsets
+        self._link = MavlinkLink()
+        self._pending = {}
+        for each in {*sum(imu_messages.ARDUPILOT.values(), ()), *sum(imu_messages.PX4.values(), ())}:
+            self._listen(each)
+        self._link.receive(known.mavlink, entry.t_s)
+        self._solution, self._no_solution = None, "it was measured before this part of the recording"
+        if known.solved is not None:
+            self._solve(known.solved)
+
+    def _listen(self, kind: ImuMessage) -> None:
+        pending = self._pending[kind.kind.message] = deque(maxlen=PENDING)
+
+        def take(message: Any, t_s: float) -> None:
+            reading = kind.decode(message)
+            if isinstance(reading, Reading):
+                pending.append((t_s, reading))
+
+        self._link.subscribe(kind.message, take)
+
+    def _take_serial(self, name: str, data: bytes) -> None:
+        raw = msgspec.json.decode(data, type=topics.RawBytes)
+        self._at(raw.t_s)
+        decoder = self._decoders[name]
+        if raw.data is None:
+            decoder.interrupted()
+            return
+        for sample in decoder.feed(raw.data, raw.t_s):
+            self._take_sample(name, sample)
+
+    def _take_sample(self, name: str, sample: Sample) -> None:
+        if self._collector is None:
+            return
+        if isinstance(sample, ImuSample):
+            if name not in ("gradienter", "compass"):
+                self._collector.add_imu(name, sample)
+        elif isinstance(sample, TiltSample):
+            self._collector.add_tilt(sample)
+        elif isinstance(sample, CompassSample):
+            self._collector.add_compass(sample)
+
+    def _take_mavlink(self, data: bytes) -> None:
+        raw = msgspec.json.decode(data, type=topics.RawBytes)
+        self._at(raw.t_s)
+        if raw.data is None:
+            self._link.attach(None)
+        else:
+            self._link.receive(raw.data, raw.t_s)
+
+    def _take_telemetry(self, name: str, data: bytes) -> None:
+        """A sample of the autopilot that counted: find its message among those received, and take that."""
+        entry = msgspec.json.decode(data, type=topics.ImuEntry)
+        pending = self._pending.get(entry.message or "")
+        while pending:
+            t_s, reading = pending.popleft()
+            if reading.t_device_s == entry.t_device_s:
+                sample = ImuSample(
+                    t_s, reading.gyro_rad_s, reading.accel_m_s2, entry.temperature_degc, None, reading.t_device_s
+                )
+                # As the recording wrote it.
+                again = msgspec.json.decode(topics.imu_json(sample, entry.message), type=topics.ImuEntry)
+                if again != entry:
+                    self._strange[f"imu {name}: a sample does not decode as it did"] += 1
+                break
+        else:
+            self._strange[f"imu {name}: a sample is not in the MAVLink bytes"] += 1
+            sample = ImuSample(
+                entry.t_s, entry.gyro_rad_s, entry.accel_m_s2, entry.temperature_degc, None, entry.t_device_s
+            )
+        if self._collector is not None:
+            self._collector.add_imu(name, sample)
+
+    def _take_event(self, data: bytes) -> None:
+        entry = msgspec.json.decode(data, type=topics.JournalEntry)
+        collector = self._collector
+        if collector is None:
+            return
+        self._at(entry.t_s)
+        if entry.event == "look":
+            collector.glance(entry.t_s)
+            return
+        detail = state.from_json(entry.detail)
+        match entry.event:
+            case "window":
+                try:
+                    self._windows[detail] = collector.window(entry.t_s)
+                except CalibrationRefusedError as error:
+                    self._windows[detail] = error
+                while len(self._windows) > PENDING:
+                    del self._windows[next(iter(self._windows))]
+            case "reset":
+                collector.reset(*detail)
+            case "imu":
+                collector.set_imu(detail)
+            case "retarget":
+                collector.retarget(detail)
+            case "expect":
+                collector.expect(gradienter=detail[0], compass=detail[1])
+            case "place":
+                self._where = detail
+            case "offsets":
+                self._offsets = detail
+            case "solved":
+                self._solve(detail)
+
+    # --- calibrations
+
+    def _solve(self, detail: dict[str, Any]) -> None:
+        self._solution, self._no_solution = None, ""
+        window = self._windows.get(detail["window"])
+        self._where, self._solved_with = detail["where"], detail["offsets"]
+        if window is None:
+            self._no_solution = "its measurement is not in the recording"
+            return
+        try:
+            if isinstance(window, CalibrationRefusedError):
+                raise window
+            self._solution = self._solved(_refined(window, detail["refined"]), What[detail["what"]])
+        except CalibrationRefusedError as error:
+            self._no_solution = f"refused here: {error}"
+
+    def _solved(self, window: Window, what: What) -> Solution:
+        config = self._config
+        assert config is not None
+        gradienter, compass = models.gradienter_model(config.gradienter), models.compass_model(config.compass)
+        return solve_at(window, self._where, gradienter, compass, what)
+
+    def _take_record(self, data: bytes) -> None:
+        entry = msgspec.json.decode(data, type=topics.RecordEntry)
+        recorded = from_json(entry.record.encode())
+        self._at(entry.t_s)
+        solution, self._solution = self._solution, None
+        why = self._no_solution
+        if recorded.pose is None:
+            # It ended before anything was worked out; there is nothing to recompute.
+            self._calibrations.append(Replayed(recorded, [], "it ended before anything was worked out"))
+        elif solution is not None:
+            again = self._again(recorded, solution)
+            self._calibrations.append(Replayed(again, differences(recorded, again), None))
+        elif why.startswith("refused here"):
+            gone = msgspec.structs.replace(recorded, state="failed", reason=why, pose=None, site=None, imus=())
+            self._calibrations.append(Replayed(gone, differences(recorded, gone), None))
+        else:
+            self._calibrations.append(Replayed(recorded, [], why))
+
+    def _again(self, recorded: Record, solution: Solution) -> Record:
+        """The recomputed record; what no recording can tell anew is the recorded one's."""
+        draft = Draft(datetime.datetime.fromtimestamp(0.0, tz=datetime.UTC), recorded.system_id, solution)
+        corrected = {imu.name for imu in recorded.imus if imu.residual_gyro_rad_s or imu.residual_accel_m_s2}
+        for found in solution.imus:
+            calibration = self._solved_with.get(found.name)
+            if calibration is not None and found.name in corrected:
+                draft.whole[found.name] = whole_of(calibration, found)
+        words = in_words(solution)
+        reason = recorded.reason
+        if recorded.state == "done":
+            reason = words + (reason[len(words) :] if reason.startswith(words) else "")
+        again = draft.record(recorded.state, reason, recorded.duration_s)
+        before = {imu.name: imu for imu in recorded.imus}
+        return msgspec.structs.replace(
+            again,
+            started_at=recorded.started_at,
+            duration_s=recorded.duration_s,
+            warnings=_with_rest(again.warnings, recorded.warnings),
+            imus=tuple(_imu_again(imu, before.get(imu.name)) for imu in again.imus),
+        )
+
+    def _estimate(self) -> Record:
+        """What a calibration would have found at the end."""
+        unix_s = float(self._versions.get("unix_s", "0"))
+        draft = Draft(datetime.datetime.fromtimestamp(unix_s, tz=datetime.UTC))
+        seconds = 0.0 if self._first_s is None else self._now_s - self._first_s
+        try:
+            assert self._collector is not None
+            draft.solution = self._solved(self._collector.window(self._now_s), What.BOTH)
+        except CalibrationRefusedError as error:
+            return draft.record("failed", str(error), seconds)
+        for found in draft.solution.imus:
+            calibration = self._offsets.get(found.name)
+            if calibration is not None:
+                draft.whole[found.name] = whole_of(calibration, found)
+        return draft.record("done", in_words(draft.solution), seconds)
+
+
+def _refined(window: Window, refined: Window | None) -> Window:
+    """The window with the means that a dither has found."""
+    if refined is None:
+        return window
+    found = {imu.name: imu for imu in refined.imus if imu.dithered}
+    return msgspec.structs.replace(window, imus=tuple(found.get(imu.name, imu) for imu in window.imus))
+
+
+def _with_rest(ours: tuple[str, ...], recorded: tuple[str, ...]) -> tuple[str, ...]:
+    """Our warnings first, as ever; then those that come from the autopilot."""
+    return (*ours, *recorded[len(ours) :])
+
+
+def _imu_again(imu: ImuRecord, recorded: ImuRecord | None) -> ImuRecord:
+    if recorded is None:
+        return imu
+    return msgspec.structs.replace(imu, written=recorded.written, warnings=_with_rest(imu.warnings, recorded.warnings))

@@ -1,0 +1,286 @@
+"""The daemon as a service: a real process, its signals, and what the service manager hears of it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import os
+import signal
+import time
+from collections.abc import AsyncIterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from sim.ardupilot.parameters import offset_names
+from sim.companion_process import CompanionProcess
+from sim.scenario import Scenario
+from tests.support.live_aircraft import QUICK, live_aircraft
+from tests.support.notify_socket import NotifySocket
+
+WATCHDOG_S = 2.0
+# One task waits for ever; the limits are short so that the test is.
+HANGING = """
+import asyncio, sys
+from companion.cli import main
+from companion.daemon import supervisor
+from companion.daemon.in_force import InForce
+from companion.component.component import Component
+from companion.links import bytestream
+from companion.links.bytestream import ByteLink
+
+supervisor.ESTIMATOR_S = supervisor.COMPONENT_S = 3.0
+bytestream.BEAT_WITHIN_S, supervisor.MARGIN_S = 3.0, 0.0
+
+async def for_ever(*_):
+    await asyncio.Event().wait()
+
+def hang(owner, name, only=lambda self: True):
+    working = getattr(owner, name)
+    async def method(self, *arguments):
+        return await (for_ever() if only(self) else working(self, *arguments))
+    setattr(owner, name, method)
+
+{patch}
+sys.exit(main())
+"""
+
+NOTHING_THERE = """
+[mavlink]
+url = "udpout:127.0.0.1:9"
+[[imu]]
+name = "fc"
+source = "autopilot"
+[gradienter]
+port = "tcp://127.0.0.1:9"
+protocol = "inclinometer_xy"
+law = "axis"
+[compass]
+port = "/nowhere/compass"
+protocol = "hmr3300"
+[control]
+socket = "{folder}/control.sock"
+[storage]
+directory = "{folder}/state"
+"""
+
+
+@contextlib.asynccontextmanager
+async def service(
+    folder: Path, *, entry: Sequence[str] = ("-m", "companion"), abstract: bool = False, more: str = QUICK
+) -> AsyncIterator[tuple[Scenario, CompanionProcess, NotifySocket]]:
+    async with live_aircraft(folder, more) as scenario:
+        with NotifySocket(None if abstract else folder / "notify") as manager:
+            environment = manager.environment(WATCHDOG_S)
+            async with CompanionProcess(folder, environment=environment, entry=entry) as daemon:
+                await manager.until("READY")
+                yield scenario, daemon, manager
+
+
+@pytest.mark.parametrize("abstract", [False, True])
+def test_ready_status_watchdog_and_stop(tmp_path: Path, *, abstract: bool) -> None:
+    async def main() -> None:
+        async with service(tmp_path, abstract=abstract) as (_, daemon, manager):
+            # Ready means that it can be talked to, and not a moment earlier.
+            assert await daemon.status() is not None
+            await manager.until("STATUS", "ArduPilot")
+            await manager.until("STATUS", "gradienter, compass good")
+            assert "disarmed" in manager.status
+            assert "idle" in manager.status
+            await manager.until("WATCHDOG", count=5)
+            fed = manager.times("WATCHDOG")
+            assert max(after - before for before, after in itertools.pairwise(fed)) < WATCHDOG_S
+            daemon.signal(signal.SIGTERM)
+            assert await daemon.ended(10.0) == 0
+            assert manager.times("STOPPING")
+            assert len(manager.times("READY")) == 1
+            assert not (tmp_path / "control.sock").exists()
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(
+    ("patch", "name"),
+    [
+        ('hang(InForce, "measure")', "estimator"),
+        ('hang(ByteLink, "_until_lost", lambda self: self.name == "compass")', "sensor compass"),
+        ("Component.run = for_ever", "MAVLink component"),
+    ],
+    ids=["estimator", "sensor", "mavlink"],
+)
+def test_a_task_that_hangs_starves_the_watchdog_and_is_named(tmp_path: Path, patch: str, name: str) -> None:
+    async def main() -> None:
+        entry = ("-c", HANGING.replace("{patch}", patch))
+        async with service(tmp_path, entry=entry) as (_, daemon, manager):
+            await manager.until("STATUS", f"HUNG: {name}")
+            starved_s = asyncio.get_running_loop().time()
+            statuses = len(manager.messages)
+            await asyncio.sleep(1.5 * WATCHDOG_S)
+            # The loop turns and the status goes on, but nobody feeds the watchdog any more.
+            assert max(manager.times("WATCHDOG")) < starved_s
+            assert len(manager.messages) >= statuses
+            (line,) = [line for line in daemon.log().splitlines() if "watchdog:" in line]
+            assert f"watchdog: {name} has not gone on for" in line
+            assert "waits in" in line
+
+    asyncio.run(main())
+
+
+def test_where_the_whole_process_stands_still_is_in_the_log(tmp_path: Path) -> None:
+    """The loop itself is blocked, nobody is fed, and the manager's SIGABRT finds out where."""
+
+    async def main() -> None:
+        patch = "import time\ndef block(*_):\n    time.sleep(1000)\nComponent._step = block"
+        async with service(tmp_path, entry=("-c", HANGING.replace("{patch}", patch))) as (_, daemon, manager):
+            await asyncio.sleep(WATCHDOG_S)
+            assert len(manager.times("WATCHDOG")) <= 1
+            daemon.signal(signal.SIGABRT)
+            assert await daemon.ended(10.0) == -signal.SIGABRT
+            assert "Fatal Python error: Aborted" in daemon.log()
+            assert ", line " in daemon.log()
+            assert " in block" in daemon.log()
+
+    asyncio.run(main())
+
+
+def test_ports_and_autopilots_that_are_not_there_are_no_reason_to_restart(tmp_path: Path) -> None:
+    """Who waits for a device goes on; only who waits for ever is hung."""
+
+    async def main() -> None:
+        entry = ("-c", HANGING.replace("{patch}", ""))
+        (tmp_path / "companion.toml").write_text(NOTHING_THERE.format(folder=tmp_path))
+        with NotifySocket(tmp_path / "notify") as manager:
+            environment = manager.environment(WATCHDOG_S)
+            async with CompanionProcess(tmp_path, environment=environment, entry=entry) as daemon:
+                await manager.until("READY")
+                await manager.until("WATCHDOG", count=20)
+                fed = manager.times("WATCHDOG")
+                assert max(after - before for before, after in itertools.pairwise(fed)) < WATCHDOG_S
+                assert "watchdog:" not in daemon.log()
+                assert "compass: " in manager.status
+
+    asyncio.run(main())
+
+
+def offsets(scenario: Scenario) -> dict[str, float]:
+    """What the autopilot subtracts."""
+    return {
+        name: scenario.autopilot.parameter(name)
+        for instance in (1, 2)
+        for kind in ("gyro", "accel")
+        for name in offset_names(instance, kind)
+    }
+
+
+async def calibrate(daemon: CompanionProcess) -> None:
+    """Start a calibration and leave it alone."""
+    await daemon.ready()
+    asking = await asyncio.create_subprocess_exec(*daemon.command("calibrate"), stdout=asyncio.subprocess.DEVNULL)
+    assert await asking.wait() == 0
+
+
+@pytest.mark.parametrize("moment", ["measuring", "writing"])
+def test_sigterm_in_a_calibration_leaves_the_old_values(tmp_path: Path, moment: str) -> None:
+    async def main() -> None:
+        async with service(tmp_path) as (scenario, daemon, manager):
+            before = offsets(scenario)
+            await calibrate(daemon)
+            if moment == "measuring":
+                await manager.until("STATUS", "collecting")
+                assert offsets(scenario) == before
+            else:
+                async with asyncio.timeout(60.0):
+                    while offsets(scenario) == before:  # the double has no event for a write
+                        await asyncio.sleep(0.02)
+            daemon.signal(signal.SIGTERM)
+            await manager.until("STOPPING")
+            if moment == "writing":
+                daemon.signal(signal.SIGTERM)  # an impatient second one cuts nothing off
+            assert await daemon.ended(30.0) == 0
+            assert offsets(scenario) == before
+            assert "Calibration cancelled" in daemon.log()
+            assert ("stopping already" in daemon.log()) == (moment == "writing")
+            # Nothing is left for the next start to put in order.
+            async with CompanionProcess(tmp_path) as again:
+                await again.ready()
+                status = await again.status()
+                assert status is not None
+                assert not status["putting_back"]
+                assert status["fault"] is None
+                assert status["last"]["state"] == "cancelled"
+
+    asyncio.run(main())
+
+
+def test_sighup_takes_over_what_it_can_and_names_the_rest(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with service(tmp_path) as (_, daemon, manager):
+            await daemon.ready()
+            file = tmp_path / "companion.toml"
+            good = file.read_text()
+
+            file.write_text(good.replace('at_arm = "off"', 'at_arm = "warn"\ntarget_gyro_sigma_deg_h = 7.5'))
+            daemon.signal(signal.SIGHUP)
+            message = await manager.until("RELOADING")
+            # The time of the reload, as Type=notify-reload wants it: later than the signal, on the same clock.
+            assert 0 < time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000 - int(message["MONOTONIC_USEC"]) < 10e6
+            await manager.until("READY", count=2)
+            status = await daemon.status()
+            assert status is not None
+            assert status["arming"]["at_arm"] == "warn"
+            log = daemon.log()
+            assert "calibration.at_arm = 'warn' (was 'off')" in log
+            assert "calibration.target_gyro_sigma_deg_h = 7.5 (was 5.0)" in log
+            assert "restart to change" not in log
+
+            # A mistake: one line, and everything stays as it was.
+            file.write_text(file.read_text().replace('at_arm = "warn"', 'at_arm = "wran"'))
+            daemon.signal(signal.SIGHUP)
+            await manager.until("READY", count=3)
+            (refusal,) = [line for line in daemon.log().splitlines() if "reload refused" in line]
+            assert f"{file}: 'calibration.at_arm': found 'wran'; allowed: " in refusal
+            file.write_text(good)  # not reloaded: only the command line reads it, to find the socket
+            status = await daemon.status()
+            assert status is not None
+            assert status["arming"]["at_arm"] == "warn"
+            await manager.until("STATUS", "reload refused")
+
+            # What only a restart can change is named, and the rest of the same file is taken over.
+            changed = good.replace("udpout:127.0.0.1", "udpout:127.0.0.2").replace('at_arm = "off"', 'at_arm = "gate"')
+            file.write_text(changed)
+            daemon.signal(signal.SIGHUP)
+            await manager.until("READY", count=4)
+            assert "restart to change mavlink.url (systemctl restart companion)" in daemon.log()
+            await manager.until("STATUS", "restart to change mavlink.url")
+            status = await daemon.status()
+            assert status is not None
+            assert status["arming"]["at_arm"] == "gate"
+            assert status["vehicle"]["armed"] == "disarmed"  # the old connection still carries
+            assert daemon.log().count("Traceback") == 0
+
+    asyncio.run(main())
+
+
+def test_the_levels_of_the_journal(tmp_path: Path) -> None:
+    """Where stderr is the journal its lines carry priorities; where it merely inherited the variable they do not."""
+
+    async def first_line(environment: dict[str, str]) -> str:
+        read, write = os.pipe()
+        status = os.fstat(write)
+        filled = {key: value.format(f"{status.st_dev}:{status.st_ino}") for key, value in environment.items()}
+        command = CompanionProcess(tmp_path).command("run")
+        process = await asyncio.create_subprocess_exec(*command, stderr=write, env={**os.environ, **filled})
+        os.close(write)
+        line = await asyncio.to_thread(lambda: os.read(read, 4096))
+        process.terminate()
+        await process.wait()
+        os.close(read)
+        return line.decode()
+
+    async def main() -> None:
+        async with live_aircraft(tmp_path):
+            assert (await first_line({"JOURNAL_STREAM": "{}"})).startswith("<6>INFO ready: ")
+            assert " INFO ready: " in await first_line({"JOURNAL_STREAM": "1:2"})
+
+    asyncio.run(main())

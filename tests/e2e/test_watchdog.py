@@ -1,0 +1,50 @@
+"""A daemon that works is never taken for hung, whatever happens around it: minutes of flight line on virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from companion.calibration.request import What
+from companion.component.service import Refusal
+from companion.daemon.supervisor import Supervisor
+from companion.links.service_manager import ServiceManager
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+def test_nobody_is_accused_who_works(tmp_path: Path, firmware: Literal["ardupilot", "px4"]) -> None:
+    async def main() -> dict[str, float]:
+        rig = Rig(tmp_path, firmware=firmware, min_still_s=4.0, max_s=8.0, loss=0.2, at_arm="gate")
+        oldest: dict[str, float] = {}
+        async with rig.running() as running:
+            beats = Supervisor(running.service, ServiceManager(None)).beats
+
+            async def look() -> None:
+                while True:
+                    await asyncio.sleep(1.0)
+                    for name, age_s in beats.look(1.0).items():
+                        oldest[name] = max(age_s, oldest.get(name, 0.0))
+
+            looking = asyncio.create_task(look())
+            await asyncio.sleep(20.0)
+            for _ in range(2):
+                job = running.service.conductor.start_calibration(What.BOTH, "test")
+                assert not isinstance(job, Refusal)
+                await job.finished
+                rig.wire.cut = True
+                await asyncio.sleep(40.0)
+                rig.wire.cut = False
+                rig.autopilot.reboot(down_s=20.0)
+                await asyncio.sleep(60.0)
+            rig.unplugged |= {"compass", "gradienter"}
+            await asyncio.sleep(40.0)
+            looking.cancel()
+        return oldest
+
+    # The rig itself carries the bytes: the tasks that would do that are not running, and are missed.
+    assert run_virtual(main()).keys() == {"MAVLink connection", "sensor gradienter", "sensor compass"}

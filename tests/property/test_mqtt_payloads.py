@@ -1,0 +1,37 @@
+"""Whatever is published as a request, it is judged in one line and the verdict can be sent."""
+
+from __future__ import annotations
+
+import json
+
+import msgspec
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.daemon.mqtt.payloads import KEYS, MAX_PAYLOAD_BYTES, Misfit, parse
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=10,
+)
+keys = st.sampled_from(["transaction", "what", "timeout_s", "reboot", "force"]) | st.text()
+objects = st.dictionaries(keys, values, max_size=4).map(lambda found: json.dumps(found).encode())
+
+
+@given(command=st.sampled_from([*KEYS, "other"]), payload=st.binary(max_size=200) | objects)
+def test_no_payload_raises_and_every_verdict_is_one_short_line(command: str, payload: bytes) -> None:
+    verdict = parse(command, payload)
+    if isinstance(verdict, Misfit):
+        assert verdict.reason.isprintable()
+        assert len(verdict.reason) < 400
+        msgspec.json.encode({"transaction": verdict.transaction, "reason": verdict.reason})
+    else:
+        assert len(payload) <= MAX_PAYLOAD_BYTES
+        assert set(verdict.content) <= set(KEYS[command])
+        sent = json.loads(payload) if payload.strip() else {}
+        assert verdict.transaction == sent.get("transaction")
+        assert verdict.question == {
+            "command": command,
+            **{key: value for key, value in sent.items() if key != "transaction"},
+        }

@@ -1,0 +1,202 @@
+"""`companion install-service` below a folder of its own: what is put where, what is left alone, what goes away."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import stat
+import subprocess
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from companion import cli
+from companion.errors import CompanionError
+from companion.installation import files
+from companion.installation import install as installation
+from companion.installation.install import Target, install, uninstall, unreachable
+from tests.support.systemd import SYSTEMD_ANALYZE, needs_systemd_analyze
+
+UNIT = "usr/local/lib/systemd/system/companion.service"
+RULES = "usr/local/lib/udev/rules.d/70-companion.rules"
+MODULES = "usr/local/lib/modules-load.d/companion.conf"
+CONFIGURATION = "etc/companion/companion.toml"
+SAMPLE = CONFIGURATION + ".sample"
+EXECUTABLE = "/opt/elsewhere/bin/companion"
+
+
+def target(root: Path, *, dry_run: bool = False, executable: str = EXECUTABLE) -> Target:
+    return Target(root, Path("/usr/local"), executable, dry_run=dry_run)
+
+
+def outcomes(root: Path, steps: Sequence[object]) -> dict[str, str]:
+    return {str(Path(step.what).relative_to(root)): step.outcome for step in steps}  # type: ignore[attr-defined]
+
+
+def tree(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def test_everything_is_put_in_place_once(tmp_path: Path) -> None:
+    first = outcomes(tmp_path, list(install(target(tmp_path))))
+    assert first == dict.fromkeys((UNIT, RULES, MODULES, SAMPLE, CONFIGURATION), "written")
+    placed = tree(tmp_path)
+    assert placed.keys() == first.keys()
+    assert f"ExecStart={EXECUTABLE} -c /etc/companion/companion.toml run\n" in placed[UNIT].decode()
+    assert all(stat.S_IMODE((tmp_path / name).stat().st_mode) == 0o644 for name in placed)
+    again = outcomes(tmp_path, list(install(target(tmp_path))))
+    assert set(again.values()) == {"unchanged"}
+    assert tree(tmp_path) == placed
+
+
+def test_what_its_owner_has_changed_is_kept_and_the_rest_brought_up_to_date(tmp_path: Path) -> None:
+    list(install(target(tmp_path)))
+    (tmp_path / CONFIGURATION).write_text("[mavlink]\n")
+    with (tmp_path / RULES).open("a") as rules:
+        rules.write("# mine\n")
+    again = outcomes(tmp_path, list(install(target(tmp_path, executable="/opt/companion/bin/companion"))))
+    assert again == {UNIT: "updated", RULES: "kept", MODULES: "unchanged", SAMPLE: "unchanged", CONFIGURATION: "kept"}
+    assert (tmp_path / CONFIGURATION).read_text() == "[mavlink]\n"
+    assert (tmp_path / RULES).read_text().endswith("# mine\n")
+    gone = outcomes(tmp_path, list(uninstall(target(tmp_path))))
+    assert gone == {UNIT: "removed", RULES: "kept", MODULES: "removed", SAMPLE: "removed", CONFIGURATION: "kept"}
+    assert tree(tmp_path).keys() == {RULES, CONFIGURATION}
+
+
+def test_an_unedited_sample_of_an_older_version_is_brought_up_to_date(tmp_path: Path) -> None:
+    list(install(target(tmp_path)))
+    new = (tmp_path / CONFIGURATION).read_bytes()
+    (tmp_path / CONFIGURATION).write_bytes(b"# older\n")
+    (tmp_path / SAMPLE).write_bytes(files.stamped(b"# older\n"))
+    again = outcomes(tmp_path, list(install(target(tmp_path))))
+    assert (again[SAMPLE], again[CONFIGURATION]) == ("updated", "updated")
+    assert (tmp_path / CONFIGURATION).read_bytes() == new
+
+
+def test_uninstalling_leaves_nothing_and_can_be_repeated(tmp_path: Path) -> None:
+    list(install(target(tmp_path)))
+    assert set(outcomes(tmp_path, list(uninstall(target(tmp_path)))).values()) == {"removed"}
+    assert tree(tmp_path) == {}
+    assert set(outcomes(tmp_path, list(uninstall(target(tmp_path)))).values()) == {"absent"}
+
+
+def test_a_dry_run_tells_and_changes_nothing(tmp_path: Path) -> None:
+    assert "written" in outcomes(tmp_path, list(install(target(tmp_path, dry_run=True)))).values()
+    assert tree(tmp_path) == {}
+    list(install(target(tmp_path)))
+    before = tree(tmp_path)
+    assert "removed" in outcomes(tmp_path, list(uninstall(target(tmp_path, dry_run=True)))).values()
+    assert tree(tmp_path) == before
+
+
+def test_the_group_of_the_serial_ports_is_that_of_the_machine(tmp_path: Path) -> None:
+    (tmp_path / "etc").mkdir()
+    (tmp_path / "etc/group").write_text("root:x:0:\nuucp:x:14:me\n")
+    list(install(target(tmp_path)))
+    unit = (tmp_path / UNIT).read_text()
+    assert "\nSupplementaryGroups=uucp\n" in unit
+    assert "\nEnvironment=COMPANION_CONTROL_GROUP=uucp\n" in unit
+    assert "dialout" not in unit
+
+
+def test_a_path_that_cannot_stand_in_a_unit_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CompanionError, match="allowed: an absolute path without spaces"):
+        list(install(target(tmp_path, executable="/opt/my companion/bin/companion")))
+
+
+def test_what_the_service_could_not_reach_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert unreachable(Path("/usr/bin/env")) is None
+    assert (
+        unreachable(Path("/home/pi/companion")) == "/home/pi/companion is below /home, where the service may not look"
+    )
+    closed = tmp_path / "closed"
+    (closed / "bin").mkdir(parents=True)
+    closed.chmod(0o700)
+    monkeypatch.setattr(installation, "HIDDEN", ())  # pytest's own folders are below /tmp
+    assert unreachable(closed / "bin") == f"{closed} is closed to everybody but its owner (mode 0700)"
+
+
+def test_the_command_says_line_by_line_what_it_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["install-service", "--root", str(tmp_path), "--prefix", "/usr", "--executable", EXECUTABLE]
+    assert cli.main([*words, "--dry-run"]) == 0
+    told = capsys.readouterr()
+    assert f"written    {tmp_path}/usr/lib/systemd/system/companion.service" in told.out.splitlines()
+    assert "nothing was changed" in told.err
+    assert cli.main([*words, "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["state"] == "done"
+    assert [step["outcome"] for step in answer["steps"]] == ["written"] * 5
+    assert cli.main(["uninstall-service", "--root", str(tmp_path), "--prefix", "/usr"]) == 0
+    assert capsys.readouterr().out.count("removed    ") == 5
+
+
+def test_without_root_this_machine_is_left_alone(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert cli.main(["install-service"]) == 1
+    assert "this needs root: sudo " in capsys.readouterr().err
+
+
+def test_the_files_are_found_in_a_checkout_and_in_a_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    project = Path(files.__file__).parents[2]
+    assert files.folder() == project / "systemd"
+    building = tomllib.loads((project / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]
+    ((source, place),) = building["wheel"]["force-include"].items()
+    shutil.copytree(project / source, tmp_path / place)
+    assert source in building["sdist"]["include"]
+    monkeypatch.setattr(files, "__file__", str(tmp_path / "companion/installation/files.py"))
+    assert files.folder() == tmp_path / "companion/installation/systemd"
+    shutil.rmtree(tmp_path / place)
+    with pytest.raises(CompanionError, match="the installation is not complete"):
+        files.folder()
+
+
+# --- what systemd says to it
+
+
+@needs_systemd_analyze
+def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path) -> None:
+    list(install(target(tmp_path, executable="/bin/true")))
+    verified = subprocess.run(
+        [SYSTEMD_ANALYZE, "verify", "--man=no", str(tmp_path / UNIT)], capture_output=True, text=True, check=False
+    )
+    assert (verified.returncode, verified.stdout, verified.stderr) == (0, "", "")
+
+
+@needs_systemd_analyze
+def test_the_exposure_of_the_unit(tmp_path: Path) -> None:
+    list(install(target(tmp_path, executable="/bin/true")))
+    command = [SYSTEMD_ANALYZE, "security", "--offline=true", "--json=short", "--threshold=20", str(tmp_path / UNIT)]
+    rated = subprocess.run(command, capture_output=True, text=True, check=False)
+    # The threshold is the overall exposure times ten; above it the exit code is not 0.
+    assert rated.returncode == 0, rated.stdout + rated.stderr
+    # That it judges at all: the same unit without its hardening is far above.
+    bare = tmp_path / "bare.service"
+    bare.write_text("[Service]\nExecStart=/bin/true\n")
+    assert subprocess.run([*command[:-1], str(bare)], capture_output=True, check=False).returncode != 0
+
+
+def test_the_unit_keeps_trying_and_asks_for_nothing_newer_than_systemd_252() -> None:
+    settings = [
+        line.partition("=")
+        for line in files.content(files.SERVICE).decode().splitlines()
+        if "=" in line and not line.startswith("#")
+    ]
+    values: dict[str, list[str]] = {}
+    for key, _, value in settings:
+        values.setdefault(key, []).append(value)
+    assert values["Restart"] == ["always"]
+    assert values["StartLimitIntervalSec"] == ["0"]
+    assert values["Type"] == ["notify"]
+    assert not {"RestartSteps", "RestartMaxDelaySec", "MemoryKSM", "DelegateSubgroup"} & values.keys()
+    # Classes, never paths: a path would mean one device number, and a port plugged in again has another.
+    assert {"char-ttyUSB rw", "char-ttyACM rw", "char-ttyAMA rw", "char-ttyS rw"} <= set(values["DeviceAllow"])
+    assert all(value.startswith("char-") for value in values["DeviceAllow"])
+    # Each class that a driver brings later has its driver loaded before us.
+    modules = files.content(files.MODULES).decode().splitlines()
+    assert {"usbserial", "cdc_acm"} <= set(modules)
+    assert any("systemd-modules-load.service" in value for value in values["After"])

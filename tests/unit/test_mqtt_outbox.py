@@ -1,0 +1,128 @@
+"""The outbox: what comes first, what is dropped, and that nothing makes it grow."""
+
+from __future__ import annotations
+
+import asyncio
+
+from companion.links.mqtt_outbox import MAX_ANSWERS, Outbox, Parcel
+
+
+async def drain(box: Outbox) -> list[tuple[str, bytes]]:
+    """Send everything, as a broker that takes it would see it."""
+    got = []
+    while len(box):
+        parcel = await box.next()
+        box.sent(parcel)
+        got.append((parcel.topic, parcel.payload))
+    return got
+
+
+def test_of_what_is_kept_the_latest_value_counts_and_comes_again_after_every_connection() -> None:
+    async def main() -> None:
+        box = Outbox()
+        for number in range(1000):
+            box.keep("state", b"%d" % number)
+        box.keep("status", b"online")
+        assert len(box) == 2
+        assert await drain(box) == [("state", b"999"), ("status", b"online")]
+        box.keep("state", b"999")
+        assert len(box) == 0
+        box.closed()
+        box.opened()
+        assert await drain(box) == [("state", b"999"), ("status", b"online")]
+
+    asyncio.run(main())
+
+
+def test_a_value_that_changes_while_it_is_sent_is_sent_again() -> None:
+    async def main() -> None:
+        box = Outbox()
+        box.keep("state", b"old")
+        parcel = await box.next()
+        assert (parcel.qos, parcel.retain) == (1, True)
+        box.keep("state", b"new")
+        box.sent(parcel)
+        assert await drain(box) == [("state", b"new")]
+
+    asyncio.run(main())
+
+
+def test_what_was_not_acknowledged_stays() -> None:
+    async def main() -> None:
+        box = Outbox()
+        box.opened()
+        box.answer("response", b"1", droppable=False)
+        assert (await box.next()).payload == b"1"
+        box.closed()
+        box.opened()
+        assert await drain(box) == [("response", b"1")]
+
+    asyncio.run(main())
+
+
+def test_a_flood_of_refusals_pushes_out_refusals_and_no_result() -> None:
+    async def main() -> None:
+        box = Outbox()
+        box.answer("response", b"result", droppable=False)
+        for number in range(10 * MAX_ANSWERS):
+            box.answer("response", b"%d" % number, droppable=True)
+        assert len(box) == MAX_ANSWERS
+        assert box.dropped == 9 * MAX_ANSWERS + 1
+        sent = await drain(box)
+        assert sent[0] == ("response", b"result")
+        assert sent[-1] == ("response", b"%d" % (10 * MAX_ANSWERS - 1))
+        for number in range(2 * MAX_ANSWERS):
+            box.answer("response", b"%d" % number, droppable=False)
+        assert len(box) == MAX_ANSWERS
+        box.answer("response", b"refusal", droppable=True)
+        assert ("response", b"refusal") not in await drain(box)
+
+    asyncio.run(main())
+
+
+def test_an_answer_dropped_on_its_way_does_not_take_the_next_one_with_it() -> None:
+    async def main() -> None:
+        box = Outbox()
+        box.answer("response", b"first", droppable=True)
+        on_its_way = await box.next()
+        for number in range(MAX_ANSWERS):
+            box.answer("response", b"%d" % number, droppable=True)
+        box.sent(on_its_way)
+        assert (await drain(box))[0] == ("response", b"0")
+
+    asyncio.run(main())
+
+
+def test_telemetry_is_only_for_now() -> None:
+    async def main() -> None:
+        box = Outbox()
+        box.pass_on("attitude", b"before")
+        assert len(box) == 0
+        box.opened()
+        for number in range(100):
+            box.pass_on("attitude", b"%d" % number)
+        parcel = await box.next()
+        assert parcel == Parcel("passing", "attitude", b"99")
+        assert (parcel.qos, parcel.retain) == (0, False)
+        box.pass_on("attitude", b"lost")
+        box.closed()
+        assert len(box) == 0
+
+    asyncio.run(main())
+
+
+def test_waiting_for_something_and_for_nothing() -> None:
+    async def main() -> None:
+        box = Outbox()
+        await box.empty()
+        waiting = asyncio.create_task(box.next())
+        await asyncio.sleep(0)
+        box.keep("status", b"online")
+        parcel = await waiting
+        emptied = asyncio.create_task(box.empty())
+        await asyncio.sleep(0)
+        assert not emptied.done()
+        box.sent(parcel)
+        await emptied
+
+    asyncio.run(main())

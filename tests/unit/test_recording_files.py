@@ -1,0 +1,208 @@
+"""The thread's side of recording: files, the ring, a full disk, a disk that does not keep up."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable
+from pathlib import Path
+from typing import IO, Any
+
+import pytest
+from mcap.reader import make_reader
+
+from companion.errors import StorageError
+from companion.recording import journal as journal_module
+from companion.recording import topics
+from companion.recording.files import RESERVE_BYTES, RecordingFile, Ring, versions
+from companion.recording.journal import Beginning, Entry, Journal, Queue
+from companion.recording.walk import Message, Recording
+
+MB = 1 << 20
+
+
+def beginning(t_s: float = 1000.0) -> Beginning:
+    return Beginning(t_s=t_s, unix_s=1.7e9, versions=versions(), config=b"{}", state={"a": 1})
+
+
+def raw(count: int, size: int, seed: int = 0) -> list[Entry]:
+    """Entries that do not get smaller by compression."""
+    import random
+
+    rng = random.Random(seed)
+    made = Journal()
+    made.queues.append(queue := Queue())
+    for k in range(count):
+        made.raw("/serial/own", 1000.0 + k / 100, rng.randbytes(size))
+    return [item for item in queue.take() if not isinstance(item, Beginning)]
+
+
+def messages(path: Path, topic: str) -> list[Message]:
+    return [item for item in Recording(path) if isinstance(item, Message) and item.topic == topic]
+
+
+def numbers(folder: Path) -> list[int]:
+    return sorted(int(path.stem) for path in folder.glob("*.mcap"))
+
+
+def test_the_ring_keeps_within_its_size_and_the_oldest_go_first(tmp_path: Path) -> None:
+    ring = Ring(tmp_path / "ring", 2 * MB)
+    kept = tmp_path / "ring" / "kept-001.mcap"
+    most = 0
+    seen: set[int] = set()
+    for second in range(60):
+        begin = [beginning()] if second == 0 or ring.is_full else []
+        ring.write([*begin, *raw(40, 2000, second)])
+        if second == 0:
+            kept.write_bytes(b"asked for by somebody")
+        now = [path for path in (tmp_path / "ring").iterdir() if path != kept]
+        most = max(most, sum(path.stat().st_size for path in now))
+        present = set(numbers_of(now))
+        assert not any(number < max(seen - present, default=0) for number in present), "an older file outlived a newer"
+        seen |= present
+    ring.close()
+    assert most <= 2 * MB
+    assert most > 1.5 * MB
+    assert len(seen) >= 10
+    assert kept.exists()
+    left = sorted(path for path in (tmp_path / "ring").glob("0*.mcap"))
+    assert len(left) >= 5
+    for path in left:
+        assert messages(path, topics.STATE), "every file can be replayed by itself"
+        with path.open("rb") as file:
+            summary = make_reader(file).get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count > 0
+
+
+def numbers_of(paths: Iterable[Path]) -> list[int]:
+    return [int(path.stem) for path in paths]
+
+
+def test_a_ring_found_too_large_at_start_is_made_smaller(tmp_path: Path) -> None:
+    for number in range(1, 9):
+        (tmp_path / f"{number:06d}.mcap").write_bytes(bytes(MB))
+    ring = Ring(tmp_path, 4 * MB)
+    ring.write([beginning(), *raw(1, 10)])
+    ring.close()
+    assert numbers(tmp_path) == [6, 7, 8, 9]
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "mine.mcap"
+    path.write_bytes(b"precious")
+    with pytest.raises(StorageError, match="exists already"):
+        RecordingFile(path)
+    assert path.read_bytes() == b"precious"
+
+
+def full(path: Path) -> IO[bytes]:
+    return Path("/dev/full").open("wb")
+
+
+def test_a_full_disk_is_one_line_and_what_was_written_is_a_recording(tmp_path: Path) -> None:
+    file = RecordingFile(tmp_path / "a.mcap", full)
+    with pytest.raises(StorageError, match=r"a\.mcap: cannot be written: No space left on device"):
+        file.write([beginning(), *raw(100, 1000)])
+    file.write(raw(1, 10))  # nothing more happens
+    file.close()
+
+
+def test_the_disk_is_never_filled_to_the_brim_and_the_ring_gives_way_first(tmp_path: Path) -> None:
+    free = 10 * RESERVE_BYTES
+
+    def left(folder: Path) -> int:
+        return free
+
+    ring = Ring(tmp_path, 8 * MB, free_bytes=left)
+    for second in range(8):
+        ring.write([beginning(), *raw(10, 5000, second)])
+    assert len(numbers(tmp_path)) == 8
+    free = RESERVE_BYTES - 1
+    with pytest.raises(StorageError, match="less than 32 MB free"):
+        ring.write(raw(10, 5000, 99))
+    assert numbers(tmp_path) == [8], "old recordings make room for what matters more"
+    assert messages(tmp_path / "000008.mcap", topics.STATE)
+    free = 10 * RESERVE_BYTES
+    ring.write([beginning(), *raw(10, 5000)])
+    ring.close()
+    assert numbers(tmp_path) == [8, 9]
+
+
+def test_what_finds_no_room_is_lost_in_one_piece_and_said_in_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal_module, "MOST_ENTRIES", 50)
+    queue, made = Queue(), Journal()
+    made.queues.append(queue)
+    queue.begin(beginning())
+    file = RecordingFile(tmp_path / "a.mcap")
+    for k in range(20):
+        made.raw("/serial/own", 1000.0 + k, bytes([k]))
+    file.write(queue.take())
+    for k in range(20, 90):  # the disk hangs
+        made.raw("/serial/own", 1000.0 + k, bytes([k]))
+    assert queue.take() == [], "nothing of a part with a hole in it"
+    assert queue.lost == queue.lost_in_all == 70
+    queue.begin(beginning(1090.0))
+    for k in range(90, 95):
+        made.raw("/serial/own", 1000.0 + k, bytes([k]))
+    file.write(queue.take())
+    file.close()
+    entries = [topics_of(message) for message in messages(tmp_path / "a.mcap", topics.STATE)]
+    assert [entry.lost for entry in entries] == [0, 70]
+    import msgspec
+
+    found = [
+        msgspec.json.decode(message.data, type=topics.RawBytes).data
+        for message in messages(tmp_path / "a.mcap", "/serial/own")
+    ]
+    assert found == [bytes([k]) for k in [*range(20), *range(90, 95)]]
+
+
+def topics_of(message: Message) -> topics.StateEntry:
+    import msgspec
+
+    return msgspec.json.decode(message.data, type=topics.StateEntry)
+
+
+def test_raw_bytes_in_waiting_are_bounded_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journal_module, "MOST_BYTES", 1000)
+    queue, made = Queue(), Journal()
+    made.queues.append(queue)
+    for k in range(3):
+        made.raw("/mavlink/in", float(k), bytes(400))
+    assert queue.lost == 3
+    assert queue.items == []
+
+
+@pytest.mark.parametrize("content", [b"", b"hello, world, this is no recording", bytes(100)])
+def test_an_empty_or_foreign_file_is_one_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content)
+    with pytest.raises(StorageError, match=r"the file is empty|not a recording \(MCAP\)") as caught:
+        list(Recording(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_another_writers_file_is_walked_like_its_own_reader_does(tmp_path: Path) -> None:
+    from mcap.writer import CompressionType, Writer
+
+    for compression in (CompressionType.ZSTD, CompressionType.NONE):
+        out = io.BytesIO()
+        writer: Any = Writer(out, chunk_size=500, compression=compression)
+        writer.start()
+        schema = writer.register_schema("s", "jsonschema", b"{}")
+        channels = [writer.register_channel(f"/t{k}", "json", schema) for k in range(3)]
+        for k in range(200):
+            writer.add_message(channels[k % 3], k, b"x" * k, k)
+        writer.add_attachment(0, 0, "name", "text/plain", b"attached")
+        writer.add_metadata("meta", {"a": "b"})
+        writer.finish()
+        path = tmp_path / "o.mcap"
+        path.write_bytes(out.getvalue())
+        recording = Recording(path)
+        walked = [(item.topic, item.data) for item in recording if isinstance(item, Message)]
+        out.seek(0)
+        assert walked == [(channel.topic, message.data) for _, channel, message in make_reader(out).iter_messages()]
+        assert recording.cut_short is None

@@ -1,0 +1,210 @@
+"""Somebody's own log of an IMU at rest against the truth of a simulated one, and one clear line for every mistake."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from companion.cli import main as companion
+from sim.aircraft import Pose, VirtualAircraft
+from sim.imu_model import DEG_H, MG, ImuModel
+from sim.scenario import site_at
+
+POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
+GYRO_DEG_H = (162.0, -98.0, 40.0)
+ACCEL_MG = (2.4, -2.1, 0.9)
+G = 9.80665
+SHAKEN = (0, 1, 1, 1, 1, 1, 1)
+UNITS = {
+    "si": ("t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2", 1.0, 1.0, 1.0),
+    "common": ("t_ms,gx_deg_s,gy_deg_s,gz_deg_s,ax_g,ay_g,az_g", 1e3, 180.0 / np.pi, 1.0 / G),
+    "fine": ("t_us,gx_deg_h,gy_deg_h,gz_deg_h,ax_mg,ay_mg,az_mg", 1e6, 180.0 / np.pi * 3600.0, 1e3 / G),
+}
+WHERE = ["--pitch-deg", "5", "--roll-deg", "-3", "--heading-deg", "40", "--latitude-deg", "40", "--height-m", "50"]
+
+
+def rows(seconds: float = 60.0, rate_hz: int = 200) -> tuple[np.ndarray, ImuModel]:
+    """(n, 7): time and readings of a simulated IMU in SI units, and the IMU."""
+    model = ImuModel(
+        VirtualAircraft(POSE, site_at(40.0, 116.0, 50.0)),
+        "adis16470",
+        seed=2,
+        gyro_bias_rad_s=[value * DEG_H for value in GYRO_DEG_H],
+        accel_bias_m_s2=[value * MG for value in ACCEL_MG],
+    )
+    times = 3.0 + np.arange(round(seconds * rate_hz)) / rate_hz
+    return np.column_stack([times, model.read(times, 1.0 / rate_hz)]), model
+
+
+def written(path: Path, data: np.ndarray, units: str = "si", separator: str = ",", head: str | None = None) -> Path:
+    names, time, rate, force = UNITS[units]
+    scaled = data * np.array([time, rate, rate, rate, force, force, force])
+    lines = [names.replace(",", separator)] if head is None else [head] if head else []
+    lines += [separator.join(f"{value:.9g}" if k else f"{value:.6f}" for k, value in enumerate(row)) for row in scaled]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def replay(capsys: pytest.CaptureFixture[str], path: Path, *more: str) -> tuple[int, dict[str, Any]]:
+    code = companion(["replay", str(path), "--json", *more])
+    return code, json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(("units", "separator"), [("si", ","), ("common", ";"), ("fine", "\t")])
+def test_the_biases_are_those_of_the_imu(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], units: str, separator: str
+) -> None:
+    data, model = rows()
+    code, record = replay(
+        capsys, written(tmp_path / "imu.csv", data, units, separator), *WHERE, "--profile", "adis16470"
+    )
+    assert (code, record["state"]) == (0, "done")
+    (imu,) = record["imus"]
+    true = model.mean_bias(3.0, 63.0)
+    for found, sigma, truth in (
+        ("gyro_bias_rad_s", "gyro_sigma_use_rad_s", true.gyro_rad_s),
+        ("accel_bias_m_s2", "accel_sigma_use_m_s2", true.accel_m_s2),
+    ):
+        assert (np.abs(np.subtract(imu[found], truth)) / imu[sigma]).max() < 3.5
+    assert max(imu["gyro_sigma_use_rad_s"]) < 40.0 * DEG_H
+    # All but the millisecond in which the stream began and the second that its end cut.
+    assert imu["samples"] >= 200 * 59
+
+
+def test_columns_may_be_named_by_hand_and_others_are_passed_over(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, _ = rows(20.0)
+    path = written(tmp_path / "imu.csv", data, "common", head="")
+    more = ["--columns", UNITS["common"][0]]
+    _, plain = replay(capsys, path, *WHERE, *more)
+    # A header of other names, a remark, a column more, a log that was cut in the middle of a line.
+    lines = path.read_text(encoding="utf-8").splitlines()
+    text = "time,a,b,c,d,e,f,lamp\n# remark\n" + "\n".join(f"{line},1" for line in lines) + "\n23.1,0.0"
+    path.write_text(text, encoding="utf-8")
+    code, record = replay(capsys, path, *WHERE, "--columns", UNITS["common"][0] + ",lamp")
+    assert code == 0
+    assert record["imus"] == plain["imus"]
+
+
+def test_what_is_not_said_widens_sigma_and_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data, model = rows(30.0)
+    path = written(tmp_path / "imu.csv", data)
+    code, record = replay(capsys, path)
+    (imu,) = record["imus"]
+    assert code == 0
+    assert imu["accel_bias_m_s2"] is None
+    words = " | ".join(record["warnings"])
+    for option in ("--pitch-deg", "--heading-deg", "say --latitude-deg"):
+        assert option in words
+    assert "GPS" not in words
+    _, record = replay(capsys, path, "--latitude-deg", "40")
+    assert any("say --height-m" in warning for warning in record["warnings"])
+    off = np.subtract(imu["gyro_bias_rad_s"], model.mean_bias(3.0, 33.0).gyro_rad_s)
+    assert (np.abs(off) / imu["gyro_sigma_use_rad_s"]).max() < 3.5
+    assert max(imu["gyro_sigma_use_rad_s"]) > 6.0 * DEG_H
+
+
+def test_a_mounting_turns_the_axes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data, _ = rows(20.0)
+    _, straight = replay(capsys, written(tmp_path / "a.csv", data), *WHERE)
+    # The sensor's x points to the right, its y backward.
+    turned = np.column_stack([data[:, 0], data[:, 2], -data[:, 1], data[:, 3], data[:, 5], -data[:, 4], data[:, 6]])
+    code, record = replay(capsys, written(tmp_path / "b.csv", turned), *WHERE, "--mounting", "ROTATION_YAW_90")
+    assert code == 0
+    np.testing.assert_allclose(
+        record["imus"][0]["gyro_bias_rad_s"],
+        straight["imus"][0]["gyro_bias_rad_s"],
+        atol=0.5 * DEG_H,
+    )
+
+
+def test_the_still_part_of_a_log_is_what_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data, model = rows(40.0)
+    hand = np.random.default_rng(1).normal(0.0, 0.2, (8 * 200, 3))
+    data[32 * 200 :, 1:4] += hand
+    code, record = replay(capsys, written(tmp_path / "imu.csv", data), *WHERE)
+    (imu,) = record["imus"]
+    assert code == 0
+    assert 20 * 200 < imu["samples"] <= 32 * 200
+    off = np.subtract(imu["gyro_bias_rad_s"], model.mean_bias(3.0, 33.0).gyro_rad_s)
+    assert (np.abs(off) / imu["gyro_sigma_use_rad_s"]).max() < 3.5
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda data: data * [1, 1, 1, 1, 1 / G, 1 / G, 1 / G], "not gravity"),
+        (lambda data: data + np.random.default_rng(1).normal(0.0, 1.0, data.shape) * SHAKEN, "no 5 s at rest"),
+        (lambda data: data[:300], "no 5 s at rest"),
+    ],
+    ids=["g taken for m/s^2", "shaken", "short"],
+)  # fmt: skip
+def test_a_log_that_tells_nothing_fails_and_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: object, words: str
+) -> None:
+    data = change(rows(12.0)[0])  # type: ignore[operator]
+    code, record = replay(capsys, written(tmp_path / "imu.csv", data), *WHERE)
+    assert (code, record["state"]) == (1, "failed")
+    assert words in str(record["reason"])
+
+
+GOOD = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (GOOD + "0,0,0,0,0,0,-9.8\n0.01,0,0,x,0,0,-9.8\n", "line 3: found 'x' in column gz_rad_s; allowed: a number"),
+        (GOOD + "0,0,0,0,0,0,nan\n", "line 2: found 'nan' in column az_m_s2; allowed: a number"),
+        (GOOD + "\n# remark\n0,0,0\n", "line 4: found 3 fields; allowed: 7, as many as columns"),
+        (GOOD + "1,0,0,0,0,0,-9.8\n0.5,0,0,0,0,0,-9.8\n", "line 3: time 0.500000 s after 1.000000 s"),
+        ("t_s,gx_rad_s\n0,1\n", "line 1: no column gy_rad_s or gy_deg_s or gy_deg_h in t_s, gx_rad_s"),
+        ("time,x\n0,1\n", "line 1: no column t_s or t_ms or t_us or t_ns"),
+        (GOOD.replace("gy_rad_s", "gx_deg_s") + "0\n", "line 1: two columns for gx"),
+        ("0,0,0,0,0,0,-9.8\n", "line 1: no names of columns; name them: --columns"),
+        ("# only a remark\n", "the file is empty"),
+    ],
+)
+def test_every_mistake_in_the_file_is_one_line_with_its_place(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, words: str
+) -> None:
+    path = tmp_path / "imu.csv"
+    path.write_text(text, encoding="utf-8")
+    assert companion(["replay", str(path)]) == 1
+    said = capsys.readouterr()
+    assert words in said.err
+    assert str(path) in said.err
+    assert said.err.count("\n") == 1
+    assert said.out == ""
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--pitch-deg", "5"], "both or neither"),
+        (["--mounting", "YAW_90"], "allowed: a MAVLink rotation"),
+        (["--profile", "best"], "allowed: icm42688p"),
+    ],
+)
+def test_every_mistake_in_the_options_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], words: str
+) -> None:
+    path = tmp_path / "imu.csv"
+    path.write_text(GOOD, encoding="utf-8")
+    assert companion(["replay", str(path), *more]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_out_of_range_angles_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "imu.csv"
+    path.write_text(GOOD, encoding="utf-8")
+    for more in (["--latitude-deg", "95"], ["--pitch-deg", "nan", "--roll-deg", "0"], ["--sigma-deg", "0"]):
+        with pytest.raises(SystemExit) as ended:
+            companion(["replay", str(path), *more])
+        assert ended.value.code == 2
+        assert "allowed" in capsys.readouterr().err
