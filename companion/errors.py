@@ -27,6 +27,10 @@ class DaemonDeniedError(DaemonUnreachableError):
     """A daemon is there, but this user may not use its control socket."""
 
 
+class NobodyHeardError(CompanionError):
+    """From the ground: no vehicle, or no companion, was heard or answers on the link."""
+
+
 class StorageError(CompanionError):
     """A record could not be written or read."""
 

@@ -104,12 +104,29 @@ class CompanionProcess:
 
     async def undo(self) -> Record:
         """`companion undo --json`."""
+        return await self._ask("undo")
+
+    async def cancel(self) -> Record:
+        """`companion cancel --json`."""
+        return await self._ask("cancel")
+
+    async def start_calibration(self) -> Record:
+        """`companion calibrate --json`: asked for, not waited for."""
+        return await self._ask("calibrate")
+
+    async def last_record(self) -> Record:
+        """The latest of `companion history --json`."""
+        history = await self._ask("history")
+        record: Record = history["records"][0]
+        return record
+
+    async def _ask(self, command: str) -> Record:
         process = await asyncio.create_subprocess_exec(
-            *self.command("undo", "--json"), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL
+            *self.command(command, "--json"), stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.DEVNULL
         )
         output, _ = await process.communicate()
-        record: Record = json.loads(output)
-        return record
+        answer: Record = json.loads(output)
+        return answer
 
     async def calibrate(self, within_s: float) -> Record:
         """`companion calibrate --wait --json`, its progress on our stderr; the record.

@@ -1,7 +1,8 @@
 """The command line.
 
 Exit codes of every command: 0 done, 1 failed or refused (the reason in `reason`), 2 usage or configuration error
-(one line on stderr), 3 no daemon answers. With --json stdout holds exactly one JSON object; words go to stderr.
+(one line on stderr), 3 no daemon answers (from the
+ground: no vehicle or no companion is heard). With --json stdout holds exactly one JSON object; words go to stderr.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from companion import __version__, config
-from companion.errors import CompanionError, ConfigError, DaemonUnreachableError
+from companion.errors import CompanionError, ConfigError, DaemonUnreachableError, NobodyHeardError
 
 DONE: Final = 0
 FAILED: Final = 1
@@ -33,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         print(error, file=sys.stderr)
         return USAGE
-    except DaemonUnreachableError as error:
+    except (DaemonUnreachableError, NobodyHeardError) as error:
         _fail(options, "unreachable", str(error))
         return NO_DAEMON
     except CompanionError as error:
@@ -69,27 +70,29 @@ def config_path(options: argparse.Namespace) -> Path:
     return path
 
 
-class _Parser(argparse.ArgumentParser):
+class Parser(argparse.ArgumentParser):
+    """Says a usage error in one line."""
+
     def error(self, message: str) -> NoReturn:
         """Say a usage error in one line."""
         self.exit(USAGE, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
-def _parser() -> argparse.ArgumentParser:
-    from companion.cli import client, install, local, monitor, recordings, report
+def _parser() -> Parser:
+    from companion.cli import client, ground, install, local, monitor, recordings, report
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
-    common = _Parser(add_help=False, argument_default=argparse.SUPPRESS)
+    common = Parser(add_help=False, argument_default=argparse.SUPPRESS)
     common.add_argument("-c", "--config", type=Path, metavar="FILE", help=f"default: {config.DEFAULT_PATH}")
     common.add_argument("--json", action="store_true", help="print one JSON object on stdout")
 
-    parser = _Parser(
+    parser = Parser(
         prog="companion", parents=[common], description="Field self-calibration of gyro and accelerometer biases."
     )
     parser.add_argument("--version", action="version", version=f"companion {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    def add(name: str, command: Command, words: str) -> argparse.ArgumentParser:
+    def add(name: str, command: Command, words: str) -> Parser:
         sub = commands.add_parser(name, parents=[common], help=words, description=words)
         sub.set_defaults(command=command)
         return sub
@@ -128,6 +131,7 @@ def _parser() -> argparse.ArgumentParser:
     add("monitor", monitor.monitor, "watch the daemon until Ctrl-C")
     add("web-token", local.web_token, "where the page is, and the token that its buttons need")
     recordings.add_commands(add)
+    ground.add_commands(commands, common)
     return parser
 
 

@@ -7,11 +7,16 @@ know; the component carries requests in and verdicts out.
 from __future__ import annotations
 
 import asyncio
-from typing import Literal, Protocol
+from typing import Final, Literal, Protocol
 
 import msgspec
 
 from companion.calibration.request import What
+
+MEASURED_PERCENT: Final = 70.0
+"""Progress of a calibration: below this it measures, from here on it works out and writes."""
+WRITTEN_PERCENT: Final = 80.0
+"""From here on it watches the telemetry take the new values, and the autopilot settle."""
 
 
 class Refusal(msgspec.Struct, frozen=True):

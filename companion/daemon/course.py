@@ -22,6 +22,7 @@ from companion.calibration.request import What
 from companion.calibration.rolling import RollingCollector, Settings, Window
 from companion.calibration.site import Whereabouts
 from companion.calibration.solve import Solution, solve_at
+from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity, Weight
 from companion.config import Config
 from companion.daemon import estimating, models
@@ -47,9 +48,6 @@ READ_ATTEMPTS: Final = 2
 """So often, within one calibration, the autopilot's offsets may fail to be read."""
 WRONG_IMU_ATTEMPTS: Final = 3
 """Of three IMUs two may have been taken for the one that is meant."""
-# Shares of the progress bar: measuring, then writing, then verifying, then waiting for the EKF.
-MEASURED_PERCENT: Final = 70.0
-WRITTEN_PERCENT: Final = 80.0
 SETTLING_PERCENT: Final = 95.0
 
 

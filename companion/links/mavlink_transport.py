@@ -43,7 +43,7 @@ async def run_transport(link: MavlinkLink, url: str, *, on_state: OnState | None
     Raises:
         LinkError: the url is none of ours. A peer that is not there is no error.
     """
-    kind, where, number = _parse(url)
+    kind, where, number = parse_url(url)
     if kind in ("udpin", "udpout"):
         await _run_udp(link, url, (where, number), listen=kind == "udpin", on_state=on_state)
         return
@@ -59,7 +59,12 @@ async def run_transport(link: MavlinkLink, url: str, *, on_state: OnState | None
     await stream.run()
 
 
-def _parse(url: str) -> tuple[str, str, int]:
+def parse_url(url: str) -> tuple[str, str, int]:
+    """Kind ("udpin", "udpout", "tcp", "serial"), host or path, and port or baud rate of a MAVLink url.
+
+    Raises:
+        LinkError: it is none; says what is allowed.
+    """
     match = _URL.fullmatch(url)
     if match is None or (match["kind"] != "serial" and int(match["number"]) > 65535):
         raise LinkError(

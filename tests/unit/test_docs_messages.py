@@ -19,7 +19,8 @@ NOT_MESSAGES = {
     # Kinds of port in `companion ports`.
     "USB device", "on-board port", "on-board port (…)",
     # Headings and labels of `status`, `history`, `calibrate` and `check`.
-    "started (UTC)", "armed (UTC)", "last calibration: …", "pitch …  roll …  heading …", "NOT ready", "not yet", "… in force", "in force: …",
+    "started (UTC)", "armed (UTC)", "last calibration: …",
+    "pitch …  roll …  heading …", "NOT ready", "not yet", "… in force", "in force: …",
     "ground stations: …", "ground stations", "at arming (…): …", "… … … …  what came of it", "; … parameters written",
     "an undo",
     # Names of tasks, in the line of the watchdog, and of what failed, in the log.

@@ -1,0 +1,149 @@
+"""`companion ground ...`: on the laptop at the flight line, not on the aircraft."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import re
+import signal
+import sys
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import TYPE_CHECKING, Final
+
+from companion.cli import DONE, FAILED, Parser, print_json, seconds
+from companion.errors import LinkError
+
+if TYPE_CHECKING:
+    from companion.ground.station import Outcome, Station
+
+DEFAULT_URL: Final = "udpin:0.0.0.0:14550"
+_SETTING: Final = re.compile(r"([A-Za-z0-9_]{1,16})=(.+)")
+
+
+def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -> None:
+    """Add `ground` and its own commands."""
+    words = "from the laptop on the ground, over the telemetry link (no ground station program needed)"
+    ground = commands.add_parser("ground", help=words, description=words)
+    link = Parser(add_help=False, argument_default=argparse.SUPPRESS)
+    link.add_argument(
+        "--url",
+        type=_url,
+        help=f"udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:PATH:BAUD (default {DEFAULT_URL})",
+    )
+    link.add_argument("--system", type=_number, metavar="N", help="the vehicle's system id, where several are heard")
+    link.add_argument("--component", type=_number, metavar="N", help="the companion's component id (default 191)")
+    link.add_argument(
+        "--within", type=seconds, metavar="S", help="how long to look for the companion on the link (default 5)"
+    )
+    subcommands = ground.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    def add(name: str, command: Callable[[argparse.Namespace], Awaitable[int]], words: str) -> argparse.ArgumentParser:
+        sub = subcommands.add_parser(name, parents=[common, link], help=words, description=words)
+        sub.set_defaults(command=command)
+        return sub
+
+    calibrate = add("calibrate", _calibrate, "calibrate now and show how it goes; Ctrl-C cancels")
+    what = calibrate.add_mutually_exclusive_group()
+    what.add_argument("--gyros", action="store_true", help="gyros only")
+    what.add_argument("--accelerometers", action="store_true", help="accelerometers only")
+    calibrate.add_argument("--timeout", type=seconds, metavar="S", help="cancel when it has not finished by then")
+    calibrate.add_argument(
+        "--reboot", action="store_true", help="restart the autopilot afterwards, where it needs that"
+    )
+    add("status", _status, "what the companion is doing, its last result and its settings")
+    add("cancel", _cancel, "cancel what runs, whoever asked for it")
+    add("undo", _undo, "put the autopilot's values from before the last calibration back")
+    parameters = add("params", _parameters, "list the companion's own parameters, or set some until it restarts")
+    parameters.add_argument("settings", nargs="*", type=_setting, metavar="NAME=VALUE", help="such as CMP_PUSH=0")
+
+
+async def _calibrate(options: argparse.Namespace) -> int:
+    from companion.calibration.request import What
+
+    what = What.GYROS if options.gyros else What.ACCELEROMETERS if options.accelerometers else What.BOTH
+    return await _on_the_link(options, lambda one: one.calibrate(what, options.timeout, reboot=options.reboot))
+
+
+async def _status(options: argparse.Namespace) -> int:
+    return await _on_the_link(options, lambda one: one.status())
+
+
+async def _cancel(options: argparse.Namespace) -> int:
+    return await _on_the_link(options, lambda one: one.cancel())
+
+
+async def _undo(options: argparse.Namespace) -> int:
+    return await _on_the_link(options, lambda one: one.undo())
+
+
+async def _parameters(options: argparse.Namespace) -> int:
+    return await _on_the_link(options, lambda one: one.parameters(dict(options.settings)))
+
+
+async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Awaitable[Outcome]]) -> int:
+    """Find the companion, do the work, print what came of it."""
+    from companion.ground.display import Display
+    from companion.ground.heard import Heard
+    from companion.ground.link import open_link
+    from companion.ground.station import Station
+
+    url = getattr(options, "url", DEFAULT_URL)
+    heard = Heard(getattr(options, "component", 191))
+    # MAVSDK prints some of its own troubles on stdout, which is for the answer alone.
+    with contextlib.redirect_stdout(sys.stderr), Display() as display:
+        async with open_link(url, heard) as link:
+            station = Station(link, url, display)
+            await station.find(getattr(options, "system", None), getattr(options, "within", 5.0))
+            async with _interruptible(station):
+                outcome = await work(station)
+    if getattr(options, "json", False):
+        print_json(outcome.answer)
+    else:
+        for line in outcome.lines:
+            print(line)
+    return DONE if outcome.good else FAILED
+
+
+@contextlib.asynccontextmanager
+async def _interruptible(station: Station) -> AsyncIterator[None]:
+    """Ctrl-C and SIGTERM cancel what the station has asked for, instead of leaving it alone with its request."""
+    loop = asyncio.get_running_loop()
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.getsignal(number) for number in numbers}
+    for number in numbers:
+        loop.add_signal_handler(number, station.interrupt)
+    try:
+        yield
+    finally:
+        for number in numbers:
+            loop.remove_signal_handler(number)
+            signal.signal(number, before[number])
+
+
+def _url(text: str) -> str:
+    from companion.links.mavlink_transport import parse_url
+
+    try:
+        parse_url(text)
+    except LinkError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return text
+
+
+def _number(text: str) -> int:
+    value = int(text) if text.isdecimal() else 0
+    if not 1 <= value <= 255:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number from 1 to 255")
+    return value
+
+
+def _setting(text: str) -> tuple[str, float]:
+    match = _SETTING.fullmatch(text)
+    try:
+        value = float(match[2]) if match is not None else float("nan")
+    except ValueError:
+        value = float("nan")
+    if match is None or value != value or abs(value) == float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE with a number, such as CMP_PUSH=0")
+    return match[1].upper(), value

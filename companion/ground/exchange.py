@@ -1,0 +1,141 @@
+"""One command to the companion and all its answers, over a radio that loses some of them.
+
+MAVLink's command protocol, from the asking side: repeat with a counted-up `confirmation` until the first answer, then
+follow IN_PROGRESS to the one final answer. When progress falls silent the final answer may have been lost: the same
+request again brings it back for as long as the companion remembers it (`component.commands`), and later than that
+must not be sent, since it would count as a new one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Final, NamedTuple, Protocol
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.component.commands import REMEMBER_FINAL_S
+from companion.ground.heard import Target
+
+ANSWER_WITHIN_S: Final = (0.6, 0.6, 0.6, 0.6, 1.6)
+"""Of each attempt. The companion answers within 0.3 s, the rest is for the radio; all attempts are made while it would
+remember the end of the first, or else the last could start the same once more."""
+REPEAT_AFTER_S: Final = (1.2, 1.5, 1.8, 2.1, 2.4)
+"""Seconds without an answer after which progress is asked for again: two ACKs may be lost in a row before. The last
+leaves the radio the rest of the time for which the companion remembers its final answer."""
+assert max(REPEAT_AFTER_S[-1], sum(ANSWER_WITHIN_S[:-1])) < REMEMBER_FINAL_S - 0.5
+ENDED_AFTER_S: Final = 5.0
+"""So long without an answer while the heartbeat shows no work: the end came and was not heard."""
+LOST_AFTER_S: Final = 20.0
+_TICK_S: Final = 0.25
+
+
+class Ack(NamedTuple):
+    """A COMMAND_ACK that is addressed to us."""
+
+    source: Target
+    command: int
+    result: int
+    progress: int
+
+
+class Wire(Protocol):
+    """What an exchange needs of the link."""
+
+    def send_command(self, target: Target, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
+        """Send COMMAND_LONG; a packet that cannot be sent is a lost packet."""
+
+    def watch_acks(self, handler: Callable[[Ack], None]) -> Callable[[], None]:
+        """Call the handler with every ACK to us; returns how to stop that."""
+
+
+class Answer(NamedTuple):
+    """How an exchange ended."""
+
+    result: int | None
+    """MAV_RESULT_*; None: no final answer came."""
+    begun: bool
+    """Whether the companion has answered at all."""
+
+
+class Exchange:
+    """A request under way; `run` it once.
+
+    Args:
+        wire: the link.
+        target: the companion.
+        command: MAV_CMD_*.
+        parameters: its first parameters; the rest are 0.
+        busy: whether the companion is at work, by a heartbeat later than a time; None: there was none.
+    """
+
+    def __init__(
+        self, wire: Wire, target: Target, command: int, *parameters: float, busy: Callable[[float], bool | None]
+    ) -> None:
+        self._wire, self._target, self._command, self._busy = wire, target, command, busy
+        self._parameters = (*parameters, *(0.0,) * (7 - len(parameters)))
+        self._result: int | None = None
+        self._answered = asyncio.Event()
+        self._heard_s = 0.0
+        self._confirmation = 0
+        self.on_progress: Callable[[int, float], None] = lambda percent, silent_s: None
+        """Told how far it is and for how long nothing has come, several times a second."""
+        self.percent = 0
+
+    async def run(self) -> Answer:
+        """Ask and wait for the end; without an answer or a heartbeat at most 20 s."""
+        stop_watching = self._wire.watch_acks(self._take)
+        try:
+            if not await self._begin():
+                return Answer(None, begun=False)
+            while self._result is None and await self._follow():
+                pass
+            return Answer(self._result, begun=True)
+        finally:
+            stop_watching()
+
+    async def _begin(self) -> bool:
+        for within_s in ANSWER_WITHIN_S:
+            self._send()
+            if await self._hears(within_s):
+                return True
+        return False
+
+    async def _follow(self) -> bool:
+        """Wait for one more answer; False when there is no use in waiting on."""
+        loop = asyncio.get_running_loop()
+        repeats = list(REPEAT_AFTER_S)
+        while not await self._hears(_TICK_S):
+            silent_s = loop.time() - self._heard_s
+            self.on_progress(self.percent, silent_s)
+            if repeats and silent_s >= repeats[0]:
+                del repeats[0]
+                self._send()
+            busy = self._busy(max(self._heard_s + ENDED_AFTER_S / 2, loop.time() - LOST_AFTER_S))
+            if (busy is False and silent_s >= ENDED_AFTER_S) or (busy is None and silent_s >= LOST_AFTER_S):
+                return False
+        self.on_progress(self.percent, 0.0)
+        return True
+
+    def _send(self) -> None:
+        self._wire.send_command(self._target, self._command, self._parameters, min(self._confirmation, 255))
+        self._confirmation += 1
+
+    async def _hears(self, within_s: float) -> bool:
+        try:
+            async with asyncio.timeout(within_s):
+                await self._answered.wait()
+        except TimeoutError:
+            return False
+        self._answered.clear()
+        return True
+
+    def _take(self, ack: Ack) -> None:
+        if ack.source != self._target or ack.command != self._command or self._result is not None:
+            return
+        self._heard_s = asyncio.get_running_loop().time()
+        if ack.result != mavlink.MAV_RESULT_IN_PROGRESS:
+            self._result = ack.result
+        elif ack.progress <= 100:
+            self.percent = max(self.percent, ack.progress)
+        self._answered.set()

@@ -1,0 +1,155 @@
+"""What has been heard on the link: who beats, whether the vehicle is armed, and what the companion has said."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final, Literal, NamedTuple
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.component.statustext import CHUNK_BYTES, to_ascii
+
+FIRMWARES: Final = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot", mavlink.MAV_AUTOPILOT_PX4: "PX4"}
+_NO_VEHICLES: Final = frozenset({mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ONBOARD_CONTROLLER})
+FRESH_S: Final = 3.0
+"""A heartbeat older than this says nothing about now: they come once a second, and two may be lost in a row."""
+MAX_PEERS: Final = 64
+"""Newcomers beyond these are not remembered."""
+MAX_TEXTS: Final = 200
+_MAX_UNFINISHED: Final = 8
+
+Fields = Mapping[str, object]
+
+
+class Target(NamedTuple):
+    """A component of a vehicle."""
+
+    system_id: int
+    component_id: int
+
+
+class Heartbeat(NamedTuple):
+    """The last heartbeat of a component."""
+
+    kind: int
+    autopilot: int
+    base_mode: int
+    system_status: int
+    at_s: float
+
+
+class Text(NamedTuple):
+    """A whole STATUSTEXT."""
+
+    severity: int
+    words: str
+    at_s: float
+
+
+class Vehicle(NamedTuple):
+    """The autopilot as its heartbeat shows it."""
+
+    system_id: int
+    firmware: str | None
+    armed: Literal["armed", "disarmed", "unknown"]
+
+
+class Heard:
+    """Takes messages as they come; never raises, whatever they hold.
+
+    Args:
+        component_id: the companion's; what other components say is not kept.
+    """
+
+    def __init__(self, component_id: int) -> None:
+        self.component_id = component_id
+        self.first_s: float | None = None
+        """When anything was heard first."""
+        self.heartbeats: dict[Target, Heartbeat] = {}
+        self.texts: list[tuple[int, Text]] = []
+        """By the companions of all vehicles, with their system ids, oldest first; the oldest beyond 200 are gone."""
+        self.on_text: Callable[[int, Text], None] = lambda system_id, text: None
+        self._unfinished: dict[tuple[int, int], dict[int, str]] = {}
+
+    def take(self, name: str, source: Target, fields: Fields, now_s: float) -> None:
+        """Take a HEARTBEAT or STATUSTEXT; others are not looked at."""
+        if name == "HEARTBEAT":
+            self._heartbeat(source, fields, now_s)
+        elif name == "STATUSTEXT" and source.component_id == self.component_id:
+            self._chunk(source.system_id, fields, now_s)
+
+    def companions(self) -> list[int]:
+        """The system ids of the vehicles whose companion was heard."""
+        return sorted(target.system_id for target in self.heartbeats if target.component_id == self.component_id)
+
+    def vehicle(self, system_id: int, now_s: float) -> Vehicle:
+        """What is known of a vehicle's autopilot."""
+        beat = self.heartbeats.get(Target(system_id, mavlink.MAV_COMP_ID_AUTOPILOT1))
+        if beat is None:
+            return Vehicle(system_id, None, "unknown")
+        armed: Literal["armed", "disarmed", "unknown"] = "unknown"
+        if now_s - beat.at_s <= FRESH_S:
+            armed = "armed" if beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED else "disarmed"
+        return Vehicle(system_id, FIRMWARES.get(beat.autopilot, f"autopilot type {beat.autopilot}"), armed)
+
+    def busy(self, system_id: int, since_s: float) -> bool | None:
+        """Whether the companion is at work, by a heartbeat later than `since_s`; None: there was none."""
+        beat = self.heartbeats.get(Target(system_id, self.component_id))
+        if beat is None or beat.at_s <= since_s:
+            return None
+        return beat.system_status == mavlink.MAV_STATE_CALIBRATING
+
+    def texts_of(self, system_id: int, since_s: float) -> list[Text]:
+        """What the vehicle's companion has said since then."""
+        return [text for source, text in self.texts if source == system_id and text.at_s >= since_s]
+
+    def summary(self) -> str:
+        """Who was heard, in a few words; empty when nobody was."""
+        vehicles = [
+            f"system {target.system_id} ({FIRMWARES.get(beat.autopilot, f'autopilot type {beat.autopilot}')})"
+            for target, beat in sorted(self.heartbeats.items())
+            if target.component_id == mavlink.MAV_COMP_ID_AUTOPILOT1 and beat.kind not in _NO_VEHICLES
+        ]
+        others = [
+            f"{target.system_id}/{target.component_id}" + (" (a ground station)" if _is_station(beat) else "")
+            for target, beat in sorted(self.heartbeats.items())
+            if target.component_id != mavlink.MAV_COMP_ID_AUTOPILOT1 or beat.kind in _NO_VEHICLES
+        ]
+        return ", ".join([*vehicles, *others])
+
+    def _heartbeat(self, source: Target, fields: Fields, now_s: float) -> None:
+        if self.first_s is None:
+            self.first_s = now_s
+        if source in self.heartbeats or len(self.heartbeats) < MAX_PEERS:
+            self.heartbeats[source] = Heartbeat(
+                _whole(fields, "type"), _whole(fields, "autopilot"), _whole(fields, "base_mode"),
+                _whole(fields, "system_status"), now_s,
+            )  # fmt: skip
+
+    def _chunk(self, system_id: int, fields: Fields, now_s: float) -> None:
+        """Join the chunks of long texts; what stays incomplete is forgotten."""
+        words, text_id = str(fields.get("text", "")).rstrip("\0"), _whole(fields, "id")
+        if text_id != 0:
+            key = (system_id, text_id)
+            chunks = self._unfinished.setdefault(key, {})
+            chunks[_whole(fields, "chunk_seq") & 0xFF] = words
+            if len(words) == CHUNK_BYTES:
+                if len(self._unfinished) > _MAX_UNFINISHED:
+                    del self._unfinished[next(iter(self._unfinished))]
+                return
+            del self._unfinished[key]
+            words = "".join(chunks.get(number, "...") for number in range(max(chunks) + 1))
+        # Whatever it was: on a terminal it can do nothing but be read.
+        text = Text(_whole(fields, "severity"), to_ascii(words), now_s)
+        self.texts.append((system_id, text))
+        del self.texts[:-MAX_TEXTS]
+        self.on_text(system_id, text)
+
+
+def _is_station(beat: Heartbeat) -> bool:
+    return beat.kind == mavlink.MAV_TYPE_GCS
+
+
+def _whole(fields: Fields, name: str) -> int:
+    value = fields.get(name)
+    return value if isinstance(value, int) else 0

@@ -1,0 +1,181 @@
+"""The link from the ground, on MAVSDK 4.1.
+
+Of MAVSDK's parts two serve here: MavlinkDirectServer, which sends and hears any message from the start, before MAVSDK
+has found a system, and Param, a parameter client with retries. Its `send_command` would also wait for a final ACK, but
+keeps the progress to itself, repeats with confirmation 0 (which is a new request) and does not ask again when the
+final answer was lost: `exchange` does that.
+
+MAVSDK calls back in threads of its own; everything here goes on in the event loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any, ClassVar, Final
+
+from companion.errors import AutopilotError, ConfigError, LinkError
+from companion.ground.exchange import Ack
+from companion.ground.heard import Heard, Target
+from companion.links.mavlink_transport import parse_url
+
+logger = logging.getLogger(__name__)
+
+INSTALL: Final = "install it with: pip install '.[ground]' (in the folder of the companion's sources)"
+_SCHEMES: Final = {"udpin": "udpin", "udpout": "udpout", "tcp": "tcpout", "serial": "serial"}
+_HEARD: Final = ("HEARTBEAT", "STATUSTEXT", "COMMAND_ACK")
+
+
+class GroundLink:
+    """A ground station on an open link; made by `open_link`."""
+
+    def __init__(self, sdk: Any, direct: Any, own: Target, heard: Heard) -> None:
+        self.own, self.heard = own, heard
+        self._sdk, self._direct = sdk, direct
+        self._ack_handlers: list[Callable[[Ack], None]] = []
+        self._loop = asyncio.get_running_loop()
+        for name in _HEARD:
+            direct.subscribe_message(name, self._in_a_thread)
+
+    def send_command(self, target: Target, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
+        """Send COMMAND_LONG; a packet that cannot be sent is a lost packet."""
+        from mavsdk.plugins.mavlink_direct_server import MavlinkDirectServerError, MavlinkMessage
+
+        # Every field is given, as a number: MAVSDK takes a wrong name or a string and puts 0 on the wire.
+        fields = {
+            "target_system": target.system_id,
+            "target_component": target.component_id,
+            "command": command,
+            "confirmation": confirmation,
+            **{f"param{number}": float(value) for number, value in enumerate(parameters, 1)},
+        }
+        message = MavlinkMessage("COMMAND_LONG", *self.own, *target, json.dumps(fields))
+        try:
+            self._direct.send_message(message)
+        except MavlinkDirectServerError as error:
+            logger.debug("not sent: %s", error)
+
+    def watch_acks(self, handler: Callable[[Ack], None]) -> Callable[[], None]:
+        """Call the handler with every COMMAND_ACK to us; returns how to stop that."""
+        self._ack_handlers.append(handler)
+        return lambda: self._ack_handlers.remove(handler)
+
+    async def parameters(self, target: Target) -> dict[str, float]:
+        """All parameters of a component; empty when it does not answer."""
+        found = await asyncio.to_thread(self._client(target).get_all_params)
+        return {one.name: one.value for one in (*found.float_params, *found.int_params)}
+
+    async def get_parameter(self, target: Target, name: str) -> float | None:
+        """One parameter; None when there is no answer, or no such parameter."""
+        from mavsdk.plugins.param import ParamError
+
+        try:
+            return float(await asyncio.to_thread(self._client(target).get_param_float, name))
+        except ParamError as error:
+            logger.debug("%s not read: %s", name, error)
+            return None
+
+    async def set_parameter(self, target: Target, name: str, value: float) -> str | None:
+        """Set one parameter; returns why that did not work, in MAVSDK's words, or None."""
+        from mavsdk.plugins.param import ParamError
+
+        try:
+            await asyncio.to_thread(self._client(target).set_param_float, name, value)
+        except ParamError as error:
+            return str(error.result.name)
+        return None
+
+    def _client(self, target: Target) -> Any:
+        from mavsdk.plugins.param import Param, ParamError, ParamResult, ProtocolVersion
+
+        for system in self._sdk.get_systems():
+            if system.get_system_id() == target.system_id:
+                client = Param(system)
+                try:
+                    client.select_component(target.component_id, ProtocolVersion.V1)
+                except ParamError as error:
+                    # 4.1.0 selects, and then reports UNKNOWN.
+                    if error.result != ParamResult.UNKNOWN:
+                        raise AutopilotError(f"component {target.component_id}: {error.result.name}") from None
+                return client
+        raise AutopilotError(f"system {target.system_id} is not heard any more")
+
+    def _in_a_thread(self, message: Any, _: object) -> None:
+        self._loop.call_soon_threadsafe(
+            self._take, message.message_name, Target(message.system_id, message.component_id), message.fields_json
+        )
+
+    def _take(self, name: str, source: Target, fields_json: str) -> None:
+        try:
+            fields = json.loads(fields_json)
+        except ValueError:
+            logger.debug("%s of %s is no JSON: %.80s", name, source, fields_json)
+            return
+        if name != "COMMAND_ACK":
+            self.heard.take(name, source, fields, self._loop.time())
+        elif fields.get("target_system") in (0, self.own.system_id) and fields.get("target_component") in (
+            0,
+            self.own.component_id,
+        ):
+            ack = Ack(source, fields.get("command", 0), fields.get("result", 0), fields.get("progress", 0))
+            for handler in [*self._ack_handlers]:
+                handler(ack)
+
+
+class _Log:
+    """Takes MAVSDK's log, which would go to the terminal otherwise.
+
+    Not by `mavsdk.log_subscribe`: that fails on a text that is not UTF-8, as any component's STATUSTEXT may be (MAVSDK
+    logs them all), and the text then does go to the terminal, with a complaint about itself.
+    """
+
+    def __init__(self) -> None:
+        from mavsdk.cmavsdk_loader import _cmavsdk_lib
+        from mavsdk.logging import LogCallback, LogLevel
+
+        self.last_error = ""
+        self._error = LogLevel.ERROR
+        # Kept as long as the library may call it: for as long as it is loaded.
+        _Log.callback = LogCallback(self._take)
+        _cmavsdk_lib.mavsdk_log_subscribe(_Log.callback, None)
+
+    callback: ClassVar[Any] = None
+
+    def _take(self, level: int, message: bytes | None, *_: object) -> bool:
+        """In one of MAVSDK's threads; True: it is not to print this itself."""
+        words = (message or b"").decode(errors="replace")
+        logger.debug("MAVSDK: %s", words)
+        if level == self._error:
+            self.last_error = words.partition(": ")[2] or words
+        return True
+
+
+@asynccontextmanager
+async def open_link(url: str, heard: Heard) -> AsyncIterator[GroundLink]:
+    """Be a ground station on a link; `heard` learns what comes.
+
+    Raises:
+        ConfigError: MAVSDK is not installed, or the url is none.
+        LinkError: the port cannot be opened.
+    """
+    try:
+        import mavsdk
+        from mavsdk.plugins.mavlink_direct_server import MavlinkDirectServer
+    except (ImportError, OSError) as error:
+        raise ConfigError(f"companion ground needs MAVSDK 4.1: {error}; {INSTALL}") from None
+    kind, where, number = parse_url(url)
+    log = _Log()
+    configuration = mavsdk.Configuration.create_with_component_type(mavsdk.ComponentType.GROUND_STATION)
+    own = Target(configuration.system_id, configuration.component_id)
+    with mavsdk.Mavsdk(configuration) as sdk:
+        direct = MavlinkDirectServer(sdk.server_component_by_id(own.component_id))
+        link = GroundLink(sdk, direct, own, heard)
+        try:
+            await asyncio.to_thread(sdk.add_any_connection_with_handle, f"{_SCHEMES[kind]}://{where}:{number}")
+        except mavsdk.MavsdkError as error:
+            hint = "; another ground station has it: docs/ground_stations.md" if "in use" in log.last_error else ""
+            raise LinkError(f"{url} cannot be opened: {log.last_error or error}{hint}") from None
+        yield link

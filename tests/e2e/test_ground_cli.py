@@ -1,0 +1,286 @@
+"""`companion ground ...` as a person types it: real processes, the real daemon, MAVSDK, doubles of both firmwares.
+
+Nearly all of the time is waiting, as a pilot would: what can go on side by side does.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import sys
+from pathlib import Path
+from typing import cast
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.motions import Handling
+from sim.scenario import Firmware
+from tests.support.ground_line import Said, finish, ground, ground_line
+
+DONE, FAILED, USAGE, NOBODY = 0, 1, 2, 3
+FIRMWARES: tuple[Firmware, ...] = ("ardupilot", "px4")
+GYRO = {"ardupilot": "INS_GYROFFS_X", "px4": "CAL_GYRO0_XOFF"}
+NAME = {"ardupilot": "ArduPilot", "px4": "PX4"}
+
+
+def test_calibrated_and_undone_from_the_ground(tmp_path: Path) -> None:
+    async def one(firmware: Firmware) -> None:
+        folder = tmp_path / firmware
+        folder.mkdir()
+        async with ground_line(folder, firmware) as line:
+            autopilot = line.scenario.autopilot
+            before = autopilot.parameter(GYRO[firmware])
+
+            status = await line.ground("status", chosen=False)
+            assert status.code == DONE, status
+            for words in ("system 1, component 191: idle", f"{NAME[firmware]}, disarmed", "none since", "off"):
+                assert words in status.out
+
+            done = await line.ground("calibrate", "--gyros", "--json")
+            assert done.code == DONE, done
+            assert done.json["state"] == "done"
+            assert done.json["vehicle"] == {"system_id": 1, "firmware": NAME[firmware], "armed": "disarmed"}
+            assert autopilot.parameter(GYRO[firmware]) != before
+            # The daemon's own word for it, on the aircraft, by another way.
+            record = await line.daemon.last_record()
+            assert record["state"] == "done"
+            sigma_rad_s = max(sigma for imu in record["imus"] for sigma in imu["gyro_sigma_use_rad_s"])
+            assert done.json["gyro_sigma_deg_h"] == pytest.approx(sigma_rad_s * 57.29578 * 3600, rel=1e-3)
+            assert done.json["accel_sigma_mg"] is None
+            assert f"{done.json['gyro_sigma_deg_h']:.1f} deg/h" in done.json["reason"]
+            for words in ("Calibration started", "[ 70 %]", "writing", "checking", "Calibration done"):
+                assert words in done.err
+
+            shown = await line.ground("status", "--json")
+            assert shown.json["last"] == "done"
+            assert shown.json["gyro_sigma_deg_h"] == done.json["gyro_sigma_deg_h"]
+
+            undone = await line.ground("undo")
+            assert undone.code == DONE, undone
+            assert "old values back" in undone.out
+            assert autopilot.parameter(GYRO[firmware]) == before
+            again = await line.ground("undo", "--json")
+            assert again.code == FAILED
+            assert (again.json["state"], again.json["reason"]) == ("refused", "nothing to undo")
+
+    async def main() -> None:
+        async with asyncio.TaskGroup() as group:
+            for firmware in FIRMWARES:
+                group.create_task(one(firmware), name=firmware)
+
+    asyncio.run(main())
+
+
+def test_cancelled_refused_and_set(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with asyncio.TaskGroup() as group:
+            for number, one in enumerate((while_the_aircraft_is_handled, armed_and_its_own_parameters)):
+                folder = tmp_path / str(number)  # short: a socket's path has 107 bytes
+                folder.mkdir()
+                group.create_task(one(folder), name=one.__name__)
+
+    asyncio.run(main())
+
+
+async def while_the_aircraft_is_handled(folder: Path) -> None:
+    """It waits and says for what; cancelled by the time given, by Ctrl-C, and by somebody on board."""
+    async with ground_line(folder, "ardupilot", motions=[Handling(start_s=0.0, duration_s=600.0)]) as line:
+        late = await line.ground("calibrate", "--timeout", "2", "--json")
+        assert late.code == FAILED, late
+        assert late.json["state"] == "cancelled"
+        assert "not finished within 2 s" in late.json["reason"]
+        assert "still" in late.err
+
+        process = await line.start("calibrate")
+        await _until_said(process, "Calibration started")
+        process.send_signal(signal.SIGINT)
+        interrupted = await finish(process, 10.0)
+        assert interrupted.code == FAILED
+        assert "Ctrl-C: cancelling" in interrupted.err
+        assert "CANCELLED after" in interrupted.out
+        assert "Traceback" not in interrupted.err
+
+        process = await line.start("calibrate", "--json")
+        await _until_said(process, "Calibration started")
+        busy = await line.daemon.status()
+        assert busy is not None
+        assert busy["state"] == "waiting"
+        await line.daemon.cancel()
+        cancelled = await finish(process, 10.0)
+        assert cancelled.code == FAILED
+        assert cancelled.json["state"] == "cancelled"
+        assert cancelled.json["reason"] == "cancelled by companion cancel"
+
+        idle = await line.ground("cancel", "--json")
+        assert idle.code == DONE
+        assert idle.json["reason"] == "nothing was running"
+        await line.daemon.start_calibration()
+        running = await line.ground("cancel", "--json")
+        assert running.code == DONE
+        assert running.json["state"] == "cancelled"
+        assert running.json["reason"].startswith("Calibration cancelled by mavlink 245/190")
+        assert line.scenario.autopilot.writes == []
+
+
+async def armed_and_its_own_parameters(folder: Path) -> None:
+    """What is not allowed is refused with the reason, and what is allowed is set."""
+    async with ground_line(folder, "px4") as line:
+        listed = await line.ground("params", "--json")
+        assert listed.code == DONE, listed
+        assert listed.json["parameters"]["CMP_PUSH"] == 1.0
+        assert all(name.startswith("CMP_") for name in listed.json["parameters"])
+
+        changed = await line.ground("params", "CMP_PUSH=0", "cmp_gyr_tgt=2.5")
+        assert changed.code == DONE, changed
+        assert "until the companion restarts" in changed.out
+        refused = await line.ground("params", "CMP_AT_ARM=7", "--json")
+        assert refused.code == FAILED
+        assert refused.json["reason"] == "CMP_AT_ARM not set: 7 is not in 0 .. 2"
+        values = refused.json["parameters"]
+        assert (values["CMP_PUSH"], values["CMP_GYR_TGT"], values["CMP_AT_ARM"]) == (0.0, 2.5, 0.0)
+        unknown = await line.ground("params", "CMP_PSH=1")
+        assert unknown.code == USAGE
+        assert "nearest: CMP_PUSH" in unknown.err
+        assert unknown.err.count("\n") == 1
+
+        autopilot = line.scenario.autopilot
+        autopilot.arm()
+        await asyncio.sleep(1.5)  # until the heartbeat says so
+        armed = await line.ground("calibrate", "--json")
+        assert armed.code == FAILED
+        assert (armed.json["state"], armed.json["reason"]) == ("refused", "armed: disarm first")
+        assert armed.json["vehicle"]["armed"] == "armed"
+        words = await line.ground("undo")
+        assert words.code == FAILED
+        assert words.out == "REFUSED: armed: disarm first\n"
+
+
+@pytest.mark.parametrize(("firmware", "hint"), [("ardupilot", "another port"), ("px4", "MAV_1_FORWARD")])
+def test_an_autopilot_without_a_companion(tmp_path: Path, firmware: Firmware, hint: str) -> None:
+    async def main() -> None:
+        async with ground_line(tmp_path, firmware, daemon=False) as line:
+            said = await line.ground("calibrate", "--within", "2", "--json", within_s=6.0)
+            assert said.code == NOBODY
+            assert said.err.count("\n") == 1
+            for words in (f"only system 1 ({NAME[firmware]})", "component 191", "companion run", hint):
+                assert words in said.err
+            assert said.json["reason"] in said.err
+            assert line.scenario.autopilot.writes == []
+
+    asyncio.run(main())
+
+
+def test_nobody_there() -> None:
+    async def main() -> None:
+        said = await finish(await ground("status", "--url", "udpout:127.0.0.1:9", "--within", "1", "--json"), 4.0)
+        assert said.code == NOBODY
+        assert "nothing heard on udpout:127.0.0.1:9" in said.json["reason"]
+        assert said.err.count("\n") == 1
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["fly"], "invalid choice"),
+        (["status", "--url", "udp://x"], "udpin:HOST:PORT"),
+        (["params", "CMP_PUSH"], "NAME=VALUE"),
+        (["params", "CMP_PUSH=nan"], "NAME=VALUE"),
+        (["status", "--system", "0"], "1 to 255"),
+        (["calibrate", "--gyros", "--accelerometers"], "not allowed"),
+    ],
+)
+def test_usage(words: list[str], expected: str) -> None:
+    said = asyncio.run(_run(*words))
+    assert said.code == USAGE
+    assert expected in said.err
+    assert said.err.count("\n") == 1
+
+
+async def _run(*words: str) -> Said:
+    return await finish(await ground(*words))
+
+
+def test_a_port_that_cannot_be_opened_is_one_line(tmp_path: Path) -> None:
+    said = asyncio.run(_run("status", "--url", f"serial:{tmp_path}/radio:57600"))
+    assert said.code == FAILED
+    assert said.err.count("\n") == 1
+    assert "radio:57600 cannot be opened: No such file" in said.err
+
+
+def test_a_port_that_another_ground_station_has_is_named() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        port = other.getsockname()[1]
+        said = asyncio.run(_run("status", "--url", f"udpin:127.0.0.1:{port}"))
+    assert said.code == FAILED
+    assert said.err.count("\n") == 1
+    assert f"{port} cannot be opened: Address already in use; another ground station has it" in said.err
+
+
+@pytest.mark.parametrize("missing", ["mavsdk", "rich", "rich.progress"])
+def test_without_the_extra_one_line_says_how_to_get_it(missing: str) -> None:
+    code = f"import sys; sys.modules[{missing!r}] = None; from companion.cli import main; sys.exit(main(sys.argv[1:]))"
+
+    async def main() -> None:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", code, "ground", "status", "--url", "udpout:127.0.0.1:9",
+            stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": os.getcwd()},
+        )  # fmt: skip
+        said = await finish(process)
+        assert said.code == USAGE
+        assert said.out == ""
+        assert said.err.count("\n") == 1
+        assert "pip install '.[ground]'" in said.err
+
+    asyncio.run(main())
+
+
+async def _until_said(process: asyncio.subprocess.Process, words: str) -> None:
+    """Read stderr until the words come."""
+    assert process.stderr is not None
+    async with asyncio.timeout(15.0):
+        while words not in (line := await process.stderr.readline()).decode():
+            assert line, f"{words!r} was never said"
+
+
+class _Chatterbox(asyncio.DatagramProtocol):
+    """A vehicle on UDP whose components speak in bytes that are no UTF-8, with noise between the packets."""
+
+    def __init__(self) -> None:
+        self._codecs = [mavlink.MAVLink(None, 1, 1), mavlink.MAVLink(None, 1, 191)]
+        self._transport: asyncio.DatagramTransport
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast("asyncio.DatagramTransport", transport)
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        for codec, kind, autopilot in zip(self._codecs, (2, 18), (3, 8), strict=True):
+            for message in (
+                mavlink.MAVLink_statustext_message(4, b"\xff\xfe \xb2\xe2\xca\xd4 \x1b[31m", 0, 0),
+                mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, mavlink.MAV_STATE_STANDBY, 3),
+            ):
+                self._transport.sendto(message.pack(codec), addr)
+                codec.seq = (codec.seq + 1) % 256
+        self._transport.sendto(b"\x00\xff noise", addr)
+
+
+def test_texts_that_are_no_utf_8_spoil_nothing() -> None:
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        transport, _ = await loop.create_datagram_endpoint(_Chatterbox, local_addr=("127.0.0.1", 0))
+        port = transport.get_extra_info("sockname")[1]
+        try:
+            said = await finish(await ground("status", "--url", f"udpout:127.0.0.1:{port}", "--json"))
+        finally:
+            transport.close()
+        assert said.code == DONE, said
+        assert set(said.json["texts"]) == {"?? ???? ?[31m"}
+        assert set(said.err.splitlines()) == {"?? ???? ?[31m"}, "what the companion says, and nothing of MAVSDK's"
+
+    asyncio.run(main())

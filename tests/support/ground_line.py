@@ -1,0 +1,90 @@
+"""A virtual aircraft with the real daemon on board, and its telemetry radio's end on the ground."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import sys
+from collections.abc import AsyncIterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sim.companion_process import CompanionProcess
+from sim.motions import Motion
+from sim.pty_device import PtyDevice
+from sim.scenario import Firmware, Scenario, demo
+from sim.serve import configuration
+from sim.udp import open_udp
+
+
+class Said(NamedTuple):
+    """What a command printed, and its exit code."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        """The one JSON object on stdout."""
+        return json.loads(self.out)
+
+
+class GroundLine(NamedTuple):
+    """`port` is the autopilot's second telemetry port: UDP on the loopback, answering whoever spoke last."""
+
+    scenario: Scenario
+    port: int
+    daemon: CompanionProcess
+
+    async def ground(self, command: str, *words: str, chosen: bool = True, within_s: float = 60.0) -> Said:
+        """`companion ground COMMAND --url ... WORDS`; `chosen`: with --system 1, so that it looks for no others."""
+        return await finish(await self.start(command, *words, chosen=chosen), within_s)
+
+    async def start(self, command: str, *words: str, chosen: bool = True) -> asyncio.subprocess.Process:
+        """The same, not waited for."""
+        system = ("--system", "1") if chosen else ()
+        return await ground(command, "--url", f"udpout:127.0.0.1:{self.port}", *system, *words)
+
+
+async def ground(*words: str) -> asyncio.subprocess.Process:
+    """Start `companion ground ...`."""
+    return await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "companion", "ground", *words,
+        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+
+
+async def finish(process: asyncio.subprocess.Process, within_s: float = 60.0) -> Said:
+    """Wait for its end."""
+    async with asyncio.timeout(within_s):
+        out, err = await process.communicate()
+    assert process.returncode is not None
+    return Said(process.returncode, out.decode(), err.decode())
+
+
+@contextlib.asynccontextmanager
+async def ground_line(
+    folder: Path, firmware: Firmware, *, motions: Sequence[Motion] = (), daemon: bool = True
+) -> AsyncIterator[GroundLine]:
+    """Devices on ptys, the autopilot double with two UDP ports, and the daemon as a process; calibrates on request."""
+    scenario = demo(seed=25, firmware=firmware, motions=motions)
+    async with contextlib.AsyncExitStack() as stack:
+        scenario.aircraft.begin(asyncio.get_running_loop().time())
+        for name, device in (("imu", scenario.imu), ("gradienter", scenario.gradienter), ("compass", scenario.compass)):
+            await stack.enter_async_context(PtyDevice(device, folder / name))
+        link = await open_udp(scenario.autopilot, listen=("127.0.0.1", 0))
+        stack.callback(link.close)
+        radio = await open_udp(scenario.autopilot.ground, listen=("127.0.0.1", 0))
+        stack.callback(radio.close)
+        autopilot = asyncio.create_task(scenario.autopilot.run())
+        stack.callback(autopilot.cancel)
+        text = configuration(scenario, directory=folder, udp=link.local).replace("udpin:", "udpout:")
+        text += '[calibration]\nmin_still_s = 3\nmax_s = 4\nat_arm = "off"\n'
+        (folder / "companion.toml").write_text(text)
+        process = CompanionProcess(folder)
+        if daemon:
+            await stack.enter_async_context(process)
+            await process.ready()
+        yield GroundLine(scenario, radio.local[1], process)

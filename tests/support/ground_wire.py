@@ -1,0 +1,61 @@
+"""A ground station without MAVSDK: what `companion.ground` needs of a link, on a wire in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.ground.exchange import Ack
+from companion.ground.heard import Heard, Target
+from tests.support.component import Ground, command_message
+
+COMPANION = Target(1, 191)
+
+
+def is_final(message: mavlink.MAVLink_message) -> bool:
+    """Whether it is the one final answer to a command."""
+    return isinstance(message, mavlink.MAVLink_command_ack_message) and message.result != mavlink.MAV_RESULT_IN_PROGRESS
+
+
+class StationOnTheWire(Ground):
+    """pymavlink's packer and parser under an exchange."""
+
+    def __init__(self) -> None:
+        super().__init__(245, 190)
+        self.handlers: list[Callable[[Ack], None]] = []
+        self.confirmations: list[int] = []
+        self.deaf_to: Callable[[mavlink.MAVLink_message], bool] = lambda message: False
+        self.heard = Heard(COMPANION.component_id)
+        self.values: dict[str, float] = {}
+        """The companion's parameters, as if read."""
+
+    def receive(self, data: bytes, t_s: float) -> None:
+        known = len(self.received)
+        super().receive(data, t_s)
+        for _, message in self.received[known:]:
+            if self.deaf_to(message):
+                continue
+            source = Target(message.get_srcSystem(), message.get_srcComponent())
+            self.heard.take(message.get_type(), source, message.to_dict(), t_s)
+            if isinstance(message, mavlink.MAVLink_command_ack_message):
+                for handler in [*self.handlers]:
+                    handler(Ack(source, message.command, message.result, message.progress))
+
+    def send_command(self, target: Target, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
+        self.confirmations.append(confirmation)
+        self.send(command_message(command, *parameters, target=target, confirmation=confirmation))
+
+    def watch_acks(self, handler: Callable[[Ack], None]) -> Callable[[], None]:
+        self.handlers.append(handler)
+        return lambda: self.handlers.remove(handler)
+
+    async def parameters(self, target: Target) -> dict[str, float]:
+        return self.values
+
+    async def get_parameter(self, target: Target, name: str) -> float | None:
+        return self.values.get(name)
+
+    async def set_parameter(self, target: Target, name: str, value: float) -> str | None:
+        self.values[name] = value
+        return None

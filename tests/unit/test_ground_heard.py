@@ -1,0 +1,141 @@
+"""What the ground makes of what it hears: who is there, texts in chunks, and what to say when nobody is."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.daemon import flight_line
+from companion.ground import words
+from companion.ground.heard import Fields, Heard, Target, Vehicle
+
+ARDUPILOT, PX4, NO_AUTOPILOT = 3, 12, 8
+QUADROTOR, GCS, ONBOARD = 2, 6, 18
+
+
+def beat(heard: Heard, system: int, component: int, *, now_s: float = 10.0, **fields: int) -> None:
+    defaults = {"type": ONBOARD, "autopilot": NO_AUTOPILOT, "base_mode": 0, "system_status": 3}
+    heard.take("HEARTBEAT", Target(system, component), {**defaults, **fields}, now_s)
+
+
+def say(heard: Heard, text: str, text_id: int = 0, sequence: int = 0, *, component: int = 191) -> None:
+    fields: Fields = {"severity": 6, "text": text, "id": text_id, "chunk_seq": sequence}
+    heard.take("STATUSTEXT", Target(1, component), fields, 10.0)
+
+
+def said(heard: Heard) -> list[str]:
+    return [text.words for _, text in heard.texts]
+
+
+def test_the_vehicle_as_its_heartbeats_show_it() -> None:
+    heard = Heard(191)
+    beat(heard, 1, 191, now_s=10.0)
+    assert heard.companions() == [1]
+    assert heard.vehicle(1, 10.0) == Vehicle(1, None, "unknown")
+    beat(heard, 1, 1, type=QUADROTOR, autopilot=PX4, base_mode=0x80 | 1, now_s=11.0)
+    assert heard.vehicle(1, 12.0) == Vehicle(1, "PX4", "armed")
+    beat(heard, 1, 1, type=QUADROTOR, autopilot=PX4, base_mode=1, now_s=12.0)
+    assert heard.vehicle(1, 12.5) == Vehicle(1, "PX4", "disarmed")
+    assert heard.vehicle(1, 16.0) == Vehicle(1, "PX4", "unknown"), "that heartbeat says nothing about now"
+
+
+def test_work_is_seen_in_the_heartbeat_but_only_in_a_new_one() -> None:
+    heard = Heard(191)
+    beat(heard, 1, 191, system_status=4, now_s=10.0)
+    assert heard.busy(1, 9.0) is False
+    assert heard.busy(1, 10.0) is None
+    beat(heard, 1, 191, system_status=2, now_s=11.0)
+    assert heard.busy(1, 10.0) is True
+
+
+def test_long_texts_are_put_together_from_their_chunks() -> None:
+    heard = Heard(191)
+    text = "".join(chr(ord("!") + i % 90) for i in range(120))
+    say(heard, text[:50], 7, 0)
+    say(heard, "in between", 0, 0)
+    say(heard, text[50:100], 7, 1)
+    assert said(heard) == ["in between"]
+    say(heard, text[100:], 7, 2)
+    assert said(heard) == ["in between", text]
+    say(heard, "another vehicle's autopilot", component=1)
+    assert len(said(heard)) == 2
+
+
+def test_a_text_of_full_chunks_ends_with_an_empty_one_and_a_gap_shows() -> None:
+    heard = Heard(191)
+    say(heard, "a" * 50, 7, 0)
+    say(heard, "", 7, 1)
+    say(heard, "b" * 50, 8, 0)
+    say(heard, "end", 8, 2)
+    assert said(heard) == ["a" * 50, "b" * 50 + "..." + "end"]
+
+
+def test_what_a_terminal_would_obey_is_not_passed_on() -> None:
+    heard = Heard(191)
+    say(heard, "calm \x1b[31mred\x07 \ufffd 5\u00b0")
+    assert said(heard) == ["calm ?[31mred? ? 5 deg"]
+
+
+def test_what_never_ends_is_forgotten() -> None:
+    heard = Heard(191)
+    for text_id in range(1, 1000):
+        say(heard, "x" * 50, text_id, 0)
+    assert len(heard._unfinished) < 20
+    for number in range(1000):
+        say(heard, f"text {number}")
+    assert len(heard.texts) <= 200
+    assert said(heard)[-1] == "text 999"
+
+
+anything = st.sampled_from([None, True, -1, 0, 2**70, 1.5, float("nan"), "", "x" * 50, "\0", [1], {"a": 1}])
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["HEARTBEAT", "STATUSTEXT", "ATTITUDE"]),
+            st.dictionaries(st.sampled_from(["type", "autopilot", "base_mode", "id", "chunk_seq", "text"]), anything),
+        )
+    )
+)
+def test_nothing_on_the_wire_raises(messages: list[tuple[str, dict[str, object]]]) -> None:
+    heard = Heard(191)
+    for name, fields in messages:
+        heard.take(name, Target(1, 191), fields, 0.0)
+    heard.summary()
+
+
+def test_nobody_there_is_one_line_with_what_was_heard_and_what_to_try() -> None:
+    heard = Heard(191)
+    nothing = words.nobody_heard(heard, "udpin:0.0.0.0:14550", None, 5.0)
+    for part in ("nothing heard", "udpin:0.0.0.0:14550", "5 s", "--url"):
+        assert part in nothing
+    beat(heard, 255, 190, type=GCS)
+    assert "only 255/190 (a ground station)" in words.nobody_heard(heard, "url", None, 5.0)
+    beat(heard, 1, 1, type=QUADROTOR, autopilot=PX4)
+    px4 = words.nobody_heard(heard, "url", 3, 5.0)
+    for part in ("component 191", "of system 3", "system 1 (PX4)", "companion run", "MAV_1_FORWARD"):
+        assert part in px4
+    beat(heard, 1, 1, type=QUADROTOR, autopilot=ARDUPILOT)
+    ardupilot = words.nobody_heard(heard, "url", None, 5.0)
+    assert "MAV_1_FORWARD" not in ardupilot
+    assert "forwarded" in ardupilot
+    for line in (nothing, px4, ardupilot):
+        assert "\n" not in line
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accel", "expected"),
+    [(33.45, 0.178, "sigma 33.5 deg/h, 0.178 mg"), (None, 0.2, "sigma 0.2 mg"), (4.0, None, "sigma 4 deg/h"),
+     (None, None, "")],
+)  # fmt: skip
+def test_figures(gyro: float | None, accel: float | None, expected: str) -> None:
+    assert words.figures(gyro, accel) == expected
+
+
+def test_the_numbers_mean_on_the_ground_what_they_mean_in_the_daemon() -> None:
+    assert flight_line.AT_ARM == words.AT_ARM
+    assert {value: state for state, value in flight_line.STATE_NUMBER.items()} == {
+        value: state for value, state in words.RESULTS.items() if state is not None
+    }
