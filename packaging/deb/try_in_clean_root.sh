@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
 # Installs the package into a Debian that has nothing else, uses it, upgrades, removes and purges it there.
 # Needs root (chroot), debootstrap, and the mirror that this machine's apt uses; where it cannot, it says so and ends with 0.
-# Usage: try_in_clean_root.sh PACKAGE.deb [FOLDER for the root, is removed]
+# Usage: try_in_clean_root.sh PACKAGE.deb [FOLDER for the root]
 set -euo pipefail
 
 package=$(realpath "$1")
-root=${2:-$(mktemp -d)}/root
+base=${2:-$(mktemp -d)}
+root=$base/root
 log=$(mktemp)
 
 skip() { echo "deb-test skipped: $*" >&2; exit 0; }
@@ -30,8 +31,8 @@ mirror=$(apt-get indextargets --format '$(RELEASE) $(COMPONENT) $(REPO_URI)' 'Cr
 
 cleanup() {
     [ -z "${daemon:-}" ] || kill "$daemon" 2>/dev/null || true
-    rm -rf "$root" "$log"
-    [ -n "${2:-}" ] || rmdir "$(dirname "$root")" 2>/dev/null || true
+    rm -rf "$root" "$log" "$log.daemon"
+    rmdir "$base" 2>/dev/null || true
 }
 trap cleanup EXIT
 
@@ -69,7 +70,7 @@ expect 0 '' systemd-analyze verify --man=no /usr/lib/systemd/system/companion.se
 say 'the daemon, as nobody and without a writable place of its own, as the service has it'
 cat >"$root/etc/companion/companion.toml" <<'TOML'
 [mavlink]
-url = "udpin:127.0.0.1:0"
+url = "udpout:127.0.0.1:9"
 [[imu]]
 name = "fc"
 source = "autopilot"
@@ -110,6 +111,8 @@ expect 0 'Removing companion' apt-get remove -q -y companion
 
 say 'purge: nothing stays'
 expect 0 'Purging' apt-get purge -q -y companion
+# An empty /opt goes with the last package that had files in it.
+mkdir -p "$root/opt"
 left=$(find "$root/etc" "$root/opt" "$root/usr" "$root/var/lib" -path "$root/var/lib/apt" -prune -o -name '*companion*' -print)
 [ -z "$left" ] || fail "left behind: $left"
 
