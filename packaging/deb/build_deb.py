@@ -90,6 +90,7 @@ def build(python: str, extras: str, work: Path, output: Path) -> Path:
     wheels = collect_wheels(interpreter, extras, work)
     packages = install(interpreter, extras, work, wheels, stage)
     prune(packages)
+    list_what_is_there(packages)
     retarget(interpreter, stage)
     system_files(stage)
     metadata = read_metadata(next(packages.glob("companion-*.dist-info")))
@@ -118,7 +119,12 @@ def debian_python(python: str) -> Path:
         BuildError: it is not the distribution's, too old, or cannot make environments.
     """
     asked = "import sys; print(sys.prefix, '%d.%d' % sys.version_info[:2]); import venv, ensurepip"
-    answer = subprocess.run([python, "-I", "-c", asked], capture_output=True, text=True, check=False)
+    try:
+        answer = subprocess.run([python, "-I", "-c", asked], capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise BuildError(
+            f"{python}: {error.strerror}; Debian's Python is needed: sudo apt install python3-venv"
+        ) from None
     words = answer.stdout.split()
     if words[:1] != ["/usr"]:
         raise BuildError(
@@ -158,6 +164,15 @@ def prune(packages: Path) -> None:
     for path in sorted((packages / "pymavlink/dialects/v20").iterdir()):
         if path.name not in ONLY_DIALECTS:
             remove(path)
+
+
+def list_what_is_there(packages: Path) -> None:
+    """Take out of the wheels' lists of files what is not there, and the scripts, which named this machine's paths."""
+    for record in sorted(packages.glob("*.dist-info/RECORD")):
+        lines = record.read_text(encoding="utf-8").splitlines(keepends=True)
+        names = [line.rsplit(",", 2)[0].strip('"') for line in lines]
+        kept = [line for line, name in zip(lines, names, strict=True) if (packages / name).is_file()]
+        record.write_text("".join(line for line in kept if not line.startswith("../")), encoding="utf-8")
 
 
 def remove(path: Path) -> None:
