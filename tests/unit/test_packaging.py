@@ -58,9 +58,8 @@ def test_an_installed_wheel_needs_nothing_of_the_checkout(wheel: Path, tmp_path:
     pip = [sys.executable, "-m", "pip", "--python", str(home / "bin/python"), "--disable-pip-version-check"]
     subprocess.run([*pip, "install", "-q", "--no-deps", "--no-index", str(wheel)], check=True)
     (packages,) = (home / "lib").glob("python*/site-packages")
-    # What it depends on is that of these tests; of the companion there is only the wheel's.
-    for name in ("msgspec", "numpy", "pygeomag", "pymavlink", "serial"):
-        (packages / name).symlink_to(Path(sysconfig.get_path("purelib")) / name)
+    # What it depends on is that of these tests. An editable companion among it has a .pth, not followed from here.
+    (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
 
     def run(*words: str) -> str:
         command = [str(home / "bin/companion"), *words]
@@ -68,6 +67,11 @@ def test_an_installed_wheel_needs_nothing_of_the_checkout(wheel: Path, tmp_path:
         assert done.returncode == 0, done.stderr
         return done.stdout
 
+    where = subprocess.run(
+        [home / "bin/python", "-c", "import companion; print(companion.__file__)"],
+        cwd=tmp_path, env={}, capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+    assert where.startswith(str(packages))
     assert run("--version") == f"companion {companion.__version__}\n"
     assert run("lua") == (PROJECT / "companion/lua/companion_arming.lua").read_text()
     root = tmp_path / "root"
