@@ -51,13 +51,13 @@ format: $(VENV)/.dev
 bench: $(VENV)/.dev
 	@$(BIN)/python -m tests.bench
 
-# With Debian's Python, whatever PYTHON is: the package runs with it. EXTRAS=mqtt,recording,report puts more in.
+# With Debian's Python, whatever PYTHON is: the package runs with it. EXTRAS= puts neither MQTT nor recording in.
 EXTRAS ?= mqtt,recording
 SYSTEM_PYTHON ?= /usr/bin/python3
 
 deb:
 	@rm -f dist/companion_*.deb
-	@$(SYSTEM_PYTHON) packaging/deb/build_deb.py --python $(SYSTEM_PYTHON) --extras $(EXTRAS)
+	@$(SYSTEM_PYTHON) packaging/deb/build_deb.py --python $(SYSTEM_PYTHON) --extras "$(EXTRAS)"
 
 deb-test: deb
 	@packaging/deb/try_in_clean_root.sh dist/companion_*.deb
