@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 # Tests run in two processes: the boards and machines this is made for have at least two cores.
 JOBS ?= 2
 
-.PHONY: help demo test check format bench clean
+.PHONY: help demo test check format bench deb deb-test clean
 
 help:
 	@echo 'make demo    watch a virtual aircraft being calibrated (about a minute)'
@@ -14,6 +14,8 @@ help:
 	@echo 'make check   formatting, lint, types, import directions'
 	@echo 'make format  put the code into the one format'
 	@echo 'make bench   speed, as ratios within one run'
+	@echo 'make deb     a Debian package for machines like this one, in dist/'
+	@echo 'make deb-test  try that package in a clean root (as root; a minute or two)'
 	@echo 'make clean   remove what the other targets made'
 
 $(VENV)/.run: pyproject.toml
@@ -49,5 +51,16 @@ format: $(VENV)/.dev
 bench: $(VENV)/.dev
 	@$(BIN)/python -m tests.bench
 
+# With Debian's Python, whatever PYTHON is: the package runs with it. EXTRAS= puts neither MQTT nor recording in.
+EXTRAS ?= mqtt,recording
+SYSTEM_PYTHON ?= /usr/bin/python3
+
+deb:
+	@rm -f dist/companion_*.deb
+	@$(SYSTEM_PYTHON) packaging/deb/build_deb.py --python $(SYSTEM_PYTHON) --extras "$(EXTRAS)"
+
+deb-test: deb
+	@packaging/deb/try_in_clean_root.sh dist/companion_*.deb
+
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf build dist $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

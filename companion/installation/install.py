@@ -28,6 +28,8 @@ HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S10
 SERIAL_GROUPS: Final = ("dialout", "uucp")
 """Of Debian and Fedora; of Arch."""
 
+PACKAGED: Final = "packaged-by"
+"""A file at the top of the environment that a Debian package brings: the service is then the package's."""
 UDEV_RUNS: Final = Path("/run/udev/control")
 
 Outcome = Literal["written", "updated", "unchanged", "kept", "removed", "absent", "done", "failed", "skipped"]
@@ -89,9 +91,10 @@ def install(target: Target, run: Run | None = None) -> Iterator[Step]:
     """Put everything in place; each step as it is done.
 
     Raises:
-        CompanionError: it cannot be installed from here, or not by this user.
+        CompanionError: it cannot be installed from here, or not by this user, or a package has brought the service.
     """
     if target.is_this_machine:
+        _check_not_packaged("sudo systemctl enable --now companion")
         _check_user(target, "install-service")
         _check_reach(target.executable)
     group = target.serial_group()
@@ -119,9 +122,10 @@ def uninstall(target: Target, run: Run | None = None) -> Iterator[Step]:
     """Take away what `install` has put there; the owner's configuration and the records stay.
 
     Raises:
-        CompanionError: not by this user.
+        CompanionError: not by this user, or a package has brought the service.
     """
     if target.is_this_machine:
+        _check_not_packaged("sudo apt remove companion")
         _check_user(target, "uninstall-service")
         if _systemd_runs():
             yield _command(target, run or _run, "systemctl", "disable", "--now", "companion.service")
@@ -174,6 +178,11 @@ def _read(path: Path) -> bytes | None:
 
 
 # --- this machine
+
+
+def _check_not_packaged(instead: str) -> None:
+    if (Path(sys.prefix) / PACKAGED).exists():
+        raise CompanionError(f"this companion is a Debian package, and its service came with it: {instead}")
 
 
 def _check_user(target: Target, command: str) -> None:

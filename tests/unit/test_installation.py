@@ -141,6 +141,19 @@ def test_without_root_this_machine_is_left_alone(
     assert "this needs root: sudo " in capsys.readouterr().err
 
 
+def test_the_service_of_a_debian_package_is_left_to_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / installation.PACKAGED).write_text("apt\n")
+    monkeypatch.setattr("sys.prefix", str(tmp_path))
+    for command, instead in (
+        ("install-service", "sudo systemctl enable --now companion"),
+        ("uninstall-service", "sudo apt remove companion"),
+    ):
+        assert cli.main([command, "--dry-run"]) == 1
+        assert capsys.readouterr().err.strip().endswith(f"is a Debian package, and its service came with it: {instead}")
+
+
 def test_the_files_are_found_in_a_checkout_and_in_a_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     project = Path(files.__file__).parents[2]
     assert files.folder() == project / "systemd"
