@@ -30,6 +30,7 @@ from companion.calibration.sources import Source
 from companion.calibration.stillness import ImuGate, PoseGate, Verdict
 from companion.calibration.stop import Settings
 from companion.calibration.stretch import Stretch
+from companion.calibration.trace import TraceLog
 from companion.calibration.windows import Hidden, ImuInput, ImuWindow, Window
 from companion.errors import StorageError
 from companion.protocols.registry import PROTOCOLS
@@ -72,9 +73,10 @@ _VALUES: Final[dict[str, type]] = {
 }
 """Values that never change once made."""
 
-# What is only remembered to save work: (class, attribute) and what makes it anew.
+# What is only remembered to save work or to be drawn later: (class, attribute) and what makes it anew.
 _FORGOTTEN: Final[dict[tuple[str, str], Callable[[], Any]]] = {
     ("RollingCollector", "_estimates"): Estimates,
+    ("RollingCollector", "_trace"): TraceLog,
     ("VectorNavDecoder", "_layouts"): dict,
 }
 _DEEPEST: Final = 40
