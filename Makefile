@@ -10,7 +10,7 @@ JOBS ?= 2
 
 help:
 	@echo 'make demo    watch a virtual aircraft being calibrated (about a minute)'
-	@echo 'make test    run all tests (about 12 minutes on two cores)'
+	@echo 'make test    run all tests (about 7 minutes on two cores)'
 	@echo 'make check   formatting, lint, types, import directions'
 	@echo 'make format  put the code into the one format'
 	@echo 'make bench   speed, as ratios within one run'
