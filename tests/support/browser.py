@@ -20,7 +20,7 @@ from typing import Any, Final
 
 PHONE: Final = (390, 844)
 DESKTOP: Final = (1280, 800)
-REPLY_WITHIN_S: Final = 20.0
+REPLY_WITHIN_S: Final = 40.0
 LIMIT: Final = 32 * 1024 * 1024
 
 FLAGS: Final = (
@@ -59,7 +59,7 @@ class Tab:
         assert "exceptionDetails" not in reply, reply["exceptionDetails"]
         return reply["result"].get("value")
 
-    async def until(self, expression: str, within_s: float = 10.0) -> Any:
+    async def until(self, expression: str, within_s: float = 30.0) -> Any:
         """Wait until an expression is true, looked at whenever the page is drawn; its value."""
         script = f"""new Promise((done, fail) => {{
             const end = performance.now() + {within_s * 1000};
