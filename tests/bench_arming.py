@@ -179,9 +179,12 @@ def main() -> None:
         with (folder / "sim.log").open("w") as log:
             stack.enter_context(running(sim, stdout=log))
         config = folder / "companion.toml"
-        while not config.exists() and "[mavlink]" not in (folder / "sim.log").read_text():
+        up_s = time.monotonic() + 20.0
+        while "[mavlink]" not in (folder / "sim.log").read_text():
+            if time.monotonic() > up_s:
+                raise SystemExit("the simulator did not come up")
             time.sleep(0.1)
-        wanted = (config if config.exists() else folder / "sim.log").read_text()
+        wanted = (folder / "sim.log").read_text()
         wanted = wanted.replace(f"udpin:{udp}", f"udpin:127.0.0.1:{relay.daemon_port}")
         wanted += '\n[calibration]\nat_arm = "gate"\n[push]\ndither = true\n'
         wanted += '\n[[imu]]\nname = "fc2"\nsource = "autopilot"\ninstance = 2\nprofile = "icm42688p"\n'
