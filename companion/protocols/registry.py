@@ -7,6 +7,7 @@ from typing import Literal
 
 from companion.errors import ConfigError
 from companion.protocols.base import Decoder
+from companion.protocols.dialogue import Dialogue
 from companion.protocols.hmr3300 import Hmr3300Decoder
 from companion.protocols.imu_line import ImuLineDecoder
 from companion.protocols.inclinometer_xy import InclinometerXyDecoder
@@ -23,6 +24,10 @@ class ProtocolInfo:
     baud: int
     parity: Literal["none", "even", "odd"]
     decoder: type[Decoder]
+    dialogue: type[Dialogue] | None = None
+    """What has to be said to it; None for a device that speaks by itself or that we have nothing safe to say to."""
+    lag_s: float = 0.0
+    """Time constant with which its reading follows the truth: fluid, pendulum, filters."""
 
 
 PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
@@ -31,8 +36,9 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
         "imu_line": ProtocolInfo("imu_line", 500000, "none", ImuLineDecoder),
     },
     "gradienter": {
-        # MEAS DPG2; the P-series sends at 2400 baud, BEI with even parity.
-        "inclinometer_xy": ProtocolInfo("inclinometer_xy", 9600, "none", InclinometerXyDecoder),
+        # MEAS DPG2, with the damping of the BEI INC (a decade a second). The P-series sends at 2400 baud, BEI with even
+        # parity.
+        "inclinometer_xy": ProtocolInfo("inclinometer_xy", 9600, "none", InclinometerXyDecoder, lag_s=0.43),
     },
     "compass": {
         "hmr3300": ProtocolInfo("hmr3300", 19200, "none", Hmr3300Decoder),

@@ -13,7 +13,8 @@ from companion.errors import ConfigError
 from companion.protocols.registry import PROTOCOLS, Kind, make_decoder
 from companion.samples import AttitudeSample, CompassSample, ImuSample, MagSample, Sample, TiltSample
 
-KINDS: dict[str, Kind] = {name: kind for kind, names in PROTOCOLS.items() for name in names}
+KINDS: dict[str, Kind] = {name: kind for kind, names in reversed(PROTOCOLS.items()) for name in names}
+"""One of the kinds under which a device is known; its decoder is the same under all."""
 DOCUMENT = json.loads((Path(__file__).parents[1] / "vectors" / "frames.json").read_text(encoding="utf-8"))
 FRAMES = [frame for frame in DOCUMENT["frames"] if frame["device"] in KINDS]
 
