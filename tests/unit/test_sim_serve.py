@@ -15,8 +15,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion import config
 from sim.__main__ import main
-from sim.imu_model import DEG_H, MG
 from sim.families import COMPASSES, GRADIENTERS, IMUS
+from sim.imu_model import DEG_H, MG
 from sim.scenario import demo, site_at
 from sim.serve import configuration, describe, parser, serve
 from sim.station import Station
