@@ -12,6 +12,7 @@ from companion.calibration.rolling import ImuInput, Settings
 from companion.calibration.site import Whereabouts
 from companion.calibration.solve import CompassModel, GradienterModel
 from companion.config import Compass, Config, Gradienter, Imu
+from companion.config.sections import GradienterProtocol
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H, MG
 from companion.protocols.registry import PROTOCOLS
@@ -29,6 +30,8 @@ SCALED_BYTES: Final = 36.0
 
 TILT_SIGMA_DEG: Final = 0.05
 """Of a gradienter whose protocol names no device that is known to be worse: cell and mounting."""
+COMPASS_TILT_SIGMA_DEG: Final = 0.65
+"""Of what may be a compass' own tilt where its documents give no figure: the HMR3300's."""
 HEADING_SIGMA_DEG: Final = 3.0
 """Of a compass likewise: the aircraft's own iron and currents."""
 
@@ -109,8 +112,14 @@ def gradienter_model(gradienter: Gradienter | None) -> GradienterModel | None:
         law=gradienter.law,
         vehicle_from_sensor=rotation_matrix(gradienter.mounting),
         offset_deg=gradienter.offset_deg,
-        sigma_deg=gradienter.sigma_deg or PROTOCOLS["gradienter"][gradienter.protocol].sigma_deg or TILT_SIGMA_DEG,
+        sigma_deg=gradienter.sigma_deg or tilt_sigma_deg(gradienter.protocol),
     )
+
+
+def tilt_sigma_deg(protocol: GradienterProtocol) -> float:
+    """How well the tilt of a device with this protocol is known where nobody says better."""
+    known = PROTOCOLS["gradienter"][protocol].sigma_deg
+    return known or (COMPASS_TILT_SIGMA_DEG if protocol in PROTOCOLS["compass"] else TILT_SIGMA_DEG)
 
 
 def compass_model(compass: Compass | None) -> CompassModel | None:

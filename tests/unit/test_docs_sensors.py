@@ -66,7 +66,7 @@ def test_a_row_says_what_the_code_does(kind: Kind, info: ProtocolInfo) -> None:
     assert row.line == f"{info.baud} 8{info.parity[0].upper()}1"
     if kind == "gradienter":
         assert row.law.startswith(info.law or "not documented")
-        sigma = figure(info.sigma_deg or models.TILT_SIGMA_DEG)
+        sigma = figure(models.tilt_sigma_deg(info.name))  # type: ignore[arg-type]
         assert re.search(rf"(?<![\d.]){sigma} deg", row.sigma), sigma
     if kind == "compass":
         for value in {info.sigma_deg or models.HEADING_SIGMA_DEG, info.tilted_sigma_deg or info.sigma_deg}:
