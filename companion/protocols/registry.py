@@ -11,7 +11,10 @@ from companion.protocols.dialogue import Dialogue
 from companion.protocols.hmr3300 import Hmr3300Decoder
 from companion.protocols.imu_line import ImuLineDecoder
 from companion.protocols.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.pni import PniDecoder, PniDialogue
+from companion.protocols.rion import RionDecoder, RionDialogue
 from companion.protocols.vectornav import VectorNavDecoder
+from companion.protocols.witmotion import WitMotionDecoder
 
 Kind = Literal["imu", "gradienter", "compass"]
 
@@ -34,14 +37,22 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
     "imu": {
         "vectornav": ProtocolInfo("vectornav", 115200, "none", VectorNavDecoder),
         "imu_line": ProtocolInfo("imu_line", 500000, "none", ImuLineDecoder),
+        # 9600 baud carries 21 of its usual epochs a second; a faster line is set with the vendor's program.
+        "witmotion": ProtocolInfo("witmotion", 9600, "none", WitMotionDecoder),
     },
     "gradienter": {
         # MEAS DPG2, with the damping of the BEI INC (a decade a second). The P-series sends at 2400 baud, BEI with even
         # parity.
         "inclinometer_xy": ProtocolInfo("inclinometer_xy", 9600, "none", InclinometerXyDecoder, lag_s=0.43),
+        "rion": ProtocolInfo("rion", 9600, "none", RionDecoder, RionDialogue),
+        "pni": ProtocolInfo("pni", 38400, "none", PniDecoder, PniDialogue),
+        "witmotion": ProtocolInfo("witmotion", 9600, "none", WitMotionDecoder),
     },
     "compass": {
         "hmr3300": ProtocolInfo("hmr3300", 19200, "none", Hmr3300Decoder),
+        # 38400 is what public drivers of the TRAX open; no document of PNI's that says so was found.
+        "pni": ProtocolInfo("pni", 38400, "none", PniDecoder, PniDialogue),
+        "rion": ProtocolInfo("rion", 9600, "none", RionDecoder, RionDialogue),
     },
 }
 
