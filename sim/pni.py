@@ -60,7 +60,8 @@ class PniCompass(SerialDevice):
         self.calibrated = True
         self.saves = 0
         """How often it has been told to write to its non-volatile memory."""
-        self.components = self._saved = FACTORY_COMPONENTS
+        self.components: tuple[int, ...] = FACTORY_COMPONENTS
+        self._saved: tuple[int, ...] = FACTORY_COMPONENTS
         self.streaming = continuous
         self._mounting = mounting_matrix(*mounting_deg)
         self._random = np.random.default_rng([seed, 21])

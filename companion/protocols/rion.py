@@ -62,7 +62,7 @@ class RionDecoder(FrameDecoder):
             samples.append(_measurement(buffer[at + 4 : end - 1], self._time_of(origin + end)))
             self.accepted += 1
         except RejectedError as error:
-            self.rejected[error.reason] += 1
+            return self._reject(error.reason, at + 1)  # rather no frame at all, with a sum that is right by chance
         return end
 
 

@@ -8,9 +8,10 @@
 Little-endian 16-bit numbers, and the low byte of the sum of the ten bytes before it. Sources: WitMotion's WT901 data
 sheet p. 10-14, WT901SDCL p. 13-16, HWT905-TTL protocol page (9600 8N1, 10 Hz, 51 to 54 as it comes).
 
-0x55 stands in data too and the sum is weak: a frame is believed only in company, that is with another good one right
-before or right behind it. Alone one place in 10^6 of noise would pass; so it is one in 10^12. The packets of Bluetooth
-models (0x61) have no checksum and are not read.
+0x55 stands in data too and the sum is weak: a frame is believed only in company, that is when another good one follows
+at once. Alone one place in 10^6 of noise would pass, and one in 256 of the frames that have lost a byte; so it is one
+in 10^12. The price is that the last frame of an epoch waits for the next epoch; its time does not suffer. The packets
+of Bluetooth models (0x61) have no checksum and are not read.
 
 The axes are the device's own, and Z is up. The angles turn Z-Y-X about these axes (WT901 p. 12), so with X forward and
 Y left roll is right side down and pitch nose down: as a gradienter it gives x = roll and y = -pitch, law "euler",
@@ -30,7 +31,7 @@ from companion.samples import ImuSample, MagSample, Sample, TiltSample, Vector
 
 FRAME_BYTES: Final = 11
 ALONE: Final = "alone"
-"""A frame whose sum is right, without another one next to it."""
+"""A frame whose sum is right, but none follows it."""
 
 _START: Final = b"\x55"
 _FIRST_TYPE, _LAST_TYPE = 0x50, 0x5F
@@ -53,33 +54,34 @@ class WitMotionDecoder(FrameDecoder):
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)
-        self._believed = -1
-        """Stream position of the end of the last frame that was believed."""
+        self._good_at = -1
+        """Stream position of a frame that was found good when it followed another, or that waits for one to follow."""
         self._accel: tuple[int, Vector, float] | None = None
         """End of the last acceleration's frame, which waits for its rate; m/s^2, degrees Celsius."""
 
     def interrupted(self) -> None:
-        """Forget the frame and the epoch under way; the next frame needs company anew."""
+        """Forget the frames and the epoch under way."""
         super().interrupted()
-        self._believed = -1
+        self._good_at = -1
         self._drop_accel()
 
     def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         if buffer[at] != 0x55:
             return self._skip_to(_START, buffer, at)
-        size = _good(buffer, at)
-        if size == WAIT:
-            return WAIT
-        if size != FRAME_BYTES:
-            return self._no_frame(size, at)
-        end = at + FRAME_BYTES
-        if self._believed != origin + at:
-            neighbour = _good(buffer, end)
-            if neighbour == WAIT:
+        if self._good_at != origin + at:
+            size = _good(buffer, at)
+            if size == WAIT:
                 return WAIT
-            if neighbour != FRAME_BYTES:
-                return self._reject(ALONE, at + 1)
-        self._believed = origin + end
+            if size != FRAME_BYTES:
+                return self._no_frame(size, at)
+            self._good_at = origin + at
+        end = at + FRAME_BYTES
+        following = _good(buffer, end)
+        if following == WAIT:
+            return WAIT
+        if following != FRAME_BYTES:
+            return self._reject(ALONE, at + 1)
+        self._good_at = origin + end
         self._take(buffer, at, origin, samples)
         return end
 
