@@ -8,8 +8,6 @@ from companion.protocols.dialogue import SILENT_S, Dialogue
 
 ANSWER_S: Final = 1.0
 """So long an answer is waited for before the device is asked again; none of those asked here documents a delay."""
-ANEW_AFTER: Final = 3
-"""After so many questions without a usable answer the device is set up anew: it may have been without power."""
 
 
 class PollDialogue(Dialogue):
@@ -20,7 +18,7 @@ class PollDialogue(Dialogue):
 
     QUESTION: ClassVar[bytes]
     SET_UP: ClassVar[bytes] = b""
-    """Said before the first question, and again to a device that does not give what it was set up for."""
+    """Said before the first question, and before the one after a question in vain: it may have been without power."""
     PERIOD_S: ClassVar[float]
     NAME: ClassVar[str]
 
@@ -29,13 +27,13 @@ class PollDialogue(Dialogue):
         self._asked_s: float | None = None
         """When the question was put that has not been answered yet."""
         self._next_s = 0.0
-        self._in_vain = ANEW_AFTER
+        self._set_up = False
         self._words = ""
 
     def opened(self, t_s: float) -> None:  # noqa: D102 - as in the base class
         self._quiet_until_s = t_s + SILENT_S
         self._asked_s = None
-        self._in_vain = ANEW_AFTER
+        self._set_up = False
 
     def heard(self, data: bytes, samples: int, t_s: float) -> None:  # noqa: D102
         if not data:
@@ -43,22 +41,19 @@ class PollDialogue(Dialogue):
         if self._asked_s is None:
             self._quiet_until_s = t_s + SILENT_S
         elif samples:
-            self._asked_s, self._in_vain = None, 0
+            self._asked_s = None
 
     def due(self, t_s: float) -> bytes:  # noqa: D102
         if self._asked_s is not None:
             if t_s - self._asked_s < ANSWER_S:
                 return b""
-            self._asked_s = None
-            self._in_vain += 1
+            self._asked_s, self._set_up = None, False
         if t_s < max(self._quiet_until_s, self._next_s):
             return b""
         self._asked_s, self._next_s = t_s, t_s + self.PERIOD_S
         self._words = f"asked {1.0 / self.PERIOD_S:.0f} times a second with {self.NAME}"
-        if self._in_vain < ANEW_AFTER:
-            return self.QUESTION
-        self._in_vain = 0
-        return self.SET_UP + self.QUESTION
+        set_up, self._set_up = self._set_up, True
+        return self.QUESTION if set_up else self.SET_UP + self.QUESTION
 
     @property
     def words(self) -> str:  # noqa: D102
