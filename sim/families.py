@@ -8,21 +8,30 @@ from typing import NamedTuple
 from sim.aircraft import VirtualAircraft
 from sim.devices import HMR3300, Gradienter, ImuLine, Law, SerialDevice, VectorNavBinary
 from sim.imu_model import ImuModel
+from sim.pni import PniCompass
+from sim.rion import RionCompass, RionInclinometer
+from sim.witmotion import WitMotionImu, WitMotionInclinometer
 
 IMUS: dict[str, Callable[[ImuModel], SerialDevice]] = {
     "vectornav": VectorNavBinary,
     "imu_line": ImuLine,
+    "witmotion": WitMotionImu,
 }
 """Made from the model whose readings they send."""
 
 GRADIENTERS: dict[str, Callable[[VirtualAircraft, int], SerialDevice]] = {
     "inclinometer_xy": lambda aircraft, seed: Gradienter(aircraft, seed=seed),
     "hmr3300": lambda aircraft, seed: HMR3300(aircraft, seed=seed),
+    "rion": lambda aircraft, seed: RionInclinometer(aircraft, seed=seed),
+    "pni": lambda aircraft, seed: PniCompass(aircraft, seed=seed),
+    "witmotion": lambda aircraft, seed: WitMotionInclinometer(aircraft, seed=seed),
 }
 """Made from the aircraft on which they sit and a seed; upright, without errors but noise and lag."""
 
 COMPASSES: dict[str, Callable[[VirtualAircraft, int], SerialDevice]] = {
     "hmr3300": lambda aircraft, seed: HMR3300(aircraft, seed=seed),
+    "pni": lambda aircraft, seed: PniCompass(aircraft, seed=seed),
+    "rion": lambda aircraft, seed: RionCompass(aircraft, seed=seed),
 }
 """The same."""
 
@@ -44,6 +53,7 @@ Z_UP = (180.0, 0.0, 0.0)
 FITS: dict[tuple[str, str], Fit] = {
     ("gradienter", "inclinometer_xy"): Fit(sigma_deg=0.005),
     ("compass", "hmr3300"): Fit(sigma_deg=1.0),
+    ("imu", "witmotion"): Fit(mounting_deg=Z_UP),
 }
 """By role ("imu", "gradienter", "compass") and protocol name; who is not here needs nothing said."""
 

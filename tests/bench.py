@@ -26,12 +26,12 @@ from companion.calibration.rolling import ImuInput, RollingCollector, Settings
 from companion.component.arm_authorisation import ArmAuthoriser
 from companion.daemon.job import Job
 from companion.links.mavlink import MavlinkLink
-from companion.protocols.registry import make_decoder
+from companion.protocols.registry import Kind, make_decoder
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
 from companion.samples import ImuSample
 from tests.support.component import FakeVehicle, ScriptedGate
-from tests.support.frames import imu_line, vectornav_imu
+from tests.support.frames import imu_line, pni_heading, rion_angles, vectornav_imu, wit, wit_imu
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -55,9 +55,10 @@ def reference() -> Callable[[], object]:
     return lambda: (binascii.crc_hqx(frame, 0), floats.unpack_from(frame, 8))
 
 
-def decoder(name: str, frame: bytes) -> Callable[[], object]:
-    device = make_decoder("imu", name, 1e-5)
-    head, tail = frame[:33], frame[33:]  # a port seldom gives a frame in one piece
+def decoder(name: str, frame: bytes, kind: Kind = "imu") -> Callable[[], object]:
+    device = make_decoder(kind, name, 1e-5)
+    cut = 33 if len(frame) > 33 else len(frame) // 2
+    head, tail = frame[:cut], frame[cut:]  # a port seldom gives a frame in one piece
 
     def work() -> None:
         device.feed(head, 1.0)
@@ -188,6 +189,9 @@ def main() -> None:
         ("reference: CRC and unpacking of 44 bytes", reference()),
         ("VectorNav binary frame, decoded", decoder("vectornav", vectornav_imu())),
         ("$IMU line, decoded", decoder("imu_line", imu_line(1, 2))),
+        ("WitMotion epoch of four frames, decoded", decoder("witmotion", wit_imu() + wit(0x53, 9, 9) + wit(0x54, 9))),
+        ("PNI heading, pitch and roll, decoded", decoder("pni", pni_heading(123.5), "compass")),
+        ("RION angles, decoded", decoder("rion", rion_angles(1.5, -2.5, 123.5), "compass")),
         ("HIGHRES_IMU, received and handed on", mavlink_imu()),
         ("IMU sample into the rolling collector", collector_sample()),
     ):

@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-ImuProtocol = Literal["vectornav", "imu_line"]
+ImuProtocol = Literal["vectornav", "imu_line", "witmotion"]
 Profile = Literal["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
-GradienterProtocol = Literal["inclinometer_xy", "hmr3300"]
-CompassProtocol = Literal["hmr3300"]
+GradienterProtocol = Literal["inclinometer_xy", "hmr3300", "rion", "pni", "witmotion"]
+CompassProtocol = Literal["hmr3300", "pni", "rion"]
 Law = Literal["axis", "slope", "euler"]
 Parity = Literal["none", "even", "odd"]
 AtArm = Literal["gate", "warn", "off"]

@@ -59,6 +59,8 @@ class Decoder(ABC):
         """Frames that gave samples."""
         self.rejected: Counter[str] = Counter()
         """Frames, or what began like one, that gave none, by reason."""
+        self.warned: Counter[str] = Counter()
+        """Frames that gave samples and said something against them, by what they said."""
         self.skipped = 0
         """Bytes passed over that did not look like part of any frame; many of them mean a wrong baud or protocol."""
 

@@ -14,7 +14,10 @@ from companion.protocols.hmr3300 import Hmr3300Decoder
 from companion.protocols.hmr3300_dialogue import Hmr3300Dialogue
 from companion.protocols.imu_line import ImuLineDecoder
 from companion.protocols.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.pni import PniDecoder, PniDialogue
+from companion.protocols.rion import RionDecoder, RionDialogue
 from companion.protocols.vectornav import VectorNavDecoder
+from companion.protocols.witmotion import WitMotionDecoder
 
 Kind = Literal["imu", "gradienter", "compass"]
 
@@ -44,6 +47,8 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
     "imu": {
         "vectornav": ProtocolInfo("vectornav", 115200, "none", VectorNavDecoder),
         "imu_line": ProtocolInfo("imu_line", 500000, "none", ImuLineDecoder),
+        # 9600 baud carries 21 of its usual epochs a second; a faster line is set with the vendor's program.
+        "witmotion": ProtocolInfo("witmotion", 9600, "none", WitMotionDecoder),
     },
     "gradienter": {
         # MEAS DPG2, with the damping of the BEI INC (a decade a second). The P-series sends at 2400 baud, BEI with even
@@ -53,12 +58,18 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
         "hmr3300": ProtocolInfo(
             "hmr3300", 19200, "none", Hmr3300Decoder, Hmr3300Dialogue, sigma_deg=math.hypot(0.4, 0.5), law="euler"
         ),
+        "rion": ProtocolInfo("rion", 9600, "none", RionDecoder, RionDialogue),
+        "pni": ProtocolInfo("pni", 38400, "none", PniDecoder, PniDialogue, law="euler"),
+        "witmotion": ProtocolInfo("witmotion", 9600, "none", WitMotionDecoder, law="euler"),
     },
     "compass": {
         # Honeywell: 1 deg rms level, 3 deg to 30 deg of tilt.
         "hmr3300": ProtocolInfo(
             "hmr3300", 19200, "none", Hmr3300Decoder, Hmr3300Dialogue, sigma_deg=1.0, tilted_sigma_deg=3.0
         ),
+        # 38400 is what public drivers of the TRAX open; no document of PNI's that says so was found.
+        "pni": ProtocolInfo("pni", 38400, "none", PniDecoder, PniDialogue),
+        "rion": ProtocolInfo("rion", 9600, "none", RionDecoder, RionDialogue),
     },
 }
 

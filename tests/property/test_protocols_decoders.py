@@ -13,16 +13,39 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.protocols.base import Decoder, LineDecoder, xor_checksum
+from companion.protocols.framing import FrameDecoder
 from companion.protocols.hmr3300 import Hmr3300Decoder
 from companion.protocols.imu_line import ImuLineDecoder
 from companion.protocols.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.pni import LONGEST as PNI_LONGEST
+from companion.protocols.pni import PniDecoder
+from companion.protocols.rion import LONGEST as RION_LONGEST
+from companion.protocols.rion import RionDecoder
 from companion.protocols.vectornav import SENTENCE_LIMIT, VectorNavDecoder
 from companion.protocols.vectornav_binary import MAX_FRAME_BYTES
-from companion.samples import CompassSample, ImuSample, Sample, TiltSample
-from tests.support.frames import floats, imu_line, sentence, vectornav_binary, vectornav_imu, xor
+from companion.protocols.witmotion import FRAME_BYTES as WIT_BYTES
+from companion.protocols.witmotion import WitMotionDecoder
+from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
+from tests.support.frames import (
+    floats,
+    imu_line,
+    pni,
+    pni_data,
+    pni_heading,
+    rion,
+    rion_angles,
+    rion_long,
+    sentence,
+    vectornav_binary,
+    vectornav_imu,
+    wit,
+    wit_imu,
+    xor,
+)
 
 SECONDS_PER_BYTE = 1 / 1024  # exact in binary, so that times can be compared exactly
 DECODERS: list[type[Decoder]] = [Hmr3300Decoder, InclinometerXyDecoder, ImuLineDecoder, VectorNavDecoder]
+DECODERS += [PniDecoder, RionDecoder, WitMotionDecoder]
 
 finite = st.floats(-50, 50, allow_nan=False, width=32)
 triples = st.tuples(finite, finite, finite)
@@ -51,11 +74,39 @@ vectornav_frames = st.one_of(
         [b"\xfa\x05\xff\x7f\xff\x0f", b"\xfa\x04", b"$VNYMR,", b"$VN", sentence("VNERR,1"), b"\xfa\x01\x00"]
     ),
 )
+pni_floats = st.sampled_from([5, 7, 21, 22, 23, 24, 25, 27, 28, 29, 74, 75, 76, 88])
+pni_parts = st.one_of(
+    st.tuples(pni_floats, finite),
+    st.tuples(st.sampled_from([8, 9, 79]), st.integers(0, 3).map(lambda n: bytes([n]))),
+    st.tuples(st.just(77), st.binary(min_size=16, max_size=16)),
+)
+pni_frames = st.one_of(
+    st.builds(pni_heading, st.floats(0, 359.5, width=32), finite, finite),
+    st.builds(pni_data, st.lists(pni_parts, max_size=16), st.sampled_from("><")),
+    st.builds(pni, st.integers(0, 255), st.binary(max_size=20)),
+    st.sampled_from([b"\x00\xc8\x05\x10", b"\x00\x05\x05", b"\x00\x07\x05\x01\xc8", b"\x00"]),
+)
+hundredths = st.integers(-9999, 9999).map(lambda n: n / 100)
+rion_frames = st.one_of(
+    st.builds(rion_angles, hundredths, hundredths, st.integers(0, 39999).map(lambda n: n / 100)),
+    st.builds(rion_long, hundredths, hundredths, st.binary(min_size=3, max_size=3)),
+    st.builds(rion, st.integers(0, 255), st.binary(max_size=46)),
+    st.sampled_from([b"\x68\x0d\x00\x84", b"\x68\x32\x00\x94", b"\x68"]),
+)
+counts = st.integers(-32768, 32767)
+wit_frames = st.one_of(
+    st.builds(wit_imu, st.tuples(counts, counts, counts), st.tuples(counts, counts, counts)),
+    st.builds(wit, st.integers(0x50, 0x61), counts, counts, counts, counts),
+    st.sampled_from([wit(0x53, 1, 2, 3) * 3, wit(0x51), b"\x55\x51", b"\x55" * 12]),
+)
 FRAMES: dict[type[Decoder], st.SearchStrategy[bytes]] = {
     Hmr3300Decoder: hmr_lines,
     InclinometerXyDecoder: xy_lines,
     ImuLineDecoder: imu_lines,
     VectorNavDecoder: vectornav_frames,
+    PniDecoder: pni_frames,
+    RionDecoder: rion_frames,
+    WitMotionDecoder: wit_frames,
 }
 
 
@@ -67,7 +118,7 @@ def damaged(draw: st.DrawFn, frames: st.SearchStrategy[bytes]) -> bytes:
         if frame:
             at = draw(st.integers(0, len(frame) - 1))
             frame[at : at + 1] = draw(
-                st.sampled_from([b"", b"\n", b"$", b"\xfa", b"\x80", bytes(frame[at : at + 1] * 2)])
+                st.sampled_from([b"", b"\n", b"$", b"\xfa", b"\x80", b"\0", b"hU", bytes(frame[at : at + 1] * 2)])
             )
     return bytes(frame)
 
@@ -92,7 +143,7 @@ def feed_in(decoder: Decoder, stream: bytes, cuts: list[int]) -> list[Sample]:
 
 
 def held_bytes(decoder: Decoder) -> int:
-    if isinstance(decoder, VectorNavDecoder):
+    if isinstance(decoder, VectorNavDecoder | FrameDecoder):
         return len(decoder._buffer)
     assert isinstance(decoder, LineDecoder | ImuLineDecoder)
     return len(decoder._partial)
@@ -101,6 +152,8 @@ def held_bytes(decoder: Decoder) -> int:
 def limit_of(decoder: Decoder) -> int:
     if isinstance(decoder, VectorNavDecoder):
         return max(MAX_FRAME_BYTES, SENTENCE_LIMIT + 1)
+    if isinstance(decoder, FrameDecoder):
+        return {PniDecoder: PNI_LONGEST, RionDecoder: RION_LONGEST, WitMotionDecoder: 2 * WIT_BYTES}[type(decoder)]
     assert isinstance(decoder, LineDecoder | ImuLineDecoder)
     return decoder.LIMIT
 
@@ -152,6 +205,9 @@ GOOD: dict[type[Decoder], bytes] = {
     InclinometerXyDecoder: b"X=+00.430\r\nY=-00.084\r\n",
     ImuLineDecoder: imu_line(1, 2),
     VectorNavDecoder: vectornav_imu(),
+    PniDecoder: pni_heading(123.5),
+    RionDecoder: rion_angles(10.5, -10.05, 104.01),
+    WitMotionDecoder: wit_imu() + wit(0x50),  # believed when another follows
 }
 
 
@@ -209,3 +265,25 @@ def test_only_an_x_and_the_y_right_after_it_make_a_reading(lines: list[tuple[str
     unpaired = Counter(axes.replace("XY", ""))
     waiting = int(axes.endswith("X"))
     assert decoder.rejected.total() == unpaired.total() - waiting
+
+
+@settings(deadline=None, max_examples=80)
+@given(st.integers(0, 35999), st.integers(-9000, 9000), st.integers(-9000, 9000))
+def test_an_angle_in_digits_is_read_as_it_was_written(heading: int, pitch: int, roll: int) -> None:
+    (sample,) = RionDecoder().feed(rion_angles(pitch / 100, roll / 100, heading / 100), 0.0)
+    assert sample == CompassSample(0.0, heading / 100, pitch / 100, roll / 100)
+
+
+@settings(deadline=None, max_examples=80)
+@given(st.permutations([5, 7, 8, 9, 21, 24, 25, 27, 28, 29, 79]), st.floats(0, 359.5, width=32), finite, finite)
+def test_components_are_read_in_whatever_order_they_come(
+    order: list[int], heading: float, pitch: float, roll: float
+) -> None:
+    value = {5: heading, 24: pitch, 25: roll, 7: 20.5, 21: 0.5, 27: 12.5, 28: -25.0, 29: 50.0}
+    flag = {8: b"\0", 9: b"\1", 79: b"\1"}
+    frame = pni_data([(part, value[part] if part in value else flag[part]) for part in order])
+    samples = PniDecoder().feed(frame, 0.0)
+    if any(0.0 < abs(angle) < 1e-6 for angle in (heading, pitch, roll)):
+        assert samples == []  # no device prints so little: it is a float of the other byte order
+        return
+    assert samples == [CompassSample(0.0, heading, pitch, roll), MagSample(0.0, (0.125, -0.25, 0.5))]

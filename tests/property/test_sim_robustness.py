@@ -15,8 +15,11 @@ from sim.autopilot import ArduPilotDouble
 from sim.devices import HMR3300, Gradienter, ImuLine, SerialDevice, VectorNavBinary
 from sim.earth import EARTH_RATE_RAD_S, angles_of, body_from_ned
 from sim.imu_model import ImuModel
+from sim.pni import PniCompass
 from sim.px4.double import PX4Double
+from sim.rion import RionCompass, RionInclinometer
 from sim.station import Station
+from sim.witmotion import WitMotionImu, WitMotionInclinometer
 from tests.support.virtual_time import run_virtual
 
 TILT = st.floats(-60.0, 60.0)
@@ -59,7 +62,11 @@ def test_a_compass_always_says_three_numbers_in_range(pitch: float, roll: float,
 def all_devices() -> list[SerialDevice]:
     aircraft = VirtualAircraft()
     imu = ImuModel(aircraft)
-    return [HMR3300(aircraft), Gradienter(aircraft), VectorNavBinary(imu), ImuLine(imu)]
+    binary = [PniCompass(aircraft), RionCompass(aircraft), RionInclinometer(aircraft)]
+    return [
+        *(HMR3300(aircraft), Gradienter(aircraft), VectorNavBinary(imu), ImuLine(imu)),
+        *(*binary, WitMotionImu(imu), WitMotionInclinometer(aircraft)),
+    ]
 
 
 @settings(deadline=None, max_examples=60)

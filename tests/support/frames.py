@@ -112,3 +112,100 @@ def right_binaries(data: bytes) -> list[Found]:
             if end <= len(data) and crc16_xmodem(data[start + 1 : end]) == 0:
                 found.append(Found(start, end))
     return found
+
+
+def pni(frame_id: int, payload: bytes = b"") -> bytes:
+    """A frame of a PNI compass (TCM manual, figure 7-1)."""
+    body = struct.pack(">H", 5 + len(payload)) + bytes([frame_id]) + payload
+    return body + struct.pack(">H", crc16_xmodem(body))
+
+
+def pni_data(parts: list[tuple[int, float | bytes]], order: str = ">") -> bytes:
+    """kGetDataResp: component and value, a float or its bytes."""
+    payload = bytes([len(parts)])
+    for part, value in parts:
+        payload += bytes([part]) + (value if isinstance(value, bytes) else struct.pack(order + "f", value))
+    return pni(5, payload)
+
+
+def pni_heading(heading: float, pitch: float = 1.5, roll: float = -2.5) -> bytes:
+    return pni_data([(5, heading), (24, pitch), (25, roll)])
+
+
+def sum8(data: bytes) -> int:
+    value = 0
+    for byte in data:
+        value = (value + byte) % 256
+    return value
+
+
+def rion(command: int, data: bytes = b"", address: int = 0) -> bytes:
+    body = bytes([4 + len(data), address, command]) + data
+    return b"\x68" + body + bytes([sum8(body)])
+
+
+def rion_angle(angle: float, digits: int = 5, decimals: int = 2) -> bytes:
+    return bytes.fromhex(("1" if angle < 0 else "0") + str(round(abs(angle) * 10**decimals)).zfill(digits))
+
+
+def rion_angles(pitch: float, roll: float, heading: float) -> bytes:
+    return rion(0x84, rion_angle(pitch) + rion_angle(roll) + rion_angle(heading))
+
+
+def rion_long(x: float, y: float, rest: bytes = b"\0\0\0") -> bytes:
+    return rion(0x84, rion_angle(x, 7, 4) + rion_angle(y, 7, 4) + rest)
+
+
+def wit(kind: int, x: int = 0, y: int = 0, z: int = 0, last: int = 2500) -> bytes:
+    body = struct.pack("<BBhhhh", 0x55, kind, x, y, z, last)
+    return body + bytes([sum8(body)])
+
+
+def wit_imu(accel: tuple[int, int, int] = (0, 0, 2048), gyro: tuple[int, int, int] = (1, -2, 3)) -> bytes:
+    return wit(0x51, *accel) + wit(0x52, *gyro)
+
+
+def right_pni_data(data: bytes) -> list[Found]:
+    """Every data frame of a PNI compass whose CRC is right, at whatever offset."""
+    found = []
+    for start in range(len(data) - 4):
+        size = int.from_bytes(data[start : start + 2], "big")
+        if 5 <= size <= 200 and data[start + 2] == 5 and start + size <= len(data):
+            body, crc = data[start : start + size - 2], data[start + size - 2 : start + size]
+            if crc16_xmodem(body) == int.from_bytes(crc, "big"):
+                found.append(Found(start, start + size))
+    return found
+
+
+def right_rion_angles(data: bytes) -> list[Found]:
+    """Every answer with angles whose sum is right and whose digits are digits; of two that overlap the first."""
+    found: list[Found] = []
+    for start in range(len(data) - 13):
+        length = data[start + 1]
+        if data[start] != 0x68 or data[start + 3] != 0x84 or length not in (13, 15):
+            continue
+        if found and start < found[-1].end:
+            continue
+        frame = data[start : start + 1 + length]
+        if len(frame) == 1 + length and sum8(frame[1:-1]) == frame[-1]:
+            digits, each = (frame[4:-1].hex(), 6) if length == 13 else (frame[4:12].hex(), 8)
+            angles = [digits[at : at + each] for at in range(0, len(digits), each)]
+            if digits.isdecimal() and all(map(_can_be, angles, ("01", "01", "0"), (90, 90, 359.99))):
+                found.append(Found(start, start + 1 + length))
+    return found
+
+
+def _can_be(digits: str, signs: str, greatest: float) -> bool:
+    return digits[0] in signs and int(digits[1:4]) + int(digits[4:]) / 10 ** len(digits[4:]) <= greatest
+
+
+def right_wit(data: bytes) -> list[Found]:
+    """Every frame of a WitMotion device whose sum is right and that has another one right behind it."""
+    right = {
+        start
+        for start in range(len(data) - 10)
+        if data[start] == 0x55
+        and 0x50 <= data[start + 1] <= 0x5F
+        and sum8(data[start : start + 10]) == data[start + 10]
+    }
+    return [Found(start, start + 11) for start in sorted(right) if start + 11 in right]

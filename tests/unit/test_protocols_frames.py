@@ -1,8 +1,9 @@
-"""The documented frames, valid and invalid, of the four families."""
+"""The documented frames, valid and invalid, of the families."""
 
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any, get_args
 
@@ -38,8 +39,8 @@ def as_decoded(samples: list[Sample]) -> dict[str, Any]:
                 said |= {"x_deg": sample.x_deg, "y_deg": sample.y_deg}
             case CompassSample():
                 said |= {"heading_deg": sample.heading_deg}
-                if sample.pitch_deg is not None:
-                    said |= {"pitch_deg": sample.pitch_deg, "roll_deg": sample.roll_deg}
+                tilt = {"pitch_deg": sample.pitch_deg, "roll_deg": sample.roll_deg}
+                said |= {key: value for key, value in tilt.items() if value is not None}
             case AttitudeSample():
                 said |= {"yaw_pitch_roll_deg": [sample.yaw_deg, sample.pitch_deg, sample.roll_deg]}
             case MagSample(counts=None):
@@ -50,11 +51,26 @@ def as_decoded(samples: list[Sample]) -> dict[str, Any]:
 
 
 def test_the_document_has_frames_of_all_families_but_our_own() -> None:
-    assert {frame["device"] for frame in FRAMES} == {"hmr3300", "inclinometer_xy", "vectornav"}
+    assert {frame["device"] for frame in FRAMES} == {
+        "hmr3300",
+        "inclinometer_xy",
+        "pni",
+        "rion",
+        "vectornav",
+        "witmotion",
+    }
     assert {frame["valid"] for frame in FRAMES} == {True, False}
 
 
-@pytest.mark.parametrize("frame", FRAMES, ids=name_of)
+TOGETHER = [frame for frame in FRAMES if frame["device"] == "witmotion"]
+"""Its frames are believed only in company: see below."""
+MESSAGES = [frame for frame in FRAMES if "frame_id" in frame["decoded"]]
+"""Right, but no measurements."""
+
+
+@pytest.mark.parametrize(
+    "frame", [frame for frame in FRAMES if frame not in TOGETHER and frame not in MESSAGES], ids=name_of
+)
 def test_a_documented_frame_is_read_as_documented(frame: dict[str, Any]) -> None:
     decoder = make_decoder(KINDS[frame["device"]], frame["device"])
     samples = decoder.feed(bytes_of(frame), 7.0)
@@ -72,10 +88,44 @@ def test_a_documented_frame_is_read_as_documented(frame: dict[str, Any]) -> None
     assert {sample.t_s for sample in samples} == {7.0}
 
 
-@pytest.mark.parametrize("device", ["hmr3300", "inclinometer_xy", "vectornav"])
+@pytest.mark.parametrize("frame", MESSAGES, ids=name_of)
+def test_a_documented_message_is_known_and_no_measurement(frame: dict[str, Any]) -> None:
+    assert frame["valid"]
+    decoder = make_decoder(KINDS[frame["device"]], frame["device"])
+    assert decoder.feed(bytes_of(frame), 7.0) == []
+    reason = "reply" if frame["decoded"]["frame_id"] == 2 else "echo of a command"
+    assert decoder.rejected == {reason: 1}
+    assert (decoder.accepted, decoder.skipped) == (0, 0)
+
+
+def test_documented_frames_of_one_epoch_are_read_as_documented() -> None:
+    accel, gyro, angle = TOGETHER
+    assert all(frame["valid"] for frame in TOGETHER)
+    decoder = make_decoder("imu", "witmotion")
+    imu, tilt = decoder.feed(b"".join(map(bytes_of, [*TOGETHER, accel])), 7.0)
+    assert isinstance(imu, ImuSample)
+    assert isinstance(tilt, TiltSample)
+    assert [x / 9.80665 for x in imu.accel_m_s2] == pytest.approx(accel["decoded"]["accel_g"], abs=5e-5)
+    assert imu.temperature_degc == accel["decoded"]["temperature_degc"]
+    rates_deg_s = [math.degrees(x) for x in imu.gyro_rad_s]
+    assert rates_deg_s == pytest.approx(gyro["decoded"]["gyro_deg_s"], abs=0.031)  # the rounding that it states
+    roll, pitch, _ = angle["decoded"]["roll_pitch_yaw_deg"]
+    assert (tilt.x_deg, -tilt.y_deg) == pytest.approx((roll, pitch), abs=0.003)
+    assert (decoder.accepted, decoder.rejected.total()) == (2, 0)
+
+
+@pytest.mark.parametrize("frame", TOGETHER, ids=name_of)
+def test_a_documented_frame_alone_is_not_believed(frame: dict[str, Any]) -> None:
+    decoder = make_decoder("imu", "witmotion")
+    assert decoder.feed(bytes_of(frame) + bytes(11), 7.0) == []
+    assert decoder.rejected == {"alone": 1}
+
+
+@pytest.mark.parametrize("device", ["hmr3300", "inclinometer_xy", "pni", "rion", "vectornav"])
 def test_an_invalid_frame_does_not_harm_its_neighbours(device: str) -> None:
-    valid = [bytes_of(frame) for frame in FRAMES if frame["device"] == device and frame["valid"]]
-    invalid = [bytes_of(frame) for frame in FRAMES if frame["device"] == device and not frame["valid"]]
+    frames = [frame for frame in FRAMES if frame["device"] == device and frame not in MESSAGES]
+    valid = [bytes_of(frame) for frame in frames if frame["valid"]]
+    invalid = [bytes_of(frame) for frame in frames if not frame["valid"]]
     decoder = make_decoder(KINDS[device], device)
     for good in valid:
         for bad in invalid:

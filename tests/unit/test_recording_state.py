@@ -19,7 +19,10 @@ from companion.recording.state import freeze, from_json, to_json
 from sim.aircraft import VirtualAircraft
 from sim.devices import HMR3300, Gradienter, SerialDevice, VectorNavBinary
 from sim.imu_model import ImuModel
+from sim.pni import PniCompass
+from sim.rion import RionCompass
 from sim.scenario import site_at
+from sim.witmotion import WitMotionImu
 from tests.support.frames import imu_line
 from tests.support.rig import POSE
 from tests.support.still_aircraft import Feeder, imu, settings
@@ -35,6 +38,9 @@ def stream(protocol: str) -> bytes:
             "vectornav": lambda: VectorNavBinary(ImuModel(aircraft, "adis16470", seed=1)),
             "inclinometer_xy": lambda: Gradienter(aircraft, seed=1, law="slope"),
             "hmr3300": lambda: HMR3300(aircraft, seed=1),
+            "pni": lambda: PniCompass(aircraft, seed=1, continuous=True),
+            "rion": lambda: RionCompass(aircraft, seed=1, automatic=True),
+            "witmotion": lambda: WitMotionImu(ImuModel(aircraft, "adis16470", seed=1)),
         }
         device = makers[protocol]()
         device.power_on(0.0)
