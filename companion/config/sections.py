@@ -75,6 +75,8 @@ class Gradienter(Section, frozen=True):
     mounting: Mounting = "ROTATION_NONE"
     offset_deg: tuple[float, float] = (0.0, 0.0)
     sigma_deg: PositiveFloat = 0.05
+    lag_s: Annotated[float, Meta(ge=0, le=60)] | None = None
+    """Time constant of fluid and filters; that of the protocol's device where it is not said."""
 
 
 class Compass(Section, frozen=True):
@@ -88,6 +90,8 @@ class Compass(Section, frozen=True):
     mounting: Mounting = "ROTATION_NONE"
     offset_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
     sigma_deg: PositiveFloat = 3.0
+    lag_s: Annotated[float, Meta(ge=0, le=60)] | None = None
+    """Likewise."""
 
 
 class Calibration(Section, frozen=True):

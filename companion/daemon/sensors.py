@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable
 from typing import Final, Literal
 
 from companion.links.bytestream import ByteLink, PortSettings
 from companion.protocols.registry import PROTOCOLS, make_decoder
 from companion.samples import Sample
+
+logger = logging.getLogger(__name__)
 
 SILENT_AFTER_S: Final = 3.0
 RATE_SPAN_S: Final = 2.0
@@ -39,6 +42,7 @@ class SerialSensor:
         self._last_sample_s: float | None = None
         self._counted = (0.0, 0)
         self._rate_hz = 0.0
+        self._restarts = 0
 
     async def run(self) -> None:
         """Read until cancelled."""
@@ -55,7 +59,10 @@ class SerialSensor:
         """Take bytes that were read at `t_s`."""
         if self.tap is not None:
             self.tap(self.name, data, t_s)
-        samples = self.decoder.feed(data, t_s)
+        samples = self.decoder.receive(data, t_s)
+        if (restarts := self.decoder.times.clock.restarts) != self._restarts:
+            self._restarts = restarts
+            logger.warning("%s: the device restarted, its biases are new ones; measuring afresh", self.name)
         if not samples:
             return
         self._last_sample_s = t_s
@@ -95,4 +102,5 @@ class SerialSensor:
             "frames": self.decoder.accepted,
             "rejected": dict(self.decoder.rejected),
             "reconnects": self.link.reconnects,
+            **self.decoder.times.status(),
         }

@@ -229,7 +229,7 @@ class Replay:
         if raw.data is None:
             decoder.interrupted()
             return
-        for sample in decoder.feed(raw.data, raw.t_s):
+        for sample in decoder.receive(raw.data, raw.t_s):
             self._take_sample(name, sample)
 
     def _take_sample(self, name: str, sample: Sample) -> None:
