@@ -87,7 +87,7 @@ class Decoder(ABC):
         samples = self.feed(data, t_s)
         if self.seconds_per_byte:
             self._check_line(len(data), t_s)
-        return self.times.place(samples, self.frame_bytes * self.seconds_per_byte) if samples else samples
+        return self.times.place(samples, t_s, self.frame_bytes * self.seconds_per_byte) if samples else samples
 
     def _check_line(self, received: int, t_s: float) -> None:
         """Find out whether bytes come faster than the line could carry them: then its line time means nothing."""
@@ -96,6 +96,7 @@ class Decoder(ABC):
             self._ahead_s = max(self._ahead_s, -_STALL_S)
             if self._ahead_s > AHEAD_S:
                 self.seconds_per_byte = 0.0
+                self.times.clock.remap()
         self._read_s = t_s
 
     @abstractmethod

@@ -73,6 +73,10 @@ class DeviceClock:
         self._new_span(arrival_s)
         return arrival_s
 
+    def remap(self) -> None:
+        """The times at which samples arrived so far were wrong."""
+        self._offset_s = math.nan
+
     def host_s(self, raw_s: float, arrival_s: float) -> float | None:
         """The host's time of a device time, at most `arrival_s`, when it had come; None where that cannot be told.
 
@@ -148,11 +152,12 @@ class SampleTimes:
         self._sequence = 0
         self._newest_s = -math.inf
 
-    def place(self, samples: list[Sample], frame_s: float) -> list[Sample]:
+    def place(self, samples: list[Sample], read_s: float, frame_s: float = 0.0) -> list[Sample]:
         """The samples of one feed with their times; those that get none are dropped and counted.
 
         Args:
             samples: in their order, timed when their frame's last byte had come.
+            read_s: when the bytes were read that completed them.
             frame_s: line time of one frame; its sample was taken before its first byte was sent.
         """
         placed: list[Sample] = []
@@ -160,7 +165,7 @@ class SampleTimes:
         for sample in samples:
             at_s = sample.t_s
             if isinstance(sample, ImuSample):
-                found = self._imu(sample, at_s - frame_s)
+                found = self._imu(sample, at_s - frame_s, read_s)
                 if found is None:
                     self.dropped[LATE] += 1
                     continue
@@ -168,7 +173,7 @@ class SampleTimes:
                 # Whatever else the same frame brought was taken at the same time.
                 frame_at_s, frame_t_s = at_s, found.t_s
             else:
-                t_s = frame_t_s if at_s == frame_at_s else self._in_order(at_s - frame_s, at_s)
+                t_s = frame_t_s if at_s == frame_at_s else self._in_order(at_s - frame_s, read_s)
                 placed.append(msgspec.structs.replace(sample, t_s=t_s))
         return placed
 
@@ -180,7 +185,7 @@ class SampleTimes:
             "too_late": self.dropped[LATE],
         }
 
-    def _imu(self, sample: ImuSample, arrival_s: float) -> ImuSample | None:
+    def _imu(self, sample: ImuSample, arrival_s: float, read_s: float) -> ImuSample | None:
         clock, raw_s = self.clock, sample.t_device_s
         restarts = clock.restarts
         device_s: float | None = None
@@ -192,7 +197,7 @@ class SampleTimes:
         if t_s is None:
             return None
         return ImuSample(
-            self._in_order(t_s, sample.t_s),
+            self._in_order(t_s, read_s),
             sample.gyro_rad_s,
             sample.accel_m_s2,
             sample.temperature_degc,

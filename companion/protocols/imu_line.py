@@ -50,7 +50,7 @@ class ImuLineDecoder(Decoder):
                 try:
                     samples.append(_decode(sentence[1:], t_s - self.seconds_per_byte * remaining))
                     self.accepted += 1
-                    self.frame_bytes = len(sentence) + 2
+                    self.frame_bytes = len(sentence) + 1
                 except RejectedError as error:
                     self.rejected[error.reason] += 1
         self._partial = self._last_sentence(partial)

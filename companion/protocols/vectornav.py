@@ -151,7 +151,7 @@ class VectorNavDecoder(Decoder):
         try:
             samples += _decode(buffer[at + 1 : end], self._time_of(origin + end + 1))
             self.accepted += 1
-            self.frame_bytes = end + 2 - at
+            self.frame_bytes = end + 1 - at
         except RejectedError as error:
             self.rejected[error.reason] += 1
         return end
