@@ -268,7 +268,7 @@ class RollingCollector:
         estimates = self._estimate(slots, since_s)
         if isinstance(estimates, CalibrationRefusedError):
             raise estimates
-        if (settling := self._settles(slots)) is not None:
+        if (settling := self._settles(slots, 0)) is not None:
             raise CalibrationRefusedError(settling)
         return Window(
             start_s=float(slots[0]),
@@ -381,20 +381,16 @@ class RollingCollector:
         obstacle = self._obstacle(now_s)
         if obstacle is not None:
             return obstacle
-        if self._stretch.begun:
-            return self._settles(self._slots(None))
-        return f"hold still {self._min_good - self._stretch.good} s more"
+        left_s = 0 if self._stretch.begun else self._min_good - self._stretch.good
+        settling = self._settles(self._slots(None), left_s)
+        if settling is not None or not left_s:
+            return settling
+        return f"hold still {left_s} s more"
 
-    def _settles(self, slots: list[int]) -> str | None:
-        """What the mean of a pose sensor over these seconds has to wait for; only after a movement."""
-        needed = min(MIN_BATCHES, self._min_good, len(slots))
-        for source in (self._tilt, self._heading):
-            if source is None or source.settling is None:
-                continue
-            settled = sum(slot not in source.unsettled for slot in slots)
-            if settled < needed:
-                return f"{source.label} settles: {source.settling.left_s + needed - settled} s more"
-        return None
+    def _settles(self, slots: list[int], left_s: int) -> str | None:
+        needed = min(MIN_BATCHES, self._min_good)
+        lacks = (source.lacks(slots, needed, left_s) for source in (self._tilt, self._heading) if source is not None)
+        return next(filter(None, lacks), None)
 
     def _slots(self, since_s: float | None) -> list[int]:
         start = self._stretch.start
@@ -430,8 +426,7 @@ class RollingCollector:
         )
 
     def _pose_batches(self, source: Source, slots: list[int]) -> list[Batch]:
-        batches = source.batches.batches
-        found = [batches[slot] for slot in slots if slot in batches and slot not in source.unsettled]
+        found = source.settled(slots)
         if not found:
             raise CalibrationRefusedError(f"no reading from {source.label} in {len(slots)} s")
         return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Final, Literal
 
 import msgspec
@@ -88,6 +89,19 @@ class Source:
         elif batch.slot == slot:
             self.verdict = self.gate.judge(batch)
         return self.verdict.still
+
+    def settled(self, slots: Sequence[int]) -> list[Batch]:
+        """Its batches of these seconds that do not follow a movement any more."""
+        batches = self.batches.batches
+        return [batches[slot] for slot in slots if slot in batches and slot not in self.unsettled]
+
+    def lacks(self, slots: Sequence[int], needed: int, left_s: int) -> str | None:
+        """What its mean over these seconds and the next `left_s` has to wait for, after a movement; else None."""
+        unsettled = sum(slot in self.unsettled for slot in slots)
+        needed -= len(slots) - unsettled
+        if self.settling is None or unsettled == 0 or needed <= 0 or self.settling.left_s + needed <= left_s:
+            return None
+        return f"{self.label} settles: {self.settling.left_s + needed} s more"
 
     def silence(self, now_s: float) -> str | None:
         """One line when nothing comes; None when data flows."""
