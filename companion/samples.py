@@ -1,7 +1,8 @@
 """The words for what sensors say: one frozen structure a kind, units in the field names.
 
 `t_s` is the host's monotonic clock (the event loop's `time()`), in seconds, at which the quantity was sampled as
-well as the protocol can tell: the time of the read minus the line time of the bytes that came after the frame.
+well as the protocol can tell: by the device's own clock where it has one, else the time of the read minus the line time
+of the frame and of the bytes that came after it (`protocols.clock`).
 Vectors are in the sensor's own axes until a `mounting` has turned them into the vehicle's FRD.
 """
 
@@ -23,9 +24,11 @@ class ImuSample(msgspec.Struct, frozen=True, gc=False):
     accel_m_s2: Vector
     temperature_degc: float | None = None
     sequence: int | None = None
-    """The device's own counter as it came, not unwrapped; None where the protocol has none."""
+    """The device's own counter, None where the protocol has none; unwrapped by `Decoder.receive`."""
     t_device_s: float | None = None
-    """The device's own clock as it came, not unwrapped; None where the protocol has none."""
+    """The device's own clock, None where the protocol has none; unwrapped by `Decoder.receive`."""
+    restarts: int = 0
+    """How often the device had been seen to restart before: its biases are new ones every time."""
 
 
 class TiltSample(msgspec.Struct, frozen=True, gc=False):

@@ -85,6 +85,8 @@ class BatchSource:
         self.closed_through: int | None = None
         """No batch of this slot or an earlier one will come any more."""
         self.last_s: float | None = None
+        self.lost = 0
+        """Samples that never came, by the device's counter or clock, since the beginning."""
         self.restarts = 0
         """How often the clock went back and everything was dropped."""
         self._limits = np.asarray(limits)
@@ -98,6 +100,7 @@ class BatchSource:
         self._newest = -_MAX_TIME_S
         self._partial = True
         self._backward = 0
+        self._last_stamp = math.nan
         self._clear()
 
     def _clear(self) -> None:
@@ -114,6 +117,7 @@ class BatchSource:
             self.closed_through = self._slot
         # The rest of the running second may still hold what is to be forgotten, so it is skipped.
         self._partial = True
+        self._last_stamp = math.nan
         self._clear()
 
     def add(
@@ -205,6 +209,9 @@ class BatchSource:
         n = len(rows)
         if n == 0:
             return None
+        if stamps is not None:
+            self.lost += _missing(np.append(self._last_stamp, stamps))
+            self._last_stamp = stamps[-1]
         ordered = np.sort(rows, axis=0)
         distinct = 1 + (ordered[1:] != ordered[:-1]).sum(axis=0)
         centre = rows.mean(axis=0)
@@ -222,7 +229,7 @@ class BatchSource:
             distinct=np.asarray(distinct, dtype=np.int64),
             clipped=_clipped(ordered, distinct),
             largest_gap_s=float(gaps.max()),
-            missing=_missing(stamps),
+            missing=None if stamps is None else _missing(stamps),
             temperature_degc=self._temperature_sum / self._temperature_count if self._temperature_count else None,
             counts=None if self.steps is None else _counts(rows, self.steps),
         )
@@ -261,13 +268,11 @@ def _first_of_each(stamps: Floats, rows: Floats) -> NDArray[np.bool_]:
     return np.asarray((original == np.arange(len(stamps))) | (rows != rows[original]).any(axis=1))
 
 
-def _missing(stamps: Floats | None) -> int | None:
+def _missing(stamps: Floats) -> int:
     """Samples that a counter says were lost; a clock in seconds counts in its own steps just as well.
 
-    The step is learned (some devices count at an internal rate), and a wrap, which goes down, is nobody's loss.
+    The step is learned (some devices count at an internal rate), and going down, as after a restart, is nobody's loss.
     """
-    if stamps is None:
-        return None
     steps = np.diff(stamps)
     steps = steps[steps > 0]
     if len(steps) == 0:

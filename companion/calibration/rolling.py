@@ -17,6 +17,7 @@ from companion.calibration.batches import Batch
 from companion.calibration.estimates import Estimates, Found, Work
 from companion.calibration.outlook import Glance, Status
 from companion.calibration.pose_windows import HeadingWindow, TiltWindow, heading_window, tilt_window
+from companion.calibration.settling import AT_ONCE, Lag
 from companion.calibration.sources import Source, SourceStatus, compass_source, gradienter_source, imu_source
 from companion.calibration.stillness import ImuGate, Verdict
 from companion.calibration.stop import Settings, expected_s, is_enough
@@ -59,12 +60,23 @@ class RollingCollector:
         imus: in the order of the result; names are unique.
         gradienter: whether a gradienter is expected.
         compass: whether a compass is expected.
+        gradienter_lag: how the gradienter follows the truth.
+        compass_lag: likewise.
 
     Raises:
         ValueError: two IMUs of one name.
     """
 
-    def __init__(self, settings: Settings, imus: Sequence[ImuInput], *, gradienter: bool, compass: bool) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        imus: Sequence[ImuInput],
+        *,
+        gradienter: bool,
+        compass: bool,
+        gradienter_lag: Lag = AT_ONCE,
+        compass_lag: Lag = AT_ONCE,
+    ) -> None:
         if len({imu.name for imu in imus}) != len(imus):
             raise ValueError("two IMUs have one name")
         self._settings = settings
@@ -73,8 +85,10 @@ class RollingCollector:
         self._keep = self._max_slots + _MARGIN
         self._inputs: dict[str, ImuInput] = {}
         self._imus: dict[str, Source] = {}
-        self._tilt = gradienter_source(self._keep) if gradienter else None
-        self._heading = compass_source(self._keep) if compass else None
+        self._lags = (gradienter_lag, compass_lag)
+        self._tilt = gradienter_source(self._keep, gradienter_lag) if gradienter else None
+        self._heading = compass_source(self._keep, compass_lag) if compass else None
+        self._boots: dict[str, int] = {}
         self._stretch = Stretch(self._min_good, self._max_slots)
         self._next: int | None = None
         self._now_s = -math.inf
@@ -96,6 +110,9 @@ class RollingCollector:
         if source is None:
             self.unknown_samples += 1
             return
+        if sample.restarts != self._boots.get(name, 0):
+            self._boots[name] = sample.restarts
+            self._forget(f"imu {name} restarted", name)
         stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
         row = sample.gyro_rad_s + sample.accel_m_s2
         if source.batches.add(sample.t_s, row, sample.temperature_degc, stamp):
@@ -145,9 +162,9 @@ class RollingCollector:
         """Change which pose sensors are waited for, for example when one is found dead; the IMUs' history stays."""
         added = (gradienter and self._tilt is None) or (compass and self._heading is None)
         if gradienter != (self._tilt is not None):
-            self._tilt = gradienter_source(self._keep) if gradienter else None
+            self._tilt = gradienter_source(self._keep, self._lags[0]) if gradienter else None
         if compass != (self._heading is not None):
-            self._heading = compass_source(self._keep) if compass else None
+            self._heading = compass_source(self._keep, self._lags[1]) if compass else None
         if added:
             self._break()
 
@@ -156,6 +173,9 @@ class RollingCollector:
 
         The second under way is forgotten too. The stretch begins again; learned noise stays.
         """
+        self._forget(why, imu)
+
+    def _forget(self, why: str, imu: str | None) -> None:
         self._restarted_because = why
         for source in self._sources():
             if imu is None or (source.kind == "imu" and source.name == imu):
@@ -248,6 +268,8 @@ class RollingCollector:
         estimates = self._estimate(slots, since_s)
         if isinstance(estimates, CalibrationRefusedError):
             raise estimates
+        if (settling := self._settles(slots, 0)) is not None:
+            raise CalibrationRefusedError(settling)
         return Window(
             start_s=float(slots[0]),
             end_s=slots[-1] + 1.0,
@@ -312,8 +334,10 @@ class RollingCollector:
 
     def _judge(self, slot: int, sources: list[Source]) -> None:
         # Every gate sees every second: one that is skipped learns nothing.
-        verdicts = [source.judge(slot) for source in sources]
-        good = all(verdicts)
+        good, moved = True, False
+        for source in sources:  # the IMUs first: they say whether it moved
+            good = source.judge(slot, moved=moved) and good
+            moved = moved or (source.kind == "imu" and not source.verdict.still and not source.verdict.fault)
         self._trace.add(slot, sources, good=good)
         if not self._stretch.add(slot, good=good):
             self._break()
@@ -330,7 +354,7 @@ class RollingCollector:
                 continue
             if isinstance(source.gate, ImuGate):
                 source.gate.accept(batch, settled=self._stretch.begun)
-            else:
+            elif slot not in source.unsettled:
                 source.gate.accept(batch)
 
     def _obstacle(self, now_s: float) -> str | None:
@@ -355,9 +379,18 @@ class RollingCollector:
 
     def _waiting_for(self, now_s: float) -> str | None:
         obstacle = self._obstacle(now_s)
-        if obstacle is not None or self._stretch.begun:
+        if obstacle is not None:
             return obstacle
-        return f"hold still {self._min_good - self._stretch.good} s more"
+        left_s = 0 if self._stretch.begun else self._min_good - self._stretch.good
+        settling = self._settles(self._slots(None), left_s)
+        if settling is not None or not left_s:
+            return settling
+        return f"hold still {left_s} s more"
+
+    def _settles(self, slots: list[int], left_s: int) -> str | None:
+        needed = min(MIN_BATCHES, self._min_good)
+        lacks = (source.lacks(slots, needed, left_s) for source in (self._tilt, self._heading) if source is not None)
+        return next(filter(None, lacks), None)
 
     def _slots(self, since_s: float | None) -> list[int]:
         start = self._stretch.start
@@ -393,7 +426,7 @@ class RollingCollector:
         )
 
     def _pose_batches(self, source: Source, slots: list[int]) -> list[Batch]:
-        found = [source.batches.batches[slot] for slot in slots if slot in source.batches.batches]
+        found = source.settled(slots)
         if not found:
             raise CalibrationRefusedError(f"no reading from {source.label} in {len(slots)} s")
         return found

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Sequence
 from typing import Final, Literal
 
 import msgspec
@@ -9,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.calibration.batches import Batch, BatchSource
+from companion.calibration.settling import Lag, Settling
 from companion.calibration.stillness import ImuGate, PoseGate, Verdict, compass_gate, gradienter_gate
 
 Kind = Literal["imu", "gradienter", "compass"]
@@ -32,17 +35,30 @@ class SourceStatus(msgspec.Struct, frozen=True, kw_only=True):
     rate_hz: int
     """Samples in its last whole second."""
     dropped: dict[str, int]
+    lost: int
+    """Samples that never came, by the device's counter or clock."""
 
 
 class Source:
     """One stream: its batches, its gate, its last verdict."""
 
-    def __init__(self, kind: Kind, name: str, batches: BatchSource, gate: ImuGate | PoseGate) -> None:
+    def __init__(
+        self,
+        kind: Kind,
+        name: str,
+        batches: BatchSource,
+        gate: ImuGate | PoseGate,
+        settling: Settling | None = None,
+        keep: int = 0,
+    ) -> None:
         self.kind = kind
         self.name = name
         self.batches = batches
         self.gate = gate
+        self.settling = settling
         self.verdict = Verdict(still=False)
+        self.unsettled: deque[int] = deque(maxlen=keep)
+        """Seconds in which its readings still followed a movement; good for the others, not for a mean of its own."""
 
     @property
     def label(self) -> str:
@@ -59,9 +75,13 @@ class Source:
                     break
         return found
 
-    def judge(self, slot: int) -> bool:
-        """Whether this source was still in that second; remembers the verdict."""
+    def judge(self, slot: int, *, moved: bool = False) -> bool:
+        """Whether this source was still in that second, in which by the IMUs the aircraft `moved`; remembers it."""
         batch = self.batch_for(slot)
+        if self.settling is not None:
+            own = batch if batch is not None and batch.slot == slot else None
+            if not self.settling.judge(slot, own, moved=moved):
+                self.unsettled.append(slot)
         if batch is None:
             # Before the first whole second there is nothing to complain about.
             words = f"{self.label} was silent for a second" if self.batches.batches else ""
@@ -69,6 +89,19 @@ class Source:
         elif batch.slot == slot:
             self.verdict = self.gate.judge(batch)
         return self.verdict.still
+
+    def settled(self, slots: Sequence[int]) -> list[Batch]:
+        """Its batches of these seconds that do not follow a movement any more."""
+        batches = self.batches.batches
+        return [batches[slot] for slot in slots if slot in batches and slot not in self.unsettled]
+
+    def lacks(self, slots: Sequence[int], needed: int, left_s: int) -> str | None:
+        """What its mean over these seconds and the next `left_s` has to wait for, after a movement; else None."""
+        unsettled = sum(slot in self.unsettled for slot in slots)
+        needed -= len(slots) - unsettled
+        if self.settling is None or unsettled == 0 or needed <= 0 or self.settling.left_s + needed <= left_s:
+            return None
+        return f"{self.label} settles: {self.settling.left_s + needed} s more"
 
     def silence(self, now_s: float) -> str | None:
         """One line when nothing comes; None when data flows."""
@@ -90,6 +123,7 @@ class Source:
             words=silence or self.verdict.words,
             rate_hz=newest.n if newest is not None and silence is None else 0,
             dropped=dict(self.batches.dropped),
+            lost=self.batches.lost,
         )
 
 
@@ -105,11 +139,13 @@ def integer_batches(steps: NDArray[np.float64], keep: int) -> BatchSource:
     return batches
 
 
-def gradienter_source(keep: int) -> Source:
+def gradienter_source(keep: int, lag: Lag) -> Source:
     """A source of two channels in degrees."""
-    return Source("gradienter", "gradienter", BatchSource(_LIMITS_TILT, keep), gradienter_gate())
+    batches = BatchSource(_LIMITS_TILT, keep)
+    return Source("gradienter", "gradienter", batches, gradienter_gate(), Settling(lag), keep)
 
 
-def compass_source(keep: int) -> Source:
+def compass_source(keep: int, lag: Lag) -> Source:
     """A source of one heading in degrees."""
-    return Source("compass", "compass", BatchSource(_LIMITS_HEADING, keep, circle=True), compass_gate())
+    batches = BatchSource(_LIMITS_HEADING, keep, circle=True)
+    return Source("compass", "compass", batches, compass_gate(), Settling(lag, circle=True), keep)

@@ -86,7 +86,7 @@ def status_lines(status: Object) -> list[str]:
         lines.append(f"recording to {file['path']}: {file['seconds']:.0f} s, {file['bytes'] / 1e6:.1f} MB")
     vehicle = status["vehicle"]
     lines.append(f"autopilot: {vehicle['summary']}")
-    lines += [f"{device['name']}: {device['summary']}" for device in status["devices"]]
+    lines += [f"{device['name']}: {device['summary']}{_counts(device)}" for device in status["devices"]]
     lines += [f"warning: {warning}" for warning in status["warnings"]]
     if not status["ground_stations"]["good"]:
         lines.append(f"ground stations: {status['ground_stations']['summary']}")
@@ -102,6 +102,18 @@ def status_lines(status: Object) -> list[str]:
         lines.append(f"page: {'' if status['page']['good'] else 'none: '}{status['page']['summary']}")
     lines.append(_last_line(status))
     return lines
+
+
+def _counts(device: Object) -> str:
+    """What has happened to a device's samples so far; empty while all is well."""
+    words = {
+        "lost": device.get("lost"),
+        "repeated": (device.get("dropped") or {}).get("repeated"),
+        "too late": device.get("too_late"),
+        "restarts": device.get("restarts"),
+        "clock jumps": device.get("clock_jumps"),
+    }
+    return "".join(f"; {number} {what}" for what, number in words.items() if number)
 
 
 def headline_line(status: Object) -> str:

@@ -79,6 +79,8 @@ class Gradienter(Section, frozen=True):
     sigma_deg: PositiveFloat | None = None
     """That of the protocol's device, else 0.05, where it is not said."""
     read_only: bool = False
+    lag_s: Annotated[float, Meta(ge=0, le=60)] | None = None
+    """Time constant of fluid and filters; that of the protocol's device where it is not said."""
 
 
 class Compass(Section, frozen=True):
@@ -94,6 +96,8 @@ class Compass(Section, frozen=True):
     sigma_deg: PositiveFloat | None = None
     """That of the protocol's device, else 3, where it is not said."""
     read_only: bool = False
+    lag_s: Annotated[float, Meta(ge=0, le=60)] | None = None
+    """Likewise."""
 
 
 class Calibration(Section, frozen=True):

@@ -167,6 +167,8 @@ class Answers:
         still = self._collector.status(now_s)
         age_s = self._vehicle.heartbeat_age_s
         received = self._link.received
+        devices = [device.status() for device in self._devices]
+        counts = {source.name: {"lost": source.lost, "dropped": source.dropped} for source in still.sources}
         return {
             "headline": _plain(self._headlines.now()),
             "state": conductor.state.value,
@@ -192,7 +194,7 @@ class Answers:
             "fault": self._mender.fault,
             "putting_back": self._mender.pending,
             "why_no_undo": self._mender.why_no_undo(),
-            "devices": [device.status() for device in self._devices],
+            "devices": [device | counts.get(str(device["name"]), {}) for device in devices],
             "arming": {
                 **self._readiness.status(),
                 "setup": self._gate_setup.status(),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import datetime
-from typing import Final
+from typing import Final, Literal
 
 from companion.autopilot.imu_stream import StreamKind
 from companion.autopilot.vehicle import Vehicle
 from companion.calibration.allan import noise_profile
 from companion.calibration.rolling import ImuInput, Settings
+from companion.calibration.settling import AT_ONCE, Lag
 from companion.calibration.site import Whereabouts
 from companion.calibration.solve import CompassModel, GradienterModel
 from companion.config import Compass, Config, Gradienter, Imu
@@ -135,6 +136,15 @@ def compass_model(compass: Compass | None) -> CompassModel | None:
         sigma_deg=said_deg or info.sigma_deg or HEADING_SIGMA_DEG,
         tilted_sigma_deg=info.tilted_sigma_deg if said_deg is None else None,
     )
+
+
+def lag(kind: Literal["gradienter", "compass"], device: Gradienter | Compass | None) -> Lag:
+    """How a pose sensor follows the truth: as configured, else as its protocol's device does."""
+    model = gradienter_model(device) if isinstance(device, Gradienter) else compass_model(device)
+    if device is None or model is None:
+        return AT_ONCE
+    lag_s = PROTOCOLS[kind][device.protocol].lag_s if device.lag_s is None else device.lag_s
+    return Lag(lag_s, model.sigma_deg)
 
 
 def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:

@@ -84,6 +84,7 @@ class SensorRole:
             "reconnects": sensor.link.reconnects,
             "words": words,
             "shared_with": others,
+            **sensor.decoder.times.status(),
         }
 
 
@@ -119,6 +120,7 @@ class SerialSensor:
         self._look_at_s = -math.inf
         self._held_by = ""
         self._openings = 0
+        self._restarts = 0
         self._told: set[str] = set()
 
     async def run(self) -> None:
@@ -146,7 +148,10 @@ class SerialSensor:
         """Take bytes that were read at `t_s`."""
         if self.tap is not None:
             self.tap(self.name, data, t_s)
-        samples = self.decoder.feed(data, t_s)
+        samples = self.decoder.receive(data, t_s)
+        if (restarts := self.decoder.times.clock.restarts) != self._restarts:
+            self._restarts = restarts
+            logger.warning("%s: the device restarted, its biases are new ones; measuring afresh", self.link.name)
         if samples:
             self._last_sample_s = t_s
             for sample in samples:

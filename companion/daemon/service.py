@@ -91,6 +91,8 @@ class Service:
             [models.imu_input(imu, None) for imu in config.imu],
             gradienter=config.gradienter is not None,
             compass=config.compass is not None,
+            gradienter_lag=models.lag("gradienter", config.gradienter),
+            compass_lag=models.lag("compass", config.compass),
             message_of=self._message_of,
         )
         self.slots = SlotMemory()

@@ -11,7 +11,13 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from typing import ClassVar
 
+from companion.protocols.clock import SampleTimes
 from companion.samples import Sample
+
+AHEAD_S = 0.5
+"""So far ahead of its line no stream gets: a baud rate then means nothing on that port (USB without a UART)."""
+_STALL_S = 10.0
+"""So long what came may have waited unread."""
 
 CALIBRATING = "calibrating"
 CHECKSUM = "checksum"
@@ -53,8 +59,18 @@ class Decoder(ABC):
         seconds_per_byte: line time of one byte; 0 where unknown (sockets, USB), which leaves the time of the read.
     """
 
+    device_clock_wraps_s: ClassVar[float | None] = None
+    """`ImuSample.t_device_s` starts again at 0 after so long; None where the device has no clock, or it never does."""
+    sequence_modulus: ClassVar[int | None] = None
+    """`ImuSample.sequence` counts modulo this; None where there is none, or it never wraps."""
+
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         self.seconds_per_byte = seconds_per_byte
+        self.times = SampleTimes(self.device_clock_wraps_s, self.sequence_modulus)
+        self.frame_bytes = 0
+        """Of the latest frame that gave samples; 0 where the decoder does not tell."""
+        self._read_s: float | None = None
+        self._ahead_s = 0.0
         self.accepted = 0
         """Frames that gave samples."""
         self.rejected: Counter[str] = Counter()
@@ -64,9 +80,30 @@ class Decoder(ABC):
         self.skipped = 0
         """Bytes passed over that did not look like part of any frame; many of them mean a wrong baud or protocol."""
 
+    def receive(self, data: bytes, t_s: float) -> list[Sample]:
+        """Take the next bytes, read at `t_s` on the host's clock; return the samples that they complete.
+
+        A sample's time is when it was taken, as well as can be told; a counter and a device clock are unwrapped. A
+        sample whose time cannot be told is counted in `times.dropped`.
+        """
+        samples = self.feed(data, t_s)
+        if self.seconds_per_byte:
+            self._check_line(len(data), t_s)
+        return self.times.place(samples, t_s, self.frame_bytes * self.seconds_per_byte) if samples else samples
+
+    def _check_line(self, received: int, t_s: float) -> None:
+        """Find out whether bytes come faster than the line could carry them: then its line time means nothing."""
+        if self._read_s is not None:
+            self._ahead_s += received * self.seconds_per_byte - (t_s - self._read_s)
+            self._ahead_s = max(self._ahead_s, -_STALL_S)
+            if self._ahead_s > AHEAD_S:
+                self.seconds_per_byte = 0.0
+                self.times.clock.remap()
+        self._read_s = t_s
+
     @abstractmethod
     def feed(self, data: bytes, t_s: float) -> list[Sample]:
-        """Take the next bytes, read at `t_s` on the host's clock; return the samples that they complete.
+        """Take the next bytes, read at `t_s` on the host's clock; return the samples that they complete, as they came.
 
         A sample's time is that of its frame's last byte: `t_s` less the line time of what came after it.
         """
@@ -106,6 +143,7 @@ class LineDecoder(Decoder):
             else:
                 if sample is not None:
                     self.accepted += 1
+                    self.frame_bytes = self._frame_bytes(line)
                     samples.append(sample)
         if len(partial) > self.LIMIT:
             partial, self._cut = partial[-self.LIMIT :], True
@@ -116,6 +154,10 @@ class LineDecoder(Decoder):
         if self._partial:
             self.rejected[CUT_SHORT] += 1
         self._partial, self._cut = b"", False
+
+    def _frame_bytes(self, line: bytes) -> int:
+        """Bytes of the frame that ends with this line."""
+        return len(line) + 1
 
     @abstractmethod
     def _line(self, line: bytes, t_s: float, *, cut: bool) -> Sample | None:

@@ -30,6 +30,8 @@ class ImuLineDecoder(Decoder):
 
     LIMIT: ClassVar[int] = 160
     """Bytes of a line from its "$" on; the longest sensible one has some 110."""
+    device_clock_wraps_s: ClassVar[float | None] = 2**32 / 1e6
+    sequence_modulus: ClassVar[int | None] = 2**16
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)
@@ -48,6 +50,7 @@ class ImuLineDecoder(Decoder):
                 try:
                     samples.append(_decode(sentence[1:], t_s - self.seconds_per_byte * remaining))
                     self.accepted += 1
+                    self.frame_bytes = len(sentence) + 1
                 except RejectedError as error:
                     self.rejected[error.reason] += 1
         self._partial = self._last_sentence(partial)

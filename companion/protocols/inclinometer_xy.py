@@ -50,6 +50,7 @@ class InclinometerXyDecoder(LineDecoder):
         super().__init__(seconds_per_byte)
         self._x_deg: float | Literal["spoiled"] | None = None
         """The X that waits for its Y; "spoiled" when it was rejected, and its Y with it."""
+        self._x_bytes = 0
         self._decimals = 0
         self._fewer_running = 0
 
@@ -77,7 +78,12 @@ class InclinometerXyDecoder(LineDecoder):
         if axis == b"Y":
             return self._y(text, t_s)
         self._x(text)
+        self._x_bytes = len(line) + 1
         return None
+
+    def _frame_bytes(self, line: bytes) -> int:
+        """Both lines: a pair is taken together, before the first of them is sent."""
+        return self._x_bytes + len(line) + 1
 
     def _why_no_axis(self, line: bytes, *, cut: bool) -> str:
         if _DAMAGED.search(line):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import binascii
 import re
 from collections import deque
+from typing import ClassVar
 
 from companion.protocols.base import (
     CHECKSUM,
@@ -44,6 +45,8 @@ _REPLIES = frozenset((b"VNRRG", b"VNWRG", b"VNWNV", b"VNRFS", b"VNRST", b"VNTAR"
 
 class VectorNavDecoder(Decoder):
     """VectorNav outputs; gives `ImuSample`, `AttitudeSample` and `MagSample` as far as a frame has them."""
+
+    device_clock_wraps_s: ClassVar[float | None] = 2**64 / 1e9
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)
@@ -123,6 +126,7 @@ class VectorNavDecoder(Decoder):
         try:
             samples += layout.samples(buffer, at, self._time_of(origin + end))
             self.accepted += 1
+            self.frame_bytes = layout.frame_bytes
         except RejectedError as error:
             self.rejected[error.reason] += 1
         return end
@@ -147,6 +151,7 @@ class VectorNavDecoder(Decoder):
         try:
             samples += _decode(buffer[at + 1 : end], self._time_of(origin + end + 1))
             self.accepted += 1
+            self.frame_bytes = end + 1 - at
         except RejectedError as error:
             self.rejected[error.reason] += 1
         return end

@@ -10,6 +10,7 @@ from typing import Final
 from companion.calibration.estimates import Work
 from companion.calibration.outlook import Glance, Status
 from companion.calibration.rolling import ImuInput, RollingCollector, Settings, Window
+from companion.calibration.settling import AT_ONCE, Lag
 from companion.recording.journal import Journal
 from companion.samples import CompassSample, ImuSample, TiltSample
 
@@ -25,6 +26,8 @@ class RecordedCollector(RollingCollector):
         imus: likewise.
         gradienter: likewise.
         compass: likewise.
+        gradienter_lag: likewise.
+        compass_lag: likewise.
         message_of: the autopilot's message that an IMU's samples come in at present; None for one of our own.
     """
 
@@ -37,6 +40,8 @@ class RecordedCollector(RollingCollector):
         *,
         gradienter: bool,
         compass: bool,
+        gradienter_lag: Lag = AT_ONCE,
+        compass_lag: Lag = AT_ONCE,
         message_of: Callable[[str], str | None],
     ) -> None:
         self.journal = Journal()
@@ -44,7 +49,14 @@ class RecordedCollector(RollingCollector):
         """The latest windows of whole stretches, with their numbers."""
         self._message_of = message_of
         self._windows_made = 0
-        super().__init__(settings, imus, gradienter=gradienter, compass=compass)
+        super().__init__(
+            settings,
+            imus,
+            gradienter=gradienter,
+            compass=compass,
+            gradienter_lag=gradienter_lag,
+            compass_lag=compass_lag,
+        )
 
     def number_of(self, window: Window) -> int | None:
         """The number of a window that was made lately."""

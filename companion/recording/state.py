@@ -25,6 +25,7 @@ from companion.calibration.batches import Batch, BatchSource, Counts
 from companion.calibration.estimates import Estimates
 from companion.calibration.pose_windows import HeadingWindow, TiltWindow
 from companion.calibration.rolling import RollingCollector
+from companion.calibration.settling import Lag, Settling
 from companion.calibration.site import Whereabouts
 from companion.calibration.sources import Source
 from companion.calibration.stillness import ImuGate, PoseGate, Verdict
@@ -33,6 +34,7 @@ from companion.calibration.stretch import Stretch
 from companion.calibration.trace import TraceLog
 from companion.calibration.windows import Hidden, ImuInput, ImuWindow, Window
 from companion.errors import StorageError
+from companion.protocols.clock import DeviceClock, SampleTimes
 from companion.protocols.registry import PROTOCOLS
 
 _CHANGING: Final[dict[str, type]] = {
@@ -43,7 +45,10 @@ _CHANGING: Final[dict[str, type]] = {
         BatchSource,
         ImuGate,
         PoseGate,
+        Settling,
         Stretch,
+        DeviceClock,
+        SampleTimes,
         *(info.decoder for kind in PROTOCOLS.values() for info in kind.values()),
     )
 }
@@ -62,6 +67,7 @@ _VALUES: Final[dict[str, type]] = {
         ImuInput,
         ImuParameters,
         ImuWindow,
+        Lag,
         NoiseProfile,
         Rival,
         Settings,

@@ -233,7 +233,7 @@ class Replay:
         if raw.data is None:
             decoder.interrupted()
             return
-        for sample in decoder.feed(raw.data, raw.t_s):
+        for sample in decoder.receive(raw.data, raw.t_s):
             for role, part in parts_of(sample, self._roles[name]):
                 if self._collector is not None:
                     collect(self._collector, role, part)

@@ -1,0 +1,226 @@
+"""When a sample was taken, by the host's clock: what the line, a device's own clock and its counter tell of it.
+
+A read comes late by anything: the frame's way through the line, a USB adapter that hands over every 16 ms, a host that
+was busy for 60 ms. A device's clock knows better, but not what time it is here. Between the two lies an offset, and the
+least delay ever seen tells it best: the running minimum of (read - device), which may creep upwards as fast as two
+crystals drift apart. It is causal, forgives every stall, and leaves only the least delay in, which nobody can see from
+one end (reference: sensors.md 4.4; dawonn/vectornav#88 and ethz-asl's cuckoo_time_translator discuss the choice).
+
+A clock that went back, or that has advanced by far less than the host's, is a device that restarted (its biases are
+new ones) or a clock that was set; either way it is mapped afresh.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Final
+
+import msgspec
+
+from companion.samples import ImuSample, Sample
+
+CREEP: Final = 100e-6
+"""How fast the minimum may rise: two crystals of 50 ppm. A ceramic resonator is followed in steps of `STEP_S`."""
+
+STEP_S: Final = 0.005
+"""If no sample of a whole `SPAN_S` came with less delay than this, the offset itself is another one now."""
+SPAN_S: Final = 1.0
+SPAN_SAMPLES: Final = 5
+
+LATE_S: Final = 1.0
+"""A sample that seems later than this is dropped: as old as that nobody waits for it, or its clock is wrong."""
+
+_WRAP_S: Final = 2.0
+_WRAP_SHARE: Final = 0.01
+_BOOT_S: Final = 2.0
+
+LATE: Final = "late"
+
+
+class DeviceClock:
+    """Maps one device's clock to the host's.
+
+    Args:
+        wraps_s: it starts again at 0 after so long, by its format; None where it never does.
+    """
+
+    def __init__(self, wraps_s: float | None) -> None:
+        self.restarts = 0
+        """How often the device was seen to restart: its clock went back, or counts from a time when nothing was heard.
+        """
+        self.jumps = 0
+        """How often its clock jumped forward, or fell behind without a restart."""
+        self.device_s = 0.0
+        """The clock as of the last sample, unwrapped."""
+        self._wraps_s = wraps_s
+        self._raw_s = math.nan
+        self._arrival_s = math.nan
+        self._offset_s = math.nan
+        self._restarted_in_silence = False
+        self._new_span(math.nan)
+
+    def _new_span(self, arrival_s: float) -> None:
+        self._span_end_s = arrival_s + SPAN_S
+        self._least_s = math.inf
+        self._seen = 0
+
+    def _start(self, raw_s: float, arrival_s: float) -> float:
+        self.device_s = self._raw_s = raw_s
+        self._arrival_s = arrival_s
+        self._offset_s = arrival_s - raw_s
+        self._restarted_in_silence = False
+        self._new_span(arrival_s)
+        return arrival_s
+
+    def remap(self) -> None:
+        """The times at which samples arrived so far were wrong."""
+        self._offset_s = math.nan
+
+    def host_s(self, raw_s: float, arrival_s: float) -> float | None:
+        """The host's time of a device time, at most `arrival_s`, when it had come; None where that cannot be told.
+
+        Both are finite. None lasts as long as samples come `LATE_S` or more after their time: at most `SPAN_S` when it
+        is the clock that has changed, and while there is a backlog otherwise.
+        """
+        if math.isnan(self._offset_s):
+            return self._start(raw_s, arrival_s)
+        elapsed_s = arrival_s - self._arrival_s
+        advance_s = self._advance(raw_s, elapsed_s)
+        if advance_s < 0.0:
+            self.restarts += 1
+            return self._start(raw_s, arrival_s)
+        self.device_s += advance_s
+        self._raw_s, self._arrival_s = raw_s, arrival_s
+        self._offset_s += CREEP * advance_s
+        delay_s = arrival_s - self.device_s - self._offset_s
+        if delay_s < 0.0:
+            self.jumps += delay_s < -LATE_S
+            self._offset_s += delay_s
+            delay_s = 0.0
+        if delay_s <= LATE_S:
+            self._restarted_in_silence = False
+        elif elapsed_s > LATE_S:
+            # It has been up for no longer than nothing was heard of it.
+            self._restarted_in_silence = raw_s <= elapsed_s + _BOOT_S
+        delay_s -= self._stepped(delay_s, arrival_s)
+        return None if delay_s > LATE_S else arrival_s - delay_s
+
+    def _advance(self, raw_s: float, elapsed_s: float) -> float:
+        """How far the clock went on since the last sample; negative: it went back, and not because it wraps."""
+        advance_s = raw_s - self._raw_s
+        if self._wraps_s is None:
+            return advance_s
+        turns = round((elapsed_s - advance_s) / self._wraps_s)
+        if turns > 0:
+            unwrapped_s = advance_s + turns * self._wraps_s
+            if unwrapped_s >= 0.0 and abs(unwrapped_s - elapsed_s) <= _WRAP_S + _WRAP_SHARE * elapsed_s:
+                return unwrapped_s
+        return advance_s
+
+    def _stepped(self, delay_s: float, arrival_s: float) -> float:
+        """By how much the offset has to rise now, which it then does."""
+        self._least_s = min(self._least_s, delay_s)
+        self._seen += 1
+        if arrival_s < self._span_end_s or self._seen < SPAN_SAMPLES:
+            return 0.0
+        least_s = self._least_s
+        self._new_span(arrival_s)
+        if least_s <= STEP_S:
+            return 0.0
+        self._offset_s += least_s
+        if least_s > LATE_S:
+            self.restarts += self._restarted_in_silence
+            self.jumps += not self._restarted_in_silence
+        return least_s
+
+
+class SampleTimes:
+    """Gives the samples of one device their times, and unwraps its counter.
+
+    Args:
+        clock_wraps_s: of the device's clock, as in `DeviceClock`.
+        sequence_modulus: its counter counts modulo this; None where it has none.
+    """
+
+    def __init__(self, clock_wraps_s: float | None = None, sequence_modulus: int | None = None) -> None:
+        self.clock = DeviceClock(clock_wraps_s)
+        self.dropped: Counter[str] = Counter()
+        """Samples that got no time, by reason."""
+        self._modulus = sequence_modulus
+        self._raw_sequence: int | None = None
+        self._sequence = 0
+        self._newest_s = -math.inf
+
+    def place(self, samples: list[Sample], read_s: float, frame_s: float = 0.0) -> list[Sample]:
+        """The samples of one feed with their times; those that get none are dropped and counted.
+
+        Args:
+            samples: in their order, timed when their frame's last byte had come.
+            read_s: when the bytes were read that completed them.
+            frame_s: line time of one frame; its sample was taken before its first byte was sent.
+        """
+        placed: list[Sample] = []
+        frame_at_s, frame_t_s = math.nan, math.nan
+        for sample in samples:
+            at_s = sample.t_s
+            if isinstance(sample, ImuSample):
+                found = self._imu(sample, at_s - frame_s, read_s)
+                if found is None:
+                    self.dropped[LATE] += 1
+                    continue
+                placed.append(found)
+                # Whatever else the same frame brought was taken at the same time.
+                frame_at_s, frame_t_s = at_s, found.t_s
+            else:
+                t_s = frame_t_s if at_s == frame_at_s else self._in_order(at_s - frame_s, read_s)
+                placed.append(msgspec.structs.replace(sample, t_s=t_s))
+        return placed
+
+    def status(self) -> dict[str, object]:
+        """For people: what the device's clock did, and what was dropped for it."""
+        return {
+            "restarts": self.clock.restarts,
+            "clock_jumps": self.clock.jumps,
+            "too_late": self.dropped[LATE],
+        }
+
+    def _imu(self, sample: ImuSample, arrival_s: float, read_s: float) -> ImuSample | None:
+        clock, raw_s = self.clock, sample.t_device_s
+        restarts = clock.restarts
+        device_s: float | None = None
+        t_s: float | None = arrival_s
+        if raw_s is not None and math.isfinite(raw_s):
+            t_s = clock.host_s(raw_s, arrival_s)
+            device_s = clock.device_s
+        sequence = None if sample.sequence is None else self._counted(sample.sequence, clock.restarts > restarts)
+        if t_s is None:
+            return None
+        return ImuSample(
+            self._in_order(t_s, read_s),
+            sample.gyro_rad_s,
+            sample.accel_m_s2,
+            sample.temperature_degc,
+            sequence,
+            device_s,
+            clock.restarts,
+        )
+
+    def _in_order(self, t_s: float, read_s: float) -> float:
+        """A device does not sample backwards; what seems so is the line time of bytes that came faster than that."""
+        if t_s < self._newest_s <= read_s:
+            return self._newest_s
+        self._newest_s = t_s
+        return t_s
+
+    def _counted(self, raw: int, restarted: bool) -> int:  # noqa: FBT001 - one caller
+        """The counter, unwrapped; one that went back counts on by one, so that nothing seems lost."""
+        last, self._raw_sequence = self._raw_sequence, raw
+        if last is None:
+            self._sequence = raw
+        elif self._modulus is None:
+            self._sequence += raw - last if raw >= last else 1
+        else:
+            step = (raw - last) % self._modulus
+            self._sequence += 1 if restarted or step > self._modulus // 2 else step
+        return self._sequence

@@ -1,0 +1,221 @@
+"""A gradienter whose fluid still moves after the aircraft has stopped: against the tilt that it really has."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from companion.calibration.allan import noise_profile
+from companion.calibration.batches import Batch
+from companion.calibration.rolling import RollingCollector, Window
+from companion.calibration.settling import AT_ONCE, UNKNOWN_DEG, Lag, Settling
+from companion.calibration.windows import ImuInput
+from companion.config import Compass
+from companion.config import Gradienter as Section
+from companion.daemon.models import lag
+from companion.errors import CalibrationRefusedError
+from companion.physics.gradienter import attitude_from_readings
+from companion.protocols.registry import PROTOCOLS, make_decoder
+from companion.recording.state import freeze, from_json, to_json
+from companion.samples import ImuSample, TiltSample
+from sim.aircraft import Pose, VirtualAircraft
+from sim.devices import Gradienter, VectorNavBinary
+from sim.imu_model import ImuModel
+from sim.motions import Knock, Motion, Turn
+from sim.scenario import site_at
+from tests.support.still_aircraft import settings
+
+SET_DOWN_S = 12.0
+STEP_S = 0.05
+SIGMA_DEG = 0.005
+
+
+@dataclass
+class Seen:
+    """One aircraft from power-on until `until_s`."""
+
+    windows: list[tuple[float, Window]] = field(default_factory=list)
+    """Whenever there was one, and when."""
+    words: list[str | None] = field(default_factory=list)
+    """What it waited for, twenty times a second."""
+    pitch_deg: float = 0.0
+
+    def error_deg(self, at: int = 0) -> float:
+        """Of the pitch from a window's tilt."""
+        tilt = self.windows[at][1].tilt
+        assert tilt is not None
+        return abs(math.degrees(attitude_from_readings("slope", tilt.x_deg, tilt.y_deg)[0]) - self.pitch_deg)
+
+    def first_after_s(self, since_s: float) -> float:
+        return next(t_s for t_s, _ in self.windows if t_s > since_s) - since_s
+
+
+def fly(motions: list[Motion], *, device_lag_s: float, known: Lag, until_s: float = 60.0, since_s: float = 0.0) -> Seen:
+    """Feed a collector from power-on; windows that began after `since_s` are kept."""
+    aircraft = VirtualAircraft(Pose(1.0, -0.5, 40.0), site_at(40.0, 116.0, 50.0), motions=motions)
+    model = ImuModel(aircraft, "icm42688p", seed=1)
+    devices = {
+        "imu": (VectorNavBinary(model), make_decoder("imu", "vectornav")),
+        "gradienter": (
+            Gradienter(aircraft, seed=1, law="slope", lag_s=device_lag_s),
+            make_decoder("gradienter", "inclinometer_xy"),
+        ),
+    }
+    asked = settings(min_still_s=10.0, max_s=10.0)
+    imu = ImuInput(name="own", rotation=np.eye(3), profile=noise_profile("icm42688p"))
+    collector = RollingCollector(asked, [imu], gradienter=True, compass=False, gradienter_lag=known)
+    seen = Seen()
+    for device, _ in devices.values():
+        device.power_on(0.0)
+    for k in range(1, int(until_s / STEP_S)):
+        t_s = k * STEP_S
+        for device, decoder in devices.values():
+            for frame in device.frames_until(t_s):
+                for sample in decoder.receive(frame.data, frame.complete_s):
+                    if isinstance(sample, ImuSample):
+                        collector.add_imu("own", sample)
+                    elif isinstance(sample, TiltSample):
+                        collector.add_tilt(sample)
+        seen.words.append(collector.status(t_s).waiting_for)
+        try:
+            window = collector.window(t_s)
+        except CalibrationRefusedError:
+            continue
+        if window.start_s >= since_s and (not seen.windows or seen.windows[-1][1].end_s != window.end_s):
+            seen.windows.append((t_s, window))
+    seen.pitch_deg = aircraft.pose_at(until_s).pitch_deg
+    return seen
+
+
+def set_down(device_lag_s: float, known: Lag) -> Seen:
+    """In somebody's hands, then tilted by 5 degrees in 0.8 s, and left alone."""
+    handled = [
+        Turn(start_s=k + 0.15, duration_s=0.8, pitch_deg=-5.0 if k % 2 else 5.0) for k in range(1, int(SET_DOWN_S) - 1)
+    ]
+    last = Turn(start_s=SET_DOWN_S - 0.85, duration_s=0.8, pitch_deg=5.0)
+    return fly([*handled, last], device_lag_s=device_lag_s, known=known, since_s=SET_DOWN_S - 1.0)
+
+
+@pytest.mark.parametrize(
+    ("lag_s", "sigma_deg", "without_deg", "longer_s"),
+    [(0.43, 0.005, 0.0001, 0.0), (1.0, 0.01, 0.0005, 0.0), (3.0, 0.02, 0.03, 10.0)],
+)
+def test_what_the_fluid_leaves_in_the_mean(lag_s: float, sigma_deg: float, without_deg: float, longer_s: float) -> None:
+    without = set_down(lag_s, AT_ONCE)
+    within = set_down(lag_s, Lag(lag_s, sigma_deg))
+    assert without.error_deg() > without_deg
+    assert within.error_deg() < min(0.1 * sigma_deg, 0.5 * without.error_deg())
+    assert within.first_after_s(SET_DOWN_S) <= without.first_after_s(SET_DOWN_S) + longer_s
+    # Never more than a tail's time and the five seconds that a mean takes.
+    bound_s = lag_s * math.log(30.0 * UNKNOWN_DEG / sigma_deg) + 10.0
+    assert within.first_after_s(SET_DOWN_S) < bound_s
+
+
+def test_the_wait_is_told_in_words_and_counts_down_to_nothing() -> None:
+    told = set_down(3.0, Lag(3.0, 0.02)).words
+    lines = [after for before, after in pairwise([None, *told]) if before != after]
+    waits = [line for line in lines if line is not None and "settles" in line]
+    assert re.fullmatch(r"gradienter settles: \d+ s more", waits[0])
+    seconds = [int(line.split()[2]) for line in waits]
+    assert seconds == sorted(seconds, reverse=True)
+    assert 20 < seconds[0] < 30
+    assert seconds[-1] == 1
+    assert lines[lines.index(waits[-1]) + 1 :] == [None]
+
+
+def test_an_aircraft_that_stands_still_waits_no_longer() -> None:
+    at_once = fly([], device_lag_s=0.43, known=AT_ONCE, until_s=20.0)
+    lagging = fly([], device_lag_s=0.43, known=Lag(3.0, SIGMA_DEG), until_s=20.0)
+    assert [t_s for t_s, _ in lagging.windows] == [t_s for t_s, _ in at_once.windows]
+    assert [window for _, window in lagging.windows] == [window for _, window in at_once.windows]
+    assert lagging.words == at_once.words
+
+
+def test_a_knock_in_a_still_stretch_costs_no_more_seconds_than_before() -> None:
+    knock = Knock(start_s=20.3)
+    at_once = fly([knock], device_lag_s=0.43, known=AT_ONCE, until_s=40.0)
+    lagging = fly([knock], device_lag_s=0.43, known=Lag(0.43, SIGMA_DEG), until_s=40.0)
+    assert [t_s for t_s, _ in lagging.windows] == [t_s for t_s, _ in at_once.windows]
+    for (_, one), (_, other) in zip(lagging.windows, at_once.windows, strict=True):
+        assert one.imus == other.imus
+    errors = [lagging.error_deg(k) for k in range(len(lagging.windows))]
+    assert max(errors) < 0.1 * SIGMA_DEG
+
+
+# --- one sensor
+
+
+def batch(slot: int, low: float, high: float, mean: float, n: int = 10) -> Batch:
+    one = np.ones(1)
+    return Batch(
+        slot=slot, n=n, first_s=slot + 0.05, last_s=slot + 0.95, mean=mean * one, variance=0 * one, white=1e-12 * one,
+        low=low * one, high=high * one, distinct=np.array([5]), clipped=False, largest_gap_s=0.1, missing=None,
+        temperature_degc=None,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("lag_s", [0.2, 0.43, 1.0, 3.0])
+@pytest.mark.parametrize("rate_hz", [1, 8, 10])
+@pytest.mark.parametrize("size_deg", [0.05, 1.0, 5.0, 40.0])
+def test_what_is_left_is_below_a_tenth_of_sigma_and_never_long_before(
+    lag_s: float, rate_hz: int, size_deg: float
+) -> None:
+    """Against the exponential itself; the step comes at any time of second 0."""
+    sigma_deg = 0.02
+    for at_s in (0.0, 0.37, 0.9, 0.999):
+        settling = Settling(Lag(lag_s, sigma_deg), circle=True)
+        counts = None
+        for slot in range(120):
+            t_s = slot + (np.arange(rate_hz) + 0.5) / rate_hz
+            off = np.where(t_s < at_s, size_deg, size_deg * np.exp(-np.maximum(t_s - at_s, 0.0) / lag_s))
+            readings = 359.99 + off  # on the circle
+            row = batch(slot, readings.min(), readings.max(), float(np.mod(readings.mean(), 360.0)), rate_hz)
+            if settling.judge(slot, row, moved=slot == 0):
+                counts = slot
+                break
+        assert counts is not None
+        left_deg = size_deg * math.exp(-(counts - at_s) / lag_s)
+        assert left_deg <= 0.1 * sigma_deg * 1.05
+        # Not seconds too late either, where the readings come often enough to tell.
+        if rate_hz > 1:
+            needed_s = at_s + lag_s * math.log(max(size_deg / (0.1 * sigma_deg), 1.0))
+            assert counts <= max(needed_s, 1.0) + 2.0
+
+
+def test_after_a_silence_the_most_is_assumed() -> None:
+    settling = Settling(Lag(0.43, 0.005))
+    settling.judge(0, None, moved=True)
+    counted = [settling.judge(slot, batch(slot, 1.0, 1.0, 1.0), moved=False) for slot in range(1, 8)]
+    n = math.ceil(0.43 * math.log(5.0 / 0.0005))
+    assert n == 4
+    assert counted == [slot > n for slot in range(1, 8)]
+
+
+def test_what_follows_at_once_always_counts() -> None:
+    settling = Settling(AT_ONCE)
+    assert settling.judge(0, batch(0, 0.0, 9.0, 5.0), moved=True)
+
+
+def test_the_protocols_lag_is_the_default_and_the_configuration_comes_first() -> None:
+    gradienter = Section(port="/dev/x", protocol="inclinometer_xy", law="slope", sigma_deg=0.02)
+    assert lag("gradienter", gradienter) == Lag(PROTOCOLS["gradienter"]["inclinometer_xy"].lag_s, 0.02)
+    slow = Section(port="/dev/x", protocol="inclinometer_xy", law="slope", lag_s=2.5)
+    assert lag("gradienter", slow).lag_s == 2.5
+    compass = Compass(port="/dev/x", protocol="hmr3300", lag_s=0.288, sigma_deg=1.5)
+    assert lag("compass", compass) == Lag(0.288, 1.5)
+    assert lag("compass", None).lag_s == 0.0
+
+
+def test_a_recording_that_begins_in_a_tail_goes_on_with_it() -> None:
+    settling = Settling(Lag(0.43, 0.005))
+    settling.judge(0, batch(0, 1.0, 6.0, 2.0), moved=True)
+    again = from_json(to_json(freeze(settling)))
+    for slot in range(1, 8):
+        row = batch(slot, 1.0, 1.0, 1.0)
+        assert again.judge(slot, row, moved=False) == settling.judge(slot, row, moved=False)
+        assert again.left_s == settling.left_s
