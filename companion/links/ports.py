@@ -7,12 +7,15 @@ cannot be pointed elsewhere, and it hides the platform UARTs, among them the Ras
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path("/")
 _TEXT_LIMIT = 80
+_PASSING_NAME = re.compile(r"/dev/tty(?:USB|ACM)\d+$")
+_LASTING_FOLDER = re.compile(r"/dev/serial/by-(?:id|path)/")
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +72,31 @@ def list_ports(root: Path = ROOT) -> list[SerialPort]:
 def find_holders(device: str, root: Path = ROOT) -> tuple[Holder, ...]:
     """Who has a port open, as far as we may look; `device` may be a link."""
     return tuple(_holders_by_device(root).get(_resolve(root, device), ()))
+
+
+def lasting_name(device: str) -> str | None:
+    """The name by which whatever bears a kernel's passing name at present is found after the next plugging.
+
+    None where the name is no passing one, or there is no better (no udev). What stands before /dev is kept.
+    """
+    if _LASTING_FOLDER.search(device):
+        return device
+    if (match := _PASSING_NAME.search(device)) is None:
+        return None
+    root = Path(device[: match.start()] or "/")
+    links = _links_by_device(root).get(_resolve(root, match[0]), [])
+    # Of chips without a serial number only one has the by-id name that all of them claim; a place is one device's.
+    places = [link for link in links if link.startswith("/dev/serial/by-path/")]
+    names = [link for link in links if link.startswith("/dev/serial/by-id/")]
+    serial = _serial_number(root, match[0])
+    best = (names + places) if serial else (places + names)
+    return str(root / best[0].lstrip("/")) if best else None
+
+
+def _serial_number(root: Path, device: str) -> str | None:
+    hardware = (root / "sys/class/tty" / device.rpartition("/")[2] / "device").resolve()
+    usb = _node_with(root, hardware, "idVendor")
+    return _read(usb / "serial") if usb else None
 
 
 def _describe(
