@@ -71,7 +71,7 @@ def list_ports(root: Path = ROOT) -> list[SerialPort]:
 
 def find_holders(device: str, root: Path = ROOT) -> tuple[Holder, ...]:
     """Who has a port open, as far as we may look; `device` may be a link."""
-    return tuple(_holders_by_device(root).get(_resolve(root, device), ()))
+    return tuple(_holders_by_device(root).get(resolve(root, device), ()))
 
 
 def lasting_name(device: str) -> str | None:
@@ -84,7 +84,7 @@ def lasting_name(device: str) -> str | None:
     if (match := _PASSING_NAME.search(device)) is None:
         return None
     root = Path(device[: match.start()] or "/")
-    links = _links_by_device(root).get(_resolve(root, match[0]), [])
+    links = _links_by_device(root).get(resolve(root, match[0]), [])
     # Of chips without a serial number only one has the by-id name that all of them claim; a place is one device's.
     places = [link for link in links if link.startswith("/dev/serial/by-path/")]
     names = [link for link in links if link.startswith("/dev/serial/by-id/")]
@@ -167,12 +167,12 @@ def _links_by_device(root: Path) -> dict[str, list[str]]:
         for entry in _entries(root / folder):
             if entry.is_symlink():
                 name = f"/{folder}/{entry.name}"
-                found.setdefault(_resolve(root, name), []).append(name)
+                found.setdefault(resolve(root, name), []).append(name)
     return found
 
 
-def _resolve(root: Path, name: str) -> str:
-    """Follow a link below `root`, whether it is relative or absolute, and name its end without `root`."""
+def resolve(root: Path, name: str) -> str:
+    """The device that a name leads to, without `root`: links are followed below it, relative and absolute ones."""
     for _ in range(8):
         path = root / name.lstrip("/")
         try:
@@ -204,7 +204,7 @@ def _holders_by_device(root: Path) -> dict[str, list[Holder]]:
 def _consoles(root: Path) -> set[str]:
     words = (_read(root / "proc/cmdline", limit=4096) or "").split()
     names = [word.removeprefix("console=").split(",")[0] for word in words if word.startswith("console=")]
-    return {_resolve(root, f"/dev/{name}") for name in names}
+    return {resolve(root, f"/dev/{name}") for name in names}
 
 
 def _entries(folder: Path) -> Iterator[Path]:
