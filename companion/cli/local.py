@@ -42,7 +42,7 @@ async def ports(options: argparse.Namespace) -> int:
             answer["heard"] = {port: _heard(heard) for port, heard in listened.items()}
         print_json(answer)
         return DONE
-    for line in show.port_lines(found) if listened is None or found else ():
+    for line in () if options.listen else show.port_lines(found):
         print(line)
     for port, heard in (listened or {}).items():
         print("\n".join(show.heard_lines(port, heard)))

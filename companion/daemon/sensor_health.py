@@ -60,6 +60,10 @@ class SensorHealth:
             self._grace_since_s = self._opened_s
         self._renewed = False
         self.stream.opened()
+        timer_ms = self.link.latency_timer_ms
+        if self.kind == "imu" and timer_ms is not None and timer_ms > 1:
+            words = f"its FTDI bridge collects bytes for {timer_ms} ms, samples come in bunches (companion check)"
+            self.stream.events.append(Trouble("slow bridge", words))
 
     def trouble(self, now_s: float) -> Trouble | None:
         """What is wrong with it, worst first; None while good samples come."""

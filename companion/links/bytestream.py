@@ -129,6 +129,11 @@ class ByteLink:
         """Whether the port is open; says nothing of a device that keeps silent."""
         return self._descriptor is not None
 
+    @property
+    def latency_timer_ms(self) -> int | None:
+        """For how long an FTDI bridge collects bytes before it hands them on; None for other ports."""
+        return self._opener.latency_timer_ms
+
     async def run(self) -> None:
         """Keep the port open until cancelled; a loss is an event to report, never an exception."""
         loop = asyncio.get_running_loop()

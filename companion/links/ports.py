@@ -93,8 +93,17 @@ def lasting_name(device: str) -> str | None:
     return str(root / best[0].lstrip("/")) if best else None
 
 
+def latency_timer_ms(device: str, root: Path = ROOT) -> int | None:
+    """For how long the FTDI bridge behind a name collects bytes; None for other ports. `device` may be a link."""
+    return _number(_hardware(root, resolve(root, device)) / "latency_timer", 10)
+
+
+def _hardware(root: Path, device: str) -> Path:
+    return (root / "sys/class/tty" / device.rpartition("/")[2] / "device").resolve()
+
+
 def _serial_number(root: Path, device: str) -> str | None:
-    hardware = (root / "sys/class/tty" / device.rpartition("/")[2] / "device").resolve()
+    hardware = _hardware(root, device)
     usb = _node_with(root, hardware, "idVendor")
     return _read(usb / "serial") if usb else None
 

@@ -19,7 +19,7 @@ import threading
 from typing import Literal
 
 from companion.errors import LinkError
-from companion.links.ports import find_holders, lasting_name
+from companion.links.ports import find_holders, lasting_name, latency_timer_ms
 
 Parity = Literal["none", "even", "odd"]
 
@@ -162,6 +162,8 @@ class SerialOpener:
     def __init__(self, path: str, baud: int, parity: Parity) -> None:
         self._path, self._baud, self._parity = path, baud, parity
         self._thread: threading.Thread | None = None
+        self.latency_timer_ms: int | None = None
+        """Of an FTDI bridge, as it was read back after the last opening; None for other ports."""
         self._known: str | None = None
         self._seen: str | None = None
         self._since_s: float | None = None
@@ -206,7 +208,7 @@ class SerialOpener:
                 raise
             raise LinkError(f"{error}; {instead_of} is another device now") from None
         else:
-            self._seen = attempt.lasting_name
+            self._seen, self.latency_timer_ms = attempt.lasting_name, attempt.latency_timer_ms
             return descriptor
         finally:
             attempt.abandon()
@@ -223,6 +225,7 @@ class _Attempt:
         self._descriptor: int | None = None
         self._error: LinkError | None = None
         self.lasting_name: str | None = None
+        self.latency_timer_ms: int | None = None
 
     def run(self) -> None:
         """Open the port (in the thread)."""
@@ -230,7 +233,7 @@ class _Attempt:
         error: LinkError | None = None
         try:
             descriptor = open_serial(self._path, self._baud, self._parity)
-            self.lasting_name = lasting_name(self._path)
+            self.lasting_name, self.latency_timer_ms = lasting_name(self._path), latency_timer_ms(self._path)
         except LinkError as cause:
             error = cause
         except Exception as cause:  # noqa: BLE001 - a thread that died silently would leave its caller waiting

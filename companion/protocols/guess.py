@@ -24,7 +24,7 @@ _SURE_FRAMES: Final = 4
 _MUCH_TEXT: Final = 0.9
 _CONSOLE: Final = re.compile(rb"\blogin: |\bPassword: |Linux version \d|\[ {0,4}\d+\.\d{6}\] |\bgetty\b")
 _MODEM: Final = re.compile(rb"(?:^|[\r\n])AT(?:[+&^$][A-Z]|[EZVI]\d?[\r\n])")
-_WORDS: Final = re.compile(rb"[ -~]*[A-Za-z]{4}[ -~]*")
+_WORDS: Final = re.compile(rb"[ -~]*[A-Za-z]{3}[ -~]*")
 _NOT_PLAIN: Final = bytes(byte for byte in range(256) if byte not in b"\t\r\n" and not 0x20 <= byte < 0x7F)
 _MAVLINK_OVERHEAD: Final = {0xFD: 12, 0xFE: 8}
 _MAVLINK_RUN: Final = 4
