@@ -8,6 +8,7 @@ import errno
 import fcntl
 import os
 import select
+import termios
 import tty
 from pathlib import Path
 from types import TracebackType
@@ -15,6 +16,7 @@ from typing import Self
 
 from sim.aircraft import VirtualAircraft
 from sim.devices import SerialDevice
+from sim.uart import Parity, Setting, heard
 
 _SHORTEST_SLEEP_S = 0.001
 
@@ -28,8 +30,10 @@ class PtyDevice:
     Use: `async with PtyDevice(HMR3300(aircraft), directory / "compass") as device: ...`
     """
 
-    def __init__(self, device: SerialDevice, path: Path) -> None:
-        self.device, self.path = device, path
+    def __init__(self, device: SerialDevice, path: Path, *, line: Setting | None = None) -> None:
+        self.device, self.path, self.line = device, path, line
+        """`line`: how the device's own UART is set; a reader at another speed or parity reads what a UART makes of it.
+        None: bytes pass as they are, whatever the reader believes."""
         self.frames_sent = 0
         self.bytes_dropped = 0
         self.muted = False
@@ -135,6 +139,8 @@ class PtyDevice:
         if self._master is None or self.muted or not self.opened:
             self.bytes_dropped += len(data)
             return
+        if self.line is not None:
+            data = heard(data, self.line, reader_setting(self._master))
         try:
             written = os.write(self._master, data)
         except BlockingIOError:
@@ -153,3 +159,19 @@ class PtyDevice:
             return
         if data:
             self._write(self.device.command(data, now_s))
+
+
+def reader_setting(master: int) -> Setting:
+    """How whoever has the other end of a pseudo-terminal open has set it.
+
+    A pseudo-terminal forgets PARENB, but not whether parity is to be checked, nor which.
+    """
+    flags_in, _, flags, *_ = termios.tcgetattr(master)
+    parity: Parity = "none"
+    if flags_in & termios.INPCK:
+        parity = "odd" if flags & termios.PARODD else "even"
+    speed = termios.tcgetattr(master)[5]
+    return Setting(_BAUDS.get(speed, 9600), parity)
+
+
+_BAUDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdecimal()}

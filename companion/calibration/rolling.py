@@ -278,6 +278,11 @@ class RollingCollector:
             heading=heading_window(self._pose_batches(self._heading, slots)) if self._heading else None,
         )
 
+    def imu_seconds(self) -> dict[str, Batch]:
+        """The last whole second of each IMU that has one, still or not."""
+        newest = {name: next(reversed(source.batches.batches.values()), None) for name, source in self._imus.items()}
+        return {name: batch for name, batch in newest.items() if batch is not None}
+
     def snapshot(self, started_s: float, measured_s: tuple[float, float] | None) -> Snapshot:
         """What was seen since `started_s`, or since the window `measured_s` (start, end) began; cheap."""
         return self._trace.snapshot(self._inputs, started_s, measured_s)

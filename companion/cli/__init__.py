@@ -101,7 +101,14 @@ def _parser() -> Parser:
     run.add_argument("-v", "--verbose", action="store_true", help="log what happens in detail")
     check = add("check", local.check, "check configuration, ports, sensors and autopilot; say what is wrong")
     check.add_argument("--seconds", type=seconds, default=3.0, metavar="S", help="how long to listen (default 3)")
-    add("ports", local.ports, "list serial ports with their stable names")
+    ports = add("ports", local.ports, "list serial ports with their stable names")
+    ports.add_argument(
+        "--listen",
+        nargs="*",
+        metavar="PORT",
+        help="tell who speaks on these ports (default: all that nobody holds) by listening at the usual speeds, up to"
+        " half a minute; not a byte is sent, but opening a port raises DTR, which starts an Arduino anew",
+    )
     add(
         "lua",
         local.lua,

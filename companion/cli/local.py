@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
 import dataclasses
 import faulthandler
 import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from companion.cli import DONE, FAILED, config_path, load_config, logs, print_json, show
-from companion.errors import CompanionError
+from companion.errors import CompanionError, LinkError
+
+if TYPE_CHECKING:
+    from companion.links.listening import Heard
+    from companion.links.ports import SerialPort
 
 
 async def run(options: argparse.Namespace) -> int:
@@ -24,16 +31,54 @@ async def run(options: argparse.Namespace) -> int:
 
 
 async def ports(options: argparse.Namespace) -> int:
-    """`companion ports`."""
+    """`companion ports`: listed; listened to only when that is asked for."""
     from companion.links.ports import list_ports
 
     found = list_ports()
+    listened = None if options.listen is None else await _listen(options.listen, found)
     if getattr(options, "json", False):
-        print_json({"ports": [dataclasses.asdict(port) for port in found]})
+        answer: dict[str, object] = {"ports": [dataclasses.asdict(port) for port in found]}
+        if listened is not None:
+            answer["heard"] = {port: _heard(heard) for port, heard in listened.items()}
+        print_json(answer)
         return DONE
-    for line in show.port_lines(found):
+    for line in () if options.listen else show.port_lines(found):
         print(line)
+    for port, heard in (listened or {}).items():
+        print("\n".join(show.heard_lines(port, heard)))
     return DONE
+
+
+async def _listen(wanted: Sequence[str], found: Sequence[SerialPort]) -> dict[str, Heard | str]:
+    """Who speaks on each port, or why that is not known."""
+    from companion.links.listening import listen
+
+    async def one(port: str) -> Heard | str:
+        try:
+            return await listen(port)
+        except LinkError as error:
+            return str(error)
+
+    names = list(wanted) or [port.stable_name or port.device for port in found]
+    if names:
+        print(f"listening to {', '.join(names)}: up to half a minute", file=sys.stderr, flush=True)
+    return dict(zip(names, await asyncio.gather(*map(one, names)), strict=True))
+
+
+def _heard(heard: Heard | str) -> dict[str, object]:
+    if isinstance(heard, str):
+        return {"good": False, "reason": heard}
+    candidate, line = heard.candidate, heard.line
+    return {
+        "good": candidate is not None,
+        "baud": line.baud if line is not None else None,
+        "parity": line.parity if line is not None else None,
+        "protocol": candidate.protocol if candidate is not None else None,
+        "kinds": list(candidate.kinds) if candidate is not None else [],
+        "frames": candidate.accepted if candidate is not None else 0,
+        "stranger": heard.stranger,
+        "bytes": heard.bytes_heard,
+    }
 
 
 async def lua(options: argparse.Namespace) -> int:

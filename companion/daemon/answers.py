@@ -75,13 +75,14 @@ class Answers:
         recorder: Recorder,
         link: MavlinkLink,
         pose: PoseNow,
+        trouble: Callable[[], str | None],
     ) -> None:
         self._conductor, self._vehicle, self._collector, self._devices = conductor, vehicle, collector, devices
         self._store, self._offload, self._mavlink_url = store, offload, mavlink_url
         self._rivalry, self._reach, self._mender, self._readiness = rivalry, reach, mender, readiness
         self._armings, self._gate_setup, self._automatic = armings, gate_setup, automatic
         self._recorder, self._link, self._pose = recorder, link, pose
-        self._headlines = Headlines(vehicle, collector, conductor, mender, readiness, automatic, mavlink_url)
+        self._headlines = Headlines(vehicle, collector, conductor, mender, readiness, automatic, mavlink_url, trouble)
         self.page: Callable[[], Object | None] = lambda: None
         """What is to be said of the page; None where none is configured."""
         self.mqtt: Callable[[], Object] = dict

@@ -5,12 +5,14 @@ With a daemon running the ports are its, so it is asked; otherwise every port is
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import os
 from pathlib import Path
 
 from companion.config import Config
-from companion.daemon.control import Object, ask
+from companion.daemon.control import Object, ask, process_behind
+from companion.daemon.doctor import Diagnosis, sensor_findings, system_findings
 from companion.daemon.models import doubtful, not_in_this_version
 from companion.daemon.service import Service
 from companion.errors import DaemonDeniedError, DaemonUnreachableError
@@ -23,6 +25,10 @@ class Finding:
     name: str
     good: bool
     words: str
+    remedy: str = ""
+    """What to type, or to write into the configuration, where that can be said."""
+    port: str = ""
+    """Which port it is about."""
 
 
 async def run_check(config: Config, seconds: float) -> list[Finding]:
@@ -33,6 +39,7 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
     """
     findings = [Finding("configuration", good=True, words="understood")]
     status: Object | None = None
+    ours = {os.getpid()}
     try:
         async for reply in ask(config.control.path, {"command": "status"}):
             status = reply.get("status")
@@ -40,7 +47,9 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
         raise  # its ports are in use: opening them would only find that
     except DaemonUnreachableError:
         pass
+    is_running = status is not None
     if status is not None:
+        ours |= await asyncio.to_thread(process_behind, config.control.path)
         fault = status["fault"]
         findings.append(Finding("daemon", good=fault is None, words=fault or f"running, {status['state']}"))
     else:
@@ -52,6 +61,9 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
     vehicle = status["vehicle"]
     findings.append(Finding("autopilot", good=vehicle["system_id"] is not None, words=vehicle["summary"]))
     findings += [Finding(device["name"], device["good"], device["summary"]) for device in status["devices"]]
+    diagnoses = await asyncio.to_thread(system_findings, config, list(ours))
+    diagnoses += await sensor_findings(config, status, may_listen=not is_running)
+    findings += map(_found, diagnoses)
     findings += [Finding("warning", good=True, words=words) for words in status["warnings"]]
     ground = status["ground_stations"]
     findings.append(Finding("ground stations", good=ground["good"], words=ground["summary"]))
@@ -64,6 +76,10 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
             without = {"gradienter": "gyros only", "compass": "gyro sigma widened by the Earth's rate"}[kind]
             findings.append(Finding(kind, good=True, words=f"not configured: {without}"))
     return findings
+
+
+def _found(diagnosis: Diagnosis) -> Finding:
+    return Finding(diagnosis.name, diagnosis.good, diagnosis.words, diagnosis.remedy, diagnosis.port)
 
 
 def _gate(config: Config, setup: Object) -> Finding:

@@ -17,6 +17,7 @@ import logging
 import os
 import socket
 import stat
+import struct
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any, Final, Self
@@ -175,6 +176,18 @@ def _remove_stale(path: Path) -> None:
         raise LinkError(f"control socket {path}: another companion is running (see: companion status)")
     finally:
         probe.close()
+
+
+def process_behind(path: Path) -> set[int]:
+    """The process that listens on a control socket; empty where nobody does, or it is not ours to ask."""
+    try:
+        with socket.socket(socket.AF_UNIX) as asking:
+            asking.settimeout(1.0)
+            asking.connect(str(path))
+            credentials = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    except OSError:
+        return set()
+    return {struct.unpack("3i", credentials)[0]}
 
 
 async def ask(path: Path, request: Object) -> AsyncIterator[Object]:

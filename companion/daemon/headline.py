@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import math
 import re
+from collections.abc import Callable
 from typing import Final, Literal
 
 import msgspec
@@ -56,9 +57,12 @@ class Headlines:
         readiness: Readiness,
         automatic: Automatic,
         mavlink_url: str,
+        trouble: Callable[[], str | None],
     ) -> None:
         self._vehicle, self._collector, self._conductor, self._mender = vehicle, collector, conductor, mender
         self._readiness, self._automatic, self._mavlink_url = readiness, automatic, mavlink_url
+        self._trouble = trouble
+        """What is wrong with one of our own sensors, and with which; None while all do well."""
 
     def now(self) -> Headline:
         """The headline of this moment."""
@@ -132,7 +136,8 @@ class Headlines:
             return self._failed() or Headline("NOT CALIBRATED", f"{words}: {todo}" if todo != words else words, "bad")
         glance = self._collector.glance(now_s)
         if glance.obstacle is not None and not glance.moving:
-            return Headline("NOT CALIBRATED", glance.obstacle, "bad")
+            # The sensor's own trouble says what to do; that nothing comes from it is only what follows.
+            return Headline("NOT CALIBRATED", self._trouble() or glance.obstacle, "bad")
         if glance.obstacle is not None:
             return _hold_still(glance.obstacle) or Headline("HOLD STILL", glance.obstacle, "wait")
         left_s = self._readiness.until_calibrated_s(now_s)

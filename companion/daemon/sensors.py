@@ -10,15 +10,17 @@ from collections.abc import Callable
 from typing import Final
 
 from companion.daemon.ledger import Offload
+from companion.daemon.sensor_health import SensorHealth
 from companion.daemon.serial_devices import Role, SerialDevice, parts_of
+from companion.links.budget import Budget
 from companion.links.bytestream import ByteLink, PortSettings
 from companion.links.ports import find_holders
 from companion.protocols.registry import Kind
 from companion.protocols.roles import Part
+from companion.protocols.stream_health import SILENT_AFTER_S
 
 logger = logging.getLogger(__name__)
 
-SILENT_AFTER_S: Final = 3.0
 RATE_SPAN_S: Final = 2.0
 TICK_S: Final = 0.02
 """Between two things that are said, and between two looks while a conversation goes on."""
@@ -85,6 +87,7 @@ class SensorRole:
             "words": words,
             "shared_with": others,
             **sensor.decoder.times.status(),
+            **sensor.health.status(),
         }
 
 
@@ -108,12 +111,16 @@ class SerialSensor:
         # Whoever is only read is not even thought about: without a dialogue there is nothing that could be sent.
         self.dialogue = None if device.read_only or device.info.dialogue is None else device.info.dialogue()
         name = ", ".join(role.name for role in device.roles)
-        self.link = ByteLink(settings, self.receive, name=name, on_state=self._on_state)
+        self.link = ByteLink(settings, self.receive, name=name, on_state=self._on_state, budget=Budget())
+        self.link.on_gap = self._on_gap
+        self.kinds = frozenset(role.kind for role in device.roles)
+        self.health = SensorHealth(
+            self.link, device.roles[0].kind, self.protocol, self.decoder, polled=self.dialogue is not None
+        )
         self.tap: Callable[[str, bytes | None, float], object] | None = None
         """Called with (name, bytes, time) before they are decoded; without bytes: some are missing."""
         self._take, self._offload = take, offload
         self._by_role = dict(zip(device.roles, self.roles, strict=True))
-        self._last_sample_s: float | None = None
         self._spoke_s = -math.inf
         self._alone = False
         """Nobody else has the port open, as far as can be seen."""
@@ -139,10 +146,17 @@ class SerialSensor:
             if self.tap is not None:
                 self.tap(self.name, None, now_s)
             self.decoder.interrupted()
+            self.health.opened()
             self._openings += 1
             self._alone, self._look_at_s = False, -math.inf
             if self.dialogue is not None:
                 self.dialogue.opened(now_s)
+
+    def _on_gap(self) -> None:
+        """Bytes are missing from here on."""
+        if self.tap is not None:
+            self.tap(self.name, None, asyncio.get_running_loop().time())
+        self.decoder.interrupted()
 
     def receive(self, data: bytes, t_s: float) -> None:
         """Take bytes that were read at `t_s`."""
@@ -152,8 +166,8 @@ class SerialSensor:
         if (restarts := self.decoder.times.clock.restarts) != self._restarts:
             self._restarts = restarts
             logger.warning("%s: the device restarted, its biases are new ones; measuring afresh", self.link.name)
+        self.health.stream.took(data, samples, t_s)
         if samples:
-            self._last_sample_s = t_s
             for sample in samples:
                 for role, part in parts_of(sample, self.device.roles):
                     self._by_role[role].count(t_s)
@@ -218,15 +232,4 @@ class SerialSensor:
     @property
     def problem(self) -> str | None:
         """What is wrong with the device in one line, or None while samples come."""
-        now_s = asyncio.get_running_loop().time()
-        if not self.link.connected:
-            return self.link.last_error or f"{self.link.settings.url}: not open yet"
-        if self._last_sample_s is not None and now_s - self._last_sample_s < SILENT_AFTER_S:
-            return None
-        if self.link.last_byte_s is None or now_s - self.link.last_byte_s >= SILENT_AFTER_S:
-            return f"{self.line}: silent (power? wiring? told to stop?)"
-        rejected = ", ".join(f"{count} {reason}" for reason, count in self.decoder.rejected.most_common(3))
-        return (
-            f"{self.line}: bytes come, but no {self.protocol} frames ({rejected or 'none begun'});"
-            " wrong baud or protocol?"
-        )
+        return self.health.words(asyncio.get_running_loop().time())

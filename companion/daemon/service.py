@@ -43,6 +43,7 @@ from companion.daemon.readiness import Readiness
 from companion.daemon.reboot import Reboot
 from companion.daemon.recorder import Recorder
 from companion.daemon.rivalry import Rivalry
+from companion.daemon.sensor_watch import SensorWatch
 from companion.daemon.sensors import SerialSensor
 from companion.daemon.serial_devices import Role, collect, serial_devices
 from companion.links.mavlink import MavlinkLink
@@ -99,6 +100,7 @@ class Service:
         self._imu_rate_hz = models.imu_rate_hz(config) if imu_rate_hz is None else imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
         self.sensors = [SerialSensor(device, self._take, offload) for device in serial_devices(config)]
+        self.sensor_watch = SensorWatch(self.sensors, self.collector)
         self.recorder = Recorder(
             config, self.collector, self.link, self.vehicle, self.imus.values(), self.sensors, offload
         )
@@ -179,6 +181,7 @@ class Service:
             recorder=self.recorder,
             link=self.link,
             pose=self.pose,
+            trouble=self.sensor_watch.worst,
         )
         self.mqtt = self._mqtt_face(offload)
         self.page = self._page(offload)
@@ -301,6 +304,8 @@ class Service:
                         group.create_task(imu.run(), name=imu.name)
                     for sensor in self.sensors if ports else ():
                         group.create_task(sensor.run(), name=sensor.name)
+                    if ports:
+                        group.create_task(self.sensor_watch.run(), name="sensor watch")
                     await asyncio.get_running_loop().create_future()
                 finally:
                     # Before the links go: a write under way needs them to come to its end.
@@ -314,7 +319,7 @@ class Service:
         self.conductor.only_listening = "only a check is running: start companion run"
         running = [self.component.run(), run_transport(self.link, self.config.mavlink.url)]
         running += [self.reach.run(), self.gate_setup.run(), *(imu.run() for imu in self.imus.values())]
-        running += [sensor.run() for sensor in self.sensors]
+        running += [*(sensor.run() for sensor in self.sensors), self.sensor_watch.run()]
         if self.mqtt is not None:
             self.mqtt.only_listening = True
             running.append(self.mqtt.run())

@@ -18,6 +18,7 @@ from urllib.parse import urlsplit
 
 from companion.errors import LinkError
 from companion.links.backoff import Backoff
+from companion.links.budget import Budget
 from companion.links.serial_port import SerialOpener, close_serial
 
 logger = logging.getLogger(__name__)
@@ -26,10 +27,17 @@ READ_BYTES = 4096
 """As much as a tty buffers: one wake-up empties the port, so one time stamp holds for all that it brought."""
 OUT_BUFFER_BYTES = 16384
 """Over a second at 115200 baud; what waits longer than that is better dropped than sent."""
-CONNECT_DEADLINE_S = 5.0
+CONNECT_DEADLINE_S = 2.0
+"""The kernel asks at once and after a second; a host that has come back is asked again within 2 s of that."""
+LONGEST_PAUSE_S = 1.0
+"""Between two attempts: whatever has come back is open again within 3 s, the opening itself included."""
 BEAT_S = 1.0
 BEAT_WITHIN_S = 8.0
 """An open that takes all the time it may, and the longest pause after it."""
+PAUSE_S = 0.05
+DISCARD_BYTES = 65536
+DISCARD_READS = 16
+"""After a pause so much is thrown away at the most, a millisecond's work; the rest waits in the kernel, not here."""
 WORTH_S = 2.0
 """A connection that lived this long, or that brought bytes, starts the back-off afresh."""
 
@@ -85,9 +93,14 @@ class ByteLink:
         *,
         name: str,
         on_state: Callable[[bool, str], None] | None = None,
+        budget: Budget | None = None,
     ) -> None:
         self.settings = settings
         self.name = name
+        self.budget = budget
+        """How much is taken in; None: whatever comes. What comes beyond it is thrown away unread."""
+        self.on_gap: Callable[[], None] = lambda: None
+        """Called when bytes were thrown away between the last ones and the next ones."""
         self.last_error = ""
         """Why the port is, or last was, not open; one line for people."""
         self.bytes_received = 0
@@ -104,8 +117,10 @@ class ByteLink:
         self._lost: asyncio.Future[str] | None = None
         self._out = bytearray()
         self._opener = SerialOpener(settings.url, settings.baud, settings.parity)
-        self._backoff = Backoff()
+        self._backoff = Backoff(cap_s=LONGEST_PAUSE_S)
         self._warned = False
+        self._quiet = False
+        self._paused: asyncio.TimerHandle | None = None
         self._opened_before = False
         self._said: tuple[bool, str] | None = None
 
@@ -113,6 +128,11 @@ class ByteLink:
     def connected(self) -> bool:
         """Whether the port is open; says nothing of a device that keeps silent."""
         return self._descriptor is not None
+
+    @property
+    def latency_timer_ms(self) -> int | None:
+        """For how long an FTDI bridge collects bytes before it hands them on; None for other ports."""
+        return self._opener.latency_timer_ms
 
     async def run(self) -> None:
         """Keep the port open until cancelled; a loss is an event to report, never an exception."""
@@ -129,7 +149,7 @@ class ByteLink:
                     self._lost = loop.create_future()
                     self._attach(loop, descriptor)
                     reason = await self._until_lost(self._lost)
-                    if self.bytes_received > before or loop.time() - since_s >= WORTH_S:
+                    if self.bytes_received > before or loop.time() - since_s >= WORTH_S or self._quiet:
                         self._backoff.reset()
                     self._report_down(reason)
                 await asyncio.sleep(self._backoff.next_s())
@@ -137,6 +157,16 @@ class ByteLink:
             if self._descriptor is not None:
                 self._close()
                 self._say(connected=False, reason="stopped")
+
+    def confirm(self) -> None:
+        """What is open is the right device: after a loss it is looked for by its lasting name first."""
+        self._opener.confirm()
+
+    def renew(self, reason: str) -> None:
+        """Open it anew: a peer that vanished without a word keeps its connection open for ever. Not worth a warning."""
+        if self._descriptor is not None:
+            self._quiet = True
+            self._lose(f"{self.settings.url}: {reason}")
 
     def write(self, data: bytes) -> bool:
         """Send, or keep in the bounded out-buffer; False when closed or full: then nothing of `data` is sent."""
@@ -166,8 +196,9 @@ class ByteLink:
             self.reconnects += 1
         self._opened_before = True
         loop.add_reader(descriptor, self._readable)
-        logger.info("%s: %s is %s", self.name, self.settings.url, "back" if self._warned else "open")
-        self._warned = False
+        level = logging.DEBUG if self._quiet else logging.INFO
+        logger.log(level, "%s: %s is %s", self.name, self.settings.url, "back" if self._warned else "open")
+        self._warned = self._quiet = False
         self._say(connected=True, reason=f"{self.settings.url} is open")
 
     def _readable(self) -> None:
@@ -187,7 +218,34 @@ class ByteLink:
             return
         self.bytes_received += len(data)
         self.last_byte_s = now_s
+        if self.budget is not None and not self.budget.take(len(data), now_s):
+            self._pause()
         self._on_bytes(data, now_s)
+
+    def _pause(self) -> None:
+        """Leave the port alone for a moment: whatever it sends, the others on this loop have their turn."""
+        loop = asyncio.get_running_loop()
+        assert self._descriptor is not None
+        loop.remove_reader(self._descriptor)
+        self._paused = loop.call_later(PAUSE_S, self._resume)
+
+    def _resume(self) -> None:
+        self._paused = None
+        if self._descriptor is None or self.budget is None:
+            return
+        loop = asyncio.get_running_loop()
+        try:
+            for _ in range(DISCARD_READS):
+                data = os.read(self._descriptor, DISCARD_BYTES)
+                if not data:
+                    break  # the reader will find it, and what it means
+                self.bytes_received += len(data)
+                self.budget.discarded += len(data)
+                self.last_byte_s = loop.time()
+        except OSError:
+            pass  # empty, or gone: the reader will find it
+        self.on_gap()
+        loop.add_reader(self._descriptor, self._readable)
 
     def _flush(self) -> None:
         if self._descriptor is None:
@@ -225,14 +283,17 @@ class ByteLink:
         if descriptor is None:
             return
         loop = asyncio.get_running_loop()
+        if self._paused is not None:
+            self._paused.cancel()
+            self._paused = None
         loop.remove_reader(descriptor)
         loop.remove_writer(descriptor)
         close_serial(descriptor)
 
     def _report_down(self, reason: str) -> None:
         self.last_error = reason
-        logger.log(logging.DEBUG if self._warned else logging.WARNING, "%s: %s", self.name, reason)
-        self._warned = True
+        logger.log(logging.DEBUG if self._warned or self._quiet else logging.WARNING, "%s: %s", self.name, reason)
+        self._warned = self._warned or not self._quiet
         self._say(connected=False, reason=reason)
 
     def _say(self, *, connected: bool, reason: str) -> None:

@@ -7,12 +7,15 @@ cannot be pointed elsewhere, and it hides the platform UARTs, among them the Ras
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path("/")
 _TEXT_LIMIT = 80
+_PASSING_NAME = re.compile(r"/dev/tty(?:USB|ACM)\d+$")
+_LASTING_FOLDER = re.compile(r"/dev/serial/by-(?:id|path)/")
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +71,41 @@ def list_ports(root: Path = ROOT) -> list[SerialPort]:
 
 def find_holders(device: str, root: Path = ROOT) -> tuple[Holder, ...]:
     """Who has a port open, as far as we may look; `device` may be a link."""
-    return tuple(_holders_by_device(root).get(_resolve(root, device), ()))
+    return tuple(_holders_by_device(root).get(resolve(root, device), ()))
+
+
+def lasting_name(device: str) -> str | None:
+    """The name by which whatever bears a kernel's passing name at present is found after the next plugging.
+
+    None where the name is no passing one, or there is no better (no udev). What stands before /dev is kept.
+    """
+    if _LASTING_FOLDER.search(device):
+        return device
+    if (match := _PASSING_NAME.search(device)) is None:
+        return None
+    root = Path(device[: match.start()] or "/")
+    links = _links_by_device(root).get(resolve(root, match[0]), [])
+    # Of chips without a serial number only one has the by-id name that all of them claim; a place is one device's.
+    places = [link for link in links if link.startswith("/dev/serial/by-path/")]
+    names = [link for link in links if link.startswith("/dev/serial/by-id/")]
+    serial = _serial_number(root, match[0])
+    best = (names + places) if serial else (places + names)
+    return str(root / best[0].lstrip("/")) if best else None
+
+
+def latency_timer_ms(device: str, root: Path = ROOT) -> int | None:
+    """For how long the FTDI bridge behind a name collects bytes; None for other ports. `device` may be a link."""
+    return _number(_hardware(root, resolve(root, device)) / "latency_timer", 10)
+
+
+def _hardware(root: Path, device: str) -> Path:
+    return (root / "sys/class/tty" / device.rpartition("/")[2] / "device").resolve()
+
+
+def _serial_number(root: Path, device: str) -> str | None:
+    hardware = _hardware(root, device)
+    usb = _node_with(root, hardware, "idVendor")
+    return _read(usb / "serial") if usb else None
 
 
 def _describe(
@@ -139,12 +176,12 @@ def _links_by_device(root: Path) -> dict[str, list[str]]:
         for entry in _entries(root / folder):
             if entry.is_symlink():
                 name = f"/{folder}/{entry.name}"
-                found.setdefault(_resolve(root, name), []).append(name)
+                found.setdefault(resolve(root, name), []).append(name)
     return found
 
 
-def _resolve(root: Path, name: str) -> str:
-    """Follow a link below `root`, whether it is relative or absolute, and name its end without `root`."""
+def resolve(root: Path, name: str) -> str:
+    """The device that a name leads to, without `root`: links are followed below it, relative and absolute ones."""
     for _ in range(8):
         path = root / name.lstrip("/")
         try:
@@ -176,7 +213,7 @@ def _holders_by_device(root: Path) -> dict[str, list[Holder]]:
 def _consoles(root: Path) -> set[str]:
     words = (_read(root / "proc/cmdline", limit=4096) or "").split()
     names = [word.removeprefix("console=").split(",")[0] for word in words if word.startswith("console=")]
-    return {_resolve(root, f"/dev/{name}") for name in names}
+    return {resolve(root, f"/dev/{name}") for name in names}
 
 
 def _entries(folder: Path) -> Iterator[Path]:

@@ -19,12 +19,14 @@ import threading
 from typing import Literal
 
 from companion.errors import LinkError
-from companion.links.ports import find_holders
+from companion.links.ports import find_holders, lasting_name, latency_timer_ms
 
 Parity = Literal["none", "even", "odd"]
 
 OPEN_DEADLINE_S = 5.0
 """A healthy USB port opens in some milliseconds; a driver that hangs must not hang the daemon."""
+FAITHFUL_S = 20.0
+"""So long after its loss a device is waited for by its lasting name, whatever bears its old one meanwhile."""
 
 
 def open_serial(path: str, baud: int, parity: Parity) -> int:
@@ -138,6 +140,10 @@ def _group_name(number: int) -> str:
         return str(number)
 
 
+def _exists(path: str) -> bool:
+    return os.path.exists(path)
+
+
 def _is_character_device(path: str) -> bool:
     try:
         return stat.S_ISCHR(os.stat(path).st_mode)
@@ -156,23 +162,54 @@ class SerialOpener:
     def __init__(self, path: str, baud: int, parity: Parity) -> None:
         self._path, self._baud, self._parity = path, baud, parity
         self._thread: threading.Thread | None = None
+        self.latency_timer_ms: int | None = None
+        """Of an FTDI bridge, as it was read back after the last opening; None for other ports."""
+        self._known: str | None = None
+        self._seen: str | None = None
+        self._since_s: float | None = None
+
+    def confirm(self) -> None:
+        """What was opened last is the right device: remember it by the name that a new plugging does not change."""
+        self._known, self._since_s = self._seen, None
+
+    def _names(self) -> tuple[str, str | None]:
+        """What to open, and of which device only."""
+        if self._known is None:
+            return self._path, None
+        loop = asyncio.get_running_loop()
+        if self._since_s is None:
+            self._since_s = loop.time()
+        if loop.time() - self._since_s > FAITHFUL_S and not _exists(self._known):
+            return self._path, None  # somebody has put another one in its place
+        return self._known, self._path
 
     async def open(self) -> int:
         """Return the descriptor of the opened port; when cancelled, whatever is still opened is closed again.
+
+        The kernel's names (/dev/ttyUSB0) go to whoever is plugged in first. A device that was found to be the right
+        one, and has a lasting name, is therefore opened by that after a loss.
 
         Raises:
             LinkError: one line that names the port and the cause.
         """
         if self._thread is not None and self._thread.is_alive():
             raise LinkError(f"{self._path}: the driver still hangs in the last attempt to open; replug the device")
-        attempt = _Attempt(asyncio.get_running_loop(), self._path, self._baud, self._parity)
+        path, instead_of = self._names()
+        attempt = _Attempt(asyncio.get_running_loop(), path, self._baud, self._parity)
         self._thread = threading.Thread(target=attempt.run, name=f"open {self._path}", daemon=True)
         self._thread.start()
         try:
             async with asyncio.timeout(OPEN_DEADLINE_S):
-                return await attempt.result()
+                descriptor = await attempt.result()
         except TimeoutError:
-            raise LinkError(f"{self._path}: the driver has not opened it within {OPEN_DEADLINE_S:g} s") from None
+            raise LinkError(f"{path}: the driver has not opened it within {OPEN_DEADLINE_S:g} s") from None
+        except LinkError as error:
+            if instead_of is None or not _exists(instead_of):
+                raise
+            raise LinkError(f"{error}; {instead_of} is another device now") from None
+        else:
+            self._seen, self.latency_timer_ms = attempt.lasting_name, attempt.latency_timer_ms
+            return descriptor
         finally:
             attempt.abandon()
 
@@ -187,6 +224,8 @@ class _Attempt:
         self._abandoned = False
         self._descriptor: int | None = None
         self._error: LinkError | None = None
+        self.lasting_name: str | None = None
+        self.latency_timer_ms: int | None = None
 
     def run(self) -> None:
         """Open the port (in the thread)."""
@@ -194,6 +233,7 @@ class _Attempt:
         error: LinkError | None = None
         try:
             descriptor = open_serial(self._path, self._baud, self._parity)
+            self.lasting_name, self.latency_timer_ms = lasting_name(self._path), latency_timer_ms(self._path)
         except LinkError as cause:
             error = cause
         except Exception as cause:  # noqa: BLE001 - a thread that died silently would leave its caller waiting

@@ -1,0 +1,144 @@
+"""Which device speaks? Every decoder there is has a go at the same bytes; what it accepts is counted.
+
+Pure: whoever has the bytes asks. A family that joins the registry is recognised without a word here.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal, NamedTuple
+
+from companion.protocols.registry import PROTOCOLS, Kind
+
+Parity = Literal["none", "even", "odd"]
+
+COMMON_BAUDS: Final = (9600, 115200, 19200, 38400, 57600, 230400, 460800, 921600, 4800, 2400, 1200)
+"""The likeliest first; whatever a family in the registry comes with stands before them."""
+ENOUGH_BYTES: Final = 1500
+"""Six frames of the longest kind: where none of them was one, more will not be."""
+
+_LEAST_FRAMES: Final = 2
+_SURE_FRAMES: Final = 4
+_MUCH_TEXT: Final = 0.9
+_CONSOLE: Final = re.compile(rb"\blogin: |\bPassword: |Linux version \d|\[ {0,4}\d+\.\d{6}\] |\bgetty\b")
+_MODEM: Final = re.compile(rb"(?:^|[\r\n])AT(?:[+&^$][A-Z]|[EZVI]\d?[\r\n])")
+_WORDS: Final = re.compile(rb"[ -~]*[A-Za-z]{3}[ -~]*")
+_NOT_PLAIN: Final = bytes(byte for byte in range(256) if byte not in b"\t\r\n" and not 0x20 <= byte < 0x7F)
+_MAVLINK_OVERHEAD: Final = {0xFD: 12, 0xFE: 8}
+_MAVLINK_RUN: Final = 4
+
+
+class Line(NamedTuple):
+    """How a line is set: 8 data bits and one stop bit always."""
+
+    baud: int
+    parity: Parity
+
+    def __str__(self) -> str:
+        """As people write it: 9600 8E1."""
+        return f"{self.baud} 8{self.parity[0].upper()}1"
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A protocol that the bytes may be."""
+
+    protocol: str
+    kinds: tuple[Kind, ...]
+    """What a device with this protocol may serve as."""
+    accepted: int
+    """Frames that gave samples."""
+    rejected: int
+    """What began like a frame and gave none; the cut one at the beginning does not count."""
+
+    @property
+    def likely(self) -> bool:
+        """Whether it is more than chance."""
+        return self.accepted >= _LEAST_FRAMES and self.accepted >= 2 * self.rejected
+
+    @property
+    def sure(self) -> bool:
+        """Whether it needs no more bytes."""
+        return self.accepted >= _SURE_FRAMES and self.accepted >= 4 * self.rejected
+
+
+def candidates(data: bytes, seconds_per_byte: float = 0.0) -> list[Candidate]:
+    """Who could have said this, the likeliest first; empty where it is nobody whom we know."""
+    kinds: dict[tuple[str, type], list[Kind]] = {}
+    for kind, protocols in PROTOCOLS.items():
+        for info in protocols.values():
+            kinds.setdefault((info.name, info.decoder), []).append(kind)
+    found = []
+    for (name, make), serves in kinds.items():
+        decoder = make(seconds_per_byte)
+        decoder.interrupted()  # the first frame lacks its beginning
+        decoder.feed(data, 0.0)
+        if decoder.accepted:
+            rejected = max(decoder.rejected.total() - 1, 0)
+            found.append(Candidate(name, tuple(serves), decoder.accepted, rejected))
+    return sorted(found, key=lambda one: (one.likely, one.accepted - 2 * one.rejected), reverse=True)
+
+
+def likeliest(data: bytes) -> Candidate | None:
+    """The first of `candidates` if it is more than chance."""
+    return next((one for one in candidates(data) if one.likely), None)
+
+
+def lines_to_try(first: Sequence[Line] = ()) -> Iterator[Line]:
+    """Line settings in the order in which trying them is worth most, each once.
+
+    Args:
+        first: what is believed already.
+    """
+    defaults = [Line(info.baud, info.parity) for kind in PROTOCOLS.values() for info in kind.values()]
+    bauds = dict.fromkeys([*(line.baud for line in (*first, *defaults)), *COMMON_BAUDS])
+    parities: tuple[Parity, ...] = ("none", "even", "odd")
+    rest = [Line(baud, parity) for parity in parities for baud in bauds]
+    yield from dict.fromkeys([*first, *defaults, *rest])
+
+
+def strangers(data: bytes) -> str | None:
+    """In a few words who it is when it is no sensor: a login console, a modem's commands, an autopilot."""
+    if _CONSOLE.search(data):
+        return "a login console or kernel messages"
+    if _MODEM.search(data):
+        return "AT commands, as ModemManager sends them"
+    if _is_mavlink(data):
+        return "MAVLink: an autopilot or its radio, which belongs into [mavlink]"
+    return None
+
+
+def looks_garbled(data: bytes) -> bool:
+    """Whether it looks like a line read at the wrong speed or parity: neither text nor frames of anybody we know."""
+    return bool(data) and plain_share(data) < _MUCH_TEXT
+
+
+def plain_share(data: bytes) -> float:
+    """The share of bytes that a text may hold, 0 to 1; 0 of nothing."""
+    return len(data.translate(None, _NOT_PLAIN)) / len(data) if data else 0.0
+
+
+def banner_in(data: bytes) -> str:
+    """The first whole line of words in it, at most 40 letters: what a device says when it starts; else empty."""
+    for line in data[: max(data.rfind(b"\n"), data.rfind(b"\r")) + 1].splitlines():
+        match = _WORDS.search(line)
+        if match is not None and line[:1] not in b"$#":
+            return match[0].decode("ascii").strip()[:40]
+    return ""
+
+
+def _is_mavlink(data: bytes) -> bool:
+    """A few packets in a row, each of which begins where the one before ends."""
+    for start in range(len(data)):
+        at = start
+        for _ in range(_MAVLINK_RUN):
+            overhead = _MAVLINK_OVERHEAD.get(data[at]) if at + 2 < len(data) else None
+            if overhead is None:
+                break
+            signature = 13 if data[at] == 0xFD and data[at + 2] & 1 else 0
+            at += data[at + 1] + overhead + signature
+        else:
+            return True
+    return False

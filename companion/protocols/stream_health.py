@@ -1,0 +1,258 @@
+"""What is wrong with a stream of bytes and samples, as far as the stream itself tells.
+
+Pure: time comes in. Fed with every chunk that was read and the samples it completed; asked now and then.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from companion.protocols.base import (
+    CALIBRATING,
+    COMMAND_REFUSED,
+    NON_FINITE,
+    NOTHING_OF_USE,
+    OUT_OF_RANGE,
+    OVER_RANGE,
+    REPLY,
+    SINGLE_AXIS,
+    UNKNOWN_FIELD,
+    UNKNOWN_GROUP,
+    UNKNOWN_SENTENCE,
+    Decoder,
+)
+from companion.protocols.guess import banner_in, likeliest, looks_garbled, strangers
+from companion.samples import CompassSample, ImuSample, Sample, TiltSample
+
+SILENT: Final = "silent"
+SILENT_AFTER_S: Final = 3.0
+TAIL_BYTES: Final = 1024
+SPAN_S: Final = 2.0
+"""What happened so long ago is over."""
+GUESS_EVERY_S: Final = 5.0
+STUCK_S: Final = 1.0
+STUCK_SAMPLES: Final = 20
+"""Of an IMU: in six channels of a living one some last digit moves. Of a gradienter or compass nothing follows from
+equal digits; whether it has turned meanwhile decides, and that others know."""
+
+RAILS_DEG: Final = {"jewell": (math.degrees(330e-6), "330 microradians, the end of a LILY's range")}
+"""Readings that look like data and are the end of the range (OOI's logs of a Jewell LILY: -202.490,-330.000)."""
+_RAIL_SAMPLES: Final = 3
+_RAIL_TOLERANCE_DEG: Final = 1e-6
+_HARMLESS: Final = frozenset(
+    {CALIBRATING, COMMAND_REFUSED, NON_FINITE, NOTHING_OF_USE, OUT_OF_RANGE, OVER_RANGE, REPLY, SINGLE_AXIS}
+    | {UNKNOWN_FIELD, UNKNOWN_GROUP, UNKNOWN_SENTENCE}
+)
+"""Reasons for rejecting a frame that came whole."""
+_DAMAGED_SHARE: Final = 0.1
+_DAMAGED_FRAMES: Final = 3
+_RESTART_GAP_S: Final = 0.3
+_RESTART_GAP_PERIODS: Final = 4.0
+_BACK_S: Final = 0.5
+_TICKS_S: Final = (1e-9, 1e-6, 1e-4, 1e-3)
+_WRAP_BITS: Final = (16, 24, 32, 64)
+_MOST_DAMAGE_NAMED: Final = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """What is wrong: a key to count it under, and one line for people."""
+
+    key: str
+    words: str
+    lies: bool = False
+    """Its readings look good and are not: nothing may be measured with them."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Mark:
+    t_s: float
+    accepted: int
+    rejected: Counter[str]
+
+
+class StreamHealth:
+    """Watches one stream.
+
+    Args:
+        protocol: its name in the configuration.
+        decoder: whose counts are looked at.
+    """
+
+    def __init__(self, protocol: str, decoder: Decoder) -> None:
+        self._protocol, self._decoder = protocol, decoder
+        self.last_sample_s: float | None = None
+        self.last_byte_s: float | None = None
+        self.unchanged_since_s: float | None = None
+        """Since when all readings have been the same, digit for digit."""
+        self.speaks: str | None = None
+        """The protocol that the bytes are instead."""
+        self.events: list[Trouble] = []
+        """What happened once and is over, for whoever asks to take away: a restart, a clock that went back."""
+        self._tail = b""
+        self._first_bad_s: float | None = None
+        self._reading: object = None
+        self._same = 0
+        self._rail = 0
+        self._clock_s: float | None = None
+        self._period_s = 0.0
+        self._marks: deque[_Mark] = deque()
+        self._guessed_s = -math.inf
+        self._guess = ""
+
+    def opened(self) -> None:
+        """The port was opened (again): what came before has no continuation."""
+        self._tail, self._first_bad_s, self._clock_s = b"", None, None
+        self.last_byte_s = self.unchanged_since_s = self._reading = None
+        self._same = self._rail = 0
+        self.speaks, self._guess, self._guessed_s = None, "", -math.inf
+
+    def took(self, data: bytes, samples: Sequence[Sample], t_s: float) -> None:
+        """Bytes were read at `t_s` and have completed these samples."""
+        self.last_byte_s = t_s
+        if not samples:
+            if self._first_bad_s is None:
+                self._first_bad_s = t_s
+            self._tail = (self._tail + data)[-TAIL_BYTES:]
+            return
+        if self._tail:
+            self._look_for_a_banner(t_s)
+        before_s, self.last_sample_s = self.last_sample_s, t_s
+        if before_s is not None and t_s - before_s < 1.5:
+            self._period_s += 0.1 * ((t_s - before_s) - self._period_s)
+        self._first_bad_s = None
+        self._compare(samples[-1], len(samples), t_s)
+
+    def _look_for_a_banner(self, t_s: float) -> None:
+        """Text and a pause before the samples go on: the device has started anew."""
+        tail, self._tail = self._tail, b""
+        if self.last_sample_s is None:
+            return
+        pause_s = t_s - self.last_sample_s
+        if pause_s > max(_RESTART_GAP_S, _RESTART_GAP_PERIODS * self._period_s) and (said := banner_in(tail)):
+            self.events.append(
+                Trouble("restarted", f"it started anew by itself after {pause_s:.1f} s (it said {said!r})")
+            )
+
+    def _compare(self, sample: Sample, count: int, t_s: float) -> None:
+        reading: object
+        if isinstance(sample, ImuSample):
+            reading = (sample.gyro_rad_s, sample.accel_m_s2)
+            self._look_at_clock(sample.t_device_s)
+        elif isinstance(sample, TiltSample):
+            reading = (sample.x_deg, sample.y_deg)
+            self._look_at_rail(sample)
+        elif isinstance(sample, CompassSample):
+            reading = (sample.heading_deg, sample.pitch_deg, sample.roll_deg)
+        else:
+            return
+        if reading == self._reading:
+            self._same += count
+            return
+        self._reading, self._same, self.unchanged_since_s = reading, 0, t_s
+
+    def _look_at_clock(self, clock_s: float | None) -> None:
+        before_s, self._clock_s = self._clock_s, clock_s
+        if clock_s is None or before_s is None or clock_s > before_s - _BACK_S or _wraps(before_s):
+            return
+        words = f"its clock went back from {before_s:.1f} s to {clock_s:.1f} s: it has started anew"
+        self.events.append(Trouble("clock back", words))
+
+    def _look_at_rail(self, sample: TiltSample) -> None:
+        rail = RAILS_DEG.get(self._protocol)
+        if rail is None:
+            return
+        at_end = any(abs(abs(axis) - rail[0]) < _RAIL_TOLERANCE_DEG for axis in (sample.x_deg, sample.y_deg))
+        self._rail = self._rail + 1 if at_end else 0
+
+    def trouble(self, now_s: float) -> Trouble | None:
+        """What is wrong with what comes, or with nothing coming, at `now_s` on an open port."""
+        lately = self._lately(now_s)
+        if self.last_sample_s is None or now_s - self.last_sample_s >= SILENT_AFTER_S:
+            return self._without_samples(now_s, lately)
+        self.speaks = None
+        return self._lying() or self._in_part(lately)
+
+    def _without_samples(self, now_s: float, lately: _Mark) -> Trouble:
+        if self.last_byte_s is None or now_s - self.last_byte_s >= SILENT_AFTER_S:
+            return Trouble(SILENT, "silent (power? wiring? told to stop?)")
+        if (valueless := _valueless(lately)) is not None:
+            return valueless
+        if now_s - self._guessed_s >= GUESS_EVERY_S and len(self._tail) >= TAIL_BYTES // 8:
+            self._guessed_s, self._guess = now_s, self._guesses()
+        rejected = ", ".join(f"{count} {why}" for why, count in self._decoder.rejected.most_common(_MOST_DAMAGE_NAMED))
+        guess = self._guess or "wrong baud or protocol?"
+        return Trouble(
+            "undecodable", f"bytes come, but no {self._protocol} frames ({rejected or 'none begun'}); {guess}"
+        )
+
+    def _guesses(self) -> str:
+        found = likeliest(self._tail)
+        self.speaks = found.protocol if found is not None and found.protocol != self._protocol else None
+        if found is not None and self.speaks is not None:
+            return f"this is {found.protocol} ({_a_kind(found.kinds)})"
+        if (stranger := strangers(self._tail)) is not None:
+            return f"this is {stranger}"
+        if looks_garbled(self._tail):
+            return "wrong baud or parity?"
+        return ""
+
+    def _lying(self) -> Trouble | None:
+        if self._rail >= _RAIL_SAMPLES:
+            words = f"reads exactly {RAILS_DEG[self._protocol][1]}: level its base"
+            return Trouble("end of range", words, lies=True)
+        since_s, last_s = self.unchanged_since_s, self.last_sample_s
+        if since_s is None or last_s is None or self._same < STUCK_SAMPLES or last_s - since_s < STUCK_S:
+            return None
+        if isinstance(self._reading, tuple) and isinstance(self._reading[0], tuple):
+            words = f"stuck: {self._same + 1} equal readings; switch its power off and on"
+            return Trouble("stuck", words, lies=True)
+        return None
+
+    def _in_part(self, lately: _Mark) -> Trouble | None:
+        if (valueless := _valueless(lately)) is not None:
+            return valueless
+        damage = Counter({why: n for why, n in lately.rejected.items() if why not in _HARMLESS})
+        damaged = damage.total()
+        if damaged < _DAMAGED_FRAMES or damaged < _DAMAGED_SHARE * (lately.accepted + damaged):
+            return None
+        percent = 100 * damaged // (lately.accepted + damaged)
+        named = ", ".join(f"{count} {why}" for why, count in damage.most_common(_MOST_DAMAGE_NAMED))
+        return Trouble(
+            "damaged", f"{percent} % of its frames are damaged ({named}): a second reader? wire, ground, levels?"
+        )
+
+    def _lately(self, now_s: float) -> _Mark:
+        """What was accepted and rejected within the last `SPAN_S` or a little more."""
+        marks, decoder = self._marks, self._decoder
+        if not marks or now_s - marks[-1].t_s >= SPAN_S / 4:
+            marks.append(_Mark(now_s, decoder.accepted, Counter(decoder.rejected)))
+        while len(marks) > 1 and now_s - marks[1].t_s >= SPAN_S:
+            marks.popleft()
+        oldest = marks[0]
+        return _Mark(now_s, decoder.accepted - oldest.accepted, Counter(decoder.rejected) - oldest.rejected)
+
+
+def _valueless(lately: _Mark) -> Trouble | None:
+    """Whole frames without a value in them."""
+    for why, words in (
+        (NON_FINITE, "NaN in {n} whole frames: the device has no valid reading; switch its power off and on"),
+        (OVER_RANGE, "{n} readings are over range: level it"),
+    ):
+        count = lately.rejected[why]
+        if count and count >= _DAMAGED_SHARE * (lately.accepted + count):
+            return Trouble(why, words.format(n=count))
+    return None
+
+
+def _a_kind(kinds: Sequence[str]) -> str:
+    return " or ".join(kinds)
+
+
+def _wraps(clock_s: float) -> bool:
+    """Whether a counter of a usual width and tick was about to begin again."""
+    return any(0.0 <= (2**bits) * tick - clock_s < 1.0 for bits in _WRAP_BITS for tick in _TICKS_S)

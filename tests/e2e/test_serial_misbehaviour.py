@@ -1,0 +1,467 @@
+"""Everything that a serial bus does wrong: said in words and counted while it lasts, data again within 3 s of its end.
+
+Real ports (ptys, sockets) and the daemon's own sensor on top of them, in real time; lines at another speed or parity
+are what a UART would make of them (sim/uart.py).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import socket
+import struct
+import threading
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.daemon.sensor_health import RENEW_AFTER_S
+from companion.links.budget import BURST_BYTES, BYTES_PER_S
+from sim.uart import Setting
+from tests.support.chatter import RECOVERY_S, Chatter, Listening, compass_frame, imu_frame, listening, tilt_frame
+
+USUAL = Setting(9600)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "port"
+
+
+def said(caplog: pytest.LogCaptureFixture, name: str, words: str) -> list[str]:
+    """What was said at the level of a warning of a device, with these words."""
+    lines = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+    return [line for line in lines if line.startswith(f"{name}: ") and words in line]
+
+
+def good_again(caplog: pytest.LogCaptureFixture, name: str) -> int:
+    return sum(record.getMessage().startswith(f"{name}: good again") for record in caplog.records)
+
+
+async def lasts(one: Listening, caplog: pytest.LogCaptureFixture, key: str, words: str) -> None:
+    """The trouble is in the words of the status, counted, and said once however long it lasts."""
+    await one.until(lambda: words in one.words and one.counts.get(key) == 1, 8.0)
+    name = one.sensor.name
+    await one.until(lambda: said(caplog, name, words), 2.0)
+    await asyncio.sleep(1.5)
+    assert len(said(caplog, name, words)) == 1
+    assert one.sensor.roles[0].status()["trouble"] == key
+
+
+async def over(one: Listening, caplog: pytest.LogCaptureFixture) -> None:
+    """The cause has just ended."""
+    await one.data(RECOVERY_S)
+    await one.until(lambda: good_again(caplog, one.sensor.name), 3.0)
+
+
+@pytest.fixture(autouse=True)
+def _log(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+
+
+# Plugs ----------------------------------------------------------------------------------------------------------------
+
+
+def test_unplugged_and_replugged(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def main() -> None:
+        async with Chatter(path, tilt_frame) as device, listening("gradienter", "inclinometer_xy", path) as one:
+            await one.data()
+            device.unplug()
+            await one.until(lambda: "no such device" in one.words)
+            await asyncio.sleep(3.0)  # long enough for the longest pause between two attempts
+            device.plug(path)
+            await one.data(RECOVERY_S)
+            assert one.sensor.link.reconnects == 1
+            assert len(said(caplog, "gradienter", "gone")) == 1
+
+    asyncio.run(main())
+
+
+def test_replugged_under_another_name_while_its_own_is_another_devices(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """/dev/ttyUSB0 and 1 are exchanged by the replugging; the configuration names the first by the kernel's name."""
+    name = tmp_path / "dev/serial/by-id/usb-FTDI_A-if00-port0"
+    first, second = tmp_path / "dev/ttyUSB0", tmp_path / "dev/ttyUSB1"
+    name.parent.mkdir(parents=True)
+    name.symlink_to("../../ttyUSB0")
+
+    async def main() -> None:
+        async with (
+            Chatter(first, tilt_frame) as device,
+            Chatter(second, compass_frame) as other,
+            listening("gradienter", "inclinometer_xy", first) as one,
+        ):
+            await one.data()
+            await asyncio.sleep(0.6)  # a look that finds all well
+            name.unlink()
+            device.unplug()
+            other.unplug()
+            other.plug(first)
+            await one.until(lambda: "is another device now" in one.words)
+            await asyncio.sleep(2.0)
+            rejected = one.sensor.decoder.rejected.total()
+            device.plug(second)
+            name.symlink_to("../../ttyUSB1")
+            await one.data(RECOVERY_S)
+            assert one.sensor.decoder.rejected.total() <= rejected + 1
+
+    asyncio.run(main())
+
+
+def test_two_devices_swapped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    a, b = tmp_path / "a", tmp_path / "b"
+
+    async def main() -> None:
+        async with (
+            Chatter(a, compass_frame) as compass,
+            Chatter(b, tilt_frame) as gradienter,
+            listening("gradienter", "inclinometer_xy", a) as one,
+            listening("compass", "hmr3300", b) as other,
+        ):
+            await one.until(lambda: "this is hmr3300 (gradienter or compass)" in one.words)
+            await other.until(lambda: "this is inclinometer_xy (gradienter)" in other.words)
+            assert one.sensor.roles[0].status()["speaks"] == "hmr3300"
+            compass.unplug()
+            gradienter.unplug()
+            compass.plug(b)
+            gradienter.plug(a)
+            await asyncio.gather(one.data(RECOVERY_S), other.data(RECOVERY_S))
+            assert one.sensor.roles[0].status()["speaks"] is None
+
+    asyncio.run(main())
+
+
+# tcp:// ---------------------------------------------------------------------------------------------------------------
+
+
+@contextlib.asynccontextmanager
+async def server(backlog: int = 8) -> AsyncIterator[tuple[socket.socket, str]]:
+    with socket.create_server(("127.0.0.1", 0), backlog=backlog) as listener:
+        listener.setblocking(False)
+        yield listener, f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+
+
+async def talk(peer: socket.socket) -> None:
+    loop = asyncio.get_running_loop()
+    number = 0
+    with contextlib.suppress(OSError):
+        while True:
+            await loop.sock_sendall(peer, tilt_frame(number))
+            number += 1
+            await asyncio.sleep(0.1)
+
+
+def test_a_peer_that_accepts_and_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    """Its new connections speak when the cause has ended; the one that was open then stays silent for ever."""
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        peers: list[socket.socket] = []
+        talking: list[asyncio.Task[None]] = []
+        speaks = False
+
+        async def serve(listener: socket.socket) -> None:
+            while True:
+                peer, _ = await loop.sock_accept(listener)
+                peers.append(peer)
+                if speaks:
+                    talking.append(asyncio.create_task(talk(peer)))
+
+        async with server() as (listener, url), listening("gradienter", "inclinometer_xy", url) as one:
+            serving = asyncio.create_task(serve(listener))
+            await lasts(one, caplog, "silent", "silent")
+            assert len(peers) >= 2, "it was not asked anew"
+            speaks = True
+            took_s = await one.data(RENEW_AFTER_S + 1.5)
+            assert took_s <= RECOVERY_S + 0.5
+            assert one.counts["renewed"] >= 1
+            await one.until(lambda: good_again(caplog, "gradienter"), 3.0)
+            for task in (serving, *talking):
+                task.cancel()
+            await asyncio.gather(serving, *talking, return_exceptions=True)
+            for peer in peers:
+                peer.close()
+        # Not a line for every attempt.
+        assert len(said(caplog, "gradienter", "")) == 1
+
+    asyncio.run(main())
+
+
+def test_a_cable_that_is_pulled_and_plugged_in_again(caplog: pytest.LogCaptureFixture) -> None:
+    """No FIN, and nobody answers a SYN meanwhile: the queue of a listener that accepts nobody is full."""
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        async with server(backlog=0) as (listener, url), listening("gradienter", "inclinometer_xy", url) as one:
+            first, _ = await loop.sock_accept(listener)
+            talking = asyncio.create_task(talk(first))
+            await one.data()
+            talking.cancel()  # the cable is out; `first` stays open, and says nothing ever again
+            blockers = []
+            for _ in range(3):
+                blocker = socket.socket()
+                blocker.setblocking(False)
+                with contextlib.suppress(BlockingIOError):
+                    blocker.connect(listener.getsockname())
+                blockers.append(blocker)
+            await one.until(lambda: "no answer within" in one.words)
+            await asyncio.sleep(3.0)
+            for blocker in blockers:
+                blocker.close()
+            peers = []
+
+            async def serve() -> None:
+                while True:
+                    peer, _ = await loop.sock_accept(listener)
+                    peers.append((peer, asyncio.create_task(talk(peer))))
+
+            serving = asyncio.create_task(serve())  # the cable is in again
+            await one.data(RECOVERY_S)
+            serving.cancel()
+            for peer, task in peers:
+                task.cancel()
+                peer.close()
+            first.close()
+            await asyncio.gather(serving, talking, *(task for _, task in peers), return_exceptions=True)
+
+    asyncio.run(main())
+
+
+# The line -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("sends", "reads", "words"),
+    [
+        pytest.param(Setting(19200), Setting(9600), "wrong baud or parity?", id="twice as fast"),
+        pytest.param(Setting(2400), Setting(9600), "wrong baud or parity?", id="four times as slow"),
+        pytest.param(Setting(9600, "even"), Setting(9600), "", id="8E1 read as 8N1"),
+        pytest.param(Setting(9600), Setting(9600, "even"), "wrong baud or parity?", id="8N1 read as 8E1"),
+        pytest.param(Setting(9600, "odd"), Setting(9600, "even"), "wrong baud or parity?", id="8O1 read as 8E1"),
+    ],
+)
+def test_a_line_that_is_set_otherwise(
+    path: Path, caplog: pytest.LogCaptureFixture, sends: Setting, reads: Setting, words: str
+) -> None:
+    async def main() -> None:
+        async with (
+            Chatter(path, tilt_frame, line=reads) as device,
+            listening("gradienter", "inclinometer_xy", path, baud=reads.baud, parity=reads.parity) as one,
+        ):
+            await one.data()
+            device.line = sends
+            await lasts(one, caplog, "undecodable", f"{reads.baud} baud, parity {reads.parity}: bytes come")
+            assert words in one.words
+            device.line = reads
+            await over(one, caplog)
+
+    asyncio.run(main())
+
+
+def test_a_login_console_on_the_port(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def main() -> None:
+        async with (
+            Chatter(path, tilt_frame) as device,
+            listening("gradienter", "inclinometer_xy", path) as one,
+        ):
+            await one.data()
+            device.frame = lambda _: b"\r\nRaspbian GNU/Linux 12 aircraft ttyS0\r\n\r\naircraft login: "
+            await one.until(lambda: "this is a login console or kernel messages" in one.words)
+            device.frame = tilt_frame
+            await over(one, caplog)
+
+    asyncio.run(main())
+
+
+def test_a_second_reader_takes_some_of_the_bytes(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def main() -> None:
+        async with Chatter(path, compass_frame, rate_hz=60.0) as device:
+            thief = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY)  # before anybody asks to be alone
+            async with listening("compass", "hmr3300", path) as one:
+                await one.data()
+
+                async def steal() -> None:
+                    while True:
+                        with contextlib.suppress(BlockingIOError):
+                            os.read(thief, 7)
+                        await asyncio.sleep(0.003)
+
+                stealing = asyncio.create_task(steal())
+                await one.until(lambda: "damaged" in one.words and "a second reader?" in one.words, 15.0)
+                await one.until(lambda: one.counts.get("damaged"), 5.0)
+                assert said(caplog, "compass", "a second reader?")
+                stealing.cancel()
+                await asyncio.gather(stealing, return_exceptions=True)
+                os.close(thief)
+                await one.data(RECOVERY_S)
+            assert device.master >= 0
+
+    asyncio.run(main())
+
+
+def test_a_flood_holds_nobody_up(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """As fast as a pty takes it: the loop goes on, what is decoded is bounded, and the sensor comes back."""
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        async with (
+            Chatter(path, tilt_frame) as device,
+            listening("gradienter", "inclinometer_xy", path) as one,
+        ):
+            await one.data()
+            device.muted = True
+            ended = threading.Event()
+
+            def flood() -> None:
+                junk = os.urandom(4096)
+                while not ended.is_set():
+                    with contextlib.suppress(BlockingIOError):
+                        os.write(device.master, junk)
+
+            thread = threading.Thread(target=flood, daemon=True)
+            decoded, received, since_s = 0, one.sensor.link.bytes_received, loop.time()
+            feed = one.sensor.decoder.feed
+
+            def counting(data: bytes, t_s: float) -> list[Any]:
+                nonlocal decoded
+                decoded += len(data)
+                return feed(data, t_s)
+
+            one.sensor.decoder.feed = counting  # type: ignore[method-assign]
+            thread.start()
+            turns = 0
+            while loop.time() - since_s < 3.0:
+                await asyncio.sleep(0.001)
+                turns += 1
+            spent_s = loop.time() - since_s
+            assert "floods us" in one.words
+            assert one.counts["flood"] == 1
+            assert len(said(caplog, "gradienter", "floods us")) == 1
+            assert turns > 200, f"the others had {turns} turns in 3 s"
+            assert decoded <= BYTES_PER_S * spent_s + BURST_BYTES + 4096 * spent_s / 0.05
+            assert one.sensor.link.bytes_received - received > 2 * decoded, "it was no flood"
+            ended.set()
+            await asyncio.to_thread(thread.join)
+            device.muted = False
+            await over(one, caplog)
+
+    asyncio.run(main())
+
+
+# The device -----------------------------------------------------------------------------------------------------------
+
+
+def test_silence(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def main() -> None:
+        async with (
+            Chatter(path, compass_frame) as device,
+            listening("compass", "hmr3300", path) as one,
+        ):
+            await one.data()
+            device.muted = True
+            await lasts(one, caplog, "silent", "silent (power? wiring? told to stop?)")
+            device.muted = False
+            await over(one, caplog)
+
+    asyncio.run(main())
+
+
+def test_an_imu_whose_reading_is_the_same_for_ever(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def main() -> None:
+        async with (
+            Chatter(path, imu_frame, rate_hz=50.0) as device,
+            listening("imu", "imu_line", path) as one,
+        ):
+            await one.data()
+            device.frame = lambda number: imu_frame(number, rate="0.000300")
+            await lasts(one, caplog, "stuck", "stuck: ")
+            device.frame = imu_frame
+            await over(one, caplog)
+
+    asyncio.run(main())
+
+
+def test_beyond_the_range(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def main() -> None:
+        async with (
+            Chatter(path, tilt_frame) as device,
+            listening("gradienter", "inclinometer_xy", path) as one,
+        ):
+            await one.data()
+            device.frame = lambda number: b"X=+++++++\r\nY=-00.084\r\n"
+            await lasts(one, caplog, "over range", "over range: level it")
+            device.frame = tilt_frame
+            await over(one, caplog)
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_nan_in_whole_frames(path: Path, caplog: pytest.LogCaptureFixture, every: int) -> None:
+    async def main() -> None:
+        async with (
+            Chatter(path, imu_frame, rate_hz=50.0) as device,
+            listening("imu", "imu_line", path) as one,
+        ):
+            await one.data()
+            device.frame = lambda number: imu_frame(number, rate=None if number % every else "nan")
+            await lasts(one, caplog, "non-finite", "NaN in ")
+            device.frame = imu_frame
+            await over(one, caplog)
+
+    asyncio.run(main())
+
+
+def test_a_device_that_starts_anew_and_says_who_it_is(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def main() -> None:
+        async with (
+            Chatter(path, compass_frame) as device,
+            listening("compass", "hmr3300", path) as one,
+        ):
+            await one.data()
+            device.muted = True
+            await asyncio.sleep(0.9)
+            device.say(b"HMR3300 V1.00\r\n")
+            device.muted = False
+            await one.data(RECOVERY_S)
+            await one.until(lambda: one.counts.get("restarted") == 1, 2.0)
+            assert len(said(caplog, "compass", "'HMR3300 V1.00'")) == 1
+
+    asyncio.run(main())
+
+
+def test_a_clock_that_goes_back(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def main() -> None:
+        async with (
+            Chatter(path, lambda number: imu_frame(number, seconds=100.0 + number / 50.0), rate_hz=50.0) as device,
+            listening("imu", "imu_line", path) as one,
+        ):
+            await one.data()
+            device.frame = lambda number: imu_frame(number, seconds=0.5 + number / 50.0)
+            await one.until(lambda: one.counts.get("clock back") == 1, RECOVERY_S)
+            await one.data(RECOVERY_S)
+            assert len(said(caplog, "own", "its clock went back from 10")) == 1
+
+    asyncio.run(main())
+
+
+def test_a_reset_of_the_connection_is_over_at_once() -> None:
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        async with server() as (listener, url), listening("gradienter", "inclinometer_xy", url) as one:
+            for _ in range(3):
+                peer, _ = await loop.sock_accept(listener)
+                talking = asyncio.create_task(talk(peer))
+                await one.data(RECOVERY_S)
+                talking.cancel()
+                await asyncio.gather(talking, return_exceptions=True)
+                peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                peer.close()
+            assert one.sensor.link.reconnects == 2
+
+    asyncio.run(main())
