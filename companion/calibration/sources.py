@@ -37,6 +37,9 @@ class SourceStatus(msgspec.Struct, frozen=True, kw_only=True):
 class Source:
     """One stream: its batches, its gate, its last verdict."""
 
+    hint = ""
+    """Why nothing comes, where somebody knows better than "no data"."""
+
     def __init__(self, kind: Kind, name: str, batches: BatchSource, gate: ImuGate | PoseGate) -> None:
         self.kind = kind
         self.name = name
@@ -74,9 +77,9 @@ class Source:
         """One line when nothing comes; None when data flows."""
         last = self.batches.last_s
         if last is None:
-            return f"no data from {self.label} yet"
+            return self.hint or f"no data from {self.label} yet"
         if now_s - last > _SILENT_S:
-            return f"no data from {self.label} for {now_s - last:.0f} s"
+            return self.hint or f"no data from {self.label} for {now_s - last:.0f} s"
         return None
 
     def status(self, now_s: float) -> SourceStatus:

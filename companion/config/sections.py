@@ -88,6 +88,10 @@ class Compass(Section, frozen=True):
     mounting: Mounting = "ROTATION_NONE"
     offset_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
     sigma_deg: PositiveFloat = 3.0
+    heading: Literal["device", "field"] = "device"
+    """The device's own where it sends one, or worked out from its field vector and the gradienter's tilt."""
+    counts_per_gauss: PositiveFloat | None = None
+    """Of a device that gives its field in counts; not said: the field's strength is not checked."""
 
 
 class Calibration(Section, frozen=True):

@@ -103,7 +103,15 @@ def compass_model(compass: Compass | None) -> CompassModel | None:
         vehicle_from_sensor=rotation_matrix(compass.mounting),
         offset_deg=compass.offset_deg,
         sigma_deg=compass.sigma_deg,
+        counts_per_gauss=compass.counts_per_gauss,
+        prefers_field=compass.heading == "field",
     )
+
+
+def field_by(config: Config) -> tuple[CompassModel, GradienterModel | None] | None:
+    """How a heading comes of the compass' field vector, if there is a compass."""
+    compass = compass_model(config.compass)
+    return None if compass is None else (compass, gradienter_model(config.gradienter))
 
 
 def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:

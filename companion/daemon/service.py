@@ -47,7 +47,7 @@ from companion.daemon.sensors import SerialSensor
 from companion.links.mavlink import MavlinkLink
 from companion.links.mavlink_transport import run_transport
 from companion.recording.collector import RecordedCollector
-from companion.samples import CompassSample, ImuSample, Sample, TiltSample
+from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
 from companion.storage.changes import ChangeLog
 from companion.storage.records import RecordStore
 
@@ -89,6 +89,7 @@ class Service:
             [models.imu_input(imu, None) for imu in config.imu],
             gradienter=config.gradienter is not None,
             compass=config.compass is not None,
+            field_by=models.field_by(config),
             message_of=self._message_of,
         )
         self.slots = SlotMemory()
@@ -288,6 +289,8 @@ class Service:
             self.collector.add_tilt(sample)
         elif isinstance(sample, CompassSample):
             self.collector.add_compass(sample)
+        elif isinstance(sample, MagSample) and (heading := self.collector.add_field(sample)) is not None:
+            self.pose.take(heading)
 
     async def run(self) -> None:
         """Run until cancelled, reachable on the control socket.

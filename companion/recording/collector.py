@@ -9,6 +9,7 @@ from typing import Final
 
 from companion.calibration.estimates import Work
 from companion.calibration.outlook import Glance, Status
+from companion.calibration.pose_models import CompassModel, GradienterModel
 from companion.calibration.rolling import ImuInput, RollingCollector, Settings, Window
 from companion.recording.journal import Journal
 from companion.samples import CompassSample, ImuSample, TiltSample
@@ -25,6 +26,7 @@ class RecordedCollector(RollingCollector):
         imus: likewise.
         gradienter: likewise.
         compass: likewise.
+        field_by: likewise.
         message_of: the autopilot's message that an IMU's samples come in at present; None for one of our own.
     """
 
@@ -37,6 +39,7 @@ class RecordedCollector(RollingCollector):
         *,
         gradienter: bool,
         compass: bool,
+        field_by: tuple[CompassModel, GradienterModel | None] | None = None,
         message_of: Callable[[str], str | None],
     ) -> None:
         self.journal = Journal()
@@ -44,7 +47,7 @@ class RecordedCollector(RollingCollector):
         """The latest windows of whole stretches, with their numbers."""
         self._message_of = message_of
         self._windows_made = 0
-        super().__init__(settings, imus, gradienter=gradienter, compass=compass)
+        super().__init__(settings, imus, gradienter=gradienter, compass=compass, field_by=field_by)
 
     def number_of(self, window: Window) -> int | None:
         """The number of a window that was made lately."""
@@ -59,9 +62,9 @@ class RecordedCollector(RollingCollector):
         self.journal.tilt(sample)
         super().add_tilt(sample)
 
-    def add_compass(self, sample: CompassSample) -> None:  # noqa: D102
+    def _take_heading(self, sample: CompassSample) -> None:
         self.journal.compass(sample)
-        super().add_compass(sample)
+        super()._take_heading(sample)
 
     def set_imu(self, imu: ImuInput) -> None:  # noqa: D102
         if self.journal.queues:

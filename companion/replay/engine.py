@@ -35,7 +35,7 @@ from companion.recording import state, topics
 from companion.recording.files import versions
 from companion.recording.walk import Attachment, Message, Metadata, Recording
 from companion.replay.compare import Difference, differences
-from companion.samples import CompassSample, ImuSample, Sample, TiltSample
+from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
 
 PENDING: Final = 4000
 """Telemetry that nobody has counted yet is remembered so long."""
@@ -242,6 +242,8 @@ class Replay:
             self._collector.add_tilt(sample)
         elif isinstance(sample, CompassSample):
             self._collector.add_compass(sample)
+        elif isinstance(sample, MagSample) and name == "compass":
+            self._collector.add_field(sample)
 
     def _take_mavlink(self, data: bytes) -> None:
         raw = msgspec.json.decode(data, type=topics.RawBytes)
