@@ -35,11 +35,44 @@ class Site:
     height_m: float = 50.0
     declination_deg: float = 0.0
     """East of true north +: magnetic heading = true heading - declination."""
+    inclination_deg: float = 58.1
+    """Of the magnetic field, down +; 450 mG down over 280 mG across unless a model says better (`scenario.site_at`)."""
+    field_gauss: float = 0.53
+
+    @property
+    def field_ned_gauss(self) -> Array:
+        """The Earth's magnetic field (3,), north, east, down."""
+        declination, inclination = math.radians(self.declination_deg), math.radians(self.inclination_deg)
+        across = math.cos(inclination)
+        return self.field_gauss * np.array(
+            [across * math.cos(declination), across * math.sin(declination), math.sin(inclination)]
+        )
 
     @property
     def gravity_m_s2(self) -> float:
         """Local normal gravity."""
         return normal_gravity_m_s2(self.latitude_deg, self.height_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Iron:
+    """What disturbs the magnetic field at the compass."""
+
+    body_gauss: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Hard iron: magnets that are a part of the aircraft, in its axes (forward, right, down)."""
+    dipole_a_m2: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Moment of a magnet on the ground, north, east, down: a car is some 100 to 300 A m^2."""
+    dipole_at_m: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    """Where that lies, seen from the compass, likewise."""
+
+    @property
+    def ground_ned_gauss(self) -> Array:
+        """The ground magnet's field at the compass (3,): mu0 / 4 pi (3 (m r) r - m) / |r|^3, 1 T = 1e4 gauss."""
+        moment, place = np.array(self.dipole_a_m2), np.array(self.dipole_at_m)
+        distance = float(np.linalg.norm(place))
+        towards = place / distance
+        field: Array = 1e-3 * (3.0 * (moment @ towards) * towards - moment) / distance**3
+        return field
 
 
 LEVEL = Pose()
@@ -85,6 +118,8 @@ class VirtualAircraft:
         self._temperature = temperature_degc
         self._gravity_ned = np.array([0.0, 0.0, site.gravity_m_s2])
         self._earth_rate_ned = earth_rate_ned_rad_s(site.latitude_deg)
+        self.iron = Iron()
+        """May be changed at any time: a car parks, a tool is laid down."""
         self._epoch_s: float | None = None
         self._still: tuple[float, float, Array, Truth] | None = None
 
@@ -132,6 +167,17 @@ class VirtualAircraft:
         """The attitude matrix (3, 3)."""
         still = self._still_at(t_s)
         return still[2] if still is not None else body_from_ned(*self.angles_rad(t_s))
+
+    def field_gauss(self, t_s: float) -> Array:
+        """The magnetic field at the compass in body axes (3,), with all that disturbs it."""
+        ned = self.site.field_ned_gauss + self.iron.ground_ned_gauss
+        field: Array = self.body_from_ned(t_s) @ ned + np.array(self.iron.body_gauss)
+        return field
+
+    def declination_rad(self, t_s: float) -> float:
+        """How far east of true north a perfect compass sees north: the place's declination and what iron adds."""
+        north, east, _ = self.body_from_ned(t_s).T @ self.field_gauss(t_s)
+        return math.atan2(east, north)
 
     def mounted_angles_rad(self, t_s: float, mounting: Array) -> tuple[float, float, float]:
         """Roll, pitch, heading of a device mounted with this sensor-to-vehicle matrix."""

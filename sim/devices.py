@@ -108,6 +108,10 @@ class SerialDevice(ABC):
         return b""
 
 
+COUNTS_PER_GAUSS = 4000.0
+"""Of the virtual HMR3300's magnetometer lines; the real one's data sheet gives their counts no unit."""
+
+
 class HMR3300(SerialDevice):
     """Honeywell HMR3300 magnetic compass: `123.4, 18.6, -0.5` CR LF at 8 Hz, 19200 8N1 (Honeywell data sheet).
 
@@ -126,6 +130,7 @@ class HMR3300(SerialDevice):
         seed: int = 0,
         heading_error_deg: float = 0.0,
         heading_noise_deg: float = 0.05,
+        field_noise_gauss: float = 0.0003,
         tilt_error_deg: tuple[float, float] = (0.0, 0.0),
         mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
         rate_hz: float | None = None,
@@ -137,6 +142,7 @@ class HMR3300(SerialDevice):
             heading_noise_deg,
             tilt_error_deg,
         )
+        self.field_noise_gauss = field_noise_gauss
         self.magnetometer_mode = False
         self._mounting = mounting_matrix(*mounting_deg)
         self._random = np.random.default_rng([seed, 5])
@@ -151,15 +157,15 @@ class HMR3300(SerialDevice):
         return [self._line(float(time)) for time in times_s]
 
     def _line(self, t_s: float) -> bytes:
-        site = self.aircraft.site
         if self.magnetometer_mode:
-            declination = math.radians(site.declination_deg)
-            field = np.array([280.0 * math.cos(declination), 280.0 * math.sin(declination), 450.0])
-            counts = self._mounting.T @ self.aircraft.body_from_ned(t_s) @ field * 4.0
+            field = self._mounting.T @ self.aircraft.field_gauss(t_s)
+            field = field + self.field_noise_gauss * self._random.standard_normal(3)
+            counts = field * COUNTS_PER_GAUSS
             return ", ".join(str(round(float(count))) for count in counts).encode() + b"\r\n"
         _, _, heading = self.aircraft.mounted_angles_rad(t_s, self._mounting)
         noise = self.heading_noise_deg * float(self._random.standard_normal())
-        magnetic = math.degrees(heading) - site.declination_deg + self.heading_error_deg + noise
+        declination = self.aircraft.declination_rad(t_s)
+        magnetic = math.degrees(heading - declination) + self.heading_error_deg + noise
         tenths = round(magnetic * 10.0) % 3600
         x, y, z = self._mounting.T @ self.aircraft.truth_at(t_s).force_m_s2
         pitch = math.degrees(math.atan2(x, math.hypot(y, z))) + self.tilt_error_deg[0]
@@ -361,10 +367,7 @@ class VectorNavAscii(ImuDevice):
     def _line(self, t_s: float, reading: Sequence[float]) -> bytes:
         rate = ",".join(f"{value:+010.6f}" for value in reading[:3])
         force = ",".join(f"{value:+07.3f}" for value in reading[3:])
-        site = self.aircraft.site
-        declination = math.radians(site.declination_deg)
-        ned = np.array([0.28 * math.cos(declination), 0.28 * math.sin(declination), 0.45])
-        field = self.imu.mounting.T @ self.aircraft.body_from_ned(t_s) @ ned
+        field = self.imu.mounting.T @ self.aircraft.field_gauss(t_s)
         mag = ",".join(f"{value:+08.4f}" for value in field.tolist())
         if self.message == "VNIMU":
             return nmea(f"VNIMU,{mag},{force},{rate},{self.imu.temperature_degc(t_s):+05.1f},+101.325")

@@ -31,12 +31,12 @@ DEMO_UNIX_S = 1_795_219_200.0
 
 
 def site_at(latitude_deg: float, longitude_deg: float, height_m: float, unix_s: float = DEMO_UNIX_S) -> Site:
-    """A site with the declination of the World Magnetic Model at that date."""
+    """A site with the magnetic field of the World Magnetic Model at that date."""
     date = datetime.fromtimestamp(unix_s, UTC)
     year = date.year + (date.timetuple().tm_yday - 1) / 365.25
     model = GeoMag(coefficients_file="wmm/WMM_2025.COF")
-    declination = float(model.calculate(glat=latitude_deg, glon=longitude_deg, alt=height_m / 1000.0, time=year).d)
-    return Site(latitude_deg, longitude_deg, height_m, declination)
+    field = model.calculate(glat=latitude_deg, glon=longitude_deg, alt=height_m / 1000.0, time=year)
+    return Site(latitude_deg, longitude_deg, height_m, float(field.d), float(field.i), float(field.f) * 1e-5)
 
 
 @dataclass(frozen=True, slots=True)

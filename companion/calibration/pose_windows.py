@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, Literal
 
 import msgspec
 import numpy as np
@@ -35,6 +35,22 @@ class HeadingWindow(msgspec.Struct, frozen=True, kw_only=True):
     samples: int
     heading_deg: float
     sigma_deg: float
+    from_field: bool = False
+    """Worked out from the device's field and the gradienter's tilt; else the device's own."""
+    wander_deg: float | None = None
+    """By how much it has changed while nothing else said that the aircraft turned; None: not watched long enough."""
+
+
+FieldUnit = Literal["gauss", "counts"]
+
+
+class FieldWindow(msgspec.Struct, frozen=True, kw_only=True):
+    """Mean of the magnetic field in the compass' own axes; sigmas are statistical."""
+
+    samples: int
+    field: tuple[float, float, float]
+    sigma: tuple[float, float, float]
+    unit: FieldUnit
 
 
 def tilt_window(batches: Sequence[Batch]) -> TiltWindow:
@@ -51,7 +67,9 @@ def tilt_window(batches: Sequence[Batch]) -> TiltWindow:
     )
 
 
-def heading_window(batches: Sequence[Batch]) -> HeadingWindow:
+def heading_window(
+    batches: Sequence[Batch], *, from_field: bool = False, wander_deg: float | None = None
+) -> HeadingWindow:
     """The compass' window from its good batches, at least one."""
     first = batches[0].mean
     turned = np.array([np.mod(batch.mean - first + 180.0, 360.0) - 180.0 for batch in batches])
@@ -60,7 +78,16 @@ def heading_window(batches: Sequence[Batch]) -> HeadingWindow:
         samples=sum(batch.n for batch in batches),
         heading_deg=float(np.mod(mean[0] + first[0], 360.0)),
         sigma_deg=float(sigma[0]),
+        from_field=from_field,
+        wander_deg=wander_deg,
     )
+
+
+def field_window(batches: Sequence[Batch], unit: FieldUnit) -> FieldWindow:
+    """The field's window from the batches of good seconds, at least one."""
+    mean, sigma = _pose_mean(batches, np.array([batch.mean for batch in batches]))
+    (x, y, z), (sx, sy, sz) = mean.tolist(), sigma.tolist()
+    return FieldWindow(samples=sum(batch.n for batch in batches), field=(x, y, z), sigma=(sx, sy, sz), unit=unit)
 
 
 def _pose_mean(batches: Sequence[Batch], values: Floats) -> tuple[Floats, Floats]:

@@ -43,6 +43,51 @@ class Site(msgspec.Struct, frozen=True, kw_only=True):
     source: str | None
 
 
+class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
+    """What is known of the magnetic field at the compass, and so of the heading."""
+
+    heading_bound_deg: float | None
+    """The heading's error exceeds this in one case of twenty; None where the device tells no field, or no place is
+    known. 180: the field shows no heading."""
+    heading_from: Literal["device", "field"]
+    """Whose tilt compensation: the device's own, or ours with the gradienter."""
+    field_gauss: float | None
+    """As measured; None where the device gives counts only, or no field."""
+    field_expected_gauss: float | None
+    """By WMM2025, likewise the next."""
+    inclination_deg: float | None
+    """Down positive; needs a gradienter."""
+    inclination_expected_deg: float | None
+    device_minus_field_deg: float | None
+    """The device's own heading less that from its field and the gradienter, where it gives both."""
+    wander_deg: float | None
+    """By how much the heading has changed while nothing else said that the aircraft turned."""
+
+    def in_words(self) -> str:
+        """One line for people."""
+        bound = self.heading_bound_deg
+        parts = [
+            "heading error bound unknown"
+            if bound is None
+            else "shows no heading here"
+            if bound >= 180.0
+            else f"heading good to {bound:.1f} deg"
+        ]
+        if self.heading_from == "field":
+            parts.append("worked out from its field and the gradienter")
+        if self.field_gauss is not None:
+            parts.append(f"field {self.field_gauss:.3f} gauss{_earths(self.field_expected_gauss, '.3f')}")
+        if self.inclination_deg is not None:
+            parts.append(f"inclination {self.inclination_deg:.1f} deg{_earths(self.inclination_expected_deg, '.1f')}")
+        if self.wander_deg is not None:
+            parts.append(f"wandered {self.wander_deg:.1f} deg")
+        return ", ".join(parts)
+
+
+def _earths(expected: float | None, form: str) -> str:
+    return "" if expected is None else f" (the Earth's {expected:{form}})"
+
+
 class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):
     """One autopilot parameter: before, what was set, what came back.
 
@@ -116,6 +161,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     """MAVLink system of the vehicle; None while it had not been heard."""
     undone_at: str | None = None
     """UTC, ISO 8601: when what this calibration has written was put back on request."""
+    magnetic: Magnetic | None = None
+    """How good the heading can be; None without a compass."""
     armings: tuple[Arming, ...] = ()
     """Armings while this calibration was in force; empty in the file, filled in by the history."""
 

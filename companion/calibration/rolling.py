@@ -15,7 +15,10 @@ import numpy as np
 
 from companion.calibration.batches import Batch
 from companion.calibration.estimates import Estimates, Found, Work
+from companion.calibration.field_heading import FieldHeading
+from companion.calibration.heading_watch import HeadingWatch
 from companion.calibration.outlook import Glance, Status
+from companion.calibration.pose_models import CompassModel, GradienterModel
 from companion.calibration.pose_windows import HeadingWindow, TiltWindow, heading_window, tilt_window
 from companion.calibration.settling import AT_ONCE, Lag
 from companion.calibration.sources import Source, SourceStatus, compass_source, gradienter_source, imu_source
@@ -25,7 +28,7 @@ from companion.calibration.stretch import Stretch
 from companion.calibration.trace import Snapshot, TraceLog
 from companion.calibration.windows import ImuInput, ImuWindow, Window, integer_steps
 from companion.errors import CalibrationRefusedError
-from companion.samples import CompassSample, ImuSample, TiltSample
+from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 
 __all__ = [
     "Glance",
@@ -62,10 +65,14 @@ class RollingCollector:
         compass: whether a compass is expected.
         gradienter_lag: how the gradienter follows the truth.
         compass_lag: likewise.
+        field_by: how to make a heading of the compass' field vector; None: fields are dropped.
 
     Raises:
         ValueError: two IMUs of one name.
     """
+
+    _field: FieldHeading | None = None
+    _watch: HeadingWatch | None = None
 
     def __init__(
         self,
@@ -76,6 +83,7 @@ class RollingCollector:
         compass: bool,
         gradienter_lag: Lag = AT_ONCE,
         compass_lag: Lag = AT_ONCE,
+        field_by: tuple[CompassModel, GradienterModel | None] | None = None,
     ) -> None:
         if len({imu.name for imu in imus}) != len(imus):
             raise ValueError("two IMUs have one name")
@@ -89,6 +97,8 @@ class RollingCollector:
         self._tilt = gradienter_source(self._keep, gradienter_lag) if gradienter else None
         self._heading = compass_source(self._keep, compass_lag) if compass else None
         self._boots: dict[str, int] = {}
+        self._field = None if field_by is None else FieldHeading(*field_by, self._keep)
+        self._watch = HeadingWatch()
         self._stretch = Stretch(self._min_good, self._max_slots)
         self._next: int | None = None
         self._now_s = -math.inf
@@ -120,13 +130,30 @@ class RollingCollector:
 
     def add_tilt(self, sample: TiltSample) -> None:
         """Take one reading of the gradienter; dropped when none is expected."""
+        if self._field is not None:
+            self._field.take_tilt(sample)
         if self._tilt is None:
             self.unknown_samples += 1
         elif self._tilt.batches.add(sample.t_s, (sample.x_deg, sample.y_deg), sample.temperature_degc):
             self._evaluate()
 
     def add_compass(self, sample: CompassSample) -> None:
-        """Take one heading; dropped when no compass is expected."""
+        """Take one heading of the device's own; dropped when no compass, or a heading from its field, is expected."""
+        if self._field is None or self._field.takes_own(sample):
+            self._take_heading(sample)
+
+    def add_field(self, sample: MagSample) -> CompassSample | None:
+        """Take the compass' field; the heading that came of it, where that is the one that counts."""
+        if self._heading is None or self._field is None:
+            self.unknown_samples += 1
+            return None
+        heading = self._field.take(sample)
+        self._heading.hint = self._field.hint
+        if heading is not None:
+            self._take_heading(heading)
+        return heading
+
+    def _take_heading(self, sample: CompassSample) -> None:
         if self._heading is None:
             self.unknown_samples += 1
         elif self._heading.batches.add(sample.t_s, (sample.heading_deg,)):
@@ -275,7 +302,14 @@ class RollingCollector:
             end_s=slots[-1] + 1.0,
             imus=tuple(item.window for item in estimates),
             tilt=tilt_window(self._pose_batches(self._tilt, slots)) if self._tilt else None,
-            heading=heading_window(self._pose_batches(self._heading, slots)) if self._heading else None,
+            heading=heading_window(
+                self._pose_batches(self._heading, slots),
+                from_field=self._field is not None and self._field.from_field,
+                wander_deg=None if self._watch is None else self._watch.wander_deg,
+            )
+            if self._heading
+            else None,
+            field=self._field.window(slots) if self._field and self._heading else None,
         )
 
     def imu_seconds(self) -> dict[str, Batch]:
@@ -305,6 +339,8 @@ class RollingCollector:
             self._now_s = now_s
             for source in self._sources():
                 source.batches.close_before(now_s - _CLOSE_S)
+            if self._field is not None:
+                self._field.batches.close_before(now_s - _CLOSE_S)
         self._evaluate()
 
     def _evaluate(self) -> None:
@@ -343,6 +379,9 @@ class RollingCollector:
         for source in sources:  # the IMUs first: they say whether it moved
             good = source.judge(slot, moved=moved) and good
             moved = moved or (source.kind == "imu" and not source.verdict.still and not source.verdict.fault)
+        if self._watch is not None and self._heading is not None:
+            others = [source.verdict for source in sources if source is not self._heading]
+            self._watch.take(self._heading.batches.batches.get(slot), others)
         self._trace.add(slot, sources, good=good)
         if not self._stretch.add(slot, good=good):
             self._break()

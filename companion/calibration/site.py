@@ -21,8 +21,6 @@ from companion.physics.frames import Array, Matrix
 GRAVITY_MODEL_SIGMA_M_S2: Final = 3.0e-4
 GRAVITY_BY_HEIGHT_1_S2: Final = 3.086e-6
 UNKNOWN_HEIGHT_SIGMA_M: Final = 1000.0
-# WMM2025's own error of D is about 0.4 degrees at middle latitudes.
-DECLINATION_SIGMA_DEG: Final = 0.5
 # Declination over the inhabited Earth stays within some 20 degrees: sigma when nobody knows the position.
 UNKNOWN_DECLINATION_SIGMA_DEG: Final = 12.0
 
@@ -57,6 +55,8 @@ class LocalEarth:
     declination_deg: float
     declination_sigma_deg: float
     warnings: tuple[str, ...]
+    field: earth.MagneticField | None = None
+    """The Earth's magnetic field by its model; None without position and date."""
 
     def rate_in_body(self, body_from_ned: Matrix, *, heading_known: bool) -> Uncertain:
         """The Earth's rate in body axes.
@@ -90,26 +90,27 @@ def local_earth(where: Whereabouts) -> LocalEarth:
         if where.height_m is None:
             warnings.append("height unknown: gravity uncertain by 0.3 mg (set vehicle.height_m or wait for GPS)")
             gravity_sigma = math.hypot(gravity_sigma, UNKNOWN_HEIGHT_SIGMA_M * GRAVITY_BY_HEIGHT_1_S2)
-    declination = _declination_deg(where, warnings)
+    field = _magnetic_field(where, warnings)
     return LocalEarth(
         site=Site(
             latitude_deg=where.latitude_deg,
             height_m=where.height_m,
             gravity_m_s2=gravity,
-            declination_deg=declination,
+            declination_deg=None if field is None else field.declination_deg,
             source=where.source,
         ),
         gravity_m_s2=used_gravity,
         gravity_sigma_m_s2=gravity_sigma,
         rate_ned_rad_s=rate,
         rate_ned_covariance=covariance,
-        declination_deg=declination or 0.0,
-        declination_sigma_deg=UNKNOWN_DECLINATION_SIGMA_DEG if declination is None else DECLINATION_SIGMA_DEG,
+        declination_deg=0.0 if field is None else field.declination_deg,
+        declination_sigma_deg=UNKNOWN_DECLINATION_SIGMA_DEG if field is None else field.declination_sigma_deg,
         warnings=tuple(warnings),
+        field=field,
     )
 
 
-def _declination_deg(where: Whereabouts, warnings: list[str]) -> float | None:
+def _magnetic_field(where: Whereabouts, warnings: list[str]) -> earth.MagneticField | None:
     if where.latitude_deg is None or where.longitude_deg is None or where.date is None:
         return None
     first, last = earth.WMM_VALID_YEARS
@@ -118,4 +119,4 @@ def _declination_deg(where: Whereabouts, warnings: list[str]) -> float | None:
             f"the date {where.date.isoformat()} lies outside the magnetic model ({first:.0f} to {last:.0f}):"
             " declination of its nearest year used"
         )
-    return earth.declination_deg(where.latitude_deg, where.longitude_deg, where.height_m or 0.0, where.date)
+    return earth.magnetic_field(where.latitude_deg, where.longitude_deg, where.height_m or 0.0, where.date)

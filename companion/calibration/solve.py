@@ -14,49 +14,32 @@ from typing import Final
 
 import numpy as np
 
+from companion.calibration import magnetic
 from companion.calibration.bias import accelerometer_bias, attitude_error_jacobian, bias_covariance, gyro_bias
-from companion.calibration.record import Pose, PoseSigma, Site
+from companion.calibration.pose_models import CompassModel, GradienterModel, up_in_vehicle, vehicle_heading_rad
+from companion.calibration.record import Magnetic, Pose, PoseSigma, Site
 from companion.calibration.request import What
-from companion.calibration.rolling import HeadingWindow, ImuWindow, TiltWindow, Window
+from companion.calibration.rolling import ImuWindow, TiltWindow, Window
 from companion.calibration.site import LocalEarth, Whereabouts, local_earth
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
-from companion.physics.gradienter import Law, up_in_sensor, up_jacobian
+from companion.physics.gradienter import up_jacobian
 from companion.physics.units import DEG
+
+__all__ = [
+    "CompassModel",
+    "GradienterModel",
+    "ImuSolution",
+    "Solution",
+    "Truth",
+    "solve",
+    "solve_at",
+    "up_in_vehicle",
+    "vehicle_heading_rad",
+]
 
 # Without a gradienter the accelerometers level the Earth's rate; a 50 mg bias tilts it by 3 degrees (0.8 deg/h).
 LEVEL_BY_ACCELEROMETER_SIGMA_DEG: Final = 3.0
-LEVEL_COSINE: Final = math.cos(2.0 * DEG)
-"""Data sheets give a compass' error "level" and "tilted" without a border: only what a table is counts as level."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class GradienterModel:
-    """How a gradienter's readings become the direction of up in the vehicle: law, zero offset, mounting, sigma."""
-
-    law: Law
-    vehicle_from_sensor: Matrix
-    offset_deg: tuple[float, float]
-    sigma_deg: float
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class CompassModel:
-    """How a compass reading becomes a true heading: reference, offset, mounting, sigma."""
-
-    magnetic: bool
-    vehicle_from_sensor: Matrix
-    offset_deg: float
-    sigma_deg: float
-    tilted_sigma_deg: float | None = None
-    """Where it does not stand level; None: as `sigma_deg`."""
-
-    def sigma_at(self, up: Array) -> float:
-        """Its sigma in degrees where `up`, shape (3,), is up in the vehicle's axes."""
-        upright = float(-(self.vehicle_from_sensor.T @ up)[2])
-        if self.tilted_sigma_deg is None or upright >= LEVEL_COSINE:
-            return self.sigma_deg
-        return self.tilted_sigma_deg
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -101,6 +84,8 @@ class Truth:
     from_gradienter: bool
     tilt_sigma_rad: tuple[float, float]
     """Of theta and gamma."""
+    magnetic: Magnetic | None = None
+    """What the compass' field and steadiness say of the heading; None without a compass."""
 
     @property
     def body_from_ned(self) -> Matrix:
@@ -119,6 +104,8 @@ class Solution:
     warnings: tuple[str, ...]
     unknown: tuple[str, ...] = ()
     """What was asked for and its readings do not tell, such as "gyro fc"; the IMU's warnings say why."""
+    magnetic: Magnetic | None = None
+    """How good the heading can be; None without a compass."""
 
 
 def solve(
@@ -156,7 +143,14 @@ def solve(
             raise CalibrationRefusedError("; ".join(refusals))
     unknown = [f"gyro {imu.name}" for imu in window.imus if what.gyros and imu.refused("gyro")]
     unknown += [f"accel {imu.name}" for imu in window.imus if accelerometers and imu.refused("accel")]
-    return Solution(pose=_pose(truth), site=local.site, imus=imus, warnings=tuple(warnings), unknown=tuple(unknown))
+    return Solution(
+        pose=_pose(truth),
+        site=local.site,
+        imus=imus,
+        warnings=tuple(warnings),
+        unknown=tuple(unknown),
+        magnetic=truth.magnetic,
+    )
 
 
 def solve_at(
@@ -197,35 +191,26 @@ def _truth(
         math.sqrt(up_covariance[0, 0] / (1.0 - up[0] ** 2)),
         math.sqrt(gamma_variance @ up_covariance @ gamma_variance),
     )
-    heading = heading_sigma = None
-    if compass is not None and window.heading is not None:
-        heading, heading_sigma = _heading(window.heading, compass, up, local)
-        covariance = covariance + np.outer(up, up) * heading_sigma**2
-        if compass.magnetic and local.site.declination_deg is None:
-            warnings.append("declination unknown (no position or date): magnetic heading used, sigma widened")
-    return Truth(up, covariance, heading, heading_sigma, gradienter is not None, tilt_sigma)
-
-
-def up_in_vehicle(model: GradienterModel, x_deg: float, y_deg: float) -> Array:
-    """Up in the vehicle's axes, shape (3,), from the gradienter's two readings.
-
-    Raises:
-        ValueError: the readings cannot belong together.
-    """
-    x_deg, y_deg = x_deg - model.offset_deg[0], y_deg - model.offset_deg[1]
-    return model.vehicle_from_sensor @ up_in_sensor(model.law, x_deg, y_deg)
-
-
-def vehicle_heading_rad(compass: CompassModel, heading_deg: float, up: Array) -> float:
-    """Heading of the vehicle, from the compass' own north (magnetic or true), not wrapped.
-
-    A compass gives the azimuth of its own forward axis. The azimuth that this axis has when the vehicle heads
-    north, at the tilt it has, is what the mounting adds.
-    """
-    gamma, theta = roll_pitch_from_up(up)
-    forward_ned = body_from_ned(gamma, theta, 0.0).T @ compass.vehicle_from_sensor[:, 0]
-    mounted_rad = math.atan2(forward_ned[1], forward_ned[0])
-    return (heading_deg + compass.offset_deg) * DEG - mounted_rad
+    if compass is None or window.heading is None:
+        return Truth(up, covariance, None, None, gradienter is not None, tilt_sigma)
+    found = magnetic.assess(
+        window.heading,
+        window.field,
+        compass,
+        local,
+        up,
+        up_covariance if gradienter is not None else None,
+    )
+    warnings += found.warnings
+    if not found.is_usable:
+        return Truth(up, covariance, None, None, gradienter is not None, tilt_sigma, found.magnetic)
+    if compass.magnetic and local.site.declination_deg is None:
+        warnings.append("declination unknown (no position or date): magnetic heading used, sigma widened")
+    # A heading from the field takes part in the tilt's errors: one wrong tilt turns all three angles.
+    turned = jacobian - np.outer(up, found.heading_by_up)
+    covariance = turned @ up_covariance @ turned.T + np.outer(up, up) * found.sigma_rad**2
+    sigma = math.sqrt(found.sigma_rad**2 + found.heading_by_up @ up_covariance @ found.heading_by_up)
+    return Truth(up, covariance, found.heading_rad, sigma, gradienter is not None, tilt_sigma, found.magnetic)
 
 
 def _up(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix]:
@@ -238,16 +223,6 @@ def _up(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix]:
         raise CalibrationRefusedError(str(error)) from None
     variance = [(math.hypot(model.sigma_deg, sigma) * DEG) ** 2 for sigma in (tilt.x_sigma_deg, tilt.y_sigma_deg)]
     return up, jacobian @ np.diag(variance) @ jacobian.T
-
-
-def _heading(window: HeadingWindow, compass: CompassModel, up: Array, local: LocalEarth) -> tuple[float, float]:
-    """True heading of the vehicle and its sigma, radians."""
-    sigma_deg = math.hypot(compass.sigma_at(up), window.sigma_deg)
-    heading_rad = vehicle_heading_rad(compass, window.heading_deg, up)
-    if compass.magnetic:
-        heading_rad += local.declination_deg * DEG
-        sigma_deg = math.hypot(sigma_deg, local.declination_sigma_deg)
-    return heading_rad, sigma_deg * DEG
 
 
 def _pose(truth: Truth) -> Pose:

@@ -42,6 +42,9 @@ class SourceStatus(msgspec.Struct, frozen=True, kw_only=True):
 class Source:
     """One stream: its batches, its gate, its last verdict."""
 
+    hint = ""
+    """Why nothing comes, where somebody knows better than "no data"."""
+
     def __init__(
         self,
         kind: Kind,
@@ -107,9 +110,9 @@ class Source:
         """One line when nothing comes; None when data flows."""
         last = self.batches.last_s
         if last is None:
-            return f"no data from {self.label} yet"
+            return self.hint or f"no data from {self.label} yet"
         if now_s - last > _SILENT_S:
-            return f"no data from {self.label} for {now_s - last:.0f} s"
+            return self.hint or f"no data from {self.label} for {now_s - last:.0f} s"
         return None
 
     def status(self, now_s: float) -> SourceStatus:

@@ -23,7 +23,7 @@ from companion.calibration.allan import (
 )
 from companion.calibration.batches import Batch
 from companion.calibration.integers import integer_columns
-from companion.calibration.pose_windows import HeadingWindow, TiltWindow
+from companion.calibration.pose_windows import FieldWindow, HeadingWindow, TiltWindow
 from companion.calibration.quantised import EDGE_RMS
 from companion.calibration.robust import huber_line, huber_mean
 from companion.errors import CalibrationRefusedError
@@ -126,6 +126,8 @@ class Window(msgspec.Struct, frozen=True, kw_only=True):
     imus: tuple[ImuWindow, ...]
     tilt: TiltWindow | None
     heading: HeadingWindow | None
+    field: FieldWindow | None = None
+    """Of a compass that gives the field too; its seconds are those of the others, as far as it sent in them."""
 
 
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
+from companion.calibration.record import Magnetic
 from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
@@ -36,10 +39,17 @@ def record_lines(record: Object) -> list[str]:
                 )
             )
         )
+    lines += _magnetic_lines(record.get("magnetic"))
     for imu in record["imus"]:
         lines += _imu_lines(imu)
     lines += [f"warning: {warning}" for warning in record["warnings"]]
     return lines
+
+
+def _magnetic_lines(magnetic: Object | None) -> list[str]:
+    if magnetic is None:
+        return []
+    return [f"compass: {msgspec.convert(magnetic, Magnetic).in_words()}"]
 
 
 def _imu_lines(imu: Object) -> list[str]:
@@ -103,6 +113,8 @@ def status_lines(status: Object) -> list[str]:
     if status["page"] is not None:
         lines.append(f"page: {'' if status['page']['good'] else 'none: '}{status['page']['summary']}")
     lines.append(_last_line(status))
+    if status["last"] is not None:
+        lines += _magnetic_lines(status["last"].get("magnetic"))
     return lines
 
 

@@ -52,6 +52,7 @@ def check_together(config: Config, name: str) -> None:
             _check_mounting(device.mounting, f"{section}.mounting", name)
             _check_upright(device.mounting, f"{section}.mounting", name)
             _check_port(device.port, f"{section}.port", name)
+    _check_field_heading(config, name)
     _check_ports_differ(config, name)
     _check_mavlink_url(config.mavlink.url, name)
     if config.web is not None:
@@ -71,6 +72,20 @@ def check_together(config: Config, name: str) -> None:
         raise ConfigError(
             f"{name}: 'calibration.max_s': found {config.calibration.max_s:g}; allowed: at least"
             f" min_still_s ({config.calibration.min_still_s:g})"
+        )
+
+
+def _check_field_heading(config: Config, name: str) -> None:
+    if config.compass is None or config.compass.heading != "field":
+        return
+    if config.gradienter is None:
+        raise ConfigError(
+            f"{name}: 'compass.heading': found 'field'; allowed: only with a [gradienter], whose tilt it needs"
+        )
+    if config.compass.reference != "magnetic":
+        raise ConfigError(
+            f"{name}: 'compass.heading': found 'field'; allowed: only with reference = \"magnetic\", the north that"
+            " a field shows"
         )
 
 

@@ -98,6 +98,10 @@ class Compass(Section, frozen=True):
     read_only: bool = False
     lag_s: Annotated[float, Meta(ge=0, le=60)] | None = None
     """Likewise."""
+    heading: Literal["device", "field"] = "device"
+    """The device's own where it sends one, or worked out from its field vector and the gradienter's tilt."""
+    counts_per_gauss: PositiveFloat | None = None
+    """Of a device that gives its field in counts; not said: the field's strength is not checked."""
 
 
 class Calibration(Section, frozen=True):

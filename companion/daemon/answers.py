@@ -223,4 +223,9 @@ def _plain(value: object) -> Any:
 def _summary(record: Record | None) -> Object | None:
     if record is None:
         return None
-    return {"state": record.state, "started_at": record.started_at, "reason": record.reason}
+    return {
+        "state": record.state,
+        "started_at": record.started_at,
+        "reason": record.reason,
+        "magnetic": _plain(record.magnetic),
+    }

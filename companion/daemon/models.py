@@ -135,6 +135,8 @@ def compass_model(compass: Compass | None) -> CompassModel | None:
         offset_deg=compass.offset_deg,
         sigma_deg=said_deg or info.sigma_deg or HEADING_SIGMA_DEG,
         tilted_sigma_deg=info.tilted_sigma_deg if said_deg is None else None,
+        counts_per_gauss=compass.counts_per_gauss,
+        prefers_field=compass.heading == "field",
     )
 
 
@@ -145,6 +147,12 @@ def lag(kind: Literal["gradienter", "compass"], device: Gradienter | Compass | N
         return AT_ONCE
     lag_s = PROTOCOLS[kind][device.protocol].lag_s if device.lag_s is None else device.lag_s
     return Lag(lag_s, model.sigma_deg)
+
+
+def field_by(config: Config) -> tuple[CompassModel, GradienterModel | None] | None:
+    """How a heading comes of the compass' field vector, if there is a compass."""
+    compass = compass_model(config.compass)
+    return None if compass is None else (compass, gradienter_model(config.gradienter))
 
 
 def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:

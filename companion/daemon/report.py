@@ -57,6 +57,7 @@ class Draft:
             pose=solution.pose if solution else None,
             site=solution.site if solution else None,
             system_id=self.system_id,
+            magnetic=solution.magnetic if solution else None,
             imus=tuple(self._imu(estimate) for estimate in solution.imus) if solution else (),
         )
 

@@ -13,7 +13,7 @@ from companion.calibration.rolling import RollingCollector
 from companion.config import Compass, Config, Gradienter, Imu
 from companion.protocols.registry import PROTOCOLS, Kind, ProtocolInfo
 from companion.protocols.roles import Part, part_for
-from companion.samples import CompassSample, ImuSample, Sample, TiltSample
+from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -80,8 +80,8 @@ def parts_of(sample: Sample, roles: Sequence[Role]) -> Iterator[tuple[Role, Part
             yield role, part
 
 
-def collect(collector: RollingCollector, role: Role, part: Part) -> None:
-    """Give the collector what a role has taken."""
+def collect(collector: RollingCollector, role: Role, part: Part) -> CompassSample | None:
+    """Give the collector what a role has taken; the heading that it has made of a field, if it was one."""
     match part:
         case ImuSample():
             collector.add_imu(role.name, part)
@@ -89,3 +89,6 @@ def collect(collector: RollingCollector, role: Role, part: Part) -> None:
             collector.add_tilt(part)
         case CompassSample():
             collector.add_compass(part)
+        case MagSample():
+            return collector.add_field(part)
+    return None

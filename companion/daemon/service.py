@@ -94,6 +94,7 @@ class Service:
             compass=config.compass is not None,
             gradienter_lag=models.lag("gradienter", config.gradienter),
             compass_lag=models.lag("compass", config.compass),
+            field_by=models.field_by(config),
             message_of=self._message_of,
         )
         self.slots = SlotMemory()
@@ -252,9 +253,9 @@ class Service:
         )
 
     def _take(self, role: Role, part: Part) -> None:
+        heading = collect(self.collector, role, part)
         if role.kind != "imu":
-            self.pose.take(part)
-        collect(self.collector, role, part)
+            self.pose.take(part if heading is None else heading)
 
     async def run(self) -> None:
         """Run until cancelled, reachable on the control socket.

@@ -7,9 +7,9 @@ One device on one port may be IMU, gradienter and compass at once. A decoder giv
 from __future__ import annotations
 
 from companion.protocols.registry import Kind
-from companion.samples import CompassSample, ImuSample, Sample, TiltSample
+from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
 
-Part = ImuSample | TiltSample | CompassSample
+Part = ImuSample | TiltSample | CompassSample | MagSample
 
 
 def part_for(role: Kind, sample: Sample) -> Part | None:
@@ -19,6 +19,8 @@ def part_for(role: Kind, sample: Sample) -> Part | None:
             return sample if role == "imu" else None
         case TiltSample():
             return sample if role == "gradienter" else None
+        case MagSample():
+            return sample if role == "compass" else None
         case CompassSample(pitch_deg=pitch_deg, roll_deg=roll_deg):
             if role == "compass":
                 return sample

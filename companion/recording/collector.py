@@ -9,6 +9,7 @@ from typing import Final
 
 from companion.calibration.estimates import Work
 from companion.calibration.outlook import Glance, Status
+from companion.calibration.pose_models import CompassModel, GradienterModel
 from companion.calibration.rolling import ImuInput, RollingCollector, Settings, Window
 from companion.calibration.settling import AT_ONCE, Lag
 from companion.recording.journal import Journal
@@ -28,6 +29,7 @@ class RecordedCollector(RollingCollector):
         compass: likewise.
         gradienter_lag: likewise.
         compass_lag: likewise.
+        field_by: likewise.
         message_of: the autopilot's message that an IMU's samples come in at present; None for one of our own.
     """
 
@@ -42,6 +44,7 @@ class RecordedCollector(RollingCollector):
         compass: bool,
         gradienter_lag: Lag = AT_ONCE,
         compass_lag: Lag = AT_ONCE,
+        field_by: tuple[CompassModel, GradienterModel | None] | None = None,
         message_of: Callable[[str], str | None],
     ) -> None:
         self.journal = Journal()
@@ -56,6 +59,7 @@ class RecordedCollector(RollingCollector):
             compass=compass,
             gradienter_lag=gradienter_lag,
             compass_lag=compass_lag,
+            field_by=field_by,
         )
 
     def number_of(self, window: Window) -> int | None:
@@ -71,9 +75,9 @@ class RecordedCollector(RollingCollector):
         self.journal.tilt(sample)
         super().add_tilt(sample)
 
-    def add_compass(self, sample: CompassSample) -> None:  # noqa: D102
+    def _take_heading(self, sample: CompassSample) -> None:
         self.journal.compass(sample)
-        super().add_compass(sample)
+        super()._take_heading(sample)
 
     def set_imu(self, imu: ImuInput) -> None:  # noqa: D102
         if self.journal.queues:

@@ -23,7 +23,10 @@ from companion.autopilot.rivals import Rival
 from companion.calibration.allan import AllanModel, NoiseProfile
 from companion.calibration.batches import Batch, BatchSource, Counts
 from companion.calibration.estimates import Estimates
-from companion.calibration.pose_windows import HeadingWindow, TiltWindow
+from companion.calibration.field_heading import FieldHeading
+from companion.calibration.heading_watch import HeadingWatch
+from companion.calibration.pose_models import CompassModel, GradienterModel
+from companion.calibration.pose_windows import FieldWindow, HeadingWindow, TiltWindow
 from companion.calibration.rolling import RollingCollector
 from companion.calibration.settling import Lag, Settling
 from companion.calibration.site import Whereabouts
@@ -43,6 +46,8 @@ _CHANGING: Final[dict[str, type]] = {
         RollingCollector,
         Source,
         BatchSource,
+        FieldHeading,
+        HeadingWatch,
         ImuGate,
         PoseGate,
         Settling,
@@ -59,8 +64,11 @@ _VALUES: Final[dict[str, type]] = {
     for each in (
         AllanModel,
         Batch,
+        CompassModel,
         Counts,
         FarStep,
+        FieldWindow,
+        GradienterModel,
         HeadingWindow,
         Hidden,
         ImuCalibration,

@@ -102,6 +102,7 @@ def record_json(record: Record, t_s: float) -> bytes:
     plain = msgspec.to_builtins(record)
     view = {key: plain[key] for key in ("state", "reason", "warnings", "started_at", "duration_s", "system_id")}
     view["pose"], view["site"] = plain["pose"] or {}, plain["site"] or {}
+    view["magnetic"] = plain["magnetic"]
     view["imus"] = [{key: item for key, item in _imu(imu).items() if item is not None} for imu in record.imus]
     return msgspec.json.encode(_without_none({"t_s": t_s, **view, "record": to_json(record).decode()}))
 
@@ -207,6 +208,17 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
             gravity_m_s2=_NUMBER,
             declination_deg=_NUMBER,
             source=_TEXT,
+        ),
+        magnetic=_object(
+            "",
+            heading_bound_deg=_NUMBER,
+            heading_from=_TEXT,
+            field_gauss=_NUMBER,
+            field_expected_gauss=_NUMBER,
+            inclination_deg=_NUMBER,
+            inclination_expected_deg=_NUMBER,
+            device_minus_field_deg=_NUMBER,
+            wander_deg=_NUMBER,
         ),
         imus={
             "type": "array",

@@ -23,6 +23,21 @@ _ADVICE: Final[tuple[tuple[str, str], ...]] = (
         ),
     ),
     (
+        r"move away from iron|nothing else moved|own heading is|compass field too",
+        (
+            "Move the aircraft away from cars, steel tables, reinforced concrete and running motors, calibrate again;"
+            " if it stays, the compass itself needs its calibration (docs/magnetic.md)."
+        ),
+    ),
+    (
+        r"magnetic pole|compass field is vertical",
+        "Nothing helps here: the Earth's field is too steep for a compass. The gyros' sigma allows for it.",
+    ),
+    (
+        r"counts_per_gauss|compass field without",
+        "Set counts_per_gauss in [compass] from the device's manual, or add a gradienter (docs/magnetic.md).",
+    ),
+    (
         r"declination|latitude unknown|height unknown",
         (
             "Set latitude_deg, longitude_deg and height_m in [vehicle], or wait for the autopilot's position, then"

@@ -144,6 +144,7 @@ class Rig:
         )
         if baud is not None:
             text = text.replace("udpout:127.0.0.1:9", f"serial:/nowhere/autopilot:{baud}")
+        self.text = text
         self.config = parse(text, "rig.toml")
         self.link = MavlinkLink()
         self.devices: dict[str, SerialDevice] = {

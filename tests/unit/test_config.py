@@ -295,3 +295,23 @@ def test_the_broker_by_default_and_with_tls(monkeypatch: pytest.MonkeyPatch) -> 
     assert mqtt.broker_port == 8883
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", "/run/credentials/companion")
     assert mqtt.password_path == Path("/run/credentials/companion/mqtt.password")
+
+
+COMPASS = "[compass]\nport = '/dev/ttyS1'\nprotocol = 'hmr3300'\n"
+GRADIENTER = "[gradienter]\nport = '/dev/ttyS2'\nprotocol = 'inclinometer_xy'\nlaw = 'slope'\n"
+
+
+def test_a_heading_out_of_the_field_needs_a_gradienter_and_magnetic_north() -> None:
+    usual = parse(GOOD + COMPASS, "x.toml").compass
+    assert usual is not None
+    assert (usual.heading, usual.counts_per_gauss) == ("device", None)
+    own = COMPASS + "heading = 'field'\ncounts_per_gauss = 4000\n"
+    found = parse(GOOD + GRADIENTER + own, "x.toml").compass
+    assert found is not None
+    assert (found.heading, found.counts_per_gauss) == ("field", 4000)
+    with pytest.raises(ConfigError, match=r"^x.toml: 'compass.heading': found 'field'; .*\[gradienter\]"):
+        parse(GOOD + own, "x.toml")
+    with pytest.raises(ConfigError, match=r"'compass.heading': found 'field'; .*magnetic"):
+        parse(GOOD + GRADIENTER + own + "reference = 'true'\n", "x.toml")
+    with pytest.raises(ConfigError, match=r"compass.counts_per_gauss"):
+        parse(GOOD + COMPASS + "counts_per_gauss = 0\n", "x.toml")

@@ -72,12 +72,14 @@ def test_gravity_falls_by_31_5_micro_g_per_100_m() -> None:
 
 
 def test_declination_is_noaas_test_value() -> None:
-    assert earth.declination_deg(80.0, 0.0, 0.0, datetime.date(2025, 1, 1)) == pytest.approx(1.28, abs=0.005)
+    assert earth.magnetic_field(80.0, 0.0, 0.0, datetime.date(2025, 1, 1)).declination_deg == pytest.approx(
+        1.28, abs=0.005
+    )
 
 
 def test_declination_outside_the_models_years_uses_the_nearest() -> None:
-    late = earth.declination_deg(40.0, 116.0, 0.0, datetime.date(2041, 1, 1))
-    last = earth.declination_deg(40.0, 116.0, 0.0, datetime.date(2029, 12, 31))
+    late = earth.magnetic_field(40.0, 116.0, 0.0, datetime.date(2041, 1, 1)).declination_deg
+    last = earth.magnetic_field(40.0, 116.0, 0.0, datetime.date(2029, 12, 31)).declination_deg
     assert late == pytest.approx(last, abs=0.01)
 
 

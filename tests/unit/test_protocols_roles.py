@@ -29,6 +29,7 @@ WITH_TILT = CompassSample(1.0, 40.0, pitch_deg=5.0, roll_deg=-3.0)
         ("compass", TILT, None),
         ("compass", WITH_TILT, WITH_TILT),
         ("imu", MagSample(1.0, counts=(1, 2, 3)), None),
+        ("compass", MagSample(1.0, counts=(1, 2, 3)), MagSample(1.0, counts=(1, 2, 3))),
         ("gradienter", AttitudeSample(1.0, 1.0, 2.0, 3.0), None),
     ],
 )

@@ -13,7 +13,7 @@ from operator import xor
 import numpy as np
 import pytest
 
-from sim.aircraft import Pose, Site, VirtualAircraft
+from sim.aircraft import Iron, Pose, Site, VirtualAircraft
 from sim.devices import HMR3300, Frame, Gradienter, ImuLine, SerialDevice, VectorNavAscii, VectorNavBinary
 from sim.imu_model import ImuModel
 from sim.motions import Knock, Turn
@@ -48,6 +48,29 @@ def test_hmr3300_heading_wraps_before_360_and_zero_has_no_minus() -> None:
     for heading, text in ((359.96, "0.0"), (359.94, "359.9"), (-0.04, "0.0"), (0.04, "0.0")):
         compass = HMR3300(VirtualAircraft(Pose(-0.04, 0.0, heading)), heading_noise_deg=0.0)
         assert compass.frames_until(0.0)[0].data == f"{text}, 0.0, 0.0\r\n".encode()
+
+
+def test_the_field_is_the_places_and_iron_turns_the_heading_as_it_must() -> None:
+    site = Site(40.0, 116.0, 50.0, declination_deg=-7.5, inclination_deg=60.0, field_gauss=0.5)
+    level = VirtualAircraft(Pose(heading_deg=0.0), site)
+    np.testing.assert_allclose(level.field_gauss(0.0), [0.24786, -0.03263, 0.43301], atol=1e-5)
+    compass = HMR3300(level, heading_noise_deg=0.0, field_noise_gauss=0.0)
+    assert compass.frames_until(0.0)[0].data == b"7.5, 0.0, 0.0\r\n"
+    compass.command(b"*M\r\n", 0.0)
+    assert compass.frames_until(0.125)[0].data == b"991, -131, 1732\r\n"
+    # A quarter of the horizontal field across magnetic north turns it by atan(1/4), 14.04 degrees, whoever brings it.
+    east = (0.0625 * math.sin(math.radians(7.5)), 0.0625 * math.cos(math.radians(7.5)), 0.0)
+    compass.command(b"*H\r\n", 0.0)
+    level.iron = Iron(body_gauss=east)
+    assert compass.frames_until(0.25)[0].data == b"353.5, 0.0, 0.0\r\n"
+    # A dipole a metre ahead that points at the compass' right: mu0 m / (4 pi r^3), 1 A m^2 is 1e-3 gauss, reversed.
+    across = tuple(-62.5 * value / 0.0625 for value in east)
+    level.iron = Iron(dipole_a_m2=(across[0], across[1], 0.0), dipole_at_m=(0.0, 0.0, 1.0))
+    assert compass.frames_until(0.375)[0].data == b"353.5, 0.0, 0.0\r\n"
+    # On its axis a dipole is twice as strong.
+    np.testing.assert_allclose(
+        Iron(dipole_a_m2=(0.0, 10.0, 0.0), dipole_at_m=(0.0, 2.0, 0.0)).ground_ned_gauss, [0, 0.0025, 0]
+    )
 
 
 def test_hmr3300_tilt_is_fooled_by_acceleration() -> None:

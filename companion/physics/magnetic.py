@@ -1,0 +1,103 @@
+"""What a magnetic field vector says of the heading, and how far it may be wrong.
+
+`up` is the unit vector of specific force at rest, `field` the field vector in any unit, both of shape (3,) and in the
+same axes: forward, right, down of the vehicle or of the sensor. Method section 3, rows "tilt-compensated heading" and
+"magnetic quality".
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from companion.physics.frames import Array
+from companion.physics.units import DEG
+
+BOUND_OF_TWO: Final = 3.043
+"""95 % bound of a third component over the root of the sum of squares of two that are known, where all three are drawn
+with one unknown size: Student's t with two degrees of freedom, 4.303 / sqrt(2). A direction that is uniform on the
+sphere gives the same, 0.95 / sqrt(1 - 0.95^2)."""
+BOUND_OF_ONE: Final = 12.71
+"""The same where only one component is known: Student's t with one degree of freedom."""
+
+
+def horizontal(vector: Array, up: Array) -> Array:
+    """The part of a vector that lies across up, shape (3,)."""
+    return vector - (vector @ up) * up
+
+
+def heading_rad(field: Array, up: Array) -> float:
+    """Heading of the first axis from magnetic north, clockwise, in (-pi, pi].
+
+    For up = (sin theta, -sin gamma cos theta, -cos gamma cos theta) this is the usual tilt compensation:
+    Xh = mx cos theta + my sin gamma sin theta + mz cos gamma sin theta, Yh = my cos gamma - mz sin gamma,
+    heading = atan2(-Yh, Xh).
+
+    Raises:
+        ValueError: the first axis or the field is vertical: there is no heading.
+    """
+    forward, right = _horizontal_axes(up)
+    ahead, across = float(field @ forward), float(field @ right)
+    if math.hypot(ahead, across) <= _VERTICAL * float(np.linalg.norm(field)):
+        raise ValueError("the field is vertical: it shows no heading")
+    return math.atan2(-across, ahead)
+
+
+def heading_by_up(field: Array, up: Array) -> Array:
+    """The gradient of `heading_rad` by `up` (for changes across up), shape (3,): minus tan I along magnetic east.
+
+    A wrong tilt lets the vertical field look like a horizontal one: tan I times the tilt error about magnetic north
+    (2.5 times at 68 degrees); tan theta times that about the heading comes from the definition of a heading.
+
+    Raises:
+        ValueError: as `heading_rad`.
+    """
+    forward, right = _horizontal_axes(up)
+    heading = heading_rad(field, up)
+    east = math.sin(heading) * forward + math.cos(heading) * right
+    pitch_rad = math.asin(max(-1.0, min(1.0, float(up[0]))))
+    return -math.tan(pitch_rad) * right - math.tan(inclination_rad(field, up)) * east
+
+
+def inclination_rad(field: Array, up: Array) -> float:
+    """How far the field points below the horizon, in [-pi/2, pi/2]."""
+    return math.atan2(-float(field @ up), float(np.linalg.norm(horizontal(field, up))))
+
+
+def inclination_by_up(field: Array, up: Array) -> Array:
+    """The gradient of `inclination_rad` by `up` (for changes across up), shape (3,): minus magnetic north.
+
+    Raises:
+        ValueError: as `heading_rad`.
+    """
+    across = horizontal(field, up)
+    size = float(np.linalg.norm(across))
+    if size <= _VERTICAL * float(np.linalg.norm(field)):
+        raise ValueError("the field is vertical: it shows no heading")
+    return -across / size
+
+
+def deflection_bound_deg(unseen_gauss: float, horizontal_gauss: float) -> float:
+    """How far a field across the meridian turns a compass; 180 where it may be as strong as what is measured.
+
+    With `horizontal_gauss` as measured this is exact, sin(error) = unseen / measured; for small errors it is
+    dB / (F cos I) (method section 3).
+    """
+    if unseen_gauss >= horizontal_gauss:
+        return 180.0
+    return math.asin(unseen_gauss / horizontal_gauss) / DEG
+
+
+_VERTICAL: Final = 1e-9
+
+
+def _horizontal_axes(up: Array) -> tuple[Array, Array]:
+    """Unit vectors along the first axis' horizontal projection, and to the right of it."""
+    ahead = horizontal(np.array([1.0, 0.0, 0.0]), up)
+    size = float(np.linalg.norm(ahead))
+    if size <= _VERTICAL:
+        raise ValueError("the first axis is vertical: it has no heading")
+    forward = ahead / size
+    return forward, np.cross(-up, forward)

@@ -1,0 +1,154 @@
+"""A compass in magnetometer mode, from its bytes to the record, in clean and in disturbed fields."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from companion.calibration.record import Record
+from companion.cli.show import record_lines, status_lines
+from companion.config import parse
+from companion.physics.frames import wrap_deg
+from sim.aircraft import Iron
+from sim.devices import COUNTS_PER_GAUSS, HMR3300
+from tests.e2e.test_calibration import calibrated
+from tests.support.rig import POSE, Rig
+from tests.support.virtual_time import run_virtual
+
+SCALE = f"counts_per_gauss = {COUNTS_PER_GAUSS}\n"
+
+
+class MagneticRig(Rig):
+    """A rig whose compass sends magnetometer lines."""
+
+    def __init__(self, folder: Path, *, compass_keys: str = SCALE, **more: Any) -> None:
+        super().__init__(folder, min_still_s=10.0, max_s=15.0, **more)
+        text = self.text.replace('protocol = "hmr3300"\n', f'protocol = "hmr3300"\n{compass_keys}')
+        self.config = parse(text, "rig.toml")
+        compass = self.devices["compass"]
+        assert isinstance(compass, HMR3300)
+        compass.command(b"*M\r\n", 0.0)
+
+
+async def measured(rig: Rig) -> Record:
+    await rig.ready()
+    result, record = await calibrated(rig)
+    assert result.outcome == "done", result
+    assert record.pose is not None
+    return record
+
+
+def test_magnetometer_lines_give_a_heading_with_the_gradienters_tilt_and_a_bound(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with MagneticRig(tmp_path).running() as rig:
+            record = await measured(rig)
+            assert record.magnetic is not None
+            assert record.magnetic.heading_from == "field"
+            assert record.pose is not None
+            assert record.pose.psi_deg == pytest.approx(POSE.heading_deg, abs=0.2)
+            assert record.magnetic.heading_bound_deg is not None
+            assert record.magnetic.heading_bound_deg < 2.0
+            assert record.magnetic.field_gauss == pytest.approx(rig.site.field_gauss, rel=0.002)
+            assert record.magnetic.inclination_deg == pytest.approx(rig.site.inclination_deg, abs=0.1)
+            assert not [words for words in record.warnings if "compass" in words]
+            true = rig.model.true_bias(rig.aircraft.time_at(rig.now_s))
+            (imu,) = record.imus
+            assert imu.gyro_bias_rad_s is not None
+            assert imu.gyro_sigma_use_rad_s is not None
+            off = np.abs(np.subtract(imu.gyro_bias_rad_s, true.gyro_rad_s)) / imu.gyro_sigma_use_rad_s
+            assert off.max() < 3.5
+            import msgspec
+
+            lines = record_lines(msgspec.to_builtins(record))
+            assert any(line.startswith("compass: heading good to 1.") for line in lines)
+            status = rig.service.status()
+            assert any(line.startswith("compass: heading good to 1.") for line in status_lines(status))
+            pose = status["pose"]
+            assert pose["heading_deg"] == pytest.approx(POSE.heading_deg - rig.site.declination_deg, abs=0.5)
+
+    run_virtual(main())
+
+
+def test_a_magnet_of_the_aircraft_is_bounded_warned_of_and_widens_the_gyros(tmp_path: Path) -> None:
+    async def main() -> None:
+        sigmas = {}
+        for name, iron in (
+            ("clean", Iron()),
+            ("magnet", Iron(body_gauss=(0.012, 0.014, -0.010))),
+            ("car", Iron(dipole_a_m2=(150.0, 60.0, 40.0), dipole_at_m=(1.5, 1.2, 0.2))),
+        ):
+            rig = MagneticRig(tmp_path / name)
+            rig.aircraft.iron = iron
+            async with rig.running():
+                record = await measured(rig)
+            assert record.magnetic is not None
+            assert record.pose is not None
+            assert record.pose.psi_deg is not None
+            assert record.magnetic.heading_bound_deg is not None
+            error_deg = abs(wrap_deg(record.pose.psi_deg - POSE.heading_deg))
+            assert error_deg <= record.magnetic.heading_bound_deg
+            warned = [words for words in record.warnings if "move away from iron" in words]
+            assert bool(warned) == (name != "clean")
+            if name != "clean":
+                assert error_deg > 1.0
+                assert f"off by {record.magnetic.heading_bound_deg:.0f} deg" in warned[0]
+            assert record.imus[0].gyro_sigma_use_rad_s is not None
+            sigmas[name] = record.imus[0].gyro_sigma_use_rad_s[0]
+            assert record.pose.sigma_deg.psi is not None
+            assert record.pose.sigma_deg.psi >= 0.9 * record.magnetic.heading_bound_deg
+        assert min(sigmas["magnet"], sigmas["car"]) > sigmas["clean"]
+
+    run_virtual(main())
+
+
+def test_a_car_that_parks_beside_it_between_two_calibrations_is_seen(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=15.0).running() as rig:
+            await rig.ready()
+            _, first = await calibrated(rig)
+            rig.aircraft.iron = Iron(body_gauss=(0.0, 0.03, 0.0))
+            _, second = await calibrated(rig)
+            assert first.magnetic is not None
+            assert second.magnetic is not None
+            assert first.magnetic.wander_deg is not None
+            assert first.magnetic.wander_deg < 0.3
+            assert first.magnetic.heading_bound_deg is None
+            assert first.pose is not None
+            assert second.pose is not None
+            assert first.pose.psi_deg is not None
+            assert second.pose.psi_deg is not None
+            jump_deg = abs(wrap_deg(second.pose.psi_deg - first.pose.psi_deg))
+            assert jump_deg > 3.0
+            assert second.magnetic.wander_deg == pytest.approx(jump_deg, abs=0.3)
+            assert any("while nothing else moved" in words for words in second.warnings)
+            assert second.pose.sigma_deg.psi is not None
+            assert second.pose.sigma_deg.psi >= jump_deg - 0.3
+
+    run_virtual(main())
+
+
+def test_a_recording_of_a_field_heading_replays_to_the_same_record(tmp_path: Path) -> None:
+    pytest.importorskip("mcap", reason="recordings need the extra")
+    from companion.recording.walk import Recording
+    from companion.replay.engine import Replay
+
+    records: list[Record] = []
+
+    async def main() -> None:
+        async with MagneticRig(tmp_path, recordings_mb=16).running() as rig:
+            records.append(await measured(rig))
+            await asyncio.sleep(3.0)
+
+    run_virtual(main())
+    files = sorted((tmp_path / "recordings").glob("*.mcap"))
+    assert files
+    again = [one for file in files for one in Replay(Recording(file)).run().calibrations]
+    (one,) = again
+    assert one.not_recomputed is None
+    assert one.differences == []
+    assert one.record.magnetic == records[0].magnetic
+    assert one.record.magnetic is not None
