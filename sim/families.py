@@ -55,7 +55,7 @@ Z_UP = (180.0, 0.0, 0.0)
 FITS: dict[tuple[str, str], Fit] = {
     ("gradienter", "inclinometer_xy"): Fit(sigma_deg=0.005),
     ("compass", "hmr3300"): Fit(sigma_deg=1.0),
-    ("imu", "witmotion"): Fit(mounting_deg=Z_UP),
+    ("imu", "witmotion"): Fit(mounting_deg=Z_UP, model_mounting_deg=Z_UP),
 }
 """By role ("imu", "gradienter", "compass") and protocol name; who is not here needs nothing said."""
 
