@@ -62,7 +62,6 @@ class WitMotionDecoder(FrameDecoder):
     def interrupted(self) -> None:
         """Forget the frames and the epoch under way."""
         super().interrupted()
-        self._good_at = -1
         self._drop_accel()
 
     def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
