@@ -30,7 +30,7 @@ from companion.protocols.framing import WAIT, FrameDecoder
 from companion.samples import ImuSample, MagSample, Sample, TiltSample, Vector
 
 FRAME_BYTES: Final = 11
-ALONE: Final = "alone"
+ALONE: Final = "without company"
 """A frame whose sum is right, but none follows it."""
 
 _START: Final = b"\x55"
