@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
+from companion.config.sections import Law
 from companion.errors import ConfigError
 from companion.protocols.base import Decoder
 from companion.protocols.dialogue import Dialogue
 from companion.protocols.hmr3300 import Hmr3300Decoder
+from companion.protocols.hmr3300_dialogue import Hmr3300Dialogue
 from companion.protocols.imu_line import ImuLineDecoder
 from companion.protocols.inclinometer_xy import InclinometerXyDecoder
 from companion.protocols.pni import PniDecoder, PniDialogue
@@ -31,8 +34,15 @@ class ProtocolInfo:
     """What has to be said to it; None for a device that speaks by itself or that we have nothing safe to say to."""
     lag_s: float = 0.0
     """Time constant with which its reading follows the truth: fluid, pendulum, filters."""
+    sigma_deg: float | None = None
+    """How well such a device's tilt (gradienter) or heading (compass, level) is known where nobody says better."""
+    tilted_sigma_deg: float | None = None
+    """Of a compass that does not stand level; None: as `sigma_deg`."""
+    law: Law | None = None
+    """What the documents say a gradienter's two readings are; None: they do not, the user must."""
 
 
+# One device may stand under several kinds: then its line, decoder and dialogue are the same under each.
 PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
     "imu": {
         "vectornav": ProtocolInfo("vectornav", 115200, "none", VectorNavDecoder),
@@ -44,12 +54,21 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
         # MEAS DPG2, with the damping of the BEI INC (a decade a second). The P-series sends at 2400 baud, BEI with even
         # parity.
         "inclinometer_xy": ProtocolInfo("inclinometer_xy", 9600, "none", InclinometerXyDecoder, lag_s=0.43),
+        # Honeywell: null 0.4 deg, 0.5 deg to 30 deg of tilt. Not in it: 1 deg of thermal hysteresis at the most.
+        "hmr3300": ProtocolInfo(
+            "hmr3300", 19200, "none", Hmr3300Decoder, Hmr3300Dialogue, sigma_deg=math.hypot(0.4, 0.5), law="euler"
+        ),
+        # Of the compass' frame the law would be "euler", of the inclinometer's "axis" is likely: not said.
         "rion": ProtocolInfo("rion", 9600, "none", RionDecoder, RionDialogue),
-        "pni": ProtocolInfo("pni", 38400, "none", PniDecoder, PniDialogue),
-        "witmotion": ProtocolInfo("witmotion", 9600, "none", WitMotionDecoder),
+        "pni": ProtocolInfo("pni", 38400, "none", PniDecoder, PniDialogue, law="euler"),
+        # WitMotion prints 0.2 deg for the WT9011; the SINxT are sold as better.
+        "witmotion": ProtocolInfo("witmotion", 9600, "none", WitMotionDecoder, sigma_deg=0.2, law="euler"),
     },
     "compass": {
-        "hmr3300": ProtocolInfo("hmr3300", 19200, "none", Hmr3300Decoder),
+        # Honeywell: 1 deg rms level, 3 deg to 30 deg of tilt.
+        "hmr3300": ProtocolInfo(
+            "hmr3300", 19200, "none", Hmr3300Decoder, Hmr3300Dialogue, sigma_deg=1.0, tilted_sigma_deg=3.0
+        ),
         # 38400 is what public drivers of the TRAX open; no document of PNI's that says so was found.
         "pni": ProtocolInfo("pni", 38400, "none", PniDecoder, PniDialogue),
         "rion": ProtocolInfo("rion", 9600, "none", RionDecoder, RionDialogue),
