@@ -53,6 +53,7 @@ Z_UP = (180.0, 0.0, 0.0)
 """Flat on the aircraft: X forward, Y left, Z up."""
 
 FITS: dict[tuple[str, str], Fit] = {
+    ("imu", "witmotion"): Fit(mounting_deg=Z_UP),
     ("gradienter", "inclinometer_xy"): Fit(sigma_deg=0.005),
     ("compass", "hmr3300"): Fit(sigma_deg=1.0),
     ("imu", "witmotion"): Fit(mounting_deg=Z_UP, model_mounting_deg=Z_UP),

@@ -83,6 +83,7 @@ class SensorRole:
             "summary": f"{summary}; {words}" if problem is not None and words else summary,
             "frames": self._samples,
             "rejected": dict(sensor.decoder.rejected),
+            "warned": dict(sensor.decoder.warned),
             "reconnects": sensor.link.reconnects,
             "words": words,
             "shared_with": others,

@@ -37,7 +37,7 @@ SHORTEST: Final = 5
 LONGEST: Final = 200
 """A frame may have 4096 bytes by the protocol; one with all components that there are has 97."""
 
-DISTORTION: Final = "distortion"
+DISTORTION: Final = "magnetic distortion"
 """The device says that its magnetometer is beyond its range (80 to 150 uT by model): its heading is worth nothing."""
 HEADING_UNSURE: Final = "heading unsure"
 """The device says that its heading is wrong by more than 10 degrees (TRAX p. 49, kHeadingStatus 3)."""

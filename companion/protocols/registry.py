@@ -58,9 +58,11 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
         "hmr3300": ProtocolInfo(
             "hmr3300", 19200, "none", Hmr3300Decoder, Hmr3300Dialogue, sigma_deg=math.hypot(0.4, 0.5), law="euler"
         ),
+        # Of the compass' frame the law would be "euler", of the inclinometer's "axis" is likely: not said.
         "rion": ProtocolInfo("rion", 9600, "none", RionDecoder, RionDialogue),
         "pni": ProtocolInfo("pni", 38400, "none", PniDecoder, PniDialogue, law="euler"),
-        "witmotion": ProtocolInfo("witmotion", 9600, "none", WitMotionDecoder, law="euler"),
+        # WitMotion prints 0.2 deg for the WT9011; the SINxT are sold as better.
+        "witmotion": ProtocolInfo("witmotion", 9600, "none", WitMotionDecoder, sigma_deg=0.2, law="euler"),
     },
     "compass": {
         # Honeywell: 1 deg rms level, 3 deg to 30 deg of tilt.

@@ -30,7 +30,7 @@ from companion.protocols.framing import WAIT, FrameDecoder
 from companion.samples import ImuSample, MagSample, Sample, TiltSample, Vector
 
 FRAME_BYTES: Final = 11
-ALONE: Final = "alone"
+ALONE: Final = "without company"
 """A frame whose sum is right, but none follows it."""
 
 _START: Final = b"\x55"
@@ -62,7 +62,6 @@ class WitMotionDecoder(FrameDecoder):
     def interrupted(self) -> None:
         """Forget the frames and the epoch under way."""
         super().interrupted()
-        self._good_at = -1
         self._drop_accel()
 
     def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:

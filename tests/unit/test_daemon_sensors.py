@@ -30,6 +30,7 @@ from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import HMR3300
 from sim.pty_device import PtyDevice
 from sim.scenario import site_at
+from tests.support.frames import pni_data
 from tests.support.virtual_time import run_virtual
 
 LINES = b"40.1, 5.0, -3.0\r\n40.2, 5.1, -3.1\r\n"
@@ -365,3 +366,15 @@ def test_a_stopped_hmr3300_is_started_again_unless_it_may_only_be_read(tmp_path:
                 await asyncio.gather(running, return_exceptions=True)
 
     asyncio.run(main())
+
+
+def test_what_a_device_says_against_itself_is_shown() -> None:
+    async def main() -> None:
+        which = SerialDevice("/nowhere", PROTOCOLS["compass"]["pni"], 38400, "none", read_only=True, roles=BOTH)
+        sensor, _, taken = opened(which)
+        uncalibrated = pni_data([(5, 40.0), (24, 5.0), (25, -3.0), (9, b"\0")])
+        sensor.receive(uncalibrated, 1.0)
+        assert [name for name, _ in taken] == ["gradienter", "compass"]
+        assert {role.status()["warned"]["not calibrated by the user"] for role in sensor.roles} == {1}  # type: ignore[index]
+
+    run_virtual(main())

@@ -40,7 +40,7 @@ def test_pitch_and_roll_without_a_heading_are_a_tilt() -> None:
 @pytest.mark.parametrize(
     ("parts", "reason"),
     [
-        ([(5, 10.0), (8, b"\1")], "distortion"),
+        ([(5, 10.0), (8, b"\1")], "magnetic distortion"),
         ([(5, 10.0), (79, b"\3")], "heading unsure"),
         ([(5, 10.0), (8, b"\2")], "out of range"),
         ([(5, 10.0), (9, b"\xff")], "out of range"),

@@ -77,7 +77,7 @@ def test_pni_flags_and_little_endian_are_read_as_they_are() -> None:
     assert decoder.warned.total() == 1
     device.distorted = True
     assert decoder.feed(device.reading(0.0), 0.0) == []
-    assert decoder.rejected["distortion"] == 1
+    assert decoder.rejected["magnetic distortion"] == 1
 
 
 def test_a_rion_compass_prints_what_the_manual_prints() -> None:
