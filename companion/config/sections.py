@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-ImuProtocol = Literal["vectornav", "imu_line"]
+ImuProtocol = Literal["vectornav", "imu_line", "mip", "xsens", "stim300"]
 Profile = Literal["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
-GradienterProtocol = Literal["inclinometer_xy"]
+GradienterProtocol = Literal["inclinometer_xy", "stim300"]
 CompassProtocol = Literal["hmr3300"]
 Law = Literal["axis", "slope", "euler"]
 Parity = Literal["none", "even", "odd"]

@@ -9,9 +9,13 @@ from companion.errors import ConfigError
 from companion.protocols.base import Decoder
 from companion.protocols.dialogue import Dialogue
 from companion.protocols.hmr3300 import Hmr3300Decoder
+from companion.protocols.imu_dialogues import MipDialogue, VectorNavDialogue, XsensDialogue
 from companion.protocols.imu_line import ImuLineDecoder
 from companion.protocols.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.mip import MipDecoder
+from companion.protocols.stim300 import Stim300Decoder
 from companion.protocols.vectornav import VectorNavDecoder
+from companion.protocols.xsens import XsensDecoder
 
 Kind = Literal["imu", "gradienter", "compass"]
 
@@ -32,13 +36,20 @@ class ProtocolInfo:
 
 PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
     "imu": {
-        "vectornav": ProtocolInfo("vectornav", 115200, "none", VectorNavDecoder),
+        "vectornav": ProtocolInfo("vectornav", 115200, "none", VectorNavDecoder, VectorNavDialogue),
         "imu_line": ProtocolInfo("imu_line", 500000, "none", ImuLineDecoder),
+        # The 3DM-GX5's and CV5's rate, from memory and not from a document.
+        "mip": ProtocolInfo("mip", 115200, "none", MipDecoder, MipDialogue),
+        "xsens": ProtocolInfo("xsens", 115200, "none", XsensDecoder, XsensDialogue),
+        # Of the rates that can be ordered (TS1524, table 5-11: 374400 to 1843200) the usual one, from memory.
+        "stim300": ProtocolInfo("stim300", 921600, "none", Stim300Decoder),
     },
     "gradienter": {
         # MEAS DPG2, with the damping of the BEI INC (a decade a second). The P-series sends at 2400 baud, BEI with even
         # parity.
         "inclinometer_xy": ProtocolInfo("inclinometer_xy", 9600, "none", InclinometerXyDecoder, lag_s=0.43),
+        # The slowest of its filters, 16 Hz at -3 dB: 1 / (2 pi 16 Hz).
+        "stim300": ProtocolInfo("stim300", 921600, "none", Stim300Decoder, lag_s=0.01),
     },
     "compass": {
         "hmr3300": ProtocolInfo("hmr3300", 19200, "none", Hmr3300Decoder),
