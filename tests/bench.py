@@ -30,8 +30,9 @@ from companion.protocols.registry import make_decoder
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
 from companion.samples import ImuSample
+from tests import bench_reading
 from tests.support.component import FakeVehicle, ScriptedGate
-from tests.support.frames import imu_line, vectornav_imu
+from tests.support.frames import imu_line, mip_imu, stim300, vectornav_imu, xsens_imu
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -188,6 +189,9 @@ def main() -> None:
         ("reference: CRC and unpacking of 44 bytes", reference()),
         ("VectorNav binary frame, decoded", decoder("vectornav", vectornav_imu())),
         ("$IMU line, decoded", decoder("imu_line", imu_line(1, 2))),
+        ("MIP packet, decoded", decoder("mip", mip_imu())),
+        ("MTData2 message, decoded", decoder("xsens", xsens_imu())),
+        ("STIM300 datagram with all clusters, decoded", decoder("stim300", stim300(0xA7))),
         ("HIGHRES_IMU, received and handed on", mavlink_imu()),
         ("IMU sample into the rolling collector", collector_sample()),
     ):
@@ -204,6 +208,7 @@ def main() -> None:
     print(f"\na calibration with simulator and daemon in one process: {share:.1%} of a core (100 Hz FC, 200 Hz serial)")
     print(f"the same while it is recorded: {recording:.1%}")
     print(f"a recording of it is replayed {speed:.0f} times as fast as it was made")
+    bench_reading.main()
 
 
 if __name__ == "__main__":

@@ -24,6 +24,14 @@ logger = logging.getLogger(__name__)
 
 READ_BYTES = 4096
 """As much as a tty buffers: one wake-up empties the port, so one time stamp holds for all that it brought."""
+QUICK_S = 0.0015
+QUICK_READS = 20
+"""So many reads running, each within that time of the last, are a stream whose every byte would wake the loop."""
+PAUSE_S = 0.004
+"""So long such a stream is collected before the next read: a wake-up costs far more than the bytes that it brings.
+
+What it brings is stamped that much late at worst, a quarter of what a USB adapter adds that is left as it came.
+"""
 OUT_BUFFER_BYTES = 16384
 """Over a second at 115200 baud; what waits longer than that is better dropped than sent."""
 CONNECT_DEADLINE_S = 5.0
@@ -101,6 +109,9 @@ class ByteLink:
         """The loop's time of the last read that brought bytes."""
         self._on_bytes, self._on_state = on_bytes, on_state
         self._descriptor: int | None = None
+        self._quick_reads = 0
+        self._collecting: asyncio.TimerHandle | None = None
+        """The next read, while bytes are collected; None: each wakes the loop."""
         self._lost: asyncio.Future[str] | None = None
         self._out = bytearray()
         self._opener = SerialOpener(settings.url, settings.baud, settings.parity)
@@ -171,23 +182,45 @@ class ByteLink:
         self._say(connected=True, reason=f"{self.settings.url} is open")
 
     def _readable(self) -> None:
-        now_s = asyncio.get_running_loop().time()
+        loop = asyncio.get_running_loop()
+        now_s, last_s = loop.time(), self.last_byte_s
+        if self._read(now_s) and last_s is not None and self._descriptor is not None:
+            self._quick_reads = self._quick_reads + 1 if now_s - last_s < QUICK_S else 0
+            if self._quick_reads >= QUICK_READS:
+                loop.remove_reader(self._descriptor)
+                self._collecting = loop.call_later(PAUSE_S, self._collected)
+
+    def _collected(self) -> None:
+        """Read what has come in the meantime; when that is nothing, let the next byte wake the loop again."""
+        loop = asyncio.get_running_loop()
+        came = self._read(loop.time())
         if self._descriptor is None:
             return
+        if came:
+            self._collecting = loop.call_later(PAUSE_S, self._collected)
+        else:
+            self._collecting, self._quick_reads = None, 0
+            loop.add_reader(self._descriptor, self._readable)
+
+    def _read(self, now_s: float) -> bool:
+        """Read once and hand it on; whether anything came. A dead port is closed."""
+        if self._descriptor is None:
+            return False
         try:
             data = os.read(self._descriptor, READ_BYTES)
         except (BlockingIOError, InterruptedError):
-            return
+            return False
         except OSError as error:
             self._lose(self._explain(error))
-            return
+            return False
         if not data:
             # A tty that was hung up is readable for ever and yields nothing: closing is the only way out of the spin.
             self._lose(self._explain(None))
-            return
+            return False
         self.bytes_received += len(data)
         self.last_byte_s = now_s
         self._on_bytes(data, now_s)
+        return True
 
     def _flush(self) -> None:
         if self._descriptor is None:
@@ -222,6 +255,10 @@ class ByteLink:
     def _close(self) -> None:
         descriptor, self._descriptor = self._descriptor, None
         self._out.clear()
+        self._quick_reads = 0
+        if self._collecting is not None:
+            self._collecting.cancel()
+            self._collecting = None
         if descriptor is None:
             return
         loop = asyncio.get_running_loop()
