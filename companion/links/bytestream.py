@@ -27,10 +27,10 @@ READ_BYTES = 4096
 QUICK_S = 0.0015
 QUICK_READS = 20
 """So many reads running, each within that time of the last, are a stream whose every byte would wake the loop."""
-PAUSE_S = 0.004
+PAUSE_S = 0.008
 """So long such a stream is collected before the next read: a wake-up costs far more than the bytes that it brings.
 
-What it brings is stamped that much late at worst, a quarter of what a USB adapter adds that is left as it came.
+What it brings is stamped that much late at worst, half of what a USB adapter adds that is left as it came.
 """
 OUT_BUFFER_BYTES = 16384
 """Over a second at 115200 baud; what waits longer than that is better dropped than sent."""

@@ -46,6 +46,8 @@ class VectorNavDecoder(FramedDecoder):
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)
         self._layouts: dict[bytes, Layout] = {}
+        self._header = b""
+        """Of the last good frame: the next one most likely has it too."""
 
     def _take(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         if buffer[at] == _SYNC:
@@ -59,20 +61,22 @@ class VectorNavDecoder(FramedDecoder):
 
     def _binary(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         """Where to go on after what begins with a sync byte, or `WAIT` for more bytes."""
-        available = len(buffer) - at
-        if available < 2:
+        available, header = len(buffer) - at, self._header
+        layout = self._layouts.get(header) if header and buffer.startswith(header, at) else None
+        if layout is None:
+            if available < 2:
+                return WAIT
+            try:
+                header_size = header_bytes(buffer[at + 1])
+                if available < header_size:
+                    return WAIT
+                header = buffer[at : at + header_size]
+                layout = self._layouts.get(header) or layout_of(header)
+            except RejectedError as error:
+                self.rejected[error.reason] += 1
+                return at + 1
+        if available < layout.frame_bytes:
             return WAIT
-        try:
-            header_size = header_bytes(buffer[at + 1])
-            if available < header_size:
-                return WAIT
-            header = buffer[at : at + header_size]
-            layout = self._layouts.get(header) or layout_of(header)
-            if available < layout.frame_bytes:
-                return WAIT
-        except RejectedError as error:
-            self.rejected[error.reason] += 1
-            return at + 1
         end = at + layout.frame_bytes
         if binascii.crc_hqx(buffer[at + 1 : end], 0) != 0:
             self.rejected[CHECKSUM] += 1
@@ -81,6 +85,7 @@ class VectorNavDecoder(FramedDecoder):
             if len(self._layouts) >= LAYOUTS_KEPT:
                 self._layouts.clear()
             self._layouts[header] = layout
+        self._header = header
         try:
             samples += layout.samples(buffer, at, self._time_of(origin + end))
             self.accepted += 1
