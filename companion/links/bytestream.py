@@ -32,6 +32,8 @@ PAUSE_S = 0.008
 
 What it brings is stamped that much late at worst, half of what a USB adapter adds that is left as it came.
 """
+FULLEST_LINE = 0.9
+"""Of a line's time, where its stream may be collected."""
 OUT_BUFFER_BYTES = 16384
 """Over a second at 115200 baud; what waits longer than that is better dropped than sent."""
 CONNECT_DEADLINE_S = 5.0
@@ -110,6 +112,8 @@ class ByteLink:
         self._on_bytes, self._on_state = on_bytes, on_state
         self._descriptor: int | None = None
         self._quick_reads = 0
+        self._quick_since = (0.0, 0)
+        """When that run of reads began, and the bytes received by then."""
         self._collecting: asyncio.TimerHandle | None = None
         """The next read, while bytes are collected; None: each wakes the loop."""
         self._lost: asyncio.Future[str] | None = None
@@ -184,23 +188,39 @@ class ByteLink:
     def _readable(self) -> None:
         loop = asyncio.get_running_loop()
         now_s, last_s = loop.time(), self.last_byte_s
-        if self._read(now_s) and last_s is not None and self._descriptor is not None:
-            self._quick_reads = self._quick_reads + 1 if now_s - last_s < QUICK_S else 0
-            if self._quick_reads >= QUICK_READS:
+        if not self._read(now_s) or self._descriptor is None:
+            return
+        if last_s is None or now_s - last_s >= QUICK_S:
+            self._quick_reads, self._quick_since = 0, (now_s, self.bytes_received)
+            return
+        self._quick_reads += 1
+        if self._quick_reads == QUICK_READS:
+            self._quick_reads = 0
+            if self._fits_the_line(*self._quick_since, now_s):
                 loop.remove_reader(self._descriptor)
                 self._collecting = loop.call_later(PAUSE_S, self._collected)
+            self._quick_since = (now_s, self.bytes_received)
 
     def _collected(self) -> None:
         """Read what has come in the meantime; when that is nothing, let the next byte wake the loop again."""
         loop = asyncio.get_running_loop()
-        came = self._read(loop.time())
+        now_s, before = loop.time(), (self.last_byte_s or 0.0, self.bytes_received)
+        came = self._read(now_s)
         if self._descriptor is None:
             return
-        if came:
+        if came and self._fits_the_line(*before, now_s):
             self._collecting = loop.call_later(PAUSE_S, self._collected)
         else:
-            self._collecting, self._quick_reads = None, 0
+            self._collecting = None
             loop.add_reader(self._descriptor, self._readable)
+
+    def _fits_the_line(self, since_s: float, bytes_then: int, now_s: float) -> bool:
+        """Whether the line, as it is set, could have carried what came since then.
+
+        Behind USB the speed may mean nothing, and dating a collected frame by it would put it before the one before it.
+        """
+        carried = self.bytes_received - bytes_then
+        return carried * self.settings.seconds_per_byte <= FULLEST_LINE * (now_s - since_s)
 
     def _read(self, now_s: float) -> bool:
         """Read once and hand it on; whether anything came. A dead port is closed."""

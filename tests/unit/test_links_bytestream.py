@@ -28,6 +28,8 @@ from companion.links.bytestream import OUT_BUFFER_BYTES, QUICK_READS, ByteLink, 
 from companion.links.serial_port import SerialOpener, open_serial
 
 NOBODY = 65534
+FAST = 4_000_000
+"""Baud at which a few bytes take no time."""
 
 
 class Pty:
@@ -153,7 +155,7 @@ def test_a_fast_stream_is_collected_and_a_byte_after_it_wakes_the_loop(
 
     async def main() -> None:
         with plugged(path) as pty:
-            async with running(path) as port:
+            async with running(path, FAST) as port:
                 await port.state(connected=True)
                 await collecting(port, pty)
                 for number in range(5):
@@ -164,6 +166,21 @@ def test_a_fast_stream_is_collected_and_a_byte_after_it_wakes_the_loop(
                     while port.link._collecting is not None:
                         await asyncio.sleep(0.001)
                 await collecting(port, pty)  # as at the start: each byte by itself
+
+    asyncio.run(main())
+
+
+def test_a_stream_that_is_faster_than_its_line_is_not_dated_by_it(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bytestream, "QUICK_S", 10.0)
+
+    async def main() -> None:
+        with plugged(path) as pty:
+            async with running(path, 300) as port:  # 100 bytes take more than three seconds
+                await port.state(connected=True)
+                for _ in range(3 * QUICK_READS):
+                    os.write(pty.master, bytes(100))
+                    await port.data(100)
+                    assert port.link._collecting is None
 
     asyncio.run(main())
 
@@ -189,7 +206,7 @@ def test_a_device_that_is_pulled_out_while_its_stream_is_collected_comes_back(
     monkeypatch.setattr(bytestream, "QUICK_S", 10.0)
 
     async def main() -> None:
-        async with running(path) as port:
+        async with running(path, FAST) as port:
             for _ in range(2):
                 with plugged(path) as pty:
                     await port.state(connected=True)
