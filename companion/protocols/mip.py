@@ -18,7 +18,7 @@ from typing import Final
 from companion.physics.units import G
 from companion.protocols.base import CHECKSUM, FIELD_COUNT, NOTHING_OF_USE, REPLY, RejectedError
 from companion.protocols.checks import check_imu, check_vector
-from companion.protocols.framed import WAIT, FramedDecoder
+from companion.protocols.framing import WAIT, FrameDecoder
 from companion.samples import ImuSample, MagSample, Sample, Vector
 
 MAX_FRAME_BYTES: Final = 4 + 255 + 2
@@ -31,12 +31,17 @@ _TIME = struct.Struct(">dHH")
 _ABSENT: Final[Vector] = (0.0, 0.0, 0.0)
 
 
-class MipDecoder(FramedDecoder):
+class MipDecoder(FrameDecoder):
     """MIP packets; gives `ImuSample` and `MagSample`."""
 
-    def _take(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
+    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         if not buffer.startswith(_MARK, at):
-            return self._pass_over(buffer, at, _MARK)
+            if buffer[at] != _MARK[0]:
+                return self._skip_to(_MARK[:1], buffer, at)
+            if len(buffer) == at + 1:
+                return WAIT
+            self.skipped += 1
+            return at + 1
         if len(buffer) < at + 4:
             return WAIT
         end = at + 4 + buffer[at + 3] + 2

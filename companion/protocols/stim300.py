@@ -34,7 +34,7 @@ from companion.protocols.base import (
     RejectedError,
 )
 from companion.protocols.checks import check_imu
-from companion.protocols.framed import WAIT, FramedDecoder
+from companion.protocols.framing import WAIT, FrameDecoder
 from companion.protocols.stim300_datagrams import (
     CONFIGURATION,
     FRAME_BYTES,
@@ -66,7 +66,7 @@ _SYSTEM, _START_UP, _CONDITIONS, _OVERLOAD, _CHANNEL = 0x80, 0x40, 0x20, 0x10, 0
 _IDENTIFIER = re.compile(b"[" + b"".join(re.escape(bytes((name,))) for name in sorted(FRAME_BYTES)) + b"]")
 
 
-class Stim300Decoder(FramedDecoder):
+class Stim300Decoder(FrameDecoder):
     """STIM300 datagrams; gives `ImuSample` where they hold acceleration, `TiltSample` where they hold inclination.
 
     There is no start mark: after a loss the next datagram is the next one whose CRC is right, and the bytes before it
@@ -94,7 +94,7 @@ class Stim300Decoder(FramedDecoder):
         self._in_step = True
         self._forget()
 
-    def _take(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
+    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         identifier = buffer[at]
         size = FRAME_BYTES.get(identifier)
         if size is None:

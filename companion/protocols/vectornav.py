@@ -23,7 +23,7 @@ from companion.protocols.base import (
     body_of_sentence,
 )
 from companion.protocols.checks import check_attitude, check_imu, check_vector, numbers
-from companion.protocols.framed import WAIT, FramedDecoder
+from companion.protocols.framing import WAIT, FrameDecoder
 from companion.protocols.vectornav_binary import Layout, header_bytes, layout_of
 from companion.samples import AttitudeSample, ImuSample, MagSample, Sample
 
@@ -40,7 +40,7 @@ _END_OF_TEXT = re.compile(rb"[^ -#%-~]")
 _REPLIES = frozenset((b"VNRRG", b"VNWRG", b"VNWNV", b"VNRFS", b"VNRST", b"VNTAR", b"VNASY", b"VNSGB", b"VNCMD"))
 
 
-class VectorNavDecoder(FramedDecoder):
+class VectorNavDecoder(FrameDecoder):
     """VectorNav outputs; gives `ImuSample`, `AttitudeSample` and `MagSample` as far as a frame has them."""
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
@@ -49,7 +49,7 @@ class VectorNavDecoder(FramedDecoder):
         self._header = b""
         """Of the last good frame: the next one most likely has it too."""
 
-    def _take(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
+    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         if buffer[at] == _SYNC:
             return self._binary(buffer, at, origin, samples)
         if buffer[at] == _DOLLAR:

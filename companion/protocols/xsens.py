@@ -28,7 +28,7 @@ from companion.protocols.base import (
     RejectedError,
 )
 from companion.protocols.checks import check_imu, check_vector
-from companion.protocols.framed import WAIT, FramedDecoder
+from companion.protocols.framing import WAIT, FrameDecoder
 from companion.samples import ImuSample, MagSample, Sample, Vector
 
 MAX_DATA_BYTES: Final = 1024
@@ -52,7 +52,7 @@ _ABSENT: Final[Vector] = (0.0, 0.0, 0.0)
 _FLOAT32 = struct.Struct(">3f")
 
 
-class XsensDecoder(FramedDecoder):
+class XsensDecoder(FrameDecoder):
     """MTData2 messages; gives `ImuSample`, and `MagSample` with counts for want of a unit."""
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
@@ -63,9 +63,14 @@ class XsensDecoder(FramedDecoder):
         super().interrupted()
         self._temperature_degc = None
 
-    def _take(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
+    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         if not buffer.startswith(_MARK, at):
-            return self._pass_over(buffer, at, _MARK)
+            if buffer[at] != _MARK[0]:
+                return self._skip_to(_MARK[:1], buffer, at)
+            if len(buffer) == at + 1:
+                return WAIT
+            self.skipped += 1
+            return at + 1
         available = len(buffer) - at
         if available < 4:
             return WAIT

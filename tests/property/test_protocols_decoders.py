@@ -16,7 +16,7 @@ from companion.protocols import mip as mip_protocol
 from companion.protocols import stim300_datagrams
 from companion.protocols import xsens as xsens_protocol
 from companion.protocols.base import Decoder, LineDecoder, xor_checksum
-from companion.protocols.framed import FramedDecoder
+from companion.protocols.framing import FrameDecoder
 from companion.protocols.hmr3300 import Hmr3300Decoder
 from companion.protocols.imu_line import ImuLineDecoder
 from companion.protocols.inclinometer_xy import InclinometerXyDecoder
@@ -145,7 +145,7 @@ def feed_in(decoder: Decoder, stream: bytes, cuts: list[int]) -> list[Sample]:
 
 
 def held_bytes(decoder: Decoder) -> int:
-    if isinstance(decoder, FramedDecoder):
+    if isinstance(decoder, FrameDecoder):
         return len(decoder._buffer)
     assert isinstance(decoder, LineDecoder | ImuLineDecoder)
     return len(decoder._partial)
