@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from sim.aircraft import VirtualAircraft
+from sim.binary_imus import MipImu, Stim300, XsensImu
 from sim.devices import HMR3300, Gradienter, ImuLine, Law, SerialDevice, VectorNavBinary
 from sim.imu_model import ImuModel
 from sim.pni import PniCompass
@@ -16,6 +17,9 @@ IMUS: dict[str, Callable[[ImuModel], SerialDevice]] = {
     "vectornav": VectorNavBinary,
     "imu_line": ImuLine,
     "witmotion": WitMotionImu,
+    "mip": MipImu,
+    "xsens": XsensImu,
+    "stim300": Stim300,
 }
 """Made from the model whose readings they send."""
 
@@ -25,6 +29,7 @@ GRADIENTERS: dict[str, Callable[[VirtualAircraft, int], SerialDevice]] = {
     "rion": lambda aircraft, seed: RionInclinometer(aircraft, seed=seed),
     "pni": lambda aircraft, seed: PniCompass(aircraft, seed=seed),
     "witmotion": lambda aircraft, seed: WitMotionInclinometer(aircraft, seed=seed),
+    "stim300": lambda aircraft, seed: Stim300(ImuModel(aircraft, "adis16470", seed=seed), seed=seed),
 }
 """Made from the aircraft on which they sit and a seed; upright, without errors but noise and lag."""
 
@@ -53,7 +58,9 @@ Z_UP = (180.0, 0.0, 0.0)
 """Flat on the aircraft: X forward, Y left, Z up."""
 
 FITS: dict[tuple[str, str], Fit] = {
-    ("imu", "witmotion"): Fit(mounting_deg=Z_UP),
+    ("imu", "xsens"): Fit(mounting_deg=Z_UP),
+    ("imu", "stim300"): Fit(mounting_deg=Z_UP),
+    ("gradienter", "stim300"): Fit(law="axis"),
     ("gradienter", "inclinometer_xy"): Fit(sigma_deg=0.005),
     ("compass", "hmr3300"): Fit(sigma_deg=1.0),
     ("imu", "witmotion"): Fit(mounting_deg=Z_UP, model_mounting_deg=Z_UP),

@@ -30,8 +30,19 @@ from companion.protocols.registry import Kind, make_decoder
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
 from companion.samples import ImuSample
+from tests import bench_reading
 from tests.support.component import FakeVehicle, ScriptedGate
-from tests.support.frames import imu_line, pni_heading, rion_angles, vectornav_imu, wit, wit_imu
+from tests.support.frames import (
+    imu_line,
+    mip_imu,
+    pni_heading,
+    rion_angles,
+    stim300,
+    vectornav_imu,
+    wit,
+    wit_imu,
+    xsens_imu,
+)
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -192,6 +203,9 @@ def main() -> None:
         ("WitMotion epoch of four frames, decoded", decoder("witmotion", wit_imu() + wit(0x53, 9, 9) + wit(0x54, 9))),
         ("PNI heading, pitch and roll, decoded", decoder("pni", pni_heading(123.5), "compass")),
         ("RION angles, decoded", decoder("rion", rion_angles(1.5, -2.5, 123.5), "compass")),
+        ("MIP packet, decoded", decoder("mip", mip_imu())),
+        ("MTData2 message, decoded", decoder("xsens", xsens_imu())),
+        ("STIM300 datagram with all clusters, decoded", decoder("stim300", stim300(0xA7))),
         ("HIGHRES_IMU, received and handed on", mavlink_imu()),
         ("IMU sample into the rolling collector", collector_sample()),
     ):
@@ -208,6 +222,7 @@ def main() -> None:
     print(f"\na calibration with simulator and daemon in one process: {share:.1%} of a core (100 Hz FC, 200 Hz serial)")
     print(f"the same while it is recorded: {recording:.1%}")
     print(f"a recording of it is replayed {speed:.0f} times as fast as it was made")
+    bench_reading.main()
 
 
 if __name__ == "__main__":

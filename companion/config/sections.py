@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-ImuProtocol = Literal["vectornav", "imu_line", "witmotion"]
+ImuProtocol = Literal["vectornav", "imu_line", "witmotion", "mip", "xsens", "stim300"]
 Profile = Literal["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
-GradienterProtocol = Literal["inclinometer_xy", "hmr3300", "rion", "pni", "witmotion"]
+GradienterProtocol = Literal["inclinometer_xy", "hmr3300", "rion", "pni", "witmotion", "stim300"]
 CompassProtocol = Literal["hmr3300", "pni", "rion"]
 Law = Literal["axis", "slope", "euler"]
 Parity = Literal["none", "even", "odd"]

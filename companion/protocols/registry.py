@@ -12,12 +12,16 @@ from companion.protocols.base import Decoder
 from companion.protocols.dialogue import Dialogue
 from companion.protocols.hmr3300 import Hmr3300Decoder
 from companion.protocols.hmr3300_dialogue import Hmr3300Dialogue
+from companion.protocols.imu_dialogues import MipDialogue, VectorNavDialogue, XsensDialogue
 from companion.protocols.imu_line import ImuLineDecoder
 from companion.protocols.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.mip import MipDecoder
 from companion.protocols.pni import PniDecoder, PniDialogue
 from companion.protocols.rion import RionDecoder, RionDialogue
+from companion.protocols.stim300 import Stim300Decoder
 from companion.protocols.vectornav import VectorNavDecoder
 from companion.protocols.witmotion import WitMotionDecoder
+from companion.protocols.xsens import XsensDecoder
 
 Kind = Literal["imu", "gradienter", "compass"]
 
@@ -45,10 +49,15 @@ class ProtocolInfo:
 # One device may stand under several kinds: then its line, decoder and dialogue are the same under each.
 PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
     "imu": {
-        "vectornav": ProtocolInfo("vectornav", 115200, "none", VectorNavDecoder),
+        "vectornav": ProtocolInfo("vectornav", 115200, "none", VectorNavDecoder, VectorNavDialogue),
         "imu_line": ProtocolInfo("imu_line", 500000, "none", ImuLineDecoder),
         # 9600 baud carries 21 of its usual epochs a second; a faster line is set with the vendor's program.
         "witmotion": ProtocolInfo("witmotion", 9600, "none", WitMotionDecoder),
+        # The 3DM-GX5's and CV5's rate, from memory and not from a document.
+        "mip": ProtocolInfo("mip", 115200, "none", MipDecoder, MipDialogue),
+        "xsens": ProtocolInfo("xsens", 115200, "none", XsensDecoder, XsensDialogue),
+        # Of the rates that can be ordered (TS1524, table 5-11: 374400 to 1843200) the usual one, from memory.
+        "stim300": ProtocolInfo("stim300", 921600, "none", Stim300Decoder),
     },
     "gradienter": {
         # MEAS DPG2, with the damping of the BEI INC (a decade a second). The P-series sends at 2400 baud, BEI with even
@@ -63,6 +72,8 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
         "pni": ProtocolInfo("pni", 38400, "none", PniDecoder, PniDialogue, law="euler"),
         # WitMotion prints 0.2 deg for the WT9011; the SINxT are sold as better.
         "witmotion": ProtocolInfo("witmotion", 9600, "none", WitMotionDecoder, sigma_deg=0.2, law="euler"),
+        # The slowest of its filters, 16 Hz at -3 dB: 1 / (2 pi 16 Hz).
+        "stim300": ProtocolInfo("stim300", 921600, "none", Stim300Decoder, lag_s=0.01),
     },
     "compass": {
         # Honeywell: 1 deg rms level, 3 deg to 30 deg of tilt.

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import binascii
 import re
-from collections import deque
 from typing import ClassVar
 
 from companion.protocols.base import (
@@ -21,11 +20,11 @@ from companion.protocols.base import (
     REPLY,
     TOO_LONG,
     UNKNOWN_SENTENCE,
-    Decoder,
     RejectedError,
     body_of_sentence,
 )
 from companion.protocols.checks import check_attitude, check_imu, check_vector, numbers
+from companion.protocols.framing import WAIT, FrameDecoder
 from companion.protocols.vectornav_binary import Layout, header_bytes, layout_of
 from companion.samples import AttitudeSample, ImuSample, MagSample, Sample
 
@@ -38,83 +37,49 @@ _DOLLAR = ord("$")
 _START = re.compile(rb"[\xfa$]")
 _END_OF_TEXT = re.compile(rb"[^ -#%-~]")
 """The first byte that cannot be inside a sentence: a line end, a "$", or nothing printable."""
-_WAIT = -1
 
 _REPLIES = frozenset((b"VNRRG", b"VNWRG", b"VNWNV", b"VNRFS", b"VNRST", b"VNTAR", b"VNASY", b"VNSGB", b"VNCMD"))
 
 
-class VectorNavDecoder(Decoder):
+class VectorNavDecoder(FrameDecoder):
     """VectorNav outputs; gives `ImuSample`, `AttitudeSample` and `MagSample` as far as a frame has them."""
 
     device_clock_wraps_s: ClassVar[float | None] = 2**64 / 1e9
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)
-        self._buffer = b""
-        """What may be the beginning of a frame; never longer than the longest frame."""
-        self._received = 0
-        self._chunks: deque[tuple[int, float]] = deque()
-        """Stream position of the end of each chunk that still has bytes in the buffer, and when it was read.
-
-        A false start holds back what came behind it until it is found out; the times of that must not suffer.
-        """
         self._layouts: dict[bytes, Layout] = {}
+        self._header = b""
+        """Of the last good frame: the next one most likely has it too."""
 
-    def feed(self, data: bytes, t_s: float) -> list[Sample]:  # noqa: D102 - as in the base class
-        if not data:
-            return []
-        self._received += len(data)
-        self._chunks.append((self._received, t_s))
-        buffer = self._buffer + data
-        origin = self._received - len(buffer)
-        samples: list[Sample] = []
-        at, size = 0, len(buffer)
-        while at < size:
-            if buffer[at] == _SYNC:
-                end = self._binary(buffer, at, origin, samples)
-            elif buffer[at] == _DOLLAR:
-                end = self._sentence(buffer, at, origin, samples)
-            else:
-                match = _START.search(buffer, at)
-                end = match.start() if match else size
-                self.skipped += len(buffer[at:end].translate(None, b"\r\n"))
-            if end == _WAIT:
-                break
-            at = end
-        self._buffer = buffer[at:]
-        while self._chunks and self._chunks[0][0] <= origin + at:
-            self._chunks.popleft()
-        return samples
-
-    def interrupted(self) -> None:  # noqa: D102 - as in the base class
-        if self._buffer:
-            self.rejected[CUT_SHORT] += 1
-        self._buffer = b""
-        self._chunks.clear()
-
-    def _time_of(self, end: int) -> float:
-        """When the byte before stream position `end` was on the line."""
-        while self._chunks[0][0] < end:
-            self._chunks.popleft()
-        chunk_end, t_s = self._chunks[0]
-        return t_s - self.seconds_per_byte * (chunk_end - end)
+    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
+        if buffer[at] == _SYNC:
+            return self._binary(buffer, at, origin, samples)
+        if buffer[at] == _DOLLAR:
+            return self._sentence(buffer, at, origin, samples)
+        match = _START.search(buffer, at)
+        end = match.start() if match else len(buffer)
+        self.skipped += len(buffer[at:end].translate(None, b"\r\n"))
+        return end
 
     def _binary(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
-        """Where to go on after what begins with a sync byte, or `_WAIT` for more bytes."""
-        available = len(buffer) - at
-        if available < 2:
-            return _WAIT
-        try:
-            header_size = header_bytes(buffer[at + 1])
-            if available < header_size:
-                return _WAIT
-            header = buffer[at : at + header_size]
-            layout = self._layouts.get(header) or layout_of(header)
-            if available < layout.frame_bytes:
-                return _WAIT
-        except RejectedError as error:
-            self.rejected[error.reason] += 1
-            return at + 1
+        """Where to go on after what begins with a sync byte, or `WAIT` for more bytes."""
+        available, header = len(buffer) - at, self._header
+        layout = self._layouts.get(header) if header and buffer.startswith(header, at) else None
+        if layout is None:
+            if available < 2:
+                return WAIT
+            try:
+                header_size = header_bytes(buffer[at + 1])
+                if available < header_size:
+                    return WAIT
+                header = buffer[at : at + header_size]
+                layout = self._layouts.get(header) or layout_of(header)
+            except RejectedError as error:
+                self.rejected[error.reason] += 1
+                return at + 1
+        if available < layout.frame_bytes:
+            return WAIT
         end = at + layout.frame_bytes
         if binascii.crc_hqx(buffer[at + 1 : end], 0) != 0:
             self.rejected[CHECKSUM] += 1
@@ -123,16 +88,16 @@ class VectorNavDecoder(Decoder):
             if len(self._layouts) >= LAYOUTS_KEPT:
                 self._layouts.clear()
             self._layouts[header] = layout
+        self._header = header
         try:
             samples += layout.samples(buffer, at, self._time_of(origin + end))
             self.accepted += 1
-            self.frame_bytes = layout.frame_bytes
         except RejectedError as error:
             self.rejected[error.reason] += 1
         return end
 
     def _sentence(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
-        """Where to go on after what begins with a "$", or `_WAIT` for more bytes."""
+        """Where to go on after what begins with a "$", or `WAIT` for more bytes."""
         begin = buffer[at : at + 3]
         if not b"$VN".startswith(begin):
             self.skipped += 1
@@ -141,7 +106,7 @@ class VectorNavDecoder(Decoder):
         match = _END_OF_TEXT.search(buffer, at + 1, limit)
         if match is None:
             if len(buffer) < limit:
-                return _WAIT
+                return WAIT
             self.rejected[TOO_LONG] += 1
             return at + 1
         end = match.start()
@@ -151,7 +116,6 @@ class VectorNavDecoder(Decoder):
         try:
             samples += _decode(buffer[at + 1 : end], self._time_of(origin + end + 1))
             self.accepted += 1
-            self.frame_bytes = end + 1 - at
         except RejectedError as error:
             self.rejected[error.reason] += 1
         return end

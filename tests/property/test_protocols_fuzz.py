@@ -14,26 +14,37 @@ import pytest
 from companion.protocols.hmr3300 import Hmr3300Decoder
 from companion.protocols.imu_line import ImuLineDecoder
 from companion.protocols.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.mip import MipDecoder
 from companion.protocols.pni import PniDecoder
 from companion.protocols.registry import PROTOCOLS, make_decoder
 from companion.protocols.rion import RionDecoder
+from companion.protocols.stim300 import Stim300Decoder
 from companion.protocols.vectornav import VectorNavDecoder
 from companion.protocols.witmotion import WitMotionDecoder
-from companion.samples import CompassSample, ImuSample, TiltSample
+from companion.protocols.xsens import MAX_DATA_BYTES, XsensDecoder
+from companion.samples import CompassSample, ImuSample, Sample, TiltSample
 from tests.support.frames import (
     imu_line,
+    int24,
+    mip_imu,
+    one_after_another,
     pni_heading,
     right_binaries,
+    right_mips,
     right_pni_data,
     right_rion_angles,
     right_sentences,
+    right_stims,
     right_wit,
+    right_xbus,
     rion_angles,
     rion_long,
     sentence,
+    stim300,
     vectornav_imu,
     wit,
     wit_imu,
+    xsens_imu,
 )
 
 SIZE = 1_000_000
@@ -171,6 +182,55 @@ def test_witmotion_frames_in_noise() -> None:
     assert [len(one) for one in said] == [len(one) for one in expected]
     for one, other in zip(said, expected, strict=True):
         assert one == pytest.approx(other, rel=1e-12)
+
+
+def gyros(samples: list[Sample]) -> list[tuple[float, ...]]:
+    return [sample.gyro_rad_s for sample in samples if isinstance(sample, ImuSample)]
+
+
+def test_mip_packets_in_noise() -> None:
+    source = random.Random(15)
+    data = noise_with_frames(16, [mip_imu(n, gyro=(source.uniform(-1, 1), n, 0)) for n in range(100)])
+    decoder = MipDecoder()
+    got = [sample for chunk in chunks(17, data) for sample in decoder.feed(chunk, 0.0)]
+    right = one_after_another(right_mips(data))
+    assert len(right) > 3000
+    # The gyro field is the last of a packet: 12 bytes before the checksum.
+    assert gyros(got) == [struct.unpack_from(">3f", data, found.end - 14) for found in right]
+    assert decoder.accepted == len(right)
+
+
+def test_xsens_messages_in_noise() -> None:
+    source = random.Random(18)
+    data = noise_with_frames(19, [xsens_imu(n, n, gyro=(source.uniform(-1, 1), n / 100, 0)) for n in range(100)])
+    decoder = XsensDecoder()
+    got = [sample for chunk in chunks(20, data) for sample in decoder.feed(chunk, 0.0)]
+    right = one_after_another(right_xbus(data, MAX_DATA_BYTES))
+    assert len(right) > 3000
+    # One in 256 that were cut has the right sum by chance, over what came next; it is not as it was sent then.
+    whole = [
+        found for found in right if found.end - found.start == 47 and data[found.end - 16 :][:3] == b"\x80\x20\x0c"
+    ]
+    rates = [struct.unpack_from(">3f", data, found.end - 13) for found in whole]
+    expected = [rate for rate in rates if max(map(abs, rate)) <= 100.0]
+    assert decoder.rejected["field count"] == len(right) - len(whole)
+    assert decoder.rejected["out of range"] == len(whole) - len(expected)
+    assert len(got) == len(expected)
+    assert gyros(got) == expected
+
+
+def test_stim300_datagrams_in_noise() -> None:
+    source = random.Random(21)
+    counts = [source.randrange(-(2**20), 2**20) for _ in range(100)]
+    data = noise_with_frames(22, [stim300(gyro=(count, 0, 0)) for count in counts], SIZE // 4)
+    decoder = Stim300Decoder()
+    got = [sample for chunk in chunks(23, data) for sample in decoder.feed(chunk, 0.0)]
+    right = one_after_another(right_stims(data))
+    assert len(right) > 1000
+    sent = {int24(count): count for count in counts}
+    expected = [sent[data[found.start + 1 : found.start + 4]] / 2**14 * math.pi / 180 for found in right]
+    assert [gyro[0] for gyro in gyros(got)] == pytest.approx(expected)
+    assert decoder.accepted == len(right)
 
 
 def test_lines_without_a_checksum_in_noise() -> None:

@@ -209,3 +209,176 @@ def right_wit(data: bytes) -> list[Found]:
         and sum8(data[start : start + 10]) == data[start + 10]
     }
     return [Found(start, start + 11) for start in sorted(right) if start + 11 in right]
+
+
+def one_after_another(found: list[Found]) -> list[Found]:
+    """Those that a reader takes: a frame that begins inside the one before it is part of that one."""
+    taken: list[Found] = []
+    for each in found:
+        if not taken or each.start >= taken[-1].end:
+            taken.append(each)
+    return taken
+
+
+# ------------------------------------------------------------------------------------------------ MIP, Xbus, STIM300
+
+
+def fletcher(data: bytes) -> bytes:
+    one = two = 0
+    for byte in data:
+        one = (one + byte) & 0xFF
+        two = (two + one) & 0xFF
+    return bytes([one, two])
+
+
+def mip(fields: list[tuple[int, bytes]], *, descriptor_set: int = 0x80) -> bytes:
+    payload = b"".join(bytes([len(data) + 2, descriptor]) + data for descriptor, data in fields)
+    head = bytes([0x75, 0x65, descriptor_set, len(payload)]) + payload
+    return head + fletcher(head)
+
+
+def big_floats(*values: float) -> bytes:
+    return struct.pack(f">{len(values)}f", *values)
+
+
+def mip_imu(
+    time_s: float = 5.0,
+    gyro: tuple[float, ...] = (0.25, -0.5, 0.75),
+    accel_g: tuple[float, ...] = (0.5, -0.25, -1.0),
+) -> bytes:
+    time = struct.pack(">dHH", time_s, 2400, 0)
+    return mip([(0x12, time), (0x04, big_floats(*accel_g)), (0x05, big_floats(*gyro))])
+
+
+def right_mips(data: bytes) -> list[Found]:
+    """Every packet whose checksum is right, at whatever offset."""
+    found = []
+    for start in range(len(data) - 5):
+        end = start + 6 + data[start + 3]
+        if (
+            data[start : start + 2] == b"ue"
+            and end <= len(data)
+            and fletcher(data[start : end - 2]) == data[end - 2 : end]
+        ):
+            found.append(Found(start, end))
+    return found
+
+
+def xbus(identifier: int, data: bytes = b"", *, extended: bool = False) -> bytes:
+    length = b"\xff" + struct.pack(">H", len(data)) if extended or len(data) > 254 else bytes([len(data)])
+    body = bytes([0xFF, identifier]) + length + data
+    return b"\xfa" + body + bytes([(256 - sum(body) % 256) % 256])
+
+
+def mtdata2(fields: list[tuple[int, bytes]], *, extended: bool = False) -> bytes:
+    data = b"".join(struct.pack(">HB", identifier, len(value)) + value for identifier, value in fields)
+    return xbus(0x36, data, extended=extended)
+
+
+def xsens_imu(
+    counter: int = 7,
+    ticks: int = 50_000,
+    gyro: tuple[float, ...] = (0.25, -0.5, 0.75),
+    accel: tuple[float, ...] = (0.5, -0.25, 9.75),
+) -> bytes:
+    stamps = [(0x1020, struct.pack(">H", counter)), (0x1060, struct.pack(">I", ticks))]
+    return mtdata2([*stamps, (0x4020, big_floats(*accel)), (0x8020, big_floats(*gyro))])
+
+
+def right_xbus(data: bytes, longest: int) -> list[Found]:
+    """Every message of at most so many bytes of data whose checksum is right, at whatever offset."""
+    found = []
+    for start in range(len(data) - 4):
+        if data[start : start + 2] != b"\xfa\xff":
+            continue
+        length, begin = data[start + 3], start + 4
+        if length == 255:
+            length, begin = int.from_bytes(data[start + 4 : start + 6], "big"), start + 6
+        end = begin + length + 1
+        if length <= longest and end <= len(data) and sum(data[start + 1 : end]) % 256 == 0:
+            found.append(Found(start, end))
+    return found
+
+
+def crc32_mpeg2(data: bytes) -> int:
+    crc = 0xFFFFFFFF
+    for byte in data:
+        crc ^= byte << 24
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x04C11DB7 if crc & 0x80000000 else crc << 1) & 0xFFFFFFFF
+    return crc
+
+
+def stim(body: bytes, *, crc: int | None = None) -> bytes:
+    padded = body + bytes(-len(body) % 4)
+    return body + struct.pack(">I", crc32_mpeg2(padded) if crc is None else crc)
+
+
+def int24(*values: int) -> bytes:
+    return b"".join((value & 0xFFFFFF).to_bytes(3, "big") for value in values)
+
+
+# Identifier to clusters (rate, acceleration, inclination, ...) of three values, temperatures, and AUX or PPS (TS1524,
+# tables 5-20 and 5-21): written out, as the decoder computes them.
+STIM_CONTENTS: dict[int, str] = {
+    0x90: "r", 0x91: "ra", 0x92: "ri", 0x93: "rai", 0x94: "rt", 0xA5: "rat", 0xA6: "rit", 0xA7: "rait",
+    0x98: "rx", 0x99: "rax", 0x9A: "rix", 0x9B: "raix", 0x9C: "rtx", 0xAD: "ratx", 0xAE: "ritx", 0xAF: "raitx",
+    0xF0: "rx", 0xF1: "rax", 0xF2: "rix", 0xF3: "raix", 0xF4: "rtx", 0xF5: "ratx", 0xF6: "ritx", 0xF7: "raitx",
+}  # fmt: skip
+STIM_SPECIAL_SIZES = {
+    0xB1: 20, 0xB3: 20, 0xB5: 20, 0xB7: 20, 0xBC: 26, 0xBD: 26, 0xBE: 21, 0xBF: 21, 0xD1: 40, 0xD2: 40
+}  # fmt: skip
+
+
+def stim300(
+    identifier: int = 0x93,
+    *,
+    gyro: tuple[int, ...] = (1 << 14, -2 << 14, 1 << 13),
+    accel: tuple[int, ...] = (0, 0, 1 << 19),
+    inclination: tuple[int, ...] = (0, 0, 1 << 22),
+    temperatures: tuple[int, ...] = (25 * 256, 30 * 256, 35 * 256),
+    status: dict[str, int] | None = None,
+    counter: int = 225,
+    latency_us: int = 0,
+) -> bytes:
+    """A normal mode datagram in counts; status bytes by the letter of their cluster, "t" for all temperatures."""
+    contents, said = STIM_CONTENTS[identifier], status or {}
+    clusters = [letter for letter in contents if letter in "rai"]
+    body = bytes([identifier])
+    for letter in clusters:
+        body += int24(*{"r": gyro, "a": accel, "i": inclination}[letter]) + bytes([said.get(letter, 0)])
+    if "t" in contents:
+        for _, degrees in zip(clusters, temperatures, strict=False):
+            body += struct.pack(">3h", degrees, degrees, degrees) + bytes([said.get("t", 0)])
+    if "x" in contents:
+        body += int24(-5) + b"\0"
+    return stim(body + struct.pack(">BH", counter, latency_us))
+
+
+def stim_configuration(range_code: int = 0, units: tuple[int, int, int] = (0, 0, 0)) -> bytes:
+    body = bytearray(22)
+    body[0] = 0xBC
+    for place, unit in zip((5, 8, 11), units, strict=True):
+        body[place] = 0x70 | unit
+    body[17], body[18] = range_code << 4 | range_code, range_code << 4
+    return stim(bytes(body))
+
+
+def stim_bytes(identifier: int) -> int:
+    contents = STIM_CONTENTS.get(identifier)
+    if contents is None:
+        return STIM_SPECIAL_SIZES.get(identifier, 0)
+    clusters = sum(letter in "rai" for letter in contents)
+    return 1 + clusters * 10 + ("t" in contents) * clusters * 7 + ("x" in contents) * 4 + 3 + 4
+
+
+def right_stims(data: bytes) -> list[Found]:
+    """Every datagram whose CRC is right, at whatever offset."""
+    found = []
+    for start, identifier in enumerate(data):
+        size = stim_bytes(identifier)
+        if size and start + size <= len(data):
+            body, crc = data[start : start + size - 4], data[start + size - 4 : start + size]
+            if crc32_mpeg2(body + bytes(-len(body) % 4)) == int.from_bytes(crc, "big"):
+                found.append(Found(start, start + size))
+    return found

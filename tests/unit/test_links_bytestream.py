@@ -22,12 +22,14 @@ from typing import Any
 import pytest
 
 from companion.errors import LinkError
-from companion.links import serial_port
+from companion.links import bytestream, serial_port
 from companion.links.backoff import Backoff
-from companion.links.bytestream import OUT_BUFFER_BYTES, ByteLink, PortSettings
+from companion.links.bytestream import OUT_BUFFER_BYTES, QUICK_READS, ByteLink, PortSettings
 from companion.links.serial_port import SerialOpener, open_serial
 
 NOBODY = 65534
+FAST = 4_000_000
+"""Baud at which a few bytes take no time."""
 
 
 class Pty:
@@ -132,6 +134,86 @@ def test_bytes_arrive_with_the_time_of_the_loop(path: Path) -> None:
                 assert port.link.bytes_received == 19
                 assert port.link.connected
                 assert port.link.last_error == ""
+
+    asyncio.run(main())
+
+
+async def collecting(port: Port, pty: Pty) -> None:
+    """Bytes one by one, each after the last has been read, until the link no longer wakes for each."""
+    reads = 0
+    while port.link._collecting is None:
+        os.write(pty.master, bytes([reads]))
+        assert await port.data(1) == bytes([reads])
+        reads += 1
+    assert reads - QUICK_READS in (0, 1)  # the very first byte of all has no other before it
+
+
+def test_a_fast_stream_is_collected_and_a_byte_after_it_wakes_the_loop(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bytestream, "QUICK_S", 10.0)
+
+    async def main() -> None:
+        with plugged(path) as pty:
+            async with running(path, FAST) as port:
+                await port.state(connected=True)
+                await collecting(port, pty)
+                for number in range(5):
+                    os.write(pty.master, bytes([number]))
+                chunk, _ = await asyncio.wait_for(port.chunks.get(), 10)
+                assert chunk == bytes(range(5))  # written in one turn of the loop, they come together
+                async with asyncio.timeout(10):
+                    while port.link._collecting is not None:
+                        await asyncio.sleep(0.001)
+                await collecting(port, pty)  # as at the start: each byte by itself
+
+    asyncio.run(main())
+
+
+def test_a_stream_that_is_faster_than_its_line_is_not_dated_by_it(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bytestream, "QUICK_S", 10.0)
+
+    async def main() -> None:
+        with plugged(path) as pty:
+            async with running(path, 300) as port:  # 100 bytes take more than three seconds
+                await port.state(connected=True)
+                for _ in range(3 * QUICK_READS):
+                    os.write(pty.master, bytes(100))
+                    await port.data(100)
+                    assert port.link._collecting is None
+
+    asyncio.run(main())
+
+
+def test_a_slow_stream_is_read_as_it_comes(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bytestream, "QUICK_S", 0.0)
+
+    async def main() -> None:
+        with plugged(path) as pty:
+            async with running(path) as port:
+                await port.state(connected=True)
+                for _ in range(3 * QUICK_READS):
+                    os.write(pty.master, b"x")
+                    await port.data(1)
+                    assert port.link._collecting is None
+
+    asyncio.run(main())
+
+
+def test_a_device_that_is_pulled_out_while_its_stream_is_collected_comes_back(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bytestream, "QUICK_S", 10.0)
+
+    async def main() -> None:
+        async with running(path, FAST) as port:
+            for _ in range(2):
+                with plugged(path) as pty:
+                    await port.state(connected=True)
+                    await collecting(port, pty)
+                    pty.unplug()
+                    assert "the device is gone" in await port.state(connected=False)
+                    assert port.link._collecting is None
 
     asyncio.run(main())
 

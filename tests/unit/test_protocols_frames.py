@@ -13,6 +13,7 @@ from companion import config
 from companion.errors import ConfigError
 from companion.protocols.registry import PROTOCOLS, Kind, make_decoder
 from companion.samples import AttitudeSample, CompassSample, ImuSample, MagSample, Sample, TiltSample
+from tests.support.frames import big_floats, fletcher
 
 KINDS: dict[str, Kind] = {name: kind for kind, names in reversed(PROTOCOLS.items()) for name in names}
 """One of the kinds under which a device is known; its decoder is the same under all."""
@@ -56,8 +57,11 @@ def test_the_document_has_frames_of_all_families_but_our_own() -> None:
         "inclinometer_xy",
         "pni",
         "rion",
-        "vectornav",
         "witmotion",
+        "mip",
+        "stim300",
+        "vectornav",
+        "xsens",
     }
     assert {frame["valid"] for frame in FRAMES} == {True, False}
 
@@ -68,9 +72,50 @@ MESSAGES = [frame for frame in FRAMES if "frame_id" in frame["decoded"]]
 """Right, but no measurements."""
 
 
-@pytest.mark.parametrize(
-    "frame", [frame for frame in FRAMES if frame not in TOGETHER and frame not in MESSAGES], ids=name_of
-)
+G, DEG = 9.80665, math.pi / 180
+
+
+def in_our_units(decoded: dict[str, Any]) -> dict[str, Any]:
+    """The document's words and units for inertial data as those of our samples; the rest as it is."""
+    said = dict(decoded)
+    if "gyro_deg_s" in said:
+        said["gyro_rad_s"] = [value * DEG for value in said.pop("gyro_deg_s")]
+    if "accel_g" in said:
+        said["accel_m_s2"] = [value * G for value in said.pop("accel_g")]
+    if "inclination_g" in said:  # of axes X forward, Y left, Z up: the third is positive
+        x, y, z = said.pop("inclination_g")
+        said["x_deg"] = math.asin(y / math.hypot(x, y, z)) / DEG
+        said["y_deg"] = math.asin(x / math.hypot(x, y, z)) / DEG
+    return said
+
+
+@pytest.mark.parametrize("frame", [f for f in FRAMES if f["device"] == "mip"], ids=name_of)
+def test_a_documented_mip_packet_is_read_as_documented(frame: dict[str, Any]) -> None:
+    """They hold no rates: what they hold is seen in a packet to which a field with rates has been added."""
+    packet, decoded = bytes_of(frame), frame["decoded"]
+    assert frame["valid"]
+    assert packet[-2:] == fletcher(packet[:-2])
+    decoder = make_decoder("imu", "mip")
+    assert decoder.feed(packet, 7.0) == []
+    reason = "reply" if "ack" in decoded else "non-finite" if None in decoded["accel_g"] else "nothing of use"
+    assert decoder.rejected == {reason: 1}
+    if "ack" in decoded:
+        return
+    rates = b"\x0e\x05" + big_floats(0.25, -0.5, 0.75)
+    completed = packet[:3] + bytes([packet[3] + len(rates)]) + packet[4:-2] + rates
+    samples = decoder.feed(completed + fletcher(completed), 7.0)
+    if reason == "non-finite":
+        assert samples == []
+        assert decoder.rejected == {reason: 2}
+        return
+    accel_m_s2 = [value * G for value in decoded["accel_g"]]
+    assert as_decoded(samples) == {"gyro_rad_s": [0.25, -0.5, 0.75], "accel_m_s2": pytest.approx(accel_m_s2)}
+
+
+ALONE = [f for f in FRAMES if f["device"] != "mip" and f not in TOGETHER and f not in MESSAGES]
+
+
+@pytest.mark.parametrize("frame", ALONE, ids=name_of)
 def test_a_documented_frame_is_read_as_documented(frame: dict[str, Any]) -> None:
     decoder = make_decoder(KINDS[frame["device"]], frame["device"])
     samples = decoder.feed(bytes_of(frame), 7.0)
@@ -79,13 +124,16 @@ def test_a_documented_frame_is_read_as_documented(frame: dict[str, Any]) -> None
         assert decoder.accepted == 0
         assert decoder.rejected.total() == 1
         return
-    said = as_decoded(samples)
-    assert said.keys() == frame["decoded"].keys()
-    for key, value in frame["decoded"].items():
+    said, decoded = as_decoded(samples), in_our_units(frame["decoded"])
+    latency_us = decoded.pop("latency_us", 0)
+    counters = {sample.sequence for sample in samples if isinstance(sample, ImuSample)}
+    assert {decoded.pop(key) for key in ("counter", "packet_counter") if key in decoded} == counters - {None}
+    assert said.keys() == decoded.keys()
+    for key, value in decoded.items():
         assert said[key] == pytest.approx(value, abs=5e-5), key
     assert decoder.accepted == 1
     assert not decoder.rejected
-    assert {sample.t_s for sample in samples} == {7.0}
+    assert {sample.t_s for sample in samples} == {7.0 - latency_us * 1e-6}
 
 
 @pytest.mark.parametrize("frame", MESSAGES, ids=name_of)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,7 +11,18 @@ import pytest
 from companion.protocols.base import Decoder
 from companion.protocols.registry import PROTOCOLS, Kind, make_decoder
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
-from tests.support.frames import imu_line, pni_heading, rion_angles, sentence, vectornav_imu, wit, wit_imu
+from tests.support.frames import (
+    imu_line,
+    mip_imu,
+    pni_heading,
+    rion_angles,
+    sentence,
+    stim300,
+    vectornav_imu,
+    wit,
+    wit_imu,
+    xsens_imu,
+)
 from tests.support.transports import SECONDS_PER_BYTE, START_S, TRANSPORTS, Transport
 
 COUNT = 400
@@ -38,10 +50,26 @@ def pair(n: int) -> bytes:
     return f"X={n / 100:+07.3f}\r\nY=-00.084\r\n".encode()
 
 
+def stim_imu(n: int) -> bytes:
+    return stim300(0x91, accel=(n << 8, 0, 1 << 19), counter=n * 16 % 256)
+
+
+def stim_tilt(n: int) -> bytes:
+    return stim300(0x92, inclination=(0, n << 10, 1 << 22))
+
+
+def stim_right_down_deg(n: int) -> float:
+    return math.asin((n << 10) / math.hypot(0, n << 10, 1 << 22)) / (math.pi / 180)
+
+
 DEVICES = [
     Device("imu", "imu_line", lambda n: imu_line(n, n * 2500, accel=(n / 100, 0, -9.8)), lambda n: n / 100, 1),
     Device("imu", "vectornav", lambda n: vectornav_imu(accel=(n / 4, 0, -9.75)), lambda n: n / 4, crc=True),
     Device("imu", "vectornav", ymr, lambda n: n / 100, 1),
+    Device("imu", "mip", lambda n: mip_imu(accel_g=(n / 4, 0, -1)), lambda n: n / 4 * 9.80665),
+    Device("imu", "xsens", lambda n: xsens_imu(n, accel=(n / 4, 0, 9.75)), lambda n: n / 4),
+    Device("imu", "stim300", stim_imu, lambda n: n / 2048 * 9.80665, crc=True),
+    Device("gradienter", "stim300", stim_tilt, stim_right_down_deg, crc=True),
     Device("compass", "hmr3300", lambda n: f"{n / 10:.1f}, 1.5, -2.5\r\n".encode(), lambda n: n / 10),
     Device("gradienter", "inclinometer_xy", pair, lambda n: n / 100),
     Device("compass", "pni", lambda n: pni_heading(n / 4), lambda n: n / 4, crc=True),
@@ -49,7 +77,6 @@ DEVICES = [
     Device("imu", "witmotion", lambda n: wit_imu((n, 0, 2048)), lambda n: n * (16 * 9.80665 / 32768), held=1),
     Device("gradienter", "witmotion", lambda n: wit(0x53, n, 3, 4), lambda n: n * 180 / 32768, held=1),
 ]
-IDS = ["imu_line", "binary", "ymr", "hmr3300", "inclinometer_xy", "pni", "rion", "witmotion", "witmotion_angles"]
 
 
 def value_of(sample: Sample) -> float | None:
@@ -72,7 +99,7 @@ def carry(device: Device, transport: Transport) -> tuple[Decoder, list[tuple[flo
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
-@pytest.mark.parametrize("device", DEVICES, ids=IDS)
+@pytest.mark.parametrize("device", DEVICES, ids=lambda device: f"{device.kind}-{device.name}-{len(device.frame(0))}")
 def test_a_decoder_behind_a_transport(device: Device, transport: Callable[[], Transport]) -> None:
     line = transport()
     decoder, got = carry(device, line)

@@ -17,6 +17,7 @@ from companion.errors import StorageError
 from companion.protocols.registry import PROTOCOLS, Kind, make_decoder
 from companion.recording.state import freeze, from_json, to_json
 from sim.aircraft import VirtualAircraft
+from sim.binary_imus import MipImu, Stim300, XsensImu
 from sim.devices import HMR3300, Gradienter, SerialDevice, VectorNavBinary
 from sim.imu_model import ImuModel
 from sim.pni import PniCompass
@@ -36,6 +37,9 @@ def stream(protocol: str) -> bytes:
     else:
         makers: dict[str, Callable[[], SerialDevice]] = {
             "vectornav": lambda: VectorNavBinary(ImuModel(aircraft, "adis16470", seed=1)),
+            "mip": lambda: MipImu(ImuModel(aircraft, "adis16470", seed=1)),
+            "xsens": lambda: XsensImu(ImuModel(aircraft, "adis16470", seed=1)),
+            "stim300": lambda: Stim300(ImuModel(aircraft, "adis16470", seed=1), range_g=5),
             "inclinometer_xy": lambda: Gradienter(aircraft, seed=1, law="slope"),
             "hmr3300": lambda: HMR3300(aircraft, seed=1),
             "pni": lambda: PniCompass(aircraft, seed=1, continuous=True),

@@ -1,0 +1,226 @@
+"""Serial IMUs with binary frames of the virtual aircraft: MicroStrain MIP, Xsens MTData2, STIM300.
+
+Each says its model's readings in the axes that the real device has, and obeys the commands that start and stop it.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from sim.devices import Frame, ImuDevice
+from sim.earth import Array
+from sim.imu_model import ImuModel
+
+_G = 9.80665
+_FIELD_GAUSS = (0.28, 0.0, 0.45)
+"""North (magnetic), east, down."""
+
+
+def mip_packet(descriptor_set: int, *fields: tuple[int, bytes]) -> bytes:
+    """A MIP packet of (descriptor, data) fields."""
+    payload = b"".join(bytes((2 + len(data), descriptor)) + data for descriptor, data in fields)
+    packet = bytes((0x75, 0x65, descriptor_set, len(payload))) + payload
+    one = two = 0
+    for byte in packet:
+        one = (one + byte) % 256
+        two = (two + one) % 256
+    return packet + bytes((one, two))
+
+
+class _Commanded(ImuDevice):
+    """A device that answers to messages of a known form."""
+
+    def __init__(self, imu: ImuModel, *, rate_hz: float | None = None, clock_ppm: float = 0.0) -> None:
+        super().__init__(imu, rate_hz=rate_hz, clock_ppm=clock_ppm)
+        self._pending = b""
+
+    ANSWERS: ClassVar[dict[bytes, tuple[bytes, bool | None]]]
+    """To each whole message: the answer, and whether it streams from then on (None: as before)."""
+
+    def command(self, data: bytes, t_s: float) -> bytes:
+        """Obey each whole known message; what is unknown is passed over."""
+        answer = b""
+        self._pending += data
+        while True:
+            found = [
+                (at, message) for message in self.ANSWERS if (at := self._pending.find(message)) >= 0
+            ]  # fmt: skip
+            if not found:
+                self._pending = self._pending[-16:]
+                return answer
+            at, message = min(found)
+            self._pending = self._pending[at + len(message) :]
+            said, streaming = self.ANSWERS[message]
+            answer += said
+            if streaming is not None:
+                self.streaming = streaming
+
+
+class MipImu(_Commanded):
+    """MicroStrain 3DM-GX5 or CV5: set 0x80 with GPS time, accelerometer (g), gyro, magnetometer (gauss); FRD axes."""
+
+    protocol = "mip"
+    baud = 115200
+    ANSWERS: ClassVar[dict[bytes, tuple[bytes, bool | None]]] = {
+        mip_packet(0x01, (command, b"")): (mip_packet(0x01, (0xF1, bytes((command, 0)))), streaming)
+        for command, streaming in ((0x01, None), (0x02, False), (0x06, True))
+    }
+    """Ping, to idle, resume; 0xF1 acknowledges."""
+
+    def encode(self, times_s: Array, first: int) -> list[bytes]:
+        """One packet a sample."""
+        return [
+            mip_packet(
+                0x80,
+                (0x12, struct.pack(">dHH", device_s, 0, 0)),
+                (0x04, struct.pack(">3f", *(value / _G for value in reading[3:]))),
+                (0x05, struct.pack(">3f", *reading[:3])),
+            )
+            for _, device_s, reading in self._readings(times_s, first)
+        ]
+
+
+def xbus_message(identifier: int, data: bytes = b"") -> bytes:
+    """An Xbus message from or to a stand-alone device."""
+    length = bytes((len(data),)) if len(data) < 255 else b"\xff" + struct.pack(">H", len(data))
+    body = bytes((0xFF, identifier)) + length + data
+    return b"\xfa" + body + bytes((-sum(body) % 256,))
+
+
+class XsensImu(_Commanded):
+    """Xsens MTi on its base: X forward, Y left, Z up; packet counter, time, acceleration, rate, field, status."""
+
+    protocol = "xsens"
+    baud = 230400
+    ANSWERS: ClassVar[dict[bytes, tuple[bytes, bool | None]]] = {
+        xbus_message(0x10): (xbus_message(0x11), True),
+        xbus_message(0x30): (xbus_message(0x31), False),
+        xbus_message(0x3F): (b"", False),
+    }
+    """GoToMeasurement, GoToConfig, WakeUpAck."""
+
+    def banner(self) -> bytes:
+        """WakeUp."""
+        return xbus_message(0x3E)
+
+    def encode(self, times_s: Array, first: int) -> list[bytes]:
+        """One message a sample."""
+        messages = []
+        for number, (time, device_s, reading) in enumerate(self._readings(times_s, first), first):
+            gx, gy, gz, ax, ay, az = reading
+            mx, my, mz = self.imu.mounting.T @ self.aircraft.body_from_ned(time) @ np.array(_FIELD_GAUSS) / 0.53
+            fields = (
+                (0x1020, struct.pack(">H", number % 65536)),
+                (0x1060, struct.pack(">I", round(device_s * 1e4) % 2**32)),
+                (0x4020, struct.pack(">3f", ax, -ay, -az)),
+                (0x8020, struct.pack(">3f", gx, -gy, -gz)),
+                (0xC020, struct.pack(">3f", mx, -my, -mz)),
+                (0xE020, struct.pack(">I", 0x81)),
+            )
+            messages.append(xbus_message(0x36, b"".join(struct.pack(">HB", i, len(d)) + d for i, d in fields)))
+        return messages
+
+
+def _crc_table() -> list[int]:
+    table = []
+    for byte in range(256):
+        crc = byte << 24
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x04C11DB7 if crc & 0x80000000 else crc << 1) & 0xFFFFFFFF
+        table.append(crc)
+    return table
+
+
+_TABLE = _crc_table()
+
+
+def stim_datagram(body: bytes) -> bytes:
+    """A datagram with its CRC: over the body and as many zeros as fill its last word."""
+    crc = 0xFFFFFFFF
+    for byte in body + bytes(-len(body) % 4):
+        crc = (crc << 8 & 0xFFFFFFFF) ^ _TABLE[crc >> 24 ^ byte]
+    return body + struct.pack(">I", crc)
+
+
+class Stim300(ImuDevice):
+    """Sensonor STIM300 on its base, X forward, Y left, Z up: datagram 0xA7 with all but AUX (TS1524 rev. 31).
+
+    Args:
+        range_g: of the accelerometers: 5, 10, 30 or 80.
+        upside_down: on its lid instead: X forward, Y right, Z down.
+        inclination_noise_g: of each inclinometer.
+        crlf: whether each datagram ends with CR LF.
+    """
+
+    protocol = "stim300"
+    baud = 921600
+    default_rate_hz = 250.0
+    LATENCY_S = 506e-6
+    TICKS_A_SECOND = 2000
+    BITS: ClassVar[dict[int, tuple[int, int]]] = {10: (0, 19), 5: (3, 20), 30: (4, 18), 80: (6, 16)}
+    """Range: its code in the configuration datagram, and the bits after the point."""
+
+    def __init__(
+        self,
+        imu: ImuModel,
+        *,
+        range_g: int = 10,
+        upside_down: bool = False,
+        inclination_noise_g: float = 1e-5,
+        crlf: bool = False,
+        seed: int = 0,
+        rate_hz: float | None = None,
+        clock_ppm: float = 0.0,
+    ) -> None:
+        super().__init__(imu, rate_hz=rate_hz, clock_ppm=clock_ppm)
+        self.range_g, self.upside_down, self.inclination_noise_g = range_g, upside_down, inclination_noise_g
+        self._end = b"\r\n" if crlf else b""
+        self._random = np.random.default_rng([seed, 7])
+
+    def banner(self) -> bytes:
+        """Part number, serial number, configuration."""
+        ends = bool(self._end)
+        code = self.BITS[self.range_g][0]
+        settings = bytearray(22)
+        settings[0] = 0xBD if ends else 0xBC
+        settings[1:5] = b"\x52\x01" + bytes((0x2E | ends, 0x20))  # 250 Hz; temperature, inclination, acceleration
+        settings[5] = settings[8] = settings[11] = 0x70  # all axes active; rate, acceleration
+        settings[17], settings[18] = code << 4 | code, code << 4
+        part = bytes((0xB3 if ends else 0xB1,)) + bytes(15)
+        serial = bytes((0xB7 if ends else 0xB5,)) + b"N" + bytes(14)
+        return b"".join(stim_datagram(each) + self._end for each in (part, serial, bytes(settings)))
+
+    def frames_until(self, t_s: float) -> list[Frame]:
+        """The frames, which tell of a moment somewhat before they are sent."""
+        return [frame._replace(sampled_s=frame.sampled_s - self.LATENCY_S) for frame in super().frames_until(t_s)]
+
+    def encode(self, times_s: Array, first: int) -> list[bytes]:
+        """One datagram a sample."""
+        sampled_s = times_s - self.LATENCY_S
+        g = (self.aircraft.truth(sampled_s).force_m_s2 @ self.imu.mounting) / _G
+        inclinations = g + self.inclination_noise_g * self._random.standard_normal(g.shape)
+        signs = np.array([1.0, 1.0, 1.0] if self.upside_down else [1.0, -1.0, -1.0])
+        bits = self.BITS[self.range_g][1]
+        datagrams = []
+        readings = self._readings(sampled_s, first)
+        for (time, device_s, reading), inclination in zip(readings, inclinations, strict=True):
+            rate_deg_s = np.degrees(reading[:3]) * signs
+            accel_g = np.asarray(reading[3:]) / _G * signs
+            body = bytes((0xA7,)) + _cluster(rate_deg_s, 14) + _cluster(accel_g, bits)
+            body += _cluster(inclination * signs, 22)
+            degrees = round(self.imu.temperature_degc(time) * 256)
+            body += 3 * (struct.pack(">3h", degrees, degrees, degrees) + b"\0")
+            ticks = round(device_s * self.TICKS_A_SECOND) % 256
+            body += struct.pack(">BH", ticks, round(self.LATENCY_S * 1e6))
+            datagrams.append(stim_datagram(body) + self._end)
+        return datagrams
+
+
+def _cluster(values: Sequence[float] | Array, bits: int) -> bytes:
+    """Three values as 24-bit numbers with so many bits after the point, and a status without complaint."""
+    counts = [max(-(2**23), min(2**23 - 1, round(float(value) * 2**bits))) for value in values]
+    return b"".join(struct.pack(">i", count)[1:] for count in counts) + b"\0"

@@ -1,0 +1,114 @@
+"""MicroStrain MIP packets."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import pytest
+
+from companion.protocols.mip import MAX_FRAME_BYTES, MipDecoder
+from companion.samples import ImuSample, MagSample, Sample
+from tests.support.frames import big_floats, fletcher, mip, mip_imu
+
+G = 9.80665
+PACKET = mip_imu()
+ACCEL, GYRO = (0x04, big_floats(0.5, -0.25, -1.0)), (0x05, big_floats(0.25, -0.5, 0.75))
+
+
+def feed(data: bytes) -> tuple[list[Sample], dict[str, int]]:
+    decoder = MipDecoder()
+    return decoder.feed(data, 1.0), dict(decoder.rejected)
+
+
+def test_the_test_bench_computes_the_documented_checksums() -> None:
+    for packet in ("756501020201E0C6", "756501020202E1C7", "756501020206E5CB", "7565010404F10100D56A"):
+        whole = bytes.fromhex(packet)
+        assert fletcher(whole[:-2]) == whole[-2:]
+
+
+def test_rate_and_force_of_one_packet_make_a_sample_in_si() -> None:
+    assert feed(PACKET) == ([ImuSample(1.0, (0.25, -0.5, 0.75), (0.5 * G, -0.25 * G, -G), None, None, 5.0)], {})
+    assert feed(mip([GYRO, ACCEL])) == ([ImuSample(1.0, (0.25, -0.5, 0.75), (0.5 * G, -0.25 * G, -G))], {})
+
+
+def test_a_field_that_is_not_used_is_stepped_over_by_its_length() -> None:
+    others = [(0x17, big_floats(1013.0)), (0x0E, bytes(4)), (0x9F, b"")]
+    assert feed(mip([others[0], ACCEL, others[1], GYRO, others[2]])) == feed(mip([ACCEL, GYRO]))
+
+
+def test_a_magnetic_field_is_in_gauss_and_may_come_alone() -> None:
+    mag = (0x06, big_floats(0.25, -0.125, 0.5))
+    assert feed(mip([mag])) == ([MagSample(1.0, (0.25, -0.125, 0.5))], {})
+    assert len(feed(mip([ACCEL, GYRO, mag]))[0]) == 2
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (mip([ACCEL]), "nothing of use"),
+        (mip([GYRO]), "nothing of use"),
+        (mip([]), "nothing of use"),
+        (mip([ACCEL, GYRO], descriptor_set=0x82), "nothing of use"),
+        (mip([(0xF1, b"\x01\x00")], descriptor_set=0x01), "reply"),
+        (mip([(0xF1, b"\x08\x00")], descriptor_set=0x0C), "reply"),
+        (mip([(0x04, bytes(8)), GYRO]), "field count"),
+        (mip([ACCEL, GYRO, (0x12, bytes(8))]), "field count"),
+        (mip_imu(time_s=math.nan), "non-finite"),
+        (mip_imu(gyro=(0, math.nan, 0)), "non-finite"),
+        (mip_imu(accel_g=(math.inf, -math.inf, 0)), "non-finite"),
+        (mip([(0x04, big_floats(math.nan, 0, 0))]), "non-finite"),
+        (mip([(0x06, big_floats(math.nan, 0, 0))]), "non-finite"),
+        (mip_imu(gyro=(0, 0, 1e6)), "out of range"),
+        (mip_imu(accel_g=(0, 0, 300)), "out of range"),
+        (PACKET[:-1] + bytes([PACKET[-1] ^ 1]), "checksum"),
+    ],
+)
+def test_packets_that_give_nothing_are_counted_by_reason(data: bytes, reason: str) -> None:
+    assert feed(data + PACKET + bytes(MAX_FRAME_BYTES)) == (feed(PACKET)[0], {reason: 1})
+
+
+@pytest.mark.parametrize("payload", [b"\x00", b"\x01\x04", b"\x0e\x04" + bytes(11), b"\x02"])
+def test_a_field_whose_length_does_not_fit_its_packet_is_rejected(payload: bytes) -> None:
+    head = bytes([0x75, 0x65, 0x80, len(payload)]) + payload
+    assert feed(head + fletcher(head)) == ([], {"field count": 1})
+
+
+def test_a_packet_inside_what_a_false_start_claims_is_not_lost() -> None:
+    for false_start in (b"\x75", b"\x75\x65", b"\x75\x65\x80\xff", PACKET[:-1], b"\x75\x65\x80\x40" + bytes(20)):
+        decoder = MipDecoder()
+        decoder.feed(false_start + PACKET, 1.0)
+        decoder.feed(bytes(MAX_FRAME_BYTES), 2.0)
+        assert decoder.accepted == 1, false_start
+
+
+def test_every_single_damaged_bit_is_seen() -> None:
+    for at in range(len(PACKET) * 8):
+        damaged = bytearray(PACKET)
+        damaged[at // 8] ^= 1 << at % 8
+        assert feed(bytes(damaged) + bytes(MAX_FRAME_BYTES))[0] == [], at
+
+
+def test_times_are_those_of_the_packets_ends_even_behind_a_false_start() -> None:
+    decoder = MipDecoder(seconds_per_byte=0.001)
+    samples = decoder.feed(PACKET + PACKET + PACKET[:10], 10.0)
+    assert [sample.t_s for sample in samples] == pytest.approx([10.0 - 0.001 * (len(PACKET) + 10), 10.0 - 0.01])
+    held = MipDecoder(seconds_per_byte=0.001)
+    assert held.feed(b"\x75\x65\x80\xff" + PACKET + b"\0", 10.0) == []
+    assert [sample.t_s for sample in held.feed(bytes(300), 10.5)] == pytest.approx([10.0 - 0.001])
+
+
+def test_an_interruption_forgets_the_packet_under_way() -> None:
+    decoder = MipDecoder()
+    decoder.feed(PACKET[:20], 1.0)
+    decoder.interrupted()
+    decoder.feed(PACKET[20:] + PACKET, 2.0)
+    assert decoder.accepted == 1
+    assert decoder.rejected["cut short"] == 1
+
+
+def test_the_device_clock_is_the_time_of_week() -> None:
+    week = (0x12, struct.pack(">dHH", 604_799.995, 2400, 0x0F))
+    (sample,) = feed(mip([week, ACCEL, GYRO]))[0]
+    assert isinstance(sample, ImuSample)
+    assert sample.t_device_s == 604_799.995
