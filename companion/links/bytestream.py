@@ -25,9 +25,9 @@ logger = logging.getLogger(__name__)
 
 READ_BYTES = 4096
 """As much as a tty buffers: one wake-up empties the port, so one time stamp holds for all that it brought."""
-QUICK_S = 0.0015
 QUICK_READS = 20
-"""So many reads running, each within that time of the last, are a stream whose every byte would wake the loop."""
+QUICK_S = 0.0015
+"""So many reads, that far apart in the mean or less, are a stream whose every byte would wake the loop."""
 PAUSE_S = 0.008
 """So long such a stream is collected before the next read: a wake-up costs far more than the bytes that it brings.
 
@@ -124,9 +124,9 @@ class ByteLink:
         """The loop's time of the last read that brought bytes."""
         self._on_bytes, self._on_state = on_bytes, on_state
         self._descriptor: int | None = None
-        self._quick_reads = 0
-        self._quick_since = (0.0, 0)
-        """When that run of reads began, and the bytes received by then."""
+        self._reads = 0
+        """Since `_reads_since`, a time and the bytes received by then."""
+        self._reads_since = (0.0, 0)
         self._collecting: asyncio.TimerHandle | None = None
         """The next read, while bytes are collected; None: each wakes the loop."""
         self._lost: asyncio.Future[str] | None = None
@@ -210,6 +210,7 @@ class ByteLink:
         if self._opened_before:
             self.reconnects += 1
         self._opened_before = True
+        self._reads, self._reads_since = 0, (loop.time(), self.bytes_received)
         loop.add_reader(descriptor, self._readable)
         level = logging.DEBUG if self._quiet else logging.INFO
         logger.log(level, "%s: %s is %s", self.name, self.settings.url, "back" if self._warned else "open")
@@ -218,19 +219,15 @@ class ByteLink:
 
     def _readable(self) -> None:
         loop = asyncio.get_running_loop()
-        now_s, last_s = loop.time(), self.last_byte_s
+        now_s = loop.time()
         if not self._read(now_s) or self._descriptor is None:
             return
-        if last_s is None or now_s - last_s >= QUICK_S:
-            self._quick_reads, self._quick_since = 0, (now_s, self.bytes_received)
-            return
-        self._quick_reads += 1
-        if self._quick_reads == QUICK_READS:
-            self._quick_reads = 0
-            if self._fits_the_line(*self._quick_since, now_s):
+        self._reads += 1
+        if self._reads == QUICK_READS:
+            if now_s - self._reads_since[0] < QUICK_READS * QUICK_S and self._fits_the_line(*self._reads_since, now_s):
                 loop.remove_reader(self._descriptor)
                 self._collecting = loop.call_later(PAUSE_S, self._collected)
-            self._quick_since = (now_s, self.bytes_received)
+            self._reads, self._reads_since = 0, (now_s, self.bytes_received)
 
     def _collected(self) -> None:
         """Read what has come in the meantime; when that is nothing, let the next byte wake the loop again."""
@@ -242,7 +239,7 @@ class ByteLink:
         if came and self._fits_the_line(*before, now_s):
             self._collecting = loop.call_later(PAUSE_S, self._collected)
         else:
-            self._collecting = None
+            self._collecting, self._reads_since = None, (now_s, self.bytes_received)
             loop.add_reader(self._descriptor, self._readable)
 
     def _fits_the_line(self, since_s: float, bytes_then: int, now_s: float) -> bool:
@@ -333,7 +330,6 @@ class ByteLink:
     def _close(self) -> None:
         descriptor, self._descriptor = self._descriptor, None
         self._out.clear()
-        self._quick_reads = 0
         if self._collecting is not None:
             self._collecting.cancel()
             self._collecting = None
