@@ -87,7 +87,7 @@ def test_a_ceramic_resonator_is_followed_within_milliseconds() -> None:
 def test_every_protocol_says_how_its_clock_wraps(decoder: type) -> None:
     known = {ImuLineDecoder: (2**32 / 1e6, 2**16), VectorNavDecoder: (2**64 / 1e9, None)}
     if decoder in known:
-        assert (decoder.device_clock_wraps_s, decoder.sequence_modulus) == known[decoder]  # type: ignore[attr-defined]
+        assert (decoder.device_clock_wraps_s, decoder.sequence_modulus) == known[decoder]
 
 
 @pytest.mark.parametrize("wraps_s", [2**32 / 1e6, 2**32 / 1e4, 65.536])
