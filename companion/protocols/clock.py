@@ -86,7 +86,9 @@ class DeviceClock:
         if math.isnan(self._offset_s):
             return self._start(raw_s, arrival_s)
         elapsed_s = arrival_s - self._arrival_s
-        advance_s = self._advance(raw_s, elapsed_s)
+        advance_s = raw_s - self._raw_s
+        if advance_s < 0.0 or elapsed_s - advance_s > LATE_S:
+            advance_s = self._unwrapped(advance_s, elapsed_s)
         if advance_s < 0.0:
             self.restarts += 1
             return self._start(raw_s, arrival_s)
@@ -103,12 +105,14 @@ class DeviceClock:
         elif elapsed_s > LATE_S:
             # It has been up for no longer than nothing was heard of it.
             self._restarted_in_silence = raw_s <= elapsed_s + _BOOT_S
-        delay_s -= self._stepped(delay_s, arrival_s)
+        self._least_s = min(self._least_s, delay_s)
+        self._seen += 1
+        if arrival_s >= self._span_end_s and self._seen >= SPAN_SAMPLES:
+            delay_s -= self._step(arrival_s)
         return None if delay_s > LATE_S else arrival_s - delay_s
 
-    def _advance(self, raw_s: float, elapsed_s: float) -> float:
+    def _unwrapped(self, advance_s: float, elapsed_s: float) -> float:
         """How far the clock went on since the last sample; negative: it went back, and not because it wraps."""
-        advance_s = raw_s - self._raw_s
         if self._wraps_s is None:
             return advance_s
         turns = round((elapsed_s - advance_s) / self._wraps_s)
@@ -118,12 +122,8 @@ class DeviceClock:
                 return unwrapped_s
         return advance_s
 
-    def _stepped(self, delay_s: float, arrival_s: float) -> float:
-        """By how much the offset has to rise now, which it then does."""
-        self._least_s = min(self._least_s, delay_s)
-        self._seen += 1
-        if arrival_s < self._span_end_s or self._seen < SPAN_SAMPLES:
-            return 0.0
+    def _step(self, arrival_s: float) -> float:
+        """At the end of a span: by how much the offset has to rise now, which it then does."""
         least_s = self._least_s
         self._new_span(arrival_s)
         if least_s <= STEP_S:
