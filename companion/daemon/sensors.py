@@ -42,7 +42,7 @@ class SerialSensor:
         self._last_sample_s: float | None = None
         self._counted = (0.0, 0)
         self._rate_hz = 0.0
-        self._restarts = 0
+        self._breaks = 0
 
     async def run(self) -> None:
         """Read until cancelled."""
@@ -60,9 +60,9 @@ class SerialSensor:
         if self.tap is not None:
             self.tap(self.name, data, t_s)
         samples = self.decoder.receive(data, t_s)
-        if (restarts := self.decoder.times.clock.restarts) != self._restarts:
-            self._restarts = restarts
-            logger.warning("%s: the device restarted, its biases are new ones; measuring afresh", self.name)
+        if (breaks := self.decoder.times.clock.breaks) != self._breaks:
+            self._breaks = breaks
+            logger.warning("%s: the device restarted, or its clock jumped; measuring afresh", self.name)
         if not samples:
             return
         self._last_sample_s = t_s

@@ -7,7 +7,7 @@ crystals drift apart. It is causal, forgives every stall, and leaves only the le
 one end (reference: sensors.md 4.4; dawonn/vectornav#88 and ethz-asl's cuckoo_time_translator discuss the choice).
 
 A clock that went back, or that has advanced by far less than the host's, is a device that restarted (its biases are
-new ones) or a clock that was set; either way it is mapped afresh.
+new ones); one that jumped forward belongs to another device, or the host slept. Either way it is mapped afresh.
 """
 
 from __future__ import annotations
@@ -72,6 +72,11 @@ class DeviceClock:
         self._restarted_in_silence = False
         self._new_span(arrival_s)
         return arrival_s
+
+    @property
+    def breaks(self) -> int:
+        """How often what came before and after could not be told to be one device without a pause."""
+        return self.restarts + self.jumps
 
     def remap(self) -> None:
         """The times at which samples arrived so far were wrong."""
@@ -187,13 +192,13 @@ class SampleTimes:
 
     def _imu(self, sample: ImuSample, arrival_s: float, read_s: float) -> ImuSample | None:
         clock, raw_s = self.clock, sample.t_device_s
-        restarts = clock.restarts
+        breaks = clock.breaks
         device_s: float | None = None
         t_s: float | None = arrival_s
         if raw_s is not None and math.isfinite(raw_s):
             t_s = clock.host_s(raw_s, arrival_s)
             device_s = clock.device_s
-        sequence = None if sample.sequence is None else self._counted(sample.sequence, clock.restarts > restarts)
+        sequence = None if sample.sequence is None else self._counted(sample.sequence, clock.breaks > breaks)
         if t_s is None:
             return None
         return ImuSample(
@@ -203,7 +208,7 @@ class SampleTimes:
             sample.temperature_degc,
             sequence,
             device_s,
-            clock.restarts,
+            clock.breaks,
         )
 
     def _in_order(self, t_s: float, read_s: float) -> float:
@@ -213,7 +218,7 @@ class SampleTimes:
         self._newest_s = t_s
         return t_s
 
-    def _counted(self, raw: int, restarted: bool) -> int:  # noqa: FBT001 - one caller
+    def _counted(self, raw: int, anew: bool) -> int:  # noqa: FBT001 - one caller
         """The counter, unwrapped; one that went back counts on by one, so that nothing seems lost."""
         last, self._raw_sequence = self._raw_sequence, raw
         if last is None:
@@ -222,5 +227,5 @@ class SampleTimes:
             self._sequence += raw - last if raw >= last else 1
         else:
             step = (raw - last) % self._modulus
-            self._sequence += 1 if restarted or step > self._modulus // 2 else step
+            self._sequence += 1 if anew or step > self._modulus // 2 else step
         return self._sequence
