@@ -26,14 +26,17 @@ CREEP: Final = 100e-6
 STEP_S: Final = 0.005
 """If no sample of a whole `SPAN_S` came with less delay than this, the offset itself is another one now."""
 SPAN_S: Final = 1.0
-SPAN_SAMPLES: Final = 5
+SPAN_SAMPLES: Final = 20
+"""And of no fewer samples: of a few all may have had to wait for the adapter."""
 
 LATE_S: Final = 1.0
 """A sample that seems later than this is dropped: as old as that nobody waits for it, or its clock is wrong."""
 
 _WRAP_S: Final = 2.0
 _WRAP_SHARE: Final = 0.01
+"""A clock that wraps has advanced as the host's has, but for a stall and for what the two differ by."""
 _BOOT_S: Final = 2.0
+"""By so much more than it was not heard a device that restarted meanwhile may have been up: what waited unread."""
 
 LATE: Final = "late"
 

@@ -84,7 +84,7 @@ def test_a_ceramic_resonator_is_followed_within_milliseconds() -> None:
 
 
 @pytest.mark.parametrize("decoder", [info.decoder for kind in PROTOCOLS.values() for info in kind.values()])
-def test_every_protocol_says_how_its_clock_wraps(decoder: type) -> None:
+def test_the_wraps_are_those_of_the_formats(decoder: type) -> None:
     known = {ImuLineDecoder: (2**32 / 1e6, 2**16), VectorNavDecoder: (2**64 / 1e9, None)}
     if decoder in known:
         assert (decoder.device_clock_wraps_s, decoder.sequence_modulus) == known[decoder]
