@@ -100,9 +100,6 @@ def test_a_device_that_restarts_in_the_middle_is_replayed_alike_from_any_part(tm
         for _ in range(2):
             result, _ = await calibrated(rig)
             assert result.outcome == "done", result
-            rig.unplugged.add("own")
-            await asyncio.sleep(1.3)
-            rig.unplugged.remove("own")
             rig.devices["own"].power_on(rig.aircraft.time_at(rig.now_s))
             await asyncio.sleep(1.0)
             clock = rig.service.sensors[0].decoder.times.clock
@@ -110,7 +107,8 @@ def test_a_device_that_restarts_in_the_middle_is_replayed_alike_from_any_part(tm
         result, _ = await calibrated(rig)
         assert result.outcome == "done", result
 
-    paths, records = record(tmp_path, during, own_imu=True, min_still_s=5.0, max_s=6.0)
+    # Reads that lie across the ends of seconds: to which one a sample belongs is the clock's word.
+    paths, records = record(tmp_path, during, own_imu=True, min_still_s=5.0, max_s=6.0, feed_s=0.07)
     assert len(records) == 3
     assert len(paths) >= 3
     for path, kept in zip(paths, records, strict=False):
