@@ -27,8 +27,8 @@ class ImuSample(msgspec.Struct, frozen=True, gc=False):
     """The device's own counter, None where the protocol has none; unwrapped by `Decoder.receive`."""
     t_device_s: float | None = None
     """The device's own clock, None where the protocol has none; unwrapped by `Decoder.receive`."""
-    restarts: int = 0
-    """How often the device had been seen to restart before: its biases are new ones every time."""
+    breaks: int = 0
+    """How often before the device had restarted or its clock had jumped: it may be another one, its biases new ones."""
 
 
 class TiltSample(msgspec.Struct, frozen=True, gc=False):

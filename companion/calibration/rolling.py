@@ -96,7 +96,7 @@ class RollingCollector:
         self._lags = (gradienter_lag, compass_lag)
         self._tilt = gradienter_source(self._keep, gradienter_lag) if gradienter else None
         self._heading = compass_source(self._keep, compass_lag) if compass else None
-        self._boots: dict[str, int] = {}
+        self._breaks: dict[str, int] = {}
         self._field = None if field_by is None else FieldHeading(*field_by, self._keep)
         self._watch = HeadingWatch()
         self._stretch = Stretch(self._min_good, self._max_slots)
@@ -120,8 +120,8 @@ class RollingCollector:
         if source is None:
             self.unknown_samples += 1
             return
-        if sample.restarts != self._boots.get(name, 0):
-            self._boots[name] = sample.restarts
+        if sample.breaks != self._breaks.get(name, 0):
+            self._breaks[name] = sample.breaks
             self._forget(f"imu {name} restarted", name)
         stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
         row = sample.gyro_rad_s + sample.accel_m_s2

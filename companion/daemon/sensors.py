@@ -128,7 +128,7 @@ class SerialSensor:
         self._look_at_s = -math.inf
         self._held_by = ""
         self._openings = 0
-        self._restarts = 0
+        self._breaks = 0
         self._told: set[str] = set()
 
     async def run(self) -> None:
@@ -164,9 +164,9 @@ class SerialSensor:
         if self.tap is not None:
             self.tap(self.name, data, t_s)
         samples = self.decoder.receive(data, t_s)
-        if (restarts := self.decoder.times.clock.restarts) != self._restarts:
-            self._restarts = restarts
-            logger.warning("%s: the device restarted, its biases are new ones; measuring afresh", self.link.name)
+        if (breaks := self.decoder.times.clock.breaks) != self._breaks:
+            self._breaks = breaks
+            logger.warning("%s: the device restarted, or its clock jumped; measuring afresh", self.link.name)
         self.health.stream.took(data, samples, t_s)
         if samples:
             for sample in samples:

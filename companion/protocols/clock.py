@@ -7,7 +7,7 @@ crystals drift apart. It is causal, forgives every stall, and leaves only the le
 one end (reference: sensors.md 4.4; dawonn/vectornav#88 and ethz-asl's cuckoo_time_translator discuss the choice).
 
 A clock that went back, or that has advanced by far less than the host's, is a device that restarted (its biases are
-new ones) or a clock that was set; either way it is mapped afresh.
+new ones); one that jumped forward belongs to another device, or the host slept. Either way it is mapped afresh.
 """
 
 from __future__ import annotations
@@ -26,14 +26,17 @@ CREEP: Final = 100e-6
 STEP_S: Final = 0.005
 """If no sample of a whole `SPAN_S` came with less delay than this, the offset itself is another one now."""
 SPAN_S: Final = 1.0
-SPAN_SAMPLES: Final = 5
+SPAN_SAMPLES: Final = 20
+"""And of no fewer samples: of a few all may have had to wait for the adapter."""
 
 LATE_S: Final = 1.0
 """A sample that seems later than this is dropped: as old as that nobody waits for it, or its clock is wrong."""
 
 _WRAP_S: Final = 2.0
 _WRAP_SHARE: Final = 0.01
+"""A clock that wraps has advanced as the host's has, but for a stall and for what the two differ by."""
 _BOOT_S: Final = 2.0
+"""By so much more than it was not heard a device that restarted meanwhile may have been up: what waited unread."""
 
 LATE: Final = "late"
 
@@ -73,6 +76,11 @@ class DeviceClock:
         self._new_span(arrival_s)
         return arrival_s
 
+    @property
+    def breaks(self) -> int:
+        """How often what came before and after could not be told to be one device without a pause."""
+        return self.restarts + self.jumps
+
     def remap(self) -> None:
         """The times at which samples arrived so far were wrong."""
         self._offset_s = math.nan
@@ -86,7 +94,9 @@ class DeviceClock:
         if math.isnan(self._offset_s):
             return self._start(raw_s, arrival_s)
         elapsed_s = arrival_s - self._arrival_s
-        advance_s = self._advance(raw_s, elapsed_s)
+        advance_s = raw_s - self._raw_s
+        if advance_s < 0.0 or elapsed_s - advance_s > LATE_S:
+            advance_s = self._unwrapped(advance_s, elapsed_s)
         if advance_s < 0.0:
             self.restarts += 1
             return self._start(raw_s, arrival_s)
@@ -103,12 +113,14 @@ class DeviceClock:
         elif elapsed_s > LATE_S:
             # It has been up for no longer than nothing was heard of it.
             self._restarted_in_silence = raw_s <= elapsed_s + _BOOT_S
-        delay_s -= self._stepped(delay_s, arrival_s)
+        self._least_s = min(self._least_s, delay_s)
+        self._seen += 1
+        if arrival_s >= self._span_end_s and self._seen >= SPAN_SAMPLES:
+            delay_s -= self._step(arrival_s)
         return None if delay_s > LATE_S else arrival_s - delay_s
 
-    def _advance(self, raw_s: float, elapsed_s: float) -> float:
+    def _unwrapped(self, advance_s: float, elapsed_s: float) -> float:
         """How far the clock went on since the last sample; negative: it went back, and not because it wraps."""
-        advance_s = raw_s - self._raw_s
         if self._wraps_s is None:
             return advance_s
         turns = round((elapsed_s - advance_s) / self._wraps_s)
@@ -118,12 +130,8 @@ class DeviceClock:
                 return unwrapped_s
         return advance_s
 
-    def _stepped(self, delay_s: float, arrival_s: float) -> float:
-        """By how much the offset has to rise now, which it then does."""
-        self._least_s = min(self._least_s, delay_s)
-        self._seen += 1
-        if arrival_s < self._span_end_s or self._seen < SPAN_SAMPLES:
-            return 0.0
+    def _step(self, arrival_s: float) -> float:
+        """At the end of a span: by how much the offset has to rise now, which it then does."""
         least_s = self._least_s
         self._new_span(arrival_s)
         if least_s <= STEP_S:
@@ -187,13 +195,13 @@ class SampleTimes:
 
     def _imu(self, sample: ImuSample, arrival_s: float, read_s: float) -> ImuSample | None:
         clock, raw_s = self.clock, sample.t_device_s
-        restarts = clock.restarts
+        breaks = clock.breaks
         device_s: float | None = None
         t_s: float | None = arrival_s
         if raw_s is not None and math.isfinite(raw_s):
             t_s = clock.host_s(raw_s, arrival_s)
             device_s = clock.device_s
-        sequence = None if sample.sequence is None else self._counted(sample.sequence, clock.restarts > restarts)
+        sequence = None if sample.sequence is None else self._counted(sample.sequence, clock.breaks > breaks)
         if t_s is None:
             return None
         return ImuSample(
@@ -203,7 +211,7 @@ class SampleTimes:
             sample.temperature_degc,
             sequence,
             device_s,
-            clock.restarts,
+            clock.breaks,
         )
 
     def _in_order(self, t_s: float, read_s: float) -> float:
@@ -213,7 +221,7 @@ class SampleTimes:
         self._newest_s = t_s
         return t_s
 
-    def _counted(self, raw: int, restarted: bool) -> int:  # noqa: FBT001 - one caller
+    def _counted(self, raw: int, anew: bool) -> int:  # noqa: FBT001 - one caller
         """The counter, unwrapped; one that went back counts on by one, so that nothing seems lost."""
         last, self._raw_sequence = self._raw_sequence, raw
         if last is None:
@@ -222,5 +230,5 @@ class SampleTimes:
             self._sequence += raw - last if raw >= last else 1
         else:
             step = (raw - last) % self._modulus
-            self._sequence += 1 if restarted or step > self._modulus // 2 else step
+            self._sequence += 1 if anew or step > self._modulus // 2 else step
         return self._sequence

@@ -130,6 +130,28 @@ def test_a_replay_knows_who_shares_a_port(tmp_path: Path) -> None:
     assert "/serial/compass" not in topics_seen
 
 
+def test_a_device_that_restarts_in_the_middle_is_replayed_alike_from_any_part(tmp_path: Path) -> None:
+    """Its clock begins anew; the second file of the ring begins with the clock's mapping as it was."""
+
+    async def during(rig: Rig) -> None:
+        for _ in range(2):
+            result, _ = await calibrated(rig)
+            assert result.outcome == "done", result
+            rig.devices["own"].power_on(rig.aircraft.time_at(rig.now_s))
+            await asyncio.sleep(1.0)
+            clock = rig.service.sensors[0].decoder.times.clock
+        assert clock.restarts == 2
+        result, _ = await calibrated(rig)
+        assert result.outcome == "done", result
+
+    # Reads that lie across the ends of seconds: to which one a sample belongs is the clock's word.
+    paths, records = record(tmp_path, during, own_imu=True, min_still_s=5.0, max_s=6.0, feed_s=0.07)
+    assert len(records) == 3
+    assert len(paths) >= 3
+    for path, kept in zip(paths, records, strict=False):
+        same(replayed(path), [kept])
+
+
 def test_any_bit_of_the_record_that_is_not_recomputed_alike_is_named(
     usual: tuple[Path, Record], tmp_path: Path
 ) -> None:

@@ -28,7 +28,7 @@ from sim.devices import Gradienter, VectorNavBinary
 from sim.imu_model import ImuModel
 from sim.motions import Knock, Motion, Turn
 from sim.scenario import site_at
-from tests.support.still_aircraft import settings
+from tests.support.still_aircraft import Feeder, Floats, imu, settings
 
 SET_DOWN_S = 12.0
 STEP_S = 0.05
@@ -67,8 +67,8 @@ def fly(motions: list[Motion], *, device_lag_s: float, known: Lag, until_s: floa
         ),
     }
     asked = settings(min_still_s=10.0, max_s=10.0)
-    imu = ImuInput(name="own", rotation=np.eye(3), profile=noise_profile("icm42688p"))
-    collector = RollingCollector(asked, [imu], gradienter=True, compass=False, gradienter_lag=known)
+    own = ImuInput(name="own", rotation=np.eye(3), profile=noise_profile("icm42688p"))
+    collector = RollingCollector(asked, [own], gradienter=True, compass=False, gradienter_lag=known)
     seen = Seen()
     for device, _ in devices.values():
         device.power_on(0.0)
@@ -145,6 +145,47 @@ def test_a_knock_in_a_still_stretch_costs_no_more_seconds_than_before() -> None:
         assert one.imus == other.imus
     errors = [lagging.error_deg(k) for k in range(len(lagging.windows))]
     assert max(errors) < 0.1 * SIGMA_DEG
+
+
+def turned(known: Lag, gradienter: bool = False) -> tuple[float, float]:
+    """Error of the mean heading (or tilt) after a turn of 20 degrees (2 degrees) seen through a filter of 2 s."""
+    collector = RollingCollector(
+        settings(), [imu()], gradienter=gradienter, compass=not gradienter,
+        **{"gradienter_lag" if gradienter else "compass_lag": known},
+    )  # fmt: skip
+    feed = Feeder(collector)
+    size, end_s = 2.0 if gradienter else 20.0, 1006.0
+
+    def off(t_s: float) -> float:
+        return size if t_s < end_s else size * math.exp(-(t_s - end_s) / 2.0)
+
+    def change(_name: str, times: Floats, rows: Floats) -> Floats:
+        rows[:, 2] += np.where(times < end_s, 0.5 * np.sin(40.0 * times), 0.0)
+        return rows
+
+    feed.change = change
+    if gradienter:
+        feed.tilt = lambda t_s: (1.0 + off(t_s), 2.0)
+    else:
+        feed.heading = lambda t_s: (359.0 + off(t_s)) % 360.0
+    while (words := feed.waiting_for()) is not None:
+        assert feed.now_s < 1100.0, words
+        feed.run(0.5)
+    window = collector.window(feed.now_s)
+    if window.heading is not None:
+        return abs((window.heading.heading_deg - 359.0 + 180.0) % 360.0 - 180.0), feed.now_s
+    assert window.tilt is not None
+    return abs(window.tilt.x_deg - 1.0), feed.now_s
+
+
+@pytest.mark.parametrize("gradienter", [False, True])
+def test_a_filter_of_either_sensor_is_waited_for(gradienter: bool) -> None:
+    sigma_deg = 0.05 if gradienter else 1.0
+    without_deg, at_s = turned(AT_ONCE, gradienter)
+    within_deg, later_s = turned(Lag(2.0, sigma_deg), gradienter)
+    assert without_deg > 0.2 * sigma_deg
+    assert within_deg < 0.1 * sigma_deg
+    assert later_s < at_s + 12.0
 
 
 # --- one sensor

@@ -84,7 +84,7 @@ def test_a_ceramic_resonator_is_followed_within_milliseconds() -> None:
 
 
 @pytest.mark.parametrize("decoder", [info.decoder for kind in PROTOCOLS.values() for info in kind.values()])
-def test_every_protocol_says_how_its_clock_wraps(decoder: type) -> None:
+def test_the_wraps_are_those_of_the_formats(decoder: type) -> None:
     known = {ImuLineDecoder: (2**32 / 1e6, 2**16), VectorNavDecoder: (2**64 / 1e9, None)}
     if decoder in known:
         assert (decoder.device_clock_wraps_s, decoder.sequence_modulus) == known[decoder]
@@ -220,7 +220,7 @@ def test_a_restart_is_told_with_the_first_sample_after_it() -> None:
     times = SampleTimes(None, 2**16)
     samples = [imu(100.0 + k, 50.0 + k, 500 + k) for k in range(5)] + [imu(106.0 + k, 1.0 + k, k) for k in range(5)]
     placed = times.place(list(samples), 120.0)
-    assert [sample.restarts for sample in placed if isinstance(sample, ImuSample)] == [0] * 5 + [1] * 5
+    assert [sample.breaks for sample in placed if isinstance(sample, ImuSample)] == [0] * 5 + [1] * 5
     # The counter began again with the device: nothing is lost for it.
     counted = [sample.sequence for sample in placed if isinstance(sample, ImuSample)]
     assert np.diff([one for one in counted if one is not None]).tolist() == [1] * 9

@@ -58,11 +58,12 @@ def test_a_decoder_goes_on_from_its_state_as_if_nothing_had_been(kind: Kind, pro
     rng = np.random.default_rng(5)
     for cut in rng.integers(1, len(data), size=25).tolist():
         decoder = make_decoder(kind, protocol, 1e-5)
-        decoder.feed(data[:cut], 1.0)
+        decoder.receive(data[:cut], 1.0)
         again = from_json(to_json(freeze(decoder)))
         assert type(again) is type(decoder)
         rest = data[cut:]
-        assert again.feed(rest, 2.0) == decoder.feed(rest, 2.0)
+        assert again.receive(rest, 2.0) == decoder.receive(rest, 2.0)
+        assert again.times.status() == decoder.times.status()
         assert (again.accepted, again.rejected, again.skipped) == (decoder.accepted, decoder.rejected, decoder.skipped)
 
 
