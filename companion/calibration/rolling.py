@@ -197,8 +197,6 @@ class RollingCollector:
                 source.verdict = Verdict(still=False)
                 if isinstance(source.gate, ImuGate):
                     source.gate.forget_level()
-        if self._field is not None and imu is None:
-            self._field.batches.forget()
         self._break()
 
     # ------------------------------------------------------------------------------------------------- what is known

@@ -112,6 +112,20 @@ def test_a_clean_field_and_a_good_magnetometer_are_good_to_two_degrees(place: st
     assert all(not draw.solution.warnings for draw in draws), draws[0].solution.warnings
 
 
+def test_a_gradienter_that_is_not_trusted_leaves_the_dip_unknown() -> None:
+    # A degree of tilt is a degree of dip, behind which three times as much may hide.
+    where = at.local("Quito")
+    window = at.window(where, (0.0, 0.0, 40.0), np.zeros(3), at.compass())
+    bounds = []
+    for sigma_deg in (0.01, 1.0):
+        found = solve(window, where, at.gradienter(sigma_deg), at.compass(), What.BOTH).magnetic
+        assert found is not None
+        assert found.heading_bound_deg is not None
+        bounds.append(found.heading_bound_deg)
+    assert bounds[0] < 1.5
+    assert bounds[1] == pytest.approx(3.04 / math.cos(19.9 * DEG), rel=0.15)
+
+
 def test_counts_without_a_unit_bound_by_their_direction_alone() -> None:
     random = np.random.default_rng(9)
     draws = [Drawn("Beijing", random, random.uniform(0.0, 0.05), at.compass(), unit="counts") for _ in range(400)]

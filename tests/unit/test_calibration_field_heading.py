@@ -160,11 +160,35 @@ def test_a_field_alone_is_a_compass_to_the_collector() -> None:
     assert window.heading.wander_deg < 0.2
 
 
-def test_iron_that_comes_while_nothing_turns_is_seen_across_the_broken_stretch_and_a_reset() -> None:
+def test_iron_that_comes_with_new_offsets_is_seen_although_all_readings_are_forgotten() -> None:
     stand = Stand()
     stand.feed.run(20.0)
     stand.collector.reset("offsets were written")
-    stand.feed.run(15.0)
+    stand.iron = np.array([0.0, 0.28 * math.tan(6 * DEG), 0.0])
+    stand.feed.run(25.0)
+    window = stand.collector.window(stand.feed.now_s)
+    assert window.heading is not None
+    assert window.heading.wander_deg == pytest.approx(6.0, abs=0.3)
+
+
+def test_what_happens_while_the_gyros_are_silent_is_nobodys_wandering() -> None:
+    stand = Stand()
+    stand.feed.run(20.0)
+    stand.feed.change = lambda _name, _times, _rows: None
+    stand.feed.run(7.0)
+    stand.iron = np.array([0.0, 0.28 * math.tan(6 * DEG), 0.0])
+    stand.feed.run(3.0)
+    stand.feed.change = lambda _name, _times, rows: rows
+    stand.feed.run(25.0)
+    window = stand.collector.window(stand.feed.now_s)
+    assert window.heading is not None
+    assert window.heading.wander_deg is not None
+    assert window.heading.wander_deg < 0.3
+
+
+def test_iron_that_comes_while_nothing_turns_is_seen_across_the_stretch_that_it_breaks() -> None:
+    stand = Stand()
+    stand.feed.run(20.0)
     stand.iron = np.array([0.0, 0.28 * math.tan(6 * DEG), 0.0])
     stand.feed.run(2.0)
     assert "compass moved by" in (stand.feed.waiting_for() or "")
