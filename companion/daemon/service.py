@@ -284,11 +284,12 @@ class Service:
         return take
 
     def _take(self, sample: Sample) -> None:
-        self.pose.take(sample)
         if isinstance(sample, TiltSample):
+            self.pose.take(sample)
             self.collector.add_tilt(sample)
         elif isinstance(sample, CompassSample):
-            self.collector.add_compass(sample)
+            if self.collector.add_compass(sample):
+                self.pose.take(sample)
         elif isinstance(sample, MagSample) and (heading := self.collector.add_field(sample)) is not None:
             self.pose.take(heading)
 
