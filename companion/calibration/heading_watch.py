@@ -38,10 +38,12 @@ class HeadingWatch:
         if any(not verdict.still and not verdict.fault for verdict in others) or not others:
             self._begin()
             return
-        self._blind = self._blind + 1 if any(verdict.fault for verdict in others) else 0
+        if any(verdict.fault for verdict in others):
+            self._blind += 1
+            return
         if self._blind > BLIND_S:
             self._begin()
-            return
+        self._blind = 0
         if heading is None:
             return
         value = float(heading.mean[0])

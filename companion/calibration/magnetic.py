@@ -90,34 +90,33 @@ def assess(
         up_covariance: of `up`, (3, 3); None: not from a gradienter, no inclination can be told.
     """
     heading = vehicle_heading_rad(compass, window.heading_deg, up)
-    gradient, tilt_deg = np.zeros(3), 0.0
-    vector = None if field is None else compass.vehicle_from_sensor @ np.array(field.field)
-    if window.from_field and vector is not None:
+    found = _Field(None, None, None) if field is None else _look(field, compass, local, up, up_covariance)
+    gradient, tilt_deg, vertical = np.zeros(3), 0.0, False
+    if window.from_field and field is not None:
         try:
-            gradient = heading_by_up(vector, up)
+            gradient = heading_by_up(compass.vehicle_from_sensor @ np.array(field.field), up)
         except ValueError:
-            return _unusable(window, local, "compass field is vertical: no heading")
+            vertical = True
         if up_covariance is not None:
             tilt_deg = math.sqrt(gradient @ up_covariance @ gradient) / DEG
-    found = _Field(None, None, None) if field is None else _look(field, compass, local, up, up_covariance)
     difference = None
     if not window.from_field and found.heading_rad is not None:
         difference = wrap_deg((heading - found.heading_rad) / DEG)
+    declination_sigma_deg = 0.0
+    if compass.magnetic:
+        heading += local.declination_deg * DEG
+        declination_sigma_deg = local.declination_sigma_deg
     wander_deg = window.wander_deg or 0.0
     bound_deg = None
     if found.bound_deg is not None:
-        bound_deg = math.hypot(found.bound_deg, wander_deg, _NINETY_FIVE * math.hypot(tilt_deg, window.sigma_deg))
-        bound_deg = min(max(bound_deg, abs(difference or 0.0)), 180.0)
-    # A heading is never surer than what is known of its error.
-    sigma_deg = math.hypot(max(compass.sigma_at(up), bound_deg or 0.0, wander_deg), window.sigma_deg)
-    total_deg = bound_deg
-    if compass.magnetic:
-        heading += local.declination_deg * DEG
-        sigma_deg = math.hypot(sigma_deg, local.declination_sigma_deg)
-        if bound_deg is not None:
-            total_deg = min(math.hypot(bound_deg, _NINETY_FIVE * local.declination_sigma_deg), 180.0)
-    useless = (total_deg or 0.0) > USELESS_DEG or (compass.magnetic and _use(local.field) == "none")
-    warnings = _warnings(found, local, total_deg, useless=useless, magnetic=compass.magnetic)
+        chance_deg = _NINETY_FIVE * math.hypot(tilt_deg, window.sigma_deg, declination_sigma_deg)
+        bound_deg = min(math.hypot(max(found.bound_deg, abs(difference or 0.0)), wander_deg, chance_deg), 180.0)
+    sigma_deg = math.hypot(max(compass.sigma_at(up), wander_deg), window.sigma_deg, declination_sigma_deg)
+    useless = vertical or (bound_deg or 0.0) > USELESS_DEG or (compass.magnetic and _use(local.field) == "none")
+    if useless:
+        bound_deg = 180.0
+    warnings = ["compass field is vertical: no heading"] if vertical else []
+    warnings += _warnings(found, local, bound_deg, useless=useless, magnetic=compass.magnetic)
     warnings += _unsteady(window, difference)
     if field is not None and field.unit == "counts":
         warnings.append("compass field in counts: only its direction is checked (counts_per_gauss is not set)")
@@ -125,11 +124,12 @@ def assess(
         warnings.append("compass field without a gradienter: heading error bound unknown")
     return Heading(
         heading_rad=heading,
-        sigma_rad=sigma_deg * DEG,
+        # A heading is never surer than what is known of its error.
+        sigma_rad=max(sigma_deg, bound_deg or 0.0) * DEG,
         heading_by_up=gradient,
         is_usable=not useless,
         magnetic=Magnetic(
-            heading_bound_deg=180.0 if useless else _rounded(total_deg, 2),
+            heading_bound_deg=_rounded(bound_deg, 2),
             heading_from="field" if window.from_field else "device",
             field_gauss=_rounded(found.strength_gauss, 5),
             field_expected_gauss=None if local.field is None else _rounded(local.field.strength_gauss, 5),
@@ -139,26 +139,6 @@ def assess(
             wander_deg=_rounded(window.wander_deg, 2),
         ),
         warnings=tuple(warnings),
-    )
-
-
-def _unusable(window: HeadingWindow, local: LocalEarth, words: str) -> Heading:
-    return Heading(
-        heading_rad=0.0,
-        sigma_rad=math.pi,
-        heading_by_up=np.zeros(3),
-        is_usable=False,
-        magnetic=Magnetic(
-            heading_bound_deg=180.0,
-            heading_from="field" if window.from_field else "device",
-            field_gauss=None,
-            field_expected_gauss=None if local.field is None else _rounded(local.field.strength_gauss, 5),
-            inclination_deg=None,
-            inclination_expected_deg=None if local.field is None else _rounded(local.field.inclination_deg, 3),
-            device_minus_field_deg=None,
-            wander_deg=_rounded(window.wander_deg, 2),
-        ),
-        warnings=(words,),
     )
 
 

@@ -137,10 +137,12 @@ class RollingCollector:
         elif self._tilt.batches.add(sample.t_s, (sample.x_deg, sample.y_deg), sample.temperature_degc):
             self._evaluate()
 
-    def add_compass(self, sample: CompassSample) -> None:
-        """Take one heading of the device's own; dropped when no compass, or a heading from its field, is expected."""
-        if self._field is None or self._field.takes_own(sample):
+    def add_compass(self, sample: CompassSample) -> bool:
+        """Take one heading of the device's own; whether it is the one that counts (else that from its field does)."""
+        counts = self._field is None or self._field.takes_own(sample)
+        if counts:
             self._take_heading(sample)
+        return counts
 
     def add_field(self, sample: MagSample) -> CompassSample | None:
         """Take the compass' field; the heading that came of it, where that is the one that counts."""

@@ -80,15 +80,16 @@ def parts_of(sample: Sample, roles: Sequence[Role]) -> Iterator[tuple[Role, Part
             yield role, part
 
 
-def collect(collector: RollingCollector, role: Role, part: Part) -> CompassSample | None:
-    """Give the collector what a role has taken; the heading that it has made of a field, if it was one."""
+def collect(collector: RollingCollector, role: Role, part: Part) -> TiltSample | CompassSample | None:
+    """Give the collector what a role has taken; the reading of the pose that counts, or came of it, if any."""
     match part:
         case ImuSample():
             collector.add_imu(role.name, part)
         case TiltSample():
             collector.add_tilt(part)
+            return part
         case CompassSample():
-            collector.add_compass(part)
+            return part if collector.add_compass(part) else None
         case MagSample():
             return collector.add_field(part)
     return None

@@ -253,9 +253,9 @@ class Service:
         )
 
     def _take(self, role: Role, part: Part) -> None:
-        heading = collect(self.collector, role, part)
-        if role.kind != "imu":
-            self.pose.take(part if heading is None else heading)
+        reading = collect(self.collector, role, part)
+        if reading is not None:
+            self.pose.take(reading)
 
     async def run(self) -> None:
         """Run until cancelled, reachable on the control socket.

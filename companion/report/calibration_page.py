@@ -305,7 +305,7 @@ def _pose(record: Record) -> Markup:
             )
         )
     if record.magnetic is not None:
-        parts.append(tag("p", "Compass: ", tag("span", record.magnetic.in_words(), data_key="magnetic"), "."))
+        parts.append(tag("p", f"Compass: {record.magnetic.in_words()}."))
     if site is not None:
         facts = (
             ("latitude", "latitude", site.latitude_deg, ".4f", "deg"),

@@ -175,8 +175,9 @@ def test_what_happens_while_the_gyros_are_silent_is_nobodys_wandering() -> None:
     stand = Stand()
     stand.feed.run(20.0)
     stand.feed.change = lambda _name, _times, _rows: None
-    stand.feed.run(10.0)
+    stand.feed.run(7.0)
     stand.iron = np.array([0.0, 0.28 * math.tan(6 * DEG), 0.0])
+    stand.feed.run(3.0)
     stand.feed.change = lambda _name, _times, rows: rows
     stand.feed.run(25.0)
     window = stand.collector.window(stand.feed.now_s)

@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.calibration.record import Axes
+from companion.calibration.record import Axes, Magnetic
 from companion.cli import main
 from companion.physics.units import DEG_H, MG
 from companion.report import calibration_page as calibration
@@ -119,6 +119,30 @@ def test_the_figures_are_those_of_the_record(tmp_path: Path) -> None:
     assert found.exact["site.gravity"] == [one.site.gravity_m_s2]
     assert "DONE" in found.text
     assert one.reason in found.text
+
+
+def test_how_good_the_compass_heading_can_be_is_one_line(tmp_path: Path) -> None:
+    found = Magnetic(
+        heading_bound_deg=6.24,
+        heading_from="field",
+        field_gauss=0.5731,
+        field_expected_gauss=0.5507,
+        inclination_deg=-59.04,
+        inclination_expected_deg=-59.5,
+        device_minus_field_deg=None,
+        wander_deg=0.12,
+    )
+    words = (
+        "heading good to 6.2 deg, worked out from its field and the gradienter, field 0.573 gauss (the Earth's 0.551),"
+        " inclination -59.0 deg (the Earth's -59.5), wandered 0.1 deg"
+    )
+    assert found.in_words() == words
+    _store(tmp_path).save(msgspec.structs.replace(record(), magnetic=found))
+    assert f"Compass: {words}." in Page(_calibration(tmp_path)).text
+    nothing = msgspec.structs.replace(found, heading_bound_deg=180.0, field_gauss=None, inclination_deg=None)
+    assert nothing.in_words().startswith("shows no heading here, worked out")
+    bare = msgspec.structs.replace(nothing, heading_bound_deg=None, heading_from="device", wander_deg=None)
+    assert bare.in_words() == "heading error bound unknown"
 
 
 def test_the_allan_table_is_that_of_the_noise(tmp_path: Path) -> None:
@@ -242,6 +266,12 @@ def test_a_failure_says_why_and_what_to_do(tmp_path: Path) -> None:
     ("words", "part"),
     [
         ("no compass: the horizontal part of the Earth's rate is unknown, gyro sigma widened", "compass"),
+        (
+            "compass field 4 % above the Earth's: heading may be off by 6 deg; move away from iron",
+            "Move the aircraft away",
+        ),
+        ("near the magnetic pole: the compass heading is weak", "too steep"),
+        ("compass field in counts: only its direction is checked (counts_per_gauss is not set)", "counts_per_gauss"),
         ("warm-up: gyro fc drifts 1.3 deg/h per second", "10 minutes"),
         ("imu fc lost 12% of its samples", "baud"),
         ("effect of the written offsets not seen: no telemetry", "restart the autopilot"),
