@@ -11,8 +11,8 @@ from msgspec import Meta
 
 ImuProtocol = Literal["vectornav", "imu_line"]
 Profile = Literal["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
-GradienterProtocol = Literal["inclinometer_xy"]
-CompassProtocol = Literal["hmr3300"]
+GradienterProtocol = Literal["inclinometer_xy", "jewell", "nmea", "os5000"]
+CompassProtocol = Literal["hmr3300", "nmea", "os5000"]
 Law = Literal["axis", "slope", "euler"]
 Parity = Literal["none", "even", "odd"]
 AtArm = Literal["gate", "warn", "off"]

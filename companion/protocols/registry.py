@@ -11,6 +11,11 @@ from companion.protocols.dialogue import Dialogue
 from companion.protocols.hmr3300 import Hmr3300Decoder
 from companion.protocols.imu_line import ImuLineDecoder
 from companion.protocols.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.inclinometer_xy_dialogue import InclinometerXyDialogue
+from companion.protocols.jewell import JewellDecoder
+from companion.protocols.nmea import NmeaDecoder
+from companion.protocols.os5000 import Os5000Decoder
+from companion.protocols.polls import Hmr3000Dialogue, JewellDialogue
 from companion.protocols.vectornav import VectorNavDecoder
 
 Kind = Literal["imu", "gradienter", "compass"]
@@ -38,10 +43,19 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
     "gradienter": {
         # MEAS DPG2, with the damping of the BEI INC (a decade a second). The P-series sends at 2400 baud, BEI with even
         # parity.
-        "inclinometer_xy": ProtocolInfo("inclinometer_xy", 9600, "none", InclinometerXyDecoder, lag_s=0.43),
+        "inclinometer_xy": ProtocolInfo(
+            "inclinometer_xy", 9600, "none", InclinometerXyDecoder, InclinometerXyDialogue, lag_s=0.43
+        ),
+        # MD900-T; a LILY comes set to 19200 baud. How long its fluid takes is not documented.
+        "jewell": ProtocolInfo("jewell", 9600, "none", JewellDecoder, JewellDialogue),
+        "nmea": ProtocolInfo("nmea", 19200, "none", NmeaDecoder, Hmr3000Dialogue, lag_s=0.29),
+        "os5000": ProtocolInfo("os5000", 19200, "none", Os5000Decoder),
     },
     "compass": {
         "hmr3300": ProtocolInfo("hmr3300", 19200, "none", Hmr3300Decoder),
+        # An HMR3000, with its first filter's usual time constant of 4 steps of 72 ms. NMEA 0183 itself has 4800 baud.
+        "nmea": ProtocolInfo("nmea", 19200, "none", NmeaDecoder, Hmr3000Dialogue, lag_s=0.29),
+        "os5000": ProtocolInfo("os5000", 19200, "none", Os5000Decoder),
     },
 }
 

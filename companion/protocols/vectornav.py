@@ -145,7 +145,7 @@ class VectorNavDecoder(Decoder):
             self.rejected[CUT_SHORT] += 1
             return end
         try:
-            samples += _decode(buffer[at + 1 : end], self._time_of(origin + end + 1))
+            samples += _decode(buffer[at:end], self._time_of(origin + end + 1))
             self.accepted += 1
         except RejectedError as error:
             self.rejected[error.reason] += 1
@@ -153,7 +153,7 @@ class VectorNavDecoder(Decoder):
 
 
 def _decode(sentence: bytes, t_s: float) -> list[Sample]:
-    """The samples in one sentence, `VN...*hh`.
+    """The samples in one sentence, `$VN...*hh`.
 
     Raises:
         RejectedError: wrong checksum, not a measurement that is used here, or values that cannot be.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -36,12 +37,38 @@ def pair(n: int) -> bytes:
     return f"X={n / 100:+07.3f}\r\nY=-00.084\r\n".encode()
 
 
+def hpr(n: int) -> bytes:
+    return sentence(f"PTNTHPR,{n / 10:.1f},N,-1.5,N,{n % 60 / 10:.1f},N")
+
+
+def tagged(n: int) -> bytes:
+    return sentence(f"C{n / 10:.1f}P-1.5R{n % 60 / 10:.1f}T19.0Mx-80.45My160.86Mz450.00")
+
+
+def sim(n: int) -> bytes:
+    return f"${n / 100:07.3f},-00.084,018.910,N1234\r\n".encode()
+
+
+def xdr(n: int) -> bytes:
+    return sentence(f"YXXDR,A,-00.084,D,N,A,{n / 100:07.3f},D,E,C,018.910,C,T-N1234")
+
+
+def lily(n: int) -> bytes:
+    return f"LILY,2013/06/24 23:22:00,{n / 2:8.3f},  25.666,194.25, 26.01,11.96,N9655\r\n".encode()
+
+
 DEVICES = [
     Device("imu", "imu_line", lambda n: imu_line(n, n * 2500, accel=(n / 100, 0, -9.8)), lambda n: n / 100, 1),
     Device("imu", "vectornav", lambda n: vectornav_imu(accel=(n / 4, 0, -9.75)), lambda n: n / 4, crc=True),
     Device("imu", "vectornav", ymr, lambda n: n / 100, 1),
     Device("compass", "hmr3300", lambda n: f"{n / 10:.1f}, 1.5, -2.5\r\n".encode(), lambda n: n / 10),
     Device("gradienter", "inclinometer_xy", pair, lambda n: n / 100),
+    Device("compass", "nmea", lambda n: sentence(f"HCHDG,{n / 10:.1f},,,,"), lambda n: n / 10, 1),
+    Device("compass", "nmea", hpr, lambda n: n / 10, 1),
+    Device("compass", "os5000", tagged, lambda n: n / 10, 1),
+    Device("gradienter", "jewell", sim, lambda n: n / 100),
+    Device("gradienter", "jewell", xdr, lambda n: n / 100),
+    Device("gradienter", "jewell", lily, lambda n: math.degrees(n / 2 * 1e-6)),
 ]
 
 
@@ -65,7 +92,7 @@ def carry(device: Device, transport: Transport) -> tuple[Decoder, list[tuple[flo
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
-@pytest.mark.parametrize("device", DEVICES, ids=["imu_line", "binary", "ymr", "hmr3300", "inclinometer_xy"])
+@pytest.mark.parametrize("device", DEVICES, ids=lambda device: f"{device.name} {device.frame(0)[:6]!r}")
 def test_a_decoder_behind_a_transport(device: Device, transport: Callable[[], Transport]) -> None:
     line = transport()
     decoder, got = carry(device, line)

@@ -17,7 +17,9 @@ from companion.errors import StorageError
 from companion.protocols.registry import PROTOCOLS, Kind, make_decoder
 from companion.recording.state import freeze, from_json, to_json
 from sim.aircraft import VirtualAircraft
+from sim.compasses import NmeaCompass, Os5000
 from sim.devices import HMR3300, Gradienter, SerialDevice, VectorNavBinary
+from sim.gradienters import Jewell
 from sim.imu_model import ImuModel
 from sim.scenario import site_at
 from tests.support.frames import imu_line
@@ -35,6 +37,9 @@ def stream(protocol: str) -> bytes:
             "vectornav": lambda: VectorNavBinary(ImuModel(aircraft, "adis16470", seed=1)),
             "inclinometer_xy": lambda: Gradienter(aircraft, seed=1, law="slope"),
             "hmr3300": lambda: HMR3300(aircraft, seed=1),
+            "jewell": lambda: Jewell(aircraft, seed=1, output="XDR"),
+            "nmea": lambda: NmeaCompass(aircraft, seed=1, sentences=("HDT", "HDG", "XDR", "HPR")),
+            "os5000": lambda: Os5000(aircraft, seed=1, vectors=True),
         }
         device = makers[protocol]()
         device.power_on(0.0)
