@@ -94,7 +94,7 @@ async def _run(folder: Path, seed: int) -> int:
 async def _serve(scenario: Scenario, folder: Path, stack: contextlib.AsyncExitStack) -> Station:
     """Bring the aircraft to life and write the configuration that fits it."""
     scenario.aircraft.begin(asyncio.get_running_loop().time())
-    for name, device in (("imu", scenario.imu), ("gradienter", scenario.gradienter), ("compass", scenario.compass)):
+    for name, device in scenario.ports.items():
         await stack.enter_async_context(PtyDevice(device, folder / name))
     link = await open_udp(scenario.autopilot, listen=("127.0.0.1", 0))
     stack.callback(link.close)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 from sim.aircraft import VirtualAircraft
 from sim.compasses import NmeaCompass, Os5000
-from sim.devices import HMR3300, Gradienter, ImuLine, SerialDevice, VectorNavBinary
+from sim.devices import HMR3300, Gradienter, ImuLine, Law, SerialDevice, VectorNavBinary
 from sim.gradienters import Jewell
 from sim.imu_model import ImuModel
 
@@ -18,6 +19,7 @@ IMUS: dict[str, Callable[[ImuModel], SerialDevice]] = {
 
 GRADIENTERS: dict[str, Callable[[VirtualAircraft, int], SerialDevice]] = {
     "inclinometer_xy": lambda aircraft, seed: Gradienter(aircraft, seed=seed),
+    "hmr3300": lambda aircraft, seed: HMR3300(aircraft, seed=seed),
     "jewell": lambda aircraft, seed: Jewell(aircraft, seed=seed),
     "nmea": lambda aircraft, seed: NmeaCompass(aircraft, seed=seed),
     "os5000": lambda aircraft, seed: Os5000(aircraft, seed=seed),
@@ -30,3 +32,58 @@ COMPASSES: dict[str, Callable[[VirtualAircraft, int], SerialDevice]] = {
     "os5000": lambda aircraft, seed: Os5000(aircraft, seed=seed),
 }
 """The same."""
+
+
+class Fit(NamedTuple):
+    """What a configuration has to say of a device of one of the tables, in one of its roles."""
+
+    mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Roll, pitch, yaw of its axes as they are on the aircraft; an IMU's model has to be mounted so."""
+    law: Law | None = None
+    """Of a gradienter; None: its own, or roll and pitch themselves."""
+    sigma_deg: float | None = None
+    """None: what the companion takes by itself is right."""
+
+
+Z_UP = (180.0, 0.0, 0.0)
+"""Flat on the aircraft: X forward, Y left, Z up."""
+
+FITS: dict[tuple[str, str], Fit] = {
+    ("gradienter", "inclinometer_xy"): Fit(sigma_deg=0.005),
+    ("compass", "hmr3300"): Fit(sigma_deg=1.0),
+}
+"""By role ("imu", "gradienter", "compass") and protocol name; who is not here needs nothing said."""
+
+
+def fit(role: str, name: str) -> Fit:
+    """What fits a device in a role."""
+    return FITS.get((role, name), Fit())
+
+
+def law_of(device: SerialDevice) -> Law:
+    """What a device's two readings are."""
+    own: Law = getattr(device, "law", "euler")
+    return fit("gradienter", device.protocol).law or own
+
+
+class Devices(NamedTuple):
+    """One device for each role; one that serves two of them is there twice."""
+
+    imu: SerialDevice
+    gradienter: SerialDevice
+    compass: SerialDevice
+
+
+def make(model: ImuModel, imu: str, gradienter: str, compass: str, seed: int) -> Devices:
+    """The devices of an aircraft, by their protocols; two roles of one name are one device.
+
+    Args:
+        model: what the IMU measures; mounted as `fit` says.
+        imu: a name of `IMUS`.
+        gradienter: a name of `GRADIENTERS`.
+        compass: a name of `COMPASSES`.
+        seed: of the noise.
+    """
+    inertial, magnetic = IMUS[imu](model), COMPASSES[compass](model.aircraft, seed)
+    shared = {imu: inertial, compass: magnetic}
+    return Devices(inertial, shared.get(gradienter) or GRADIENTERS[gradienter](model.aircraft, seed), magnetic)

@@ -11,7 +11,8 @@ from pygeomag.geomag import GeoMag
 
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.autopilot import ArduPilotDouble
-from sim.devices import HMR3300, Gradienter, Law, VectorNavBinary
+from sim.devices import HMR3300, Gradienter, Law, SerialDevice
+from sim.families import fit, law_of, make
 from sim.firmware.double import AutopilotDouble
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.motions import Motion
@@ -23,6 +24,8 @@ DEMO_POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
 FIRST_GYRO_DEG_H = (162.234, 169.563, 98.289)
 FIRST_ACCEL_MG = (2.4125, 2.1596, 0.89809)
 GRADIENTER_OFFSET_DEG = (0.003, -0.002)
+DEMO_DEVICES = ("vectornav", "inclinometer_xy", "hmr3300")
+"""IMU, gradienter, compass."""
 DEMO_UNIX_S = 1_795_219_200.0
 """21 November 2026, 00:00 UTC."""
 
@@ -44,10 +47,19 @@ class Scenario:
     flight_controller_imus: tuple[ImuModel, ...]
     serial_imu: ImuModel
     autopilot: AutopilotDouble
-    imu: VectorNavBinary
-    gradienter: Gradienter
-    compass: HMR3300
+    imu: SerialDevice
+    gradienter: SerialDevice
+    compass: SerialDevice
     gradienter_law: Law
+
+    @property
+    def ports(self) -> dict[str, SerialDevice]:
+        """The devices by the names of their ports; one that serves two roles has one port."""
+        found: dict[str, SerialDevice] = {}
+        for name, device in (("imu", self.imu), ("gradienter", self.gradienter), ("compass", self.compass)):
+            if not any(device is other for other in found.values()):
+                found[name] = device
+        return found
 
 
 def demo(
@@ -63,6 +75,7 @@ def demo(
     gyro_deg_h: Sequence[float] = FIRST_GYRO_DEG_H,
     accel_mg: Sequence[float] = FIRST_ACCEL_MG,
     gradienter_offset_deg: tuple[float, float] = GRADIENTER_OFFSET_DEG,
+    devices: tuple[str, str, str] = DEMO_DEVICES,
 ) -> Scenario:
     """A small aircraft on uneven ground near Beijing, 40 N, 116 E, 50 m: pitch 5, roll -3, heading 40 degrees.
 
@@ -83,16 +96,25 @@ def demo(
         gyro_deg_h: gyro biases of its first IMU.
         accel_mg: likewise of the accelerometers.
         gradienter_offset_deg: what the gradienter shows too much, x and y.
+        devices: families of IMU, gradienter and compass, by their names in `sim.families`; law and errors are those of
+            the usual ones, any other has none.
     """
     aircraft = VirtualAircraft(pose, site_at(40.0, 116.0, 50.0, unix_s), motions=motions, unix_s=unix_s)
 
-    def imu(number: int, rates_deg_h: Sequence[float], forces_mg: Sequence[float], name: str) -> ImuModel:
+    def imu(
+        number: int,
+        rates_deg_h: Sequence[float],
+        forces_mg: Sequence[float],
+        name: str,
+        mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> ImuModel:
         return ImuModel(
             aircraft,
             name,
             seed=seed * 10 + number,
             gyro_bias_rad_s=[value * DEG_H for value in rates_deg_h],
             accel_bias_m_s2=[value * MG for value in forces_mg],
+            mounting_deg=mounting_deg,
         )
 
     flight_controller = (
@@ -105,14 +127,22 @@ def demo(
     else:
         parameters = {"INS_GYR_CAL": float(gyr_cal_at_boot)}
         autopilot = ArduPilotDouble(aircraft, flight_controller, parameters=parameters, seed=seed)
-    serial = imu(3, (60.294, 124.657, 108.289), (0.21593, -2.2118, 1.2953), "bmi088")
+    inertial, tilt, magnetic = devices
+    mounting_deg = fit("imu", inertial).mounting_deg
+    serial = imu(3, (60.294, 124.657, 108.289), (0.21593, -2.2118, 1.2953), "bmi088", mounting_deg)
+    made = make(serial, inertial, tilt, magnetic, seed)
+    compass, gradienter = made.compass, made.gradienter
+    if isinstance(compass, HMR3300):
+        compass.heading_error_deg = 0.8
+    if isinstance(gradienter, Gradienter) and tilt == DEMO_DEVICES[1]:
+        gradienter = Gradienter(aircraft, seed=seed, law=law, offset_deg=gradienter_offset_deg)
     return Scenario(
         aircraft=aircraft,
         flight_controller_imus=flight_controller,
         serial_imu=serial,
         autopilot=autopilot,
-        imu=VectorNavBinary(serial),
-        gradienter=Gradienter(aircraft, seed=seed, law=law, offset_deg=gradienter_offset_deg),
-        compass=HMR3300(aircraft, seed=seed, heading_error_deg=0.8),
-        gradienter_law=law,
+        imu=made.imu,
+        gradienter=gradienter,
+        compass=compass,
+        gradienter_law=law_of(gradienter),
     )

@@ -10,13 +10,15 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Sequence
 from pathlib import Path
 
 from sim.aircraft import Pose
+from sim.devices import SerialDevice
+from sim.families import COMPASSES, GRADIENTERS, IMUS, Devices, fit
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.pty_device import PtyDevice
-from sim.scenario import DEMO_POSE, Scenario, demo
+from sim.scenario import DEMO_DEVICES, DEMO_POSE, Scenario, demo
 from sim.udp import open_udp
 
 DEFAULT_UDP = "127.0.0.1:14550"
@@ -45,6 +47,12 @@ def parser() -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=text)
         add_world_options(command)
         if name != "autopilot":
+            tables: tuple[Iterable[str], ...] = (IMUS, GRADIENTERS, COMPASSES)
+            for role, table, usual in zip(Devices._fields, tables, DEMO_DEVICES, strict=True):
+                command.add_argument(
+                    f"--{role}", choices=tuple(table), default=usual,
+                    help=f"family of the {role} (default {usual}); one name for two of them: one device on one port",
+                )  # fmt: skip
             command.add_argument("--dir", type=Path, help="folder for the ports (default: a new one)")
         if name != "devices":
             command.add_argument(
@@ -109,13 +117,11 @@ def configuration(scenario: Scenario, *, directory: Path | None, udp: tuple[str,
         site = scenario.aircraft.site
         lines += ["", f"# no gradienter, no compass; the site is {site.latitude_deg} {site.longitude_deg}"]
         return "\n".join(lines) + "\n"
-    lines += ["", "[[imu]]", 'name = "own"', 'source = "serial"', f'port = "{directory / "imu"}"']
-    lines += [f"baud = {scenario.imu.baud}", f'protocol = "{scenario.imu.protocol}"']
+    lines += ["", "[[imu]]", 'name = "own"', 'source = "serial"', *_device_lines(scenario, directory, "imu")]
     lines.append(f'profile = "{_PROFILES.get(scenario.serial_imu.spec.name, scenario.serial_imu.spec.name)}"')
-    lines += ["", "[gradienter]", f'port = "{directory / "gradienter"}"']
-    lines += [f'protocol = "{scenario.gradienter.protocol}"', f'law = "{scenario.gradienter_law}"']
-    lines += ["sigma_deg = 0.005", "", "[compass]", f'port = "{directory / "compass"}"']
-    lines += [f'protocol = "{scenario.compass.protocol}"', 'reference = "magnetic"', "sigma_deg = 1.0"]
+    lines += ["", "[gradienter]", *_device_lines(scenario, directory, "gradienter")]
+    lines += [f'law = "{scenario.gradienter_law}"', "", "[compass]", *_device_lines(scenario, directory, "compass")]
+    lines.append('reference = "magnetic"')
     # Beside the ports, so that no root is needed to try.
     lines += ["", "[control]", f'socket = "{directory / "control.sock"}"']
     lines += ["", "[storage]", f'directory = "{directory / "state"}"']
@@ -124,6 +130,19 @@ def configuration(scenario: Scenario, *, directory: Path | None, udp: tuple[str,
         lines += ["", "[vehicle]", f"latitude_deg = {site.latitude_deg}", f"longitude_deg = {site.longitude_deg}"]
         lines.append(f"height_m = {site.height_m}")
     return "\n".join(lines) + "\n"
+
+
+def _device_lines(scenario: Scenario, directory: Path, role: str) -> list[str]:
+    """Port, line, protocol, and what fits the device in this role."""
+    device: SerialDevice = getattr(scenario, role)
+    fitting = fit(role, device.protocol)
+    port = next(name for name, each in scenario.ports.items() if each is device)
+    lines = [f'port = "{directory / port}"', f"baud = {device.baud}", f'protocol = "{device.protocol}"']
+    if any(fitting.mounting_deg):
+        lines.append(f"mounting = {list(fitting.mounting_deg)}")
+    if fitting.sigma_deg is not None:
+        lines.append(f"sigma_deg = {fitting.sigma_deg:g}")
+    return lines
 
 
 def describe(scenario: Scenario, *, devices: bool, autopilot: bool) -> str:
@@ -137,7 +156,7 @@ def describe(scenario: Scenario, *, devices: bool, autopilot: bool) -> str:
     if devices:
         models.append(("serial IMU", scenario.serial_imu))
     for name, model in models:
-        gyro, accel = model.true_bias(0.0)
+        gyro, accel = model.true_bias_in_vehicle(0.0)
         rates = ", ".join(f"{value / DEG_H:.1f}" for value in gyro)
         forces = ", ".join(f"{value / MG:.3f}" for value in accel)
         lines.append(f"# {name} ({model.spec.name}): gyro bias {rates} deg/h; accelerometer bias {forces} mg")
@@ -157,11 +176,7 @@ async def serve(
         scenario.aircraft.begin(asyncio.get_running_loop().time())
         running: list[asyncio.Task[None]] = []
         if directory is not None:
-            for name, device in (
-                ("imu", scenario.imu),
-                ("gradienter", scenario.gradienter),
-                ("compass", scenario.compass),
-            ):
+            for name, device in scenario.ports.items():
                 pty = await stack.enter_async_context(PtyDevice(device, directory / name))
                 running.append(asyncio.create_task(pty.wait_closed(), name=f"watch {name}"))
         if udp is not None:
@@ -193,6 +208,7 @@ def main(argv: Sequence[str]) -> int:
         law=arguments.law,
         gyr_cal_at_boot=autopilot and arguments.gyr_cal,
         firmware=arguments.firmware if autopilot else "ardupilot",
+        devices=(arguments.imu, arguments.gradienter, arguments.compass) if devices else DEMO_DEVICES,
     )
     directory: Path | None = None
     made_here = devices and arguments.dir is None

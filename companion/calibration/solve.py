@@ -26,6 +26,8 @@ from companion.physics.units import DEG
 
 # Without a gradienter the accelerometers level the Earth's rate; a 50 mg bias tilts it by 3 degrees (0.8 deg/h).
 LEVEL_BY_ACCELEROMETER_SIGMA_DEG: Final = 3.0
+LEVEL_COSINE: Final = math.cos(2.0 * DEG)
+"""Data sheets give a compass' error "level" and "tilted" without a border: only what a table is counts as level."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +48,15 @@ class CompassModel:
     vehicle_from_sensor: Matrix
     offset_deg: float
     sigma_deg: float
+    tilted_sigma_deg: float | None = None
+    """Where it does not stand level; None: as `sigma_deg`."""
+
+    def sigma_at(self, up: Array) -> float:
+        """Its sigma in degrees where `up`, shape (3,), is up in the vehicle's axes."""
+        upright = float(-(self.vehicle_from_sensor.T @ up)[2])
+        if self.tilted_sigma_deg is None or upright >= LEVEL_COSINE:
+            return self.sigma_deg
+        return self.tilted_sigma_deg
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -231,7 +242,7 @@ def _up(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix]:
 
 def _heading(window: HeadingWindow, compass: CompassModel, up: Array, local: LocalEarth) -> tuple[float, float]:
     """True heading of the vehicle and its sigma, radians."""
-    sigma_deg = math.hypot(compass.sigma_deg, window.sigma_deg)
+    sigma_deg = math.hypot(compass.sigma_at(up), window.sigma_deg)
     heading_rad = vehicle_heading_rad(compass, window.heading_deg, up)
     if compass.magnetic:
         heading_rad += local.declination_deg * DEG

@@ -6,9 +6,10 @@ import difflib
 import ipaddress
 import math
 import re
+from collections.abc import Iterator
 
 from companion.config.mqtt_rules import check_mqtt
-from companion.config.sections import Config, Imu, Mounting
+from companion.config.sections import Compass, Config, Gradienter, Imu, Mounting
 from companion.config.words import allowed
 from companion.errors import ConfigError
 from companion.rotations import ROTATIONS_DEG
@@ -97,6 +98,11 @@ def _check_imu(imu: Imu, here: str, name: str) -> None:
                 f"{name}: '{here}.{key}': found {getattr(imu, key)!r}; allowed: only with"
                 ' source = "serial" (this IMU is read over MAVLink)'
             )
+    if imu.read_only:
+        raise ConfigError(
+            f"{name}: '{here}.read_only': found true; allowed: only with source = \"serial\" (nothing is said to an"
+            " autopilot's IMU)"
+        )
 
 
 def _check_port(port: str, here: str, name: str) -> None:
@@ -109,19 +115,44 @@ def _check_port(port: str, here: str, name: str) -> None:
 
 
 def _check_ports_differ(config: Config, name: str) -> None:
-    used: dict[str, str] = {}
-    ports = [(f"imu[{index}].port", imu.port) for index, imu in enumerate(config.imu)]
-    ports += [(f"{section}.port", device.port) for section in ("gradienter", "compass")
-              if (device := getattr(config, section)) is not None]  # fmt: skip
+    """Each port once; only the roles of one device share theirs, and they agree on how it is read."""
+    used: dict[str, list[tuple[str, Imu | Gradienter | Compass]]] = {}
+    for here, device in _serial_devices(config):
+        for before, other in (sharing := used.setdefault(device.port or "", [])):
+            _check_shared(here, device, before, other, name)
+        sharing.append((here, device))
     if config.mavlink.url.startswith("serial:"):
-        ports.append(("mavlink.url", config.mavlink.url.removeprefix("serial:").rpartition(":")[0]))
-    for here, port in ports:
-        if port is not None and port in used:
+        port = config.mavlink.url.removeprefix("serial:").rpartition(":")[0]
+        if port in used:
             raise ConfigError(
-                f"{name}: {here!r}: found {port!r}, which {used[port]} has already; allowed: a port of its own"
+                f"{name}: 'mavlink.url': found {port!r}, which {used[port][0][0]}.port has already; allowed: a port of"
+                " its own"
             )
-        if port is not None:
-            used[port] = here
+
+
+def _serial_devices(config: Config) -> Iterator[tuple[str, Imu | Gradienter | Compass]]:
+    yield from ((f"imu[{index}]", imu) for index, imu in enumerate(config.imu) if imu.port is not None)
+    if config.gradienter is not None:
+        yield "gradienter", config.gradienter
+    if config.compass is not None:
+        yield "compass", config.compass
+
+
+def _check_shared(
+    here: str, device: Imu | Gradienter | Compass, before: str, other: Imu | Gradienter | Compass, name: str
+) -> None:
+    if isinstance(device, Imu) and isinstance(other, Imu):
+        raise ConfigError(
+            f"{name}: '{here}.port': found {device.port!r}, which {before}.port has already; allowed: a port of its own"
+        )
+    for key in ("protocol", "baud", "parity"):
+        ours, theirs = getattr(device, key, None), getattr(other, key, None)
+        # What one section leaves open, another may say: there is one device and one line.
+        if ours is not None and theirs is not None and ours != theirs:
+            raise ConfigError(
+                f"{name}: '{here}.{key}': found {ours!r} on {device.port}, where {before}.{key} is {theirs!r}; allowed:"
+                f" {theirs!r} (one device serves both), or a port of its own"
+            )
 
 
 _MAVLINK_URL = re.compile(r"(udpin|udpout|tcp):[^:\s]+:(?P<port>\d{1,5})|serial:/\S+:\d{3,7}")

@@ -11,7 +11,7 @@ from msgspec import Meta
 
 ImuProtocol = Literal["vectornav", "imu_line"]
 Profile = Literal["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
-GradienterProtocol = Literal["inclinometer_xy", "jewell", "nmea", "os5000"]
+GradienterProtocol = Literal["inclinometer_xy", "jewell", "hmr3300", "nmea", "os5000"]
 CompassProtocol = Literal["hmr3300", "nmea", "os5000"]
 Law = Literal["axis", "slope", "euler"]
 Parity = Literal["none", "even", "odd"]
@@ -61,6 +61,8 @@ class Imu(Section, frozen=True):
     protocol: ImuProtocol | None = None
     mounting: Mounting = "ROTATION_NONE"
     autopilot_instance: Annotated[int, Meta(ge=1, le=3)] | None = None
+    read_only: bool = False
+    """Whether nothing may ever be sent to the device on that port."""
     profile: Profile | None = None
 
 
@@ -74,7 +76,9 @@ class Gradienter(Section, frozen=True):
     parity: Parity | None = None
     mounting: Mounting = "ROTATION_NONE"
     offset_deg: tuple[float, float] = (0.0, 0.0)
-    sigma_deg: PositiveFloat = 0.05
+    sigma_deg: PositiveFloat | None = None
+    """That of the protocol's device, else 0.05, where it is not said."""
+    read_only: bool = False
 
 
 class Compass(Section, frozen=True):
@@ -87,7 +91,9 @@ class Compass(Section, frozen=True):
     reference: Literal["magnetic", "true"] = "magnetic"
     mounting: Mounting = "ROTATION_NONE"
     offset_deg: Annotated[float, Meta(ge=-360, le=360)] = 0.0
-    sigma_deg: PositiveFloat = 3.0
+    sigma_deg: PositiveFloat | None = None
+    """That of the protocol's device, else 3, where it is not said."""
+    read_only: bool = False
 
 
 class Calibration(Section, frozen=True):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from companion.config import Config
 from companion.daemon.control import Object, ask
-from companion.daemon.models import not_in_this_version
+from companion.daemon.models import doubtful, not_in_this_version
 from companion.daemon.service import Service
 from companion.errors import DaemonDeniedError, DaemonUnreachableError
 
@@ -48,6 +48,7 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
         findings.append(_storage(config.storage.path))
         status = await _listen(config, seconds)
     findings += [Finding("configuration", good=False, words=words) for words in not_in_this_version(config)]
+    findings += [Finding("warning", good=True, words=words) for words in doubtful(config)]
     vehicle = status["vehicle"]
     findings.append(Finding("autopilot", good=vehicle["system_id"] is not None, words=vehicle["summary"]))
     findings += [Finding(device["name"], device["good"], device["summary"]) for device in status["devices"]]

@@ -12,8 +12,10 @@ from companion.calibration.rolling import ImuInput, Settings
 from companion.calibration.site import Whereabouts
 from companion.calibration.solve import CompassModel, GradienterModel
 from companion.config import Compass, Config, Gradienter, Imu
+from companion.config.sections import GradienterProtocol
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H, MG
+from companion.protocols.registry import PROTOCOLS
 
 IMU_RATE_HZ: Final = 100.0
 """Asked of the autopilot for each IMU where the connection does not limit it; its own filters pass 20 Hz."""
@@ -25,6 +27,13 @@ HIGHRES_BYTES: Final = 75.0
 """HIGHRES_IMU in MAVLink 2: 63 bytes and 12 around them."""
 SCALED_BYTES: Final = 36.0
 """SCALED_IMU2 or 3 likewise: 24 and 12."""
+
+TILT_SIGMA_DEG: Final = 0.05
+"""Of a gradienter whose protocol names no device that is known to be worse: cell and mounting."""
+COMPASS_TILT_SIGMA_DEG: Final = 0.65
+"""Of what may be a compass' own tilt where its documents give no figure: the HMR3300's."""
+HEADING_SIGMA_DEG: Final = 3.0
+"""Of a compass likewise: the aircraft's own iron and currents."""
 
 
 def settings(config: Config) -> Settings:
@@ -61,6 +70,19 @@ def not_in_this_version(config: Config) -> list[str]:
     return [words for is_asked, words in asked if is_asked]
 
 
+def doubtful(config: Config) -> list[str]:
+    """What in the configuration is taken as it stands, and is probably not meant."""
+    gradienter = config.gradienter
+    if gradienter is None:
+        return []
+    law = PROTOCOLS["gradienter"][gradienter.protocol].law
+    if law is None or law == gradienter.law:
+        return []
+    return [
+        f'gradienter.law: found "{gradienter.law}"; protocol "{gradienter.protocol}" gives "{law}" angles: say that'
+    ]
+
+
 def imu_input(imu: Imu, kind: StreamKind | None, grid: tuple[float, float] = (0.0, 0.0)) -> ImuInput:
     """One IMU as the collector takes it; an autopilot's telemetry is in the vehicle's axes already.
 
@@ -90,19 +112,28 @@ def gradienter_model(gradienter: Gradienter | None) -> GradienterModel | None:
         law=gradienter.law,
         vehicle_from_sensor=rotation_matrix(gradienter.mounting),
         offset_deg=gradienter.offset_deg,
-        sigma_deg=gradienter.sigma_deg,
+        sigma_deg=gradienter.sigma_deg or tilt_sigma_deg(gradienter.protocol),
     )
+
+
+def tilt_sigma_deg(protocol: GradienterProtocol) -> float:
+    """How well the tilt of a device with this protocol is known where nobody says better."""
+    known = PROTOCOLS["gradienter"][protocol].sigma_deg
+    return known or (COMPASS_TILT_SIGMA_DEG if protocol in PROTOCOLS["compass"] else TILT_SIGMA_DEG)
 
 
 def compass_model(compass: Compass | None) -> CompassModel | None:
     """How the compass' readings become a true heading."""
     if compass is None:
         return None
+    info = PROTOCOLS["compass"][compass.protocol]
+    said_deg = compass.sigma_deg
     return CompassModel(
         magnetic=compass.reference == "magnetic",
         vehicle_from_sensor=rotation_matrix(compass.mounting),
         offset_deg=compass.offset_deg,
-        sigma_deg=compass.sigma_deg,
+        sigma_deg=said_deg or info.sigma_deg or HEADING_SIGMA_DEG,
+        tilted_sigma_deg=info.tilted_sigma_deg if said_deg is None else None,
     )
 
 

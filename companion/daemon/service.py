@@ -44,10 +44,12 @@ from companion.daemon.reboot import Reboot
 from companion.daemon.recorder import Recorder
 from companion.daemon.rivalry import Rivalry
 from companion.daemon.sensors import SerialSensor
+from companion.daemon.serial_devices import Role, collect, serial_devices
 from companion.links.mavlink import MavlinkLink
 from companion.links.mavlink_transport import run_transport
+from companion.protocols.roles import Part
 from companion.recording.collector import RecordedCollector
-from companion.samples import CompassSample, ImuSample, Sample, TiltSample
+from companion.samples import ImuSample
 from companion.storage.changes import ChangeLog
 from companion.storage.records import RecordStore
 
@@ -94,7 +96,7 @@ class Service:
         self.slots = SlotMemory()
         self._imu_rate_hz = models.imu_rate_hz(config) if imu_rate_hz is None else imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
-        self.sensors = self._serial_sensors()
+        self.sensors = [SerialSensor(device, self._take, offload) for device in serial_devices(config)]
         self.recorder = Recorder(
             config, self.collector, self.link, self.vehicle, self.imus.values(), self.sensors, offload
         )
@@ -161,7 +163,7 @@ class Service:
             self.conductor,
             self.vehicle,
             self.collector,
-            [*self.imus.values(), *self.sensors],
+            [*self.imus.values(), *(role for sensor in self.sensors for role in sensor.roles)],
             self.store,
             offload,
             mavlink_url=config.mavlink.url,
@@ -244,50 +246,10 @@ class Service:
             memory=self.slots,
         )
 
-    def _serial_sensors(self) -> list[SerialSensor]:
-        sensors = []
-        for imu in self.config.imu:
-            if imu.source == "serial" and imu.port is not None and imu.protocol is not None:
-                sensors.append(
-                    SerialSensor(
-                        imu.name,
-                        "imu",
-                        port=imu.port,
-                        protocol=imu.protocol,
-                        baud=imu.baud,
-                        parity=None,
-                        take=self._take_imu(imu.name),
-                    )
-                )
-        for kind in ("gradienter", "compass"):
-            device = getattr(self.config, kind)
-            if device is not None:
-                sensors.append(
-                    SerialSensor(
-                        kind,
-                        kind,
-                        port=device.port,
-                        protocol=device.protocol,
-                        baud=device.baud,
-                        parity=device.parity,
-                        take=self._take,
-                    )
-                )
-        return sensors
-
-    def _take_imu(self, name: str) -> Any:
-        def take(sample: Sample) -> None:
-            if isinstance(sample, ImuSample):
-                self.collector.add_imu(name, sample)
-
-        return take
-
-    def _take(self, sample: Sample) -> None:
-        self.pose.take(sample)
-        if isinstance(sample, TiltSample):
-            self.collector.add_tilt(sample)
-        elif isinstance(sample, CompassSample):
-            self.collector.add_compass(sample)
+    def _take(self, role: Role, part: Part) -> None:
+        if role.kind != "imu":
+            self.pose.take(part)
+        collect(self.collector, role, part)
 
     async def run(self) -> None:
         """Run until cancelled, reachable on the control socket.
@@ -295,7 +257,7 @@ class Service:
         Raises:
             CompanionError: it cannot start (another daemon runs, the storage cannot be read).
         """
-        for words in models.not_in_this_version(self.config):
+        for words in (*models.not_in_this_version(self.config), *models.doubtful(self.config)):
             logger.warning("%s", words)
         control = self.config.control
         async with ControlServer(control.path, self.answers.answer, group=control.group_name):

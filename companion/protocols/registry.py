@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
+from companion.config.sections import Law
 from companion.errors import ConfigError
 from companion.protocols.base import Decoder
 from companion.protocols.dialogue import Dialogue
 from companion.protocols.hmr3300 import Hmr3300Decoder
+from companion.protocols.hmr3300_dialogue import Hmr3300Dialogue
 from companion.protocols.imu_line import ImuLineDecoder
 from companion.protocols.inclinometer_xy import InclinometerXyDecoder
 from companion.protocols.inclinometer_xy_dialogue import InclinometerXyDialogue
@@ -33,8 +36,15 @@ class ProtocolInfo:
     """What has to be said to it; None for a device that speaks by itself or that we have nothing safe to say to."""
     lag_s: float = 0.0
     """Time constant with which its reading follows the truth: fluid, pendulum, filters."""
+    sigma_deg: float | None = None
+    """How well such a device's tilt (gradienter) or heading (compass, level) is known where nobody says better."""
+    tilted_sigma_deg: float | None = None
+    """Of a compass that does not stand level; None: as `sigma_deg`."""
+    law: Law | None = None
+    """What the documents say a gradienter's two readings are; None: they do not, the user must."""
 
 
+# One device may stand under several kinds: then its line, decoder and dialogue are the same under each.
 PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
     "imu": {
         "vectornav": ProtocolInfo("vectornav", 115200, "none", VectorNavDecoder),
@@ -48,14 +58,22 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
         ),
         # MD900-T; a LILY comes set to 19200 baud. How long its fluid takes is not documented.
         "jewell": ProtocolInfo("jewell", 9600, "none", JewellDecoder, JewellDialogue),
-        "nmea": ProtocolInfo("nmea", 19200, "none", NmeaDecoder, Hmr3000Dialogue, lag_s=0.29),
+        # Honeywell: null 0.4 deg, 0.5 deg to 30 deg of tilt. Not in it: 1 deg of thermal hysteresis at the most.
+        "hmr3300": ProtocolInfo(
+            "hmr3300", 19200, "none", Hmr3300Decoder, Hmr3300Dialogue, sigma_deg=math.hypot(0.4, 0.5), law="euler"
+        ),
+        "nmea": ProtocolInfo("nmea", 19200, "none", NmeaDecoder, Hmr3000Dialogue, lag_s=0.29, law="axis"),
         "os5000": ProtocolInfo("os5000", 19200, "none", Os5000Decoder),
     },
     "compass": {
-        "hmr3300": ProtocolInfo("hmr3300", 19200, "none", Hmr3300Decoder),
+        # Honeywell: 1 deg rms level, 3 deg to 30 deg of tilt.
+        "hmr3300": ProtocolInfo(
+            "hmr3300", 19200, "none", Hmr3300Decoder, Hmr3300Dialogue, sigma_deg=1.0, tilted_sigma_deg=3.0
+        ),
         # An HMR3000, with its first filter's usual time constant of 4 steps of 72 ms. NMEA 0183 itself has 4800 baud.
         "nmea": ProtocolInfo("nmea", 19200, "none", NmeaDecoder, Hmr3000Dialogue, lag_s=0.29),
-        "os5000": ProtocolInfo("os5000", 19200, "none", Os5000Decoder),
+        # OceanServer: 0.5 deg rms level, 1 deg to 30 deg of tilt.
+        "os5000": ProtocolInfo("os5000", 19200, "none", Os5000Decoder, sigma_deg=0.5, tilted_sigma_deg=1.0),
     },
 }
 

@@ -28,6 +28,7 @@ from companion.daemon import models
 from companion.daemon.course import in_words
 from companion.daemon.plan import whole_of
 from companion.daemon.report import Draft
+from companion.daemon.serial_devices import Role, collect, parts_of, serial_devices
 from companion.errors import CalibrationRefusedError, StorageError
 from companion.links.mavlink import MavlinkLink
 from companion.protocols.base import Decoder
@@ -35,7 +36,7 @@ from companion.recording import state, topics
 from companion.recording.files import versions
 from companion.recording.walk import Attachment, Message, Metadata, Recording
 from companion.replay.compare import Difference, differences
-from companion.samples import CompassSample, ImuSample, Sample, TiltSample
+from companion.samples import ImuSample
 
 PENDING: Final = 4000
 """Telemetry that nobody has counted yet is remembered so long."""
@@ -88,6 +89,8 @@ class Replay:
         self._versions: dict[str, str] = {}
         self._collector: RollingCollector | None = None
         self._decoders: dict[str, Decoder] = {}
+        self._roles: dict[str, tuple[Role, ...]] = {}
+        """Of each device, by the name that its bytes have."""
         self._link = MavlinkLink()
         self._pending: dict[str, deque[tuple[float, Reading]]] = {}
         self._windows: dict[int, Window | CalibrationRefusedError] = {}
@@ -149,6 +152,7 @@ class Replay:
             self._config = msgspec.json.decode(data, type=Config)
         except msgspec.MsgspecError as error:
             raise StorageError(f"{self._recording.path}: its configuration is of another version: {error}") from None
+        self._roles = {device.name: device.roles for device in serial_devices(self._config)}
 
     # --- what comes, in its order
 
@@ -230,18 +234,9 @@ class Replay:
             decoder.interrupted()
             return
         for sample in decoder.feed(raw.data, raw.t_s):
-            self._take_sample(name, sample)
-
-    def _take_sample(self, name: str, sample: Sample) -> None:
-        if self._collector is None:
-            return
-        if isinstance(sample, ImuSample):
-            if name not in ("gradienter", "compass"):
-                self._collector.add_imu(name, sample)
-        elif isinstance(sample, TiltSample):
-            self._collector.add_tilt(sample)
-        elif isinstance(sample, CompassSample):
-            self._collector.add_compass(sample)
+            for role, part in parts_of(sample, self._roles[name]):
+                if self._collector is not None:
+                    collect(self._collector, role, part)
 
     def _take_mavlink(self, data: bytes) -> None:
         raw = msgspec.json.decode(data, type=topics.RawBytes)

@@ -93,6 +93,43 @@ def test_a_replay_gives_the_record_to_the_last_bit(usual: tuple[Path, Record]) -
     assert result.seconds > 15.0
 
 
+def one_compass_for_both(rig: Rig) -> None:
+    """The compass' own tilt in the gradienter's place: one device, one port, two sections."""
+    assert rig.config.gradienter is not None
+    assert rig.config.compass is not None
+    tilt = msgspec.structs.replace(
+        rig.config.gradienter, port=rig.config.compass.port, protocol="hmr3300", law="euler", sigma_deg=None
+    )
+    rig.config = msgspec.structs.replace(rig.config, gradienter=tilt)
+    rig.devices["gradienter"] = rig.devices.pop("compass")
+
+
+def test_a_replay_knows_who_shares_a_port(tmp_path: Path) -> None:
+    async def main() -> list[Record]:
+        rig = Rig(tmp_path, recordings_mb=64, own_imu=True, min_still_s=5.0, max_s=6.0)
+        one_compass_for_both(rig)
+        async with rig.running():
+            await rig.ready()
+            result, _ = await calibrated(rig)
+            assert result.outcome == "done", result
+            await asyncio.sleep(2.5)
+        assert [sensor.name for sensor in rig.service.sensors] == ["own", "gradienter"]
+        return rig.service.store.history()
+
+    records = run_virtual(main())
+    path = ring(tmp_path)[0]  # behind the record the next one begins
+    result = replayed(path)
+    same(result, records)
+    assert result.notes == []
+    pose = records[0].pose
+    assert pose is not None
+    assert None not in (pose.theta_deg, pose.psi_deg)
+    with path.open("rb") as file:
+        topics_seen = {channel.topic for channel in make_reader(file).get_summary().channels.values()}  # type: ignore[union-attr]
+    assert "/serial/gradienter" in topics_seen
+    assert "/serial/compass" not in topics_seen
+
+
 def test_any_bit_of_the_record_that_is_not_recomputed_alike_is_named(
     usual: tuple[Path, Record], tmp_path: Path
 ) -> None:

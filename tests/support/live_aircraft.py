@@ -22,7 +22,7 @@ async def live_aircraft(folder: Path, more: str = QUICK, *, seed: int = 1) -> As
     scenario = demo(seed=seed)
     scenario.aircraft.begin(asyncio.get_running_loop().time())
     async with contextlib.AsyncExitStack() as stack:
-        for name, device in (("imu", scenario.imu), ("gradienter", scenario.gradienter), ("compass", scenario.compass)):
+        for name, device in scenario.ports.items():
             await stack.enter_async_context(PtyDevice(device, folder / name))
         link = await open_udp(scenario.autopilot, listen=("127.0.0.1", 0))
         stack.callback(link.close)

@@ -22,6 +22,12 @@ source = "autopilot"
 MQTT = "[mqtt]\nhost = 'localhost'\n"
 SERIAL = '[[imu]]\nname = "own"\nsource = "serial"\nport = "/dev/ttyUSB0"\nprotocol = "vectornav"\n'
 
+BOTH = '[gradienter]\nport = "/dev/ttyUSB0"\nprotocol = "PROTOCOL"\nlaw = "euler"\n'
+HMR_TWICE = (
+    '[gradienter]\nport = "/dev/ttyS1"\nprotocol = "hmr3300"\nlaw = "euler"\nbaud = 19200\nparity = "none"\n'
+    '[compass]\nport = "/dev/ttyS1"\nprotocol = "hmr3300"\nbaud = BAUD\n'
+)
+
 
 def test_the_smallest_file_and_its_defaults() -> None:
     config = parse(GOOD, "x.toml")
@@ -33,6 +39,18 @@ def test_the_smallest_file_and_its_defaults() -> None:
     assert config.calibration.at_arm == "warn"
     assert config.push.parameters
     assert config.mqtt is None
+
+
+def test_one_device_may_serve_several_sections() -> None:
+    parse(GOOD + HMR_TWICE.replace("BAUD", "19200"), "x.toml")
+    # What one section leaves open the other says.
+    parse(GOOD + HMR_TWICE.replace("baud = BAUD\n", ""), "x.toml")
+
+
+def test_the_autopilot_s_port_is_nobody_else_s() -> None:
+    text = GOOD.replace("udpout:127.0.0.1:14550", "serial:/dev/ttyUSB0:115200") + SERIAL
+    with pytest.raises(ConfigError, match=r"'mavlink.url': found '/dev/ttyUSB0', which imu\[1\].port has already"):
+        parse(text, "x.toml")
 
 
 def test_a_full_file() -> None:
@@ -106,6 +124,28 @@ bind = "127.0.0.1:8080"
         (SERIAL + "mounting = [1, 2]", ["imu[1].mounting", "found [1, 2]", "[number, number, number]"]),
         (SERIAL + "mounting = [1, 2, inf]", ["imu[1].mounting", "inf", "finite"]),
         (SERIAL + SERIAL.replace("own", "other"), ["imu[2].port", "/dev/ttyUSB0", "imu[1].port", "a port of its own"]),
+        (
+            SERIAL.replace("vectornav", "imu_line") + BOTH.replace("PROTOCOL", "hmr3300"),
+            [
+                "gradienter.protocol",
+                "'hmr3300' on /dev/ttyUSB0",
+                "imu[1].protocol is 'imu_line'",
+                "one device serves both",
+            ],
+        ),
+        (
+            HMR_TWICE.replace("BAUD", "9600"),
+            ["compass.baud", "found 9600 on /dev/ttyS1", "gradienter.baud is 19200", "or a port of its own"],
+        ),
+        (
+            HMR_TWICE.replace("BAUD", "19200\nparity = 'odd'"),
+            ["compass.parity", "'odd'", "gradienter.parity is 'none'"],
+        ),
+        (
+            "[[imu]]\nname = 'b'\nsource = 'autopilot'\ninstance = 2\nread_only = true",
+            ["imu[1].read_only", "only with"],
+        ),
+        (SERIAL + "read_only = 1", ["imu[1].read_only", "found 1", "true or false"]),
         (SERIAL + "autopilot_instance = 1", ["imu[1]", "autopilot IMU 1 a second time"]),
         ("[[imu]]\nname = 'b'\nsource = 'autopilot'\nport = '/dev/x'\ninstance = 2", ["imu[1].port", "only with"]),
         ("[[imu]]\nname = 'b'\nsource = 'autopilot'\ninstance = 4", ["imu[1].instance", "found 4", "from 1 to 3"]),

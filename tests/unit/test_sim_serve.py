@@ -15,9 +15,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion import config
 from sim.__main__ import main
+from sim.families import COMPASSES, GRADIENTERS, IMUS
 from sim.imu_model import DEG_H, MG
 from sim.scenario import demo, site_at
-from sim.serve import configuration, describe, serve
+from sim.serve import configuration, describe, parser, serve
 from sim.station import Station
 from sim.udp import open_udp
 
@@ -49,6 +50,32 @@ def test_the_printed_configuration_is_one_the_companion_takes(tmp_path: Path) ->
     assert devices.vehicle.latitude_deg == 40.0
     autopilot = config.parse(configuration(scenario, directory=None, udp=("127.0.0.1", 14650)), "autopilot")
     assert autopilot.gradienter is None
+
+
+@pytest.mark.parametrize("gradienter", GRADIENTERS)
+@pytest.mark.parametrize("compass", COMPASSES)
+@pytest.mark.parametrize("imu", IMUS)
+def test_the_printed_configuration_fits_every_family(tmp_path: Path, imu: str, gradienter: str, compass: str) -> None:
+    scenario = demo(devices=(imu, gradienter, compass))
+    printed = config.parse(configuration(scenario, directory=tmp_path, udp=None), "devices")
+    assert printed.gradienter is not None
+    assert printed.compass is not None
+    (own,) = printed.imu
+    assert (own.protocol, printed.gradienter.protocol, printed.compass.protocol) == (imu, gradienter, compass)
+    served = {str(tmp_path / name) for name in scenario.ports}
+    assert {own.port, printed.gradienter.port, printed.compass.port} == served
+    # One name is one device on one port.
+    assert (printed.gradienter.port == printed.compass.port) == (scenario.gradienter is scenario.compass)
+    assert len(served) == len({imu, gradienter, compass})
+    for device in scenario.ports.values():
+        assert device.aircraft is scenario.aircraft
+
+
+def test_families_are_chosen_on_the_command_line() -> None:
+    chosen = parser().parse_args(["devices", "--gradienter", "hmr3300", "--imu", "imu_line"])
+    assert (chosen.imu, chosen.gradienter, chosen.compass) == ("imu_line", "hmr3300", "hmr3300")
+    with pytest.raises(SystemExit):
+        parser().parse_args(["devices", "--imu", "hmr3300"])
 
 
 def test_the_demo_is_the_documented_place_and_size() -> None:

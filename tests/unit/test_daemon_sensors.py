@@ -1,0 +1,385 @@
+"""One device on one port: its roles, and what is said to it."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import logging
+import os
+import subprocess
+import sys
+import tty
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from companion.config import Config, parse
+from companion.daemon import sensors
+from companion.daemon.sensors import SerialSensor
+from companion.daemon.serial_devices import Role, SerialDevice, serial_devices
+from companion.links.bytestream import PortSettings
+from companion.protocols.dialogue import Dialogue
+from companion.protocols.registry import PROTOCOLS, ProtocolInfo
+from companion.protocols.roles import Part
+from companion.samples import CompassSample, TiltSample
+from sim.aircraft import Pose, VirtualAircraft
+from sim.devices import HMR3300
+from sim.pty_device import PtyDevice
+from sim.scenario import site_at
+from tests.support.frames import sentence
+from tests.support.virtual_time import run_virtual
+
+LINES = b"40.1, 5.0, -3.0\r\n40.2, 5.1, -3.1\r\n"
+
+
+class Talker(Dialogue):
+    """Notes what it is told, and says what it is given to say."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[Any, ...]] = []
+        self.asked: list[float] = []
+        self.to_say: Iterator[bytes] = iter(())
+        self.last_words = ""
+
+    def opened(self, t_s: float) -> None:
+        self.told.append(("opened",))
+
+    def heard(self, data: bytes, samples: int, t_s: float) -> None:
+        self.told.append(("heard", data, samples))
+
+    def due(self, t_s: float) -> bytes:
+        self.asked.append(t_s)
+        data = next(self.to_say, b"")
+        if data:
+            self.last_words = f"said {data.decode()}"
+        return data
+
+    @property
+    def words(self) -> str:
+        return self.last_words
+
+
+class Chatterbox(Talker):
+    """Has always something to say."""
+
+    def due(self, t_s: float) -> bytes:
+        super().due(t_s)
+        return b"!"
+
+
+class OpenPort:
+    """A port that is open, in the place of a `ByteLink`."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.settings = PortSettings("tcp://nowhere:1", 19200)
+        self.connected = True
+        self.last_error = ""
+        self.last_byte_s: float | None = None
+        self.reconnects = 0
+        self.sent: list[bytes] = []
+
+    def write(self, data: bytes) -> bool:
+        self.sent.append(data)
+        return True
+
+    async def run(self) -> None:
+        await asyncio.Event().wait()
+
+
+def device(
+    *roles: Role, dialogue: type[Dialogue] | None = None, port: str = "/nowhere", **changes: Any
+) -> SerialDevice:
+    info = dataclasses.replace(PROTOCOLS["compass"]["hmr3300"], dialogue=dialogue)
+    return SerialDevice(port, info, 19200, "none", roles=roles, **{"read_only": False, **changes})
+
+
+BOTH = (Role("gradienter", "gradienter"), Role("compass", "compass"))
+
+
+def opened(which: SerialDevice) -> tuple[SerialSensor, OpenPort, list[tuple[str, Part]]]:
+    """A sensor on a port that has just been opened."""
+    taken: list[tuple[str, Part]] = []
+    sensor = SerialSensor(which, lambda role, part: taken.append((role.name, part)))
+    port = OpenPort(sensor.link.name)
+    sensor.link = port  # type: ignore[assignment]
+    sensor._on_state(True, "open")
+    return sensor, port, taken
+
+
+# --- roles
+
+
+def test_a_device_is_decoded_once_and_every_role_takes_what_it_needs() -> None:
+    async def main() -> None:
+        sensor, _, taken = opened(device(*BOTH))
+        sensor.receive(b"\r\n" + LINES, 1.0)
+        assert [name for name, _ in taken] == ["gradienter", "compass"] * 2
+        (tilt, heading) = (part for _, part in taken[:2])
+        assert isinstance(tilt, TiltSample)
+        assert isinstance(heading, CompassSample)
+        assert (tilt.x_deg, tilt.y_deg, heading.heading_deg) == (-3.0, 5.0, 40.1)
+        assert tilt.t_s == heading.t_s
+        assert sensor.decoder.accepted == 2
+
+    run_virtual(main())
+
+
+def test_headings_to_another_north_than_the_configured_one_are_refused_in_words() -> None:
+    async def main() -> None:
+        info = PROTOCOLS["compass"]["nmea"]
+        role = Role("compass", "compass", "magnetic")
+        sensor, _, taken = opened(SerialDevice("/nowhere", info, 19200, "none", read_only=True, roles=(role,)))
+        now_s = asyncio.get_running_loop().time
+        sensor.receive(sentence("HEHDT,86.2,T"), now_s())
+        assert taken == []
+        status = sensor.roles[0].status()
+        assert not status["good"]
+        assert 'its headings are true, compass.reference is another; set reference = "true"' in str(status["summary"])
+        sensor.receive(sentence("HEHDM,92.0,M") + sentence("PTNTHPR,92.0,N,1.0,N,2.0,N"), now_s())
+        assert [part.heading_deg for _, part in taken if isinstance(part, CompassSample)] == [92.0, 92.0]
+        assert sensor.roles[0].status()["good"]
+
+    run_virtual(main())
+
+
+def test_each_role_says_how_it_is() -> None:
+    async def main() -> None:
+        sensor, _, _ = opened(device(*BOTH))
+        now_s = asyncio.get_running_loop().time
+        # The two-axis sibling: headings, but no tilt.
+        sensor.receive(b"\r\n" + b"40.1\r\n" * 5, now_s())
+        gradienter, compass = (role.status() for role in sensor.roles)
+        assert (gradienter["name"], gradienter["kind"], gradienter["frames"]) == ("gradienter", "gradienter", 0)
+        assert not gradienter["good"]
+        assert "none with tilt" in str(gradienter["summary"])
+        assert (compass["good"], compass["frames"]) == (True, 5)
+        assert compass["shared_with"] == ["gradienter"]
+        sensor.receive(LINES, now_s())
+        assert all(role.status()["good"] for role in sensor.roles)
+        await asyncio.sleep(4.0)
+        assert {"silent" in str(role.status()["summary"]) for role in sensor.roles} == {True}
+
+    run_virtual(main())
+
+
+def config(text: str) -> Config:
+    return parse('[mavlink]\nurl = "tcp:h:1"\n[[imu]]\nname = "fc"\nsource = "autopilot"\n' + text, "test")
+
+
+GRADIENTER = '[gradienter]\nport = "/dev/a"\nprotocol = "hmr3300"\nlaw = "euler"\n'
+COMPASS = '[compass]\nport = "/dev/a"\nprotocol = "hmr3300"\n'
+
+
+def test_what_one_section_leaves_open_the_other_says() -> None:
+    (one,) = serial_devices(config(GRADIENTER + COMPASS + 'baud = 9600\nparity = "odd"\nread_only = true\n'))
+    assert (one.name, one.baud, one.parity, one.read_only) == ("gradienter", 9600, "odd", True)
+    assert [role.kind for role in one.roles] == ["gradienter", "compass"]
+    (one,) = serial_devices(config(GRADIENTER + COMPASS))
+    assert (one.baud, one.parity, one.read_only) == (19200, "none", False)
+    two = serial_devices(config(GRADIENTER + COMPASS.replace("/dev/a", "/dev/b")))
+    assert [each.name for each in two] == ["gradienter", "compass"]
+
+
+# --- what is said
+
+
+def test_the_dialogue_is_told_of_everything_and_asked_after_it() -> None:
+    async def main() -> None:
+        sensor, port, _ = opened(device(*BOTH, dialogue=Talker))
+        talker = sensor.dialogue
+        assert isinstance(talker, Talker)
+        running = asyncio.create_task(sensor.run())
+        await asyncio.sleep(0.3)
+        sensor.receive(b"\r\n", asyncio.get_running_loop().time())
+        talker.to_say = iter([b"*Q"])
+        sensor.receive(LINES, asyncio.get_running_loop().time())
+        assert talker.told == [("opened",), ("heard", b"\r\n", 0), ("heard", LINES, 2)]
+        assert port.sent == [b"*Q"]
+        assert {role.status()["words"] for role in sensor.roles} == {"said *Q"}
+        running.cancel()
+
+    run_virtual(main())
+
+
+def test_while_nothing_is_due_it_is_asked_seldom_and_in_a_conversation_often() -> None:
+    async def main() -> None:
+        sensor, _, _ = opened(device(*BOTH, dialogue=Talker))
+        talker = sensor.dialogue
+        assert isinstance(talker, Talker)
+        running = asyncio.create_task(sensor.run())
+        await asyncio.sleep(10.0)
+        assert 30 <= len(talker.asked) <= 41
+        talker.to_say = iter([b"?"])
+        await asyncio.sleep(0.3)
+        before = len(talker.asked)
+        await asyncio.sleep(0.5)
+        assert len(talker.asked) - before >= 24
+        await asyncio.sleep(2.0)
+        before = len(talker.asked)
+        await asyncio.sleep(10.0)
+        assert len(talker.asked) - before <= 41
+        running.cancel()
+
+    run_virtual(main())
+
+
+def test_not_even_a_talkative_dialogue_floods_a_device_or_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+
+    async def main() -> None:
+        sensor, port, _ = opened(device(*BOTH, dialogue=Chatterbox))
+        assert isinstance(sensor.dialogue, Talker)
+        sensor.dialogue.last_words = "said something"
+        running = asyncio.create_task(sensor.run())
+        await asyncio.sleep(0.3)
+        before = len(port.sent)
+        for _ in range(1000):
+            await asyncio.sleep(0.001)
+            sensor.receive(b"4", asyncio.get_running_loop().time())
+        assert 20 <= len(port.sent) - before <= 51
+        running.cancel()
+
+    run_virtual(main())
+    assert [record.message for record in caplog.records].count("gradienter, compass: said something") == 1
+
+
+def test_before_the_port_was_opened_nothing_is_said() -> None:
+    async def main() -> None:
+        sensor = SerialSensor(device(*BOTH, dialogue=Chatterbox), lambda role, part: None)
+        sensor.receive(LINES, asyncio.get_running_loop().time())
+        assert isinstance(sensor.dialogue, Talker)
+        assert sensor.dialogue.asked == []
+
+    run_virtual(main())
+
+
+TALKATIVE: dict[str, ProtocolInfo] = {
+    "chatterbox": dataclasses.replace(PROTOCOLS["compass"]["hmr3300"], dialogue=Chatterbox),
+    **{info.name: info for infos in PROTOCOLS.values() for info in infos.values() if info.dialogue is not None},
+}
+EVENTS = st.lists(
+    st.one_of(
+        st.floats(0.0, 8.0).map(lambda seconds: ("wait", seconds)),
+        st.binary(max_size=40).map(lambda data: ("read", data)),
+        st.sampled_from([LINES, b"#I\r\n", b"X=+00.430\r\nY=-00.084\r\n"]).map(lambda data: ("read", data)),
+        st.just(("reopen", None)),
+    ),
+    max_size=12,
+)
+
+
+@pytest.mark.parametrize("info", TALKATIVE.values(), ids=list(TALKATIVE))
+@given(events=EVENTS)
+@settings(max_examples=40, deadline=None)
+def test_with_read_only_not_one_byte_leaves(info: ProtocolInfo, events: list[tuple[str, Any]]) -> None:
+    async def main(*, read_only: bool) -> int:
+        sensor, port, _ = opened(dataclasses.replace(device(*BOTH, read_only=read_only), info=info))
+        running = asyncio.create_task(sensor.run())
+        for what, value in [*events, ("wait", 3.0)]:
+            if what == "wait":
+                await asyncio.sleep(value)
+            elif what == "read":
+                sensor.receive(value, asyncio.get_running_loop().time())
+            else:
+                sensor._on_state(True, "open")
+        running.cancel()
+        return len(b"".join(port.sent))
+
+    assert run_virtual(main(read_only=True)) == 0
+    if info.dialogue is Chatterbox:
+        assert run_virtual(main(read_only=False)) > 0
+
+
+# --- on a real pseudo-terminal
+
+
+def pty_pair() -> tuple[int, str]:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    path = os.ttyname(slave)
+    os.set_blocking(master, False)
+    os.close(slave)
+    return master, path
+
+
+def arrived(master: int) -> bytes:
+    try:
+        return os.read(master, 4096)
+    except (BlockingIOError, OSError):
+        return b""
+
+
+async def until(condition: Callable[[], bool], within_s: float = 8.0) -> None:
+    async with asyncio.timeout(within_s):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
+def test_while_another_program_has_the_port_open_nothing_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sensors, "HELD_AGAIN_S", 0.05)
+
+    master, path = pty_pair()
+    slave = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    other = subprocess.Popen(
+        [sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE, pass_fds=[slave]
+    )
+    os.close(slave)
+
+    async def main() -> None:
+        sensor = SerialSensor(device(*BOTH, dialogue=Chatterbox, port=path), lambda role, part: None)
+        running = asyncio.create_task(sensor.run())
+        try:
+            await until(lambda: "has the port open too" in sensor.words)
+            assert str(other.pid) in sensor.words
+            await asyncio.sleep(0.6)  # more than two looks: time enough for a byte that must not come
+            assert arrived(master) == b""
+            other.communicate()
+            await until(lambda: arrived(master) != b"")
+            assert sensor.words == ""
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+
+    try:
+        asyncio.run(main())
+    finally:
+        other.kill()
+        other.wait()
+        os.close(master)
+
+
+@pytest.mark.parametrize("read_only", [False, True])
+def test_a_stopped_hmr3300_is_started_again_unless_it_may_only_be_read(tmp_path: Path, *, read_only: bool) -> None:
+    async def main() -> None:
+        aircraft = VirtualAircraft(Pose(0.0, 0.0, 40.0), site_at(40.0, 116.0, 50.0))
+        aircraft.begin(asyncio.get_running_loop().time())
+        compass = HMR3300(aircraft)
+        async with PtyDevice(compass, tmp_path / "compass"):
+            compass.streaming = False
+            section = (
+                f'[compass]\nport = "{tmp_path / "compass"}"\nprotocol = "hmr3300"\nread_only = {read_only}\n'.lower()
+            )
+            (which,) = serial_devices(config(section.replace(str(tmp_path).lower(), str(tmp_path))))
+            taken: list[Part] = []
+            sensor = SerialSensor(which, lambda role, part: taken.append(part))
+            running = asyncio.create_task(sensor.run())
+            try:
+                if read_only:
+                    await asyncio.sleep(2.8)
+                    assert not compass.streaming
+                    assert taken == []
+                    assert sensor.words == ""
+                else:
+                    await until(lambda: len(taken) >= 5)
+                    assert compass.streaming
+                    assert "started" in sensor.words
+            finally:
+                running.cancel()
+                await asyncio.gather(running, return_exceptions=True)
+
+    asyncio.run(main())

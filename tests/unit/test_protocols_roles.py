@@ -1,0 +1,36 @@
+"""What each role of one device takes."""
+
+from __future__ import annotations
+
+import pytest
+
+from companion.protocols.registry import Kind
+from companion.protocols.roles import part_for
+from companion.samples import AttitudeSample, CompassSample, ImuSample, MagSample, Sample, TiltSample
+
+IMU = ImuSample(1.0, (0.1, 0.2, 0.3), (0.0, 0.0, -9.8))
+TILT = TiltSample(1.0, -3.0, 5.0, 20.0)
+HEADING = CompassSample(1.0, 40.0)
+WITH_TILT = CompassSample(1.0, 40.0, pitch_deg=5.0, roll_deg=-3.0)
+
+
+@pytest.mark.parametrize(
+    ("role", "sample", "part"),
+    [
+        ("imu", IMU, IMU),
+        ("imu", TILT, None),
+        ("imu", WITH_TILT, None),
+        ("gradienter", IMU, None),
+        ("gradienter", TILT, TILT),
+        ("gradienter", HEADING, None),
+        # x: right side down, which is roll; y: nose up, which is pitch.
+        ("gradienter", WITH_TILT, TiltSample(1.0, -3.0, 5.0)),
+        ("compass", IMU, None),
+        ("compass", TILT, None),
+        ("compass", WITH_TILT, WITH_TILT),
+        ("imu", MagSample(1.0, counts=(1, 2, 3)), None),
+        ("gradienter", AttitudeSample(1.0, 1.0, 2.0, 3.0), None),
+    ],
+)
+def test_a_role_takes_its_part(role: Kind, sample: Sample, part: Sample | None) -> None:
+    assert part_for(role, sample) == part
