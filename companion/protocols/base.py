@@ -145,26 +145,37 @@ class SentenceDecoder(Decoder):
         text = self._partial + data.replace(b"\r", b"\n")
         lines = text.split(b"\n")
         remaining, partial = len(text), lines.pop()
+        seconds_per_byte, limit, read = self.seconds_per_byte, self.LIMIT, self._read
         samples: list[Sample] = []
+        accepted = 0
         for line in lines:
             if not line:
                 remaining -= 1
                 continue
             remaining -= len(line) + 1
-            # Nearly every line is one whole sentence; only the others need a closer look.
-            if line.rfind(b"$") != 0 or len(line) > self.LIMIT:
-                line = self._last_sentence(line)
-                if not line:
-                    continue
             try:
-                self._read(body_of_sentence(line), t_s - self.seconds_per_byte * remaining, samples)
+                # Nearly every line is one whole sentence with two digits; only the others need a closer look.
+                if line.rfind(b"$") == 0 and len(line) <= limit:
+                    digits = _HEXADECIMAL.get(line[-2:])
+                    if digits is not None and line[-3] == _STAR:
+                        body = line[1:-3]
+                        if xor_checksum(body) != digits:
+                            raise RejectedError(CHECKSUM)
+                    else:
+                        body = body_of_sentence(line)
+                elif sentence := self._last_sentence(line):
+                    body = body_of_sentence(sentence)
+                else:
+                    continue
+                read(body, t_s - seconds_per_byte * remaining, samples)
+                accepted += 1
             except RejectedError as error:
                 self.rejected[error.reason] += 1
             except ValueError:
                 self.rejected[NOT_A_NUMBER] += 1
-            else:
-                self.accepted += 1
-        self._partial = self._last_sentence(partial) if partial else b""
+        self.accepted += accepted
+        if partial or self._partial:
+            self._partial = self._last_sentence(partial)
         return samples
 
     def interrupted(self) -> None:  # noqa: D102 - as in the base class
@@ -212,20 +223,30 @@ _from_bytes: Final = int.from_bytes
 
 def xor_checksum(body: bytes) -> int:
     """The checksum of NMEA 0183 and of its imitators: all bytes between "$" and "*" exclusive-ored."""
-    folded = _from_bytes(body, "little")
+    folded, size = _from_bytes(body, "little"), len(body)
     # Fold halves onto each other: a loop over the bytes of a longer sentence takes several times as long.
-    if len(body) > 32:
-        shift = 256
-        while shift * 2 < len(body) * 8:
-            shift *= 2
-        while shift >= 256:
-            folded ^= folded >> shift
-            shift >>= 1
+    if size > 32:
+        if size > 64:
+            if size > 128:
+                folded = _fold_long(folded, size)
+            folded ^= folded >> 512
+        folded ^= folded >> 256
     folded ^= folded >> 128
     folded ^= folded >> 64
     folded ^= folded >> 32
     folded ^= folded >> 16
     return (folded ^ folded >> 8) & 0xFF
+
+
+def _fold_long(folded: int, size: int) -> int:
+    """Fold all that lies beyond 128 bytes onto them."""
+    shift = 1024
+    while shift * 2 < size * 8:
+        shift *= 2
+    while shift >= 1024:
+        folded ^= folded >> shift
+        shift //= 2
+    return folded
 
 
 def body_of_sentence(sentence: bytes) -> bytes:

@@ -20,7 +20,7 @@ for HPR: that one is corrected for whatever has been entered in the device.
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Final, Literal
+from typing import Final, Literal
 
 from companion.protocols.base import (
     ALARM,
@@ -52,6 +52,15 @@ _HDT, _THS, _CCD, _HDM, _HDG, _HPR = range(6)
 _TILT_XDR, _TILT_CCD, _TILT_HPR = range(3)
 _NOBODY: Final = -1
 
+_PLAIN: Final[dict[bytes, tuple[int, int, tuple[bytes, ...] | None, North]]] = {
+    b"HDG": (_HDG, 6, None, "magnetic"),
+    b"HDM": (_HDM, 3, (b"M",), "magnetic"),
+    b"HDT": (_HDT, 3, (b"T",), "true"),
+    # Autonomous, estimated; M was typed in, S is simulated, V not valid.
+    b"THS": (_THS, 3, (b"A", b"E"), "true"),
+}
+"""Sentences with nothing but a heading: precedence, number of fields, what the third may be (None: a deviation)."""
+
 _ALARMS: Final = frozenset((b"L", b"P"))
 _STATUSES: Final = frozenset((b"L", b"M", b"N", b"O", b"P", b"C"))
 _DEGREES_PER_MIL: Final = 9 / 160
@@ -79,49 +88,34 @@ class NmeaDecoder(SentenceDecoder):
     def _read(self, body: bytes, t_s: float, samples: list[Sample]) -> None:
         fields = body.split(b",")
         head = fields[0]
-        read = self._STANDARD.get(head[2:]) if len(head) == 5 else self._HONEYWELL.get(head)
-        if read is None:
-            raise RejectedError(UNKNOWN_SENTENCE)
-        read(self, fields, t_s, samples)
-
-    def _hdg(self, fields: list[bytes], t_s: float, samples: list[Sample]) -> None:
-        if len(fields) != 6:
+        plain = _PLAIN.get(head[2:])
+        if plain is None or len(head) != 5:
+            if head == b"PTNTHPR":
+                self._hpr(fields, t_s, samples)
+            elif head == b"PTNTCCD":
+                self._ccd(fields, t_s, samples)
+            elif head[2:] == b"XDR" and len(head) == 5:
+                self._xdr(fields, t_s, samples)
+            else:
+                raise RejectedError(UNKNOWN_SENTENCE)
+            return
+        # All in one piece, because it is what comes most.
+        rank, size, marks, north = plain
+        if len(fields) != size:
             raise RejectedError(FIELD_COUNT)
         heading_deg = float(fields[1])
-        if fields[2] and 0.0 <= heading_deg <= 360.0:
-            heading_deg = (heading_deg + _easting(fields[2], fields[3])) % 360.0
-        self._heading(_HDG, heading_deg, t_s, samples)
-
-    def _hdm(self, fields: list[bytes], t_s: float, samples: list[Sample]) -> None:
-        if len(fields) != 3:
-            raise RejectedError(FIELD_COUNT)
-        if fields[2] != b"M":
-            raise RejectedError(UNKNOWN_FIELD)
-        self._heading(_HDM, float(fields[1]), t_s, samples)
-
-    def _hdt(self, fields: list[bytes], t_s: float, samples: list[Sample]) -> None:
-        if len(fields) != 3:
-            raise RejectedError(FIELD_COUNT)
-        if fields[2] != b"T":
-            raise RejectedError(UNKNOWN_FIELD)
-        self._heading(_HDT, float(fields[1]), t_s, samples)
-
-    def _ths(self, fields: list[bytes], t_s: float, samples: list[Sample]) -> None:
-        if len(fields) != 3:
-            raise RejectedError(FIELD_COUNT)
-        if fields[2] not in (b"A", b"E"):  # autonomous, estimated; M was typed in, S is simulated, V not valid
-            raise RejectedError(NOT_A_MEASUREMENT)
-        self._heading(_THS, float(fields[1]), t_s, samples)
-
-    def _heading(self, sentence: int, heading_deg: float, t_s: float, samples: list[Sample]) -> None:
-        """A heading without a tilt, if this sentence is the one that may give it."""
+        if marks is None:
+            if fields[2] and 0.0 <= heading_deg <= 360.0:
+                heading_deg = (heading_deg + _easting(fields[2], fields[3])) % 360.0
+        elif fields[2] not in marks:
+            raise RejectedError(NOT_A_MEASUREMENT if rank == _THS else UNKNOWN_FIELD)
         if not 0.0 <= heading_deg < 360.0:
             heading_deg = _full_circle(heading_deg)
-        if sentence == self._heading_from:
+        if rank == self._heading_from:
             self._heading_s = t_s
         else:
-            self._claim_heading(sentence, t_s)
-        samples.append(CompassSample(t_s, heading_deg, None, None, _NORTHS[sentence]))
+            self._claim_heading(rank, t_s)
+        samples.append(CompassSample(t_s, heading_deg, None, None, north))
 
     def _claim_heading(self, sentence: int, t_s: float) -> None:
         leader = self._heading_from
@@ -139,10 +133,12 @@ class NmeaDecoder(SentenceDecoder):
         # Even an alarm keeps the precedence: then the device says that it has no heading, whatever else it sends.
         self._heading_from, self._heading_s = _HPR, t_s
         self._tilt_from, self._tilt_s = _TILT_HPR, t_s
+        no_heading = False
         if not magnetic == pitch_status == roll_status == b"N":
             _check_statuses((magnetic, pitch_status, roll_status))
+            no_heading = magnetic in _ALARMS
         pitch_deg, roll_deg = float(pitch), float(roll)
-        heading_deg = 0.0 if magnetic in _ALARMS else float(heading)
+        heading_deg = 0.0 if no_heading else float(heading)
         if b"." not in pitch:  # mils are whole numbers, degrees have a decimal
             pitch_deg, roll_deg = pitch_deg * _DEGREES_PER_MIL, roll_deg * _DEGREES_PER_MIL
             heading_deg *= _DEGREES_PER_MIL
@@ -150,7 +146,7 @@ class NmeaDecoder(SentenceDecoder):
             raise _out_of_range(pitch_deg + roll_deg)
         if not 0.0 <= heading_deg < 360.0:
             heading_deg = _full_circle(heading_deg)
-        if magnetic in _ALARMS:
+        if no_heading:
             samples.append(TiltSample(t_s, roll_deg, pitch_deg))
         else:
             samples.append(CompassSample(t_s, heading_deg, pitch_deg, roll_deg))
@@ -199,9 +195,6 @@ class NmeaDecoder(SentenceDecoder):
         if not found:
             raise RejectedError(DUPLICATE if len(angles_deg) == 2 else NOTHING_OF_USE)
         samples += found
-
-    _STANDARD: ClassVar = {b"HDG": _hdg, b"HDM": _hdm, b"HDT": _hdt, b"THS": _ths, b"XDR": _xdr}
-    _HONEYWELL: ClassVar = {b"PTNTHPR": _hpr, b"PTNTCCD": _ccd}
 
 
 def _check_statuses(statuses: tuple[bytes, bytes, bytes]) -> None:
