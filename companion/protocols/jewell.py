@@ -67,6 +67,8 @@ class JewellDecoder(LineDecoder):
 
     def _line(self, line: bytes, t_s: float, *, cut: bool) -> TiltSample | None:
         text = line.removesuffix(b"\r")
+        if text.rfind(b"$") == 0 and not cut:  # nearly every line
+            return _reading(text, t_s)
         if not cut and not text:
             return None
         match = _START.match(text)
@@ -93,7 +95,7 @@ def _reading(text: bytes, t_s: float) -> TiltSample:
         raise RejectedError(PARITY)
     if b"\r" in text:
         raise RejectedError(LINE_END)
-    if match := _SIM[0].fullmatch(text) or _SIM[1].fullmatch(text):
+    if b",A," not in text and (match := _SIM[0].fullmatch(text) or _SIM[1].fullmatch(text)):
         x, y, temperature = match.groups()
         return _sample(t_s, float(x), float(y), float(temperature))
     if match := _XDR.fullmatch(text):
