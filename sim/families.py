@@ -38,11 +38,13 @@ class Fit(NamedTuple):
     """What a configuration has to say of a device of one of the tables, in one of its roles."""
 
     mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Roll, pitch, yaw of its axes as they are on the aircraft; an IMU's model has to be mounted so."""
+    """Roll, pitch, yaw of the axes in which it speaks, as it lies on the aircraft."""
     law: Law | None = None
     """Of a gradienter; None: its own, or roll and pitch themselves."""
     sigma_deg: float | None = None
     """None: what the companion takes by itself is right."""
+    model_mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of the model of an IMU that sends its model's readings as they are; one that turns them needs none."""
 
 
 Z_UP = (180.0, 0.0, 0.0)
@@ -78,7 +80,7 @@ def make(model: ImuModel, imu: str, gradienter: str, compass: str, seed: int) ->
     """The devices of an aircraft, by their protocols; two roles of one name are one device.
 
     Args:
-        model: what the IMU measures; mounted as `fit` says.
+        model: what the IMU measures; mounted as `Fit.model_mounting_deg` says.
         imu: a name of `IMUS`.
         gradienter: a name of `GRADIENTERS`.
         compass: a name of `COMPASSES`.

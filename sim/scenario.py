@@ -128,7 +128,7 @@ def demo(
         parameters = {"INS_GYR_CAL": float(gyr_cal_at_boot)}
         autopilot = ArduPilotDouble(aircraft, flight_controller, parameters=parameters, seed=seed)
     inertial, tilt, magnetic = devices
-    mounting_deg = fit("imu", inertial).mounting_deg
+    mounting_deg = fit("imu", inertial).model_mounting_deg
     serial = imu(3, (60.294, 124.657, 108.289), (0.21593, -2.2118, 1.2953), "bmi088", mounting_deg)
     made = make(serial, inertial, tilt, magnetic, seed)
     compass, gradienter = made.compass, made.gradienter

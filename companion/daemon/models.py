@@ -30,8 +30,8 @@ SCALED_BYTES: Final = 36.0
 
 TILT_SIGMA_DEG: Final = 0.05
 """Of a gradienter whose protocol names no device that is known to be worse: cell and mounting."""
-COMPASS_TILT_SIGMA_DEG: Final = 0.65
-"""Of what may be a compass' own tilt where its documents give no figure: the HMR3300's."""
+TILT_BY_THE_WAY_SIGMA_DEG: Final = 0.65
+"""Of the tilt that a compass or an IMU tells as well, where no document gives a figure: the HMR3300's."""
 HEADING_SIGMA_DEG: Final = 3.0
 """Of a compass likewise: the aircraft's own iron and currents."""
 
@@ -119,7 +119,8 @@ def gradienter_model(gradienter: Gradienter | None) -> GradienterModel | None:
 def tilt_sigma_deg(protocol: GradienterProtocol) -> float:
     """How well the tilt of a device with this protocol is known where nobody says better."""
     known = PROTOCOLS["gradienter"][protocol].sigma_deg
-    return known or (COMPASS_TILT_SIGMA_DEG if protocol in PROTOCOLS["compass"] else TILT_SIGMA_DEG)
+    by_the_way = protocol in PROTOCOLS["compass"] or protocol in PROTOCOLS["imu"]
+    return known or (TILT_BY_THE_WAY_SIGMA_DEG if by_the_way else TILT_SIGMA_DEG)
 
 
 def compass_model(compass: Compass | None) -> CompassModel | None:

@@ -21,7 +21,7 @@ from companion.config import Config, parse
 from companion.daemon import sensors
 from companion.daemon.sensors import SerialSensor
 from companion.daemon.serial_devices import Role, SerialDevice, serial_devices
-from companion.links.bytestream import PortSettings
+from companion.links.bytestream import ByteLink
 from companion.protocols.dialogue import Dialogue
 from companion.protocols.registry import PROTOCOLS, ProtocolInfo
 from companion.protocols.roles import Part
@@ -71,17 +71,16 @@ class Chatterbox(Talker):
         return b"!"
 
 
-class OpenPort:
-    """A port that is open, in the place of a `ByteLink`."""
+class OpenPort(ByteLink):
+    """A port that is open, and notes what is sent."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self.settings = PortSettings("tcp://nowhere:1", 19200)
-        self.connected = True
-        self.last_error = ""
-        self.last_byte_s: float | None = None
-        self.reconnects = 0
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
         self.sent: list[bytes] = []
+
+    @property
+    def connected(self) -> bool:
+        return True
 
     def write(self, data: bytes) -> bool:
         self.sent.append(data)
@@ -92,7 +91,7 @@ class OpenPort:
 
 
 def device(
-    *roles: Role, dialogue: type[Dialogue] | None = None, port: str = "/nowhere", **changes: Any
+    *roles: Role, dialogue: type[Dialogue] | None = None, port: str = "tcp://nowhere:1", **changes: Any
 ) -> SerialDevice:
     info = dataclasses.replace(PROTOCOLS["compass"]["hmr3300"], dialogue=dialogue)
     return SerialDevice(port, info, 19200, "none", roles=roles, **{"read_only": False, **changes})
@@ -104,9 +103,11 @@ BOTH = (Role("gradienter", "gradienter"), Role("compass", "compass"))
 def opened(which: SerialDevice) -> tuple[SerialSensor, OpenPort, list[tuple[str, Part]]]:
     """A sensor on a port that has just been opened."""
     taken: list[tuple[str, Part]] = []
-    sensor = SerialSensor(which, lambda role, part: taken.append((role.name, part)))
-    port = OpenPort(sensor.link.name)
-    sensor.link = port  # type: ignore[assignment]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sensors, "ByteLink", OpenPort)
+        sensor = SerialSensor(which, lambda role, part: taken.append((role.name, part)))
+    port = sensor.link
+    assert isinstance(port, OpenPort)
     sensor._on_state(True, "open")
     return sensor, port, taken
 
