@@ -8,6 +8,8 @@ Vectors are in the sensor's own axes until a `mounting` has turned them into the
 
 from __future__ import annotations
 
+from typing import Literal
+
 import msgspec
 
 Vector = tuple[float, float, float]
@@ -41,12 +43,15 @@ class TiltSample(msgspec.Struct, frozen=True, gc=False):
 
 
 class CompassSample(msgspec.Struct, frozen=True, gc=False):
-    """A heading, clockwise from north, in [0, 360); whether magnetic or true north is the configuration's."""
+    """A heading, clockwise from north, in [0, 360)."""
 
     t_s: float
     heading_deg: float
     pitch_deg: float | None = None
     roll_deg: float | None = None
+    north: Literal["magnetic", "true"] | None = None
+    """Which north the device itself says that it means; None where it does not: then the configuration says it."""
+    temperature_degc: float | None = None
 
 
 class MagSample(msgspec.Struct, frozen=True, gc=False):

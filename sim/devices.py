@@ -255,11 +255,16 @@ class Gradienter(SerialDevice):
         return [self._lines(float(time)) for time in times_s]
 
     def _lines(self, t_s: float) -> bytes:
+        x, y = self.reading_deg(t_s)
+        return self._line("X", x) + self._line("Y", y)
+
+    def reading_deg(self, t_s: float) -> tuple[float, float]:
+        """What it makes of the tilt at a time, with lag, offset and noise: x, y."""
         warm = self.aircraft.temperature_degc(t_s) - 25.0
         shift = np.asarray(self.offset_deg) + warm * np.asarray(self.offset_per_kelvin_deg)
         noise = self.noise_deg * self._random.standard_normal(2)
         x, y = self._settle(t_s) + shift + noise
-        return self._line("X", float(x)) + self._line("Y", float(y))
+        return float(x), float(y)
 
     def _line(self, axis: str, value_deg: float) -> bytes:
         if abs(value_deg) > self.range_deg:

@@ -7,7 +7,9 @@ from typing import NamedTuple
 
 from sim.aircraft import VirtualAircraft
 from sim.binary_imus import MipImu, Stim300, XsensImu
+from sim.compasses import NmeaCompass, Os5000
 from sim.devices import HMR3300, Gradienter, ImuLine, Law, SerialDevice, VectorNavBinary
+from sim.gradienters import Jewell
 from sim.imu_model import ImuModel
 from sim.pni import PniCompass
 from sim.rion import RionCompass, RionInclinometer
@@ -30,6 +32,9 @@ GRADIENTERS: dict[str, Callable[[VirtualAircraft, int], SerialDevice]] = {
     "pni": lambda aircraft, seed: PniCompass(aircraft, seed=seed),
     "witmotion": lambda aircraft, seed: WitMotionInclinometer(aircraft, seed=seed),
     "stim300": lambda aircraft, seed: Stim300(ImuModel(aircraft, "adis16470", seed=seed), seed=seed),
+    "jewell": lambda aircraft, seed: Jewell(aircraft, seed=seed),
+    "nmea": lambda aircraft, seed: NmeaCompass(aircraft, seed=seed),
+    "os5000": lambda aircraft, seed: Os5000(aircraft, seed=seed),
 }
 """Made from the aircraft on which they sit and a seed; upright, without errors but noise and lag."""
 
@@ -37,6 +42,8 @@ COMPASSES: dict[str, Callable[[VirtualAircraft, int], SerialDevice]] = {
     "hmr3300": lambda aircraft, seed: HMR3300(aircraft, seed=seed),
     "pni": lambda aircraft, seed: PniCompass(aircraft, seed=seed),
     "rion": lambda aircraft, seed: RionCompass(aircraft, seed=seed),
+    "nmea": lambda aircraft, seed: NmeaCompass(aircraft, seed=seed),
+    "os5000": lambda aircraft, seed: Os5000(aircraft, seed=seed),
 }
 """The same."""
 

@@ -31,6 +31,7 @@ from companion.recording.walk import Recording
 from companion.replay.engine import Replay
 from companion.samples import ImuSample
 from tests import bench_reading
+from tests.bench_text import against_pynmeagps
 from tests.support.component import FakeVehicle, ScriptedGate
 from tests.support.frames import (
     imu_line,
@@ -211,6 +212,7 @@ def main() -> None:
     ):
         print(f"{words:44} {seconds_a_call(work) / base_s:12.1f}")
     print(f"{'arm authorisation, from request to answer':44} {asyncio.run(_answering()) / base_s:12.1f}")
+    against_pynmeagps()
     with tempfile.TemporaryDirectory() as folder:
         share = run_virtual(_one_calibration(Path(folder)))
         recording = run_virtual(_one_calibration(Path(folder) / "recorded", recordings_mb=64))

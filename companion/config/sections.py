@@ -11,8 +11,10 @@ from msgspec import Meta
 
 ImuProtocol = Literal["vectornav", "imu_line", "witmotion", "mip", "xsens", "stim300"]
 Profile = Literal["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
-GradienterProtocol = Literal["inclinometer_xy", "hmr3300", "rion", "pni", "witmotion", "stim300"]
-CompassProtocol = Literal["hmr3300", "pni", "rion"]
+GradienterProtocol = Literal[
+    "inclinometer_xy", "jewell", "hmr3300", "nmea", "os5000", "rion", "pni", "witmotion", "stim300"
+]
+CompassProtocol = Literal["hmr3300", "nmea", "os5000", "pni", "rion"]
 Law = Literal["axis", "slope", "euler"]
 Parity = Literal["none", "even", "odd"]
 AtArm = Literal["gate", "warn", "off"]

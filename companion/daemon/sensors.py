@@ -18,6 +18,7 @@ from companion.links.ports import find_holders
 from companion.protocols.registry import Kind
 from companion.protocols.roles import Part
 from companion.protocols.stream_health import SILENT_AFTER_S
+from companion.samples import CompassSample
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +42,7 @@ class SensorRole:
     """What a device is used as, as `companion status` shows it."""
 
     def __init__(self, sensor: SerialSensor, role: Role) -> None:
-        self.name, self.kind = role.name, role.kind
+        self.name, self.kind, self.role = role.name, role.kind, role
         self._sensor = sensor
         self._samples = 0
         self._last_s: float | None = None
@@ -66,6 +67,8 @@ class SensorRole:
         now_s = asyncio.get_running_loop().time()
         if self._last_s is not None and now_s - self._last_s < SILENT_AFTER_S:
             return None
+        if self.kind == "compass" and (north := sensor.other_north) is not None:
+            return f'{sensor.line}: its headings are {north}, compass.reference is another; set reference = "{north}"'
         return f"{sensor.line}: {sensor.protocol} frames come, but none with {_WANTED[self.kind]}; is it set so?"
 
     def status(self) -> dict[str, object]:
@@ -122,6 +125,8 @@ class SerialSensor:
         """Called with (name, bytes, time) before they are decoded; without bytes: some are missing."""
         self._take, self._offload = take, offload
         self._by_role = dict(zip(device.roles, self.roles, strict=True))
+        self.other_north: str | None = None
+        """The north of headings that were refused because another one is configured."""
         self._spoke_s = -math.inf
         self._alone = False
         """Nobody else has the port open, as far as can be seen."""
@@ -170,6 +175,8 @@ class SerialSensor:
         self.health.stream.took(data, samples, t_s)
         if samples:
             for sample in samples:
+                if isinstance(sample, CompassSample) and any(role.refuses(sample) for role in self.device.roles):
+                    self.other_north = sample.north
                 for role, part in parts_of(sample, self.device.roles):
                     self._by_role[role].count(t_s)
                     self._take(role, part)

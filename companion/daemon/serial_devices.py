@@ -22,6 +22,12 @@ class Role:
 
     name: str
     kind: Kind
+    north: Literal["magnetic", "true"] | None = None
+    """The north that a compass' headings are configured to mean."""
+
+    def refuses(self, sample: Sample) -> bool:
+        """Whether this is a heading to another north than the configured one, by the device's own word."""
+        return self.north is not None and isinstance(sample, CompassSample) and sample.north not in (None, self.north)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -56,7 +62,7 @@ def _sections(config: Config) -> Iterator[tuple[Role, Imu | Gradienter | Compass
     if config.gradienter is not None:
         yield Role("gradienter", "gradienter"), config.gradienter
     if config.compass is not None:
-        yield Role("compass", "compass"), config.compass
+        yield Role("compass", "compass", config.compass.reference), config.compass
 
 
 def _device(port: str, used: Sequence[tuple[Role, Imu | Gradienter | Compass]]) -> SerialDevice:
@@ -76,7 +82,7 @@ def _device(port: str, used: Sequence[tuple[Role, Imu | Gradienter | Compass]]) 
 def parts_of(sample: Sample, roles: Sequence[Role]) -> Iterator[tuple[Role, Part]]:
     """What each role takes of a sample."""
     for role in roles:
-        if (part := part_for(role.kind, sample)) is not None:
+        if (part := part_for(role.kind, sample)) is not None and not role.refuses(sample):
             yield role, part
 
 

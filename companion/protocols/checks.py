@@ -21,7 +21,7 @@ def numbers(fields: list[bytes]) -> list[float]:
         RejectedError: one of them is not a number, or not a finite one.
     """
     try:
-        values = [float(field) for field in fields]
+        values = list(map(float, fields))
     except ValueError:
         raise RejectedError(NOT_A_NUMBER) from None
     # One test for all of them: whatever is not finite makes the sum so.

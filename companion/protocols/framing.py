@@ -39,9 +39,12 @@ class FrameDecoder(Decoder):
         samples: list[Sample] = []
         at, size = 0, len(buffer)
         while at < size:
+            accepted = self.accepted
             end = self._next(buffer, at, origin, samples)
             if end == WAIT:
                 break
+            if self.accepted != accepted:
+                self.frame_bytes = end - at
             at = end
         self._buffer = buffer[at:]
         while self._chunks and self._chunks[0][0] <= origin + at:

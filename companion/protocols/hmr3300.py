@@ -98,7 +98,7 @@ class Hmr3300Decoder(LineDecoder):
             raise RejectedError(OUT_OF_RANGE)
         if tilt_deg:
             self._triples, self._singles = min(self._triples + 1, _SURE), 0
-            return CompassSample(t_s, heading_deg, *tilt_deg)
+            return CompassSample(t_s, heading_deg, tilt_deg[0], tilt_deg[1])
         self._singles = min(self._singles + 1, _SURE)
         if self._triples == _SURE and self._singles < _SURE:
             raise RejectedError(SHAPE_CHANGED)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import struct
 from itertools import accumulate
-from typing import Final
+from typing import ClassVar, Final
 
 from companion.physics.units import G
 from companion.protocols.base import CHECKSUM, FIELD_COUNT, NOTHING_OF_USE, REPLY, RejectedError
@@ -33,6 +33,8 @@ _ABSENT: Final[Vector] = (0.0, 0.0, 0.0)
 
 class MipDecoder(FrameDecoder):
     """MIP packets; gives `ImuSample` and `MagSample`."""
+
+    device_clock_wraps_s: ClassVar[float | None] = 7 * 86400.0  # GPS time of week
 
     def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         if not buffer.startswith(_MARK, at):

@@ -15,8 +15,13 @@ from companion.protocols.hmr3300_dialogue import Hmr3300Dialogue
 from companion.protocols.imu_dialogues import MipDialogue, VectorNavDialogue, XsensDialogue
 from companion.protocols.imu_line import ImuLineDecoder
 from companion.protocols.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.inclinometer_xy_dialogue import InclinometerXyDialogue
+from companion.protocols.jewell import JewellDecoder
 from companion.protocols.mip import MipDecoder
+from companion.protocols.nmea import NmeaDecoder
+from companion.protocols.os5000 import Os5000Decoder
 from companion.protocols.pni import PniDecoder, PniDialogue
+from companion.protocols.polls import Hmr3000Dialogue, JewellDialogue
 from companion.protocols.rion import RionDecoder, RionDialogue
 from companion.protocols.stim300 import Stim300Decoder
 from companion.protocols.vectornav import VectorNavDecoder
@@ -62,7 +67,11 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
     "gradienter": {
         # MEAS DPG2, with the damping of the BEI INC (a decade a second). The P-series sends at 2400 baud, BEI with even
         # parity.
-        "inclinometer_xy": ProtocolInfo("inclinometer_xy", 9600, "none", InclinometerXyDecoder, lag_s=0.43),
+        "inclinometer_xy": ProtocolInfo(
+            "inclinometer_xy", 9600, "none", InclinometerXyDecoder, InclinometerXyDialogue, lag_s=0.43
+        ),
+        # MD900-T; a LILY comes set to 19200 baud. How long its fluid takes is not documented.
+        "jewell": ProtocolInfo("jewell", 9600, "none", JewellDecoder, JewellDialogue),
         # Honeywell: null 0.4 deg, 0.5 deg to 30 deg of tilt. Not in it: 1 deg of thermal hysteresis at the most.
         "hmr3300": ProtocolInfo(
             "hmr3300", 19200, "none", Hmr3300Decoder, Hmr3300Dialogue, sigma_deg=math.hypot(0.4, 0.5), law="euler"
@@ -74,6 +83,8 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
         "witmotion": ProtocolInfo("witmotion", 9600, "none", WitMotionDecoder, sigma_deg=0.2, law="euler"),
         # The slowest of its filters, 16 Hz at -3 dB: 1 / (2 pi 16 Hz).
         "stim300": ProtocolInfo("stim300", 921600, "none", Stim300Decoder, lag_s=0.01),
+        "nmea": ProtocolInfo("nmea", 19200, "none", NmeaDecoder, Hmr3000Dialogue, lag_s=0.29, law="axis"),
+        "os5000": ProtocolInfo("os5000", 19200, "none", Os5000Decoder),
     },
     "compass": {
         # Honeywell: 1 deg rms level, 3 deg to 30 deg of tilt.
@@ -83,6 +94,10 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
         # 38400 is what public drivers of the TRAX open; no document of PNI's that says so was found.
         "pni": ProtocolInfo("pni", 38400, "none", PniDecoder, PniDialogue),
         "rion": ProtocolInfo("rion", 9600, "none", RionDecoder, RionDialogue),
+        # An HMR3000, with its first filter's usual time constant of 4 steps of 72 ms. NMEA 0183 itself has 4800 baud.
+        "nmea": ProtocolInfo("nmea", 19200, "none", NmeaDecoder, Hmr3000Dialogue, lag_s=0.29),
+        # OceanServer: 0.5 deg rms level, 1 deg to 30 deg of tilt.
+        "os5000": ProtocolInfo("os5000", 19200, "none", Os5000Decoder, sigma_deg=0.5, tilted_sigma_deg=1.0),
     },
 }
 

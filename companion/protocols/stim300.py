@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Final
+from typing import ClassVar, Final
 
 from companion.physics.units import DEG, G
 from companion.protocols.base import (
@@ -72,6 +72,8 @@ class Stim300Decoder(FrameDecoder):
     There is no start mark: after a loss the next datagram is the next one whose CRC is right, and the bytes before it
     are counted as skipped. A tilt that cannot be used is counted, though the datagram may have given an `ImuSample`.
     """
+
+    sequence_modulus: ClassVar[int | None] = 256
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)

@@ -23,7 +23,7 @@ from companion.protocols.base import (
     RejectedError,
     body_of_sentence,
 )
-from companion.protocols.checks import check_attitude, check_imu, check_vector, numbers
+from companion.protocols.checks import check_attitude, check_imu, numbers
 from companion.protocols.framing import WAIT, FrameDecoder
 from companion.protocols.vectornav_binary import Layout, header_bytes, layout_of
 from companion.samples import AttitudeSample, ImuSample, MagSample, Sample
@@ -37,6 +37,8 @@ _DOLLAR = ord("$")
 _START = re.compile(rb"[\xfa$]")
 _END_OF_TEXT = re.compile(rb"[^ -#%-~]")
 """The first byte that cannot be inside a sentence: a line end, a "$", or nothing printable."""
+_TEXT = bytes(set(range(0x20, 0x7F)) - {_DOLLAR})
+"""All others."""
 
 _REPLIES = frozenset((b"VNRRG", b"VNWRG", b"VNWNV", b"VNRFS", b"VNRST", b"VNTAR", b"VNASY", b"VNSGB", b"VNCMD"))
 
@@ -103,18 +105,21 @@ class VectorNavDecoder(FrameDecoder):
             self.skipped += 1
             return at + 1
         limit = at + 1 + SENTENCE_LIMIT
-        match = _END_OF_TEXT.search(buffer, at + 1, limit)
-        if match is None:
-            if len(buffer) < limit:
-                return WAIT
-            self.rejected[TOO_LONG] += 1
-            return at + 1
-        end = match.start()
-        if buffer[end] not in b"\r\n":
-            self.rejected[CUT_SHORT] += 1
-            return end
+        end = buffer.find(b"\r", at + 1, limit)
+        # Deleting all that may be in a sentence is quicker than looking for what may not; it is nearly always whole.
+        if end < 0 or buffer[at + 1 : end].translate(None, _TEXT):
+            match = _END_OF_TEXT.search(buffer, at + 1, limit)
+            if match is None:
+                if len(buffer) < limit:
+                    return WAIT
+                self.rejected[TOO_LONG] += 1
+                return at + 1
+            end = match.start()
+            if buffer[end] not in b"\r\n":
+                self.rejected[CUT_SHORT] += 1
+                return end
         try:
-            samples += _decode(buffer[at + 1 : end], self._time_of(origin + end + 1))
+            samples += _decode(buffer[at:end], self._time_of(origin + end + 1))
             self.accepted += 1
         except RejectedError as error:
             self.rejected[error.reason] += 1
@@ -122,12 +127,13 @@ class VectorNavDecoder(FrameDecoder):
 
 
 def _decode(sentence: bytes, t_s: float) -> list[Sample]:
-    """The samples in one sentence, `VN...*hh`.
+    """The samples in one sentence, `$VN...*hh`.
 
     Raises:
         RejectedError: wrong checksum, not a measurement that is used here, or values that cannot be.
     """
-    head, *fields = body_of_sentence(sentence).split(b",")
+    fields = body_of_sentence(sentence).split(b",")
+    head = fields[0]
     if head == b"VNYMR":
         return _decode_ymr(fields, t_s)
     if head == b"VNIMU":
@@ -138,23 +144,23 @@ def _decode(sentence: bytes, t_s: float) -> list[Sample]:
 
 
 def _decode_ymr(fields: list[bytes], t_s: float) -> list[Sample]:
-    if len(fields) != 12:
+    if len(fields) != 13:
         raise RejectedError(FIELD_COUNT)
-    yaw_deg, pitch_deg, roll_deg, mx, my, mz, ax, ay, az, gx, gy, gz = numbers(fields)
+    yaw_deg, pitch_deg, roll_deg, mx, my, mz, ax, ay, az, gx, gy, gz = numbers(fields[1:])
+    gyro_rad_s, accel_m_s2, field_gauss = (gx, gy, gz), (ax, ay, az), (mx, my, mz)
     check_attitude(yaw_deg, pitch_deg, roll_deg)
-    check_imu((gx, gy, gz), (ax, ay, az), None)
-    check_vector((mx, my, mz))
+    check_imu(gyro_rad_s, accel_m_s2, None)
     return [
-        ImuSample(t_s, (gx, gy, gz), (ax, ay, az)),
+        ImuSample(t_s, gyro_rad_s, accel_m_s2),
         AttitudeSample(t_s, yaw_deg, pitch_deg, roll_deg),
-        MagSample(t_s, (mx, my, mz)),
+        MagSample(t_s, field_gauss),
     ]
 
 
 def _decode_imu(fields: list[bytes], t_s: float) -> list[Sample]:
-    if len(fields) != 11:
+    if len(fields) != 12:
         raise RejectedError(FIELD_COUNT)
-    mx, my, mz, ax, ay, az, gx, gy, gz, temperature_degc, _pressure_kpa = numbers(fields)
-    check_imu((gx, gy, gz), (ax, ay, az), temperature_degc)
-    check_vector((mx, my, mz))
-    return [ImuSample(t_s, (gx, gy, gz), (ax, ay, az), temperature_degc), MagSample(t_s, (mx, my, mz))]
+    mx, my, mz, ax, ay, az, gx, gy, gz, temperature_degc, _pressure_kpa = numbers(fields[1:])
+    gyro_rad_s, accel_m_s2 = (gx, gy, gz), (ax, ay, az)
+    check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
+    return [ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc), MagSample(t_s, (mx, my, mz))]

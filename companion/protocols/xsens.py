@@ -15,7 +15,7 @@ its base with X forward becomes forward, right, down by the mounting ROTATION_RO
 from __future__ import annotations
 
 import struct
-from typing import Final
+from typing import ClassVar, Final
 
 from companion.protocols.base import (
     CHECKSUM,
@@ -54,6 +54,9 @@ _FLOAT32 = struct.Struct(">3f")
 
 class XsensDecoder(FrameDecoder):
     """MTData2 messages; gives `ImuSample`, and `MagSample` with counts for want of a unit."""
+
+    device_clock_wraps_s: ClassVar[float | None] = 2**32 / _TICKS_A_SECOND
+    sequence_modulus: ClassVar[int | None] = 2**16
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)

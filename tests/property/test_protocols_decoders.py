@@ -15,12 +15,15 @@ from hypothesis import strategies as st
 from companion.protocols import mip as mip_protocol
 from companion.protocols import stim300_datagrams
 from companion.protocols import xsens as xsens_protocol
-from companion.protocols.base import Decoder, LineDecoder, xor_checksum
+from companion.protocols.base import Decoder, LineDecoder, SentenceDecoder, xor_checksum
 from companion.protocols.framing import FrameDecoder
 from companion.protocols.hmr3300 import Hmr3300Decoder
 from companion.protocols.imu_line import ImuLineDecoder
 from companion.protocols.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.jewell import JewellDecoder
 from companion.protocols.mip import MipDecoder
+from companion.protocols.nmea import NmeaDecoder
+from companion.protocols.os5000 import Os5000Decoder
 from companion.protocols.pni import LONGEST as PNI_LONGEST
 from companion.protocols.pni import PniDecoder
 from companion.protocols.rion import LONGEST as RION_LONGEST
@@ -60,7 +63,15 @@ from tests.support.frames import (
 )
 
 SECONDS_PER_BYTE = 1 / 1024  # exact in binary, so that times can be compared exactly
-DECODERS: list[type[Decoder]] = [Hmr3300Decoder, InclinometerXyDecoder, ImuLineDecoder, VectorNavDecoder]
+DECODERS: list[type[Decoder]] = [
+    Hmr3300Decoder,
+    InclinometerXyDecoder,
+    ImuLineDecoder,
+    VectorNavDecoder,
+    NmeaDecoder,
+    Os5000Decoder,
+    JewellDecoder,
+]
 DECODERS += [PniDecoder, RionDecoder, WitMotionDecoder]
 DECODERS += [MipDecoder, XsensDecoder, Stim300Decoder]
 
@@ -141,7 +152,41 @@ stim_datagrams = st.one_of(
     ),
     st.sampled_from([stim_configuration(code) for code in range(8)] + [b"\r\n", b"\x93", b"\xd1\0\0"]),
 )
+tilt = st.integers(-900, 900).map(lambda n: f"{n / 10:.1f}")
+circle = st.integers(0, 3599).map(lambda n: f"{n / 10:.1f}")
+nmea_lines = st.one_of(
+    st.builds(lambda h, d, side: sentence(f"HCHDG,{h},{d},{side},,"), circle, circle, st.sampled_from("EW")),
+    st.builds(
+        lambda kind, h: sentence(f"II{kind[:3]},{h},{kind[3]}"), st.sampled_from(["HDMM", "HDTT", "THSA"]), circle
+    ),
+    st.builds(lambda h, p, r: sentence(f"PTNTHPR,{h},N,{p},N,{r},N"), circle, tilt, tilt),
+    st.builds(lambda p, r, h: sentence(f"PTNTCCD,{p},{r},1,2,3,4,{h}"), st.integers(), st.integers(), circle),
+    st.builds(lambda p, r: sentence(f"HCXDR,A,{p},D,PITCH,A,{r},D,ROLL,G,1,,MAGX,G,2,,MAGY,G,3,,MAGZ"), tilt, tilt),
+    st.sampled_from([b"$HCHDM,1.0,M*00\r\n", sentence("PTNTHPR,,P,1.0,N,1.0,N"), sentence("GPHDT,nan,T"), b"$", b"\r"]),
+)
+tagged_lines = st.one_of(
+    st.builds(lambda h, p, r: sentence(f"C{h}P{p}R{r}T20.0"), circle, tilt, tilt),
+    st.builds(lambda p, r, x: sentence(f"P{p}R{r}Mx{x}My1.0Mz-1.0"), tilt, tilt, tilt),
+    st.sampled_from([sentence("C360.0"), sentence("C1.0P0.0R180.0"), sentence("C1.0P0.0R181.0"), b"$C1.0P", b"$"]),
+)
+jewell_lines = st.one_of(
+    st.builds(lambda x, y: f"${x:07.3f},{y:07.3f},018.910,N0000\r\n".encode(), thousandths, thousandths),
+    st.builds(
+        lambda x, y, unit: sentence(f"YXXDR,A,{y:07.3f},{unit},N,A,{x:07.3f},{unit},E,C,021.651,C,T-N0000"),
+        thousandths,
+        thousandths,
+        st.sampled_from("DM"),
+    ),
+    st.builds(lambda p, r: sentence(f"P{p:07.3f}R{r:07.3f}"), thousandths, thousandths),
+    st.integers(-330, 330).map(
+        lambda x: f"LILY,2013/06/24 23:22:00,{x:8.3f},  25.666,194.25, 26.01,11.96,N9655\n".encode()
+    ),
+    st.sampled_from([b"ERR XY-SO PARSE ERROR\r\n", b"$-0.619,0.023,18.910,N0000\r\n", b"IRIS,", b"$", b"\r\n"]),
+)
 FRAMES: dict[type[Decoder], st.SearchStrategy[bytes]] = {
+    NmeaDecoder: nmea_lines,
+    Os5000Decoder: tagged_lines,
+    JewellDecoder: jewell_lines,
     Hmr3300Decoder: hmr_lines,
     InclinometerXyDecoder: xy_lines,
     ImuLineDecoder: imu_lines,
@@ -190,7 +235,7 @@ def feed_in(decoder: Decoder, stream: bytes, cuts: list[int]) -> list[Sample]:
 def held_bytes(decoder: Decoder) -> int:
     if isinstance(decoder, FrameDecoder):
         return len(decoder._buffer)
-    assert isinstance(decoder, LineDecoder | ImuLineDecoder)
+    assert isinstance(decoder, LineDecoder | SentenceDecoder)
     return len(decoder._partial)
 
 
@@ -209,7 +254,7 @@ LIMITS: dict[type[Decoder], int] = {
 def limit_of(decoder: Decoder) -> int:
     if type(decoder) in LIMITS:
         return LIMITS[type(decoder)]
-    assert isinstance(decoder, LineDecoder | ImuLineDecoder)
+    assert isinstance(decoder, LineDecoder | SentenceDecoder)
     return decoder.LIMIT
 
 
@@ -246,12 +291,13 @@ def test_nothing_raises_and_what_waits_is_bounded(kind: type[Decoder], data: st.
 
 def is_sane(sample: Sample) -> bool:
     """Finite everywhere, angles within their circles."""
-    values = [x for x in msgspec.structs.astuple(sample) if x is not None]
+    values = [x for x in msgspec.structs.astuple(sample) if x is not None and not isinstance(x, str)]
     flat = [x for value in values for x in (value if isinstance(value, tuple) else (value,))]
     if not all(x == x and abs(x) != float("inf") for x in flat):
         return False
     if isinstance(sample, CompassSample):
-        return 0 <= sample.heading_deg < 360 and abs(sample.pitch_deg or 0) <= 90 and abs(sample.roll_deg or 0) <= 90
+        # An accelerometer compass may lie on its back.
+        return 0 <= sample.heading_deg < 360 and abs(sample.pitch_deg or 0) <= 90 and abs(sample.roll_deg or 0) <= 180
     return not isinstance(sample, TiltSample) or max(abs(sample.x_deg), abs(sample.y_deg)) <= 90
 
 
@@ -267,6 +313,9 @@ GOOD: dict[type[Decoder], bytes] = {
     # With a temperature: one that came before is held.
     XsensDecoder: mtdata2([(0x0810, big_floats(25)), (0x4020, big_floats(0, 1, 9)), (0x8020, big_floats(1, 2, 3))]),
     Stim300Decoder: stim300(0x92),
+    NmeaDecoder: sentence("PTNTHPR,91.7,N,-0.5,N,1.6,N"),
+    Os5000Decoder: sentence("C320.5P0.2R-18.3T19.0"),
+    JewellDecoder: b"$-00.619,000.023,018.910,N0000\r\n",
 }
 
 

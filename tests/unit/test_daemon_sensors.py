@@ -30,7 +30,7 @@ from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import HMR3300
 from sim.pty_device import PtyDevice
 from sim.scenario import site_at
-from tests.support.frames import pni_data
+from tests.support.frames import pni_data, sentence
 from tests.support.virtual_time import run_virtual
 
 LINES = b"40.1, 5.0, -3.0\r\n40.2, 5.1, -3.1\r\n"
@@ -126,6 +126,24 @@ def test_a_device_is_decoded_once_and_every_role_takes_what_it_needs() -> None:
         assert (tilt.x_deg, tilt.y_deg, heading.heading_deg) == (-3.0, 5.0, 40.1)
         assert tilt.t_s == heading.t_s
         assert sensor.decoder.accepted == 2
+
+    run_virtual(main())
+
+
+def test_headings_to_another_north_than_the_configured_one_are_refused_in_words() -> None:
+    async def main() -> None:
+        info = PROTOCOLS["compass"]["nmea"]
+        role = Role("compass", "compass", "magnetic")
+        sensor, _, taken = opened(SerialDevice("/nowhere", info, 19200, "none", read_only=True, roles=(role,)))
+        now_s = asyncio.get_running_loop().time
+        sensor.receive(sentence("HEHDT,86.2,T"), now_s())
+        assert taken == []
+        status = sensor.roles[0].status()
+        assert not status["good"]
+        assert 'its headings are true, compass.reference is another; set reference = "true"' in str(status["summary"])
+        sensor.receive(sentence("HEHDM,92.0,M") + sentence("PTNTHPR,92.0,N,1.0,N,2.0,N"), now_s())
+        assert [part.heading_deg for _, part in taken if isinstance(part, CompassSample)] == [92.0, 92.0]
+        assert sensor.roles[0].status()["good"]
 
     run_virtual(main())
 

@@ -62,6 +62,26 @@ def stim_right_down_deg(n: int) -> float:
     return math.asin((n << 10) / math.hypot(0, n << 10, 1 << 22)) / (math.pi / 180)
 
 
+def hpr(n: int) -> bytes:
+    return sentence(f"PTNTHPR,{n / 10:.1f},N,-1.5,N,{n % 60 / 10:.1f},N")
+
+
+def tagged(n: int) -> bytes:
+    return sentence(f"C{n / 10:.1f}P-1.5R{n % 60 / 10:.1f}T19.0Mx-80.45My160.86Mz450.00")
+
+
+def sim(n: int) -> bytes:
+    return f"${n / 100:07.3f},-00.084,018.910,N1234\r\n".encode()
+
+
+def xdr(n: int) -> bytes:
+    return sentence(f"YXXDR,A,-00.084,D,N,A,{n / 100:07.3f},D,E,C,018.910,C,T-N1234")
+
+
+def lily(n: int) -> bytes:
+    return f"LILY,2013/06/24 23:22:00,{n / 2:8.3f},  25.666,194.25, 26.01,11.96,N9655\r\n".encode()
+
+
 DEVICES = [
     Device("imu", "imu_line", lambda n: imu_line(n, n * 2500, accel=(n / 100, 0, -9.8)), lambda n: n / 100, 1),
     Device("imu", "vectornav", lambda n: vectornav_imu(accel=(n / 4, 0, -9.75)), lambda n: n / 4, crc=True),
@@ -76,6 +96,12 @@ DEVICES = [
     Device("compass", "rion", lambda n: rion_angles(10.5, -10.05, n / 4), lambda n: n / 4),
     Device("imu", "witmotion", lambda n: wit_imu((n, 0, 2048)), lambda n: n * (16 * 9.80665 / 32768), held=1),
     Device("gradienter", "witmotion", lambda n: wit(0x53, n, 3, 4), lambda n: n * 180 / 32768, held=1),
+    Device("compass", "nmea", lambda n: sentence(f"HCHDG,{n / 10:.1f},,,,"), lambda n: n / 10, 1),
+    Device("compass", "nmea", hpr, lambda n: n / 10, 1),
+    Device("compass", "os5000", tagged, lambda n: n / 10, 1),
+    Device("gradienter", "jewell", sim, lambda n: n / 100),
+    Device("gradienter", "jewell", xdr, lambda n: n / 100),
+    Device("gradienter", "jewell", lily, lambda n: math.degrees(n / 2 * 1e-6)),
 ]
 
 

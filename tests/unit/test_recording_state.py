@@ -18,7 +18,9 @@ from companion.protocols.registry import PROTOCOLS, Kind, make_decoder
 from companion.recording.state import freeze, from_json, to_json
 from sim.aircraft import VirtualAircraft
 from sim.binary_imus import MipImu, Stim300, XsensImu
+from sim.compasses import NmeaCompass, Os5000
 from sim.devices import HMR3300, Gradienter, SerialDevice, VectorNavBinary
+from sim.gradienters import Jewell
 from sim.imu_model import ImuModel
 from sim.pni import PniCompass
 from sim.rion import RionCompass
@@ -45,6 +47,9 @@ def stream(protocol: str) -> bytes:
             "pni": lambda: PniCompass(aircraft, seed=1, continuous=True),
             "rion": lambda: RionCompass(aircraft, seed=1, automatic=True),
             "witmotion": lambda: WitMotionImu(ImuModel(aircraft, "adis16470", seed=1)),
+            "jewell": lambda: Jewell(aircraft, seed=1, output="XDR"),
+            "nmea": lambda: NmeaCompass(aircraft, seed=1, sentences=("HDT", "HDG", "XDR", "HPR")),
+            "os5000": lambda: Os5000(aircraft, seed=1, vectors=True),
         }
         device = makers[protocol]()
         device.power_on(0.0)

@@ -1,0 +1,90 @@
+"""Jewell tiltmeters: four output formats and two logged ones, which axis comes first, and the rail."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from companion.protocols.jewell import JewellDecoder
+from companion.samples import Sample, TiltSample
+from tests.support.frames import sentence
+
+
+def feed(data: bytes) -> tuple[list[Sample], dict[str, int]]:
+    decoder = JewellDecoder()
+    return decoder.feed(data, 1.0), dict(decoder.rejected)
+
+
+# As printed: Tuff Tilt Digital manual, p. 12 and 15; D700 manual, p. 14; the last two as logged at sea.
+@pytest.mark.parametrize(
+    ("line", "sample"),
+    [
+        ("$-00.619,000.023,018.910,N0000", TiltSample(1.0, -0.619, 0.023, 18.91)),
+        ("$-00.620,000.024,018.932,N0000", TiltSample(1.0, -0.62, 0.024, 18.932)),
+        ("$-0.619,0.023,18.923,N0000", TiltSample(1.0, -0.619, 0.023, 18.923)),
+        ("$YXXDR,A,000.034,D,N,A,-00.625,D,E,C,021.651,C,T-N0000*47", TiltSample(1.0, -0.625, 0.034, 21.651)),
+        ("$YXXDR,A,000.034,D,N,A,-00.624,D,E,C,021.675,C,T-N0000*40", TiltSample(1.0, -0.624, 0.034, 21.675)),
+        ("$YXXDR,A,000.034,D,N,A,-00.624,D,E,C,021.686,C,T-N0000*4C", TiltSample(1.0, -0.624, 0.034, 21.686)),
+        ("$YXXDR,A,000.034,D,N,A,-00.625,D,E,C,021.707,C,T-N0000*45", TiltSample(1.0, -0.625, 0.034, 21.707)),
+        ("$YXXDR,A,-00.920,D,N,A,-00.210,D,E,C,030.045,C,T-N1212*57", TiltSample(1.0, -0.21, -0.92, 30.045)),
+        ("$PASHS,XDR,A,004.261,D,N,A,004.280,D,E,C,021.288,C,T-N1346", TiltSample(1.0, 4.28, 4.261, 21.288)),
+        ("$P-00.907R002.186*1C", TiltSample(1.0, 2.186, -0.907)),
+        ("$P-00.906R002.183*18", TiltSample(1.0, 2.183, -0.906)),
+        ("$P-00.905R002.190*19", TiltSample(1.0, 2.19, -0.905)),
+        ("IRIS,2013/05/29 00:25:34, -0.0882, -0.7524,28.45,N8642", TiltSample(1.0, -0.0882, -0.7524, 28.45)),
+        (
+            "LILY,2013/06/24 23:22:00,-236.026,  25.666,194.25, 26.01,11.96,N9655",
+            TiltSample(1.0, math.degrees(-236.026e-6), math.degrees(25.666e-6), 26.01),
+        ),
+    ],
+)
+@pytest.mark.parametrize("end", ["\r\n", "\n"])
+def test_lines_as_printed(line: str, sample: TiltSample, end: str) -> None:
+    assert feed((line + end).encode()) == ([sample], {})
+
+
+def test_microradians() -> None:
+    ((sample,), _) = feed(sentence("YXXDR,A,-100.000,M,N,A,8726.646,M,E,C,021.651,C,T-N0000"))
+    assert isinstance(sample, TiltSample)
+    assert (sample.x_deg, sample.y_deg) == pytest.approx((0.5, -0.00572958), abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("LILY,2013/06/24 23:22:00,-202.490,-330.000,149.88, 26.01,11.96,N9655", "over range"),
+        ("LILY,2013/06/24 23:22:00, 330.000,   1.000,149.88, 26.01,11.96,N9655", "over range"),
+        ("LILY,2013/06/24 23:22:00, 331.500,   1.000,149.88, 26.01,11.96,N9655", "over range"),
+        (sentence("YXXDR,A,-330.000,M,N,A,001.000,M,E,C,021.651,C,T-N0000").decode().strip(), "over range"),
+        (sentence("YXXDR,A,095.000,D,N,A,001.000,D,E,C,021.651,C,T-N0000").decode().strip(), "out of range"),
+        (sentence("YXXDR,A,1.2.3,D,N,A,001.000,D,E,C,021.651,C,T-N0000").decode().strip(), "not a measurement"),
+        ("$YXXDR,A,000.034,D,N,A,-00.625,D,E,C,021.651,C,T-N0000*48", "checksum"),
+        ("$YXXDR,A,000.034,D,N,A,-00.625,D,E,C,021.651,C,T-N0000", "no checksum"),
+        ("$P-00.907R002.186*1D", "checksum"),
+        ("$095.000,000.023,018.910,N0000", "out of range"),
+        # A digit has been lost on the way: padded numbers and others do not mix.
+        ("$-0.619,000.023,018.910,N0000", "not a measurement"),
+        ("$-00.619,00.023,018.910,N0000", "not a measurement"),
+        ("$-00.61,000.023,018.910,N0000", "not a measurement"),
+        ("$-00.619,000.023,018.910,0000", "not a measurement"),
+        ("$-00.619,000.023,018.910", "not a measurement"),
+        ("LILY,2013/06/24 23:22:00,-23.026,  25.666,194.25, 26.01,11.96,N9655", "not a measurement"),
+        ("PASHS,XDR,A,004.261,D,N,A,004.280,D,E,C,021.288,C,T-N1346", "not a measurement"),
+        ("$start:11-11-1997 18:43:09 4/sec", "not a measurement"),
+        ("ERR XY-SO BAD PARAMETER", "command refused"),
+        ("$-00.619,000.0\r23,018.910,N0000", "line end"),
+        ("$-00.619,000.0\u00023,018.910,N0000", "not a measurement"),
+        ("$-00.619,000.0\u00003,018.910,N0000", "parity"),
+        ("$" + "1" * 120, "too long"),
+    ],
+)
+def test_what_is_rejected_and_why(line: str, reason: str) -> None:
+    assert feed((line + "\r\n").encode()) == ([], {reason: 1})
+
+
+def test_a_line_that_has_lost_its_end_does_not_harm_the_next() -> None:
+    good = b"$-00.619,000.023,018.910,N0000\r\n"
+    samples, rejected = feed(good[:12] + good + b"garbage" + good)
+    assert samples == [TiltSample(1.0, -0.619, 0.023, 18.91)] * 2
+    assert rejected == {"cut short": 1, "not a measurement": 1}
