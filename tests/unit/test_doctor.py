@@ -79,8 +79,8 @@ def board(tmp_path: Path) -> Board:
     return made
 
 
-def faults(board: Board, port: str, **more: bool) -> list[str]:
-    return [str(fault) for fault in port_faults(port, root=board.root, **more)]
+def faults(board: Board, port: str) -> list[str]:
+    return [str(fault) for fault in port_faults(port, root=board.root)]
 
 
 def config(
@@ -155,7 +155,7 @@ def test_the_ftdi_timer_is_wrong_for_an_imu_and_a_remark_for_a_gradienter(board:
     (fault,) = port_faults(FTDI_ID, is_fast=True, root=board.root)
     assert not fault.good
     assert "16 ms" in fault.words
-    assert "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer" in fault.remedy
+    assert "sudo sh -c 'echo 1 > /sys/bus/usb-serial/devices/ttyUSB0/latency_timer'" in fault.remedy
     (fault,) = port_faults(FTDI_ID, root=board.root)
     assert fault.good
     (finding,) = system_findings(config(), [], board.root)
