@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from companion.config import Config, parse
-from companion.daemon.doctor import Diagnosis, system_findings
+from companion.daemon.doctor import system_findings, where_it_may_be
 from companion.links.port_faults import PortFault, port_faults, same_ports
 from companion.links.ports import lasting_name, latency_timer_ms
 from tests.support.usb_tree import UsbTree
@@ -189,12 +189,13 @@ def test_one_port_under_two_names(board: Board) -> None:
 
 
 def test_a_port_that_is_gone_is_told_which_are_there(board: Board) -> None:
-    found: list[Diagnosis] = system_findings(config(gradienter="/dev/ttyUSB7"), [], board.root)
-    (gone,) = [one for one in found if one.port == "/dev/ttyUSB7"]
-    assert gone.name == "gradienter"
-    assert "platform-soc-usb-0:1.2:1.0-port0" in gone.words
-    assert FTDI_ID not in gone.words, "that one is the IMU's"
-    assert gone.remedy == "companion ports --listen"
+    gone = config(gradienter="/dev/ttyUSB7")
+    assert system_findings(gone, [], board.root) == [], "its own line says that it is gone"
+    found = where_it_may_be(gone, board.root)
+    assert found is not None
+    assert "platform-soc-usb-0:1.2:1.0-port0" in found.words
+    assert FTDI_ID not in found.words, "that one is the IMU's"
+    assert found.remedy == "companion ports --listen"
 
 
 def test_the_autopilots_port_is_looked_at_too(board: Board) -> None:
