@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 
 import pytest
 
 from companion.config import Config, parse
-from companion.daemon.doctor import system_findings, where_it_may_be
+from companion.daemon.doctor import sensor_findings, system_findings, where_it_may_be
 from companion.links.port_faults import PortFault, port_faults, same_ports
 from companion.links.ports import lasting_name, latency_timer_ms
 from tests.support.usb_tree import UsbTree
@@ -178,6 +179,28 @@ def test_the_mini_uart_of_a_raspberry_pi(board: Board) -> None:
     assert fault == PortFault(fault.words, fault.remedy, good=True)
     assert "mini-UART" in fault.words
     assert "dtoverlay=disable-bt" in fault.remedy
+
+
+def device(name: str, speaks: str | None, trouble: str | None = "undecodable") -> dict[str, object]:
+    return {"name": name, "trouble": trouble, "speaks": speaks}
+
+
+def test_what_a_running_daemon_has_understood_is_explained_without_opening_anything() -> None:
+    both = config(imu="tcp://127.0.0.1:4001")
+
+    def found(*devices: dict[str, object]) -> list[tuple[str, str]]:
+        findings = asyncio.run(sensor_findings(both, {"devices": list(devices)}, may_listen=False))
+        return [(finding.name, finding.words) for finding in findings]
+
+    assert found(device("own", None, None), device("gradienter", None, None)) == []
+    ((name, words),) = found(device("own", "inclinometer_xy"), device("gradienter", "vectornav"))
+    assert name == "ports"
+    assert words == ("own's port speaks inclinometer_xy, gradienter's port speaks vectornav: swap the two port lines")
+    ((name, words),) = found(device("own", "imu_line"), device("gradienter", None, None))
+    assert (name, words) == ("own", 'this is imu_line, not vectornav: set protocol = "imu_line" in [[imu]] "own"')
+    ((name, words),) = found(device("own", None, "damaged"), device("gradienter", None, "damaged"))
+    assert name == "gradienter", "of tcp:// there is no speed to try"
+    assert "sudo systemctl stop companion" in words
 
 
 def test_one_port_under_two_names(board: Board) -> None:
