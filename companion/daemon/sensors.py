@@ -84,6 +84,8 @@ class SerialSensor:
         """For `companion status` and `check`."""
         problem = self.problem
         summary = problem or f"{self.protocol} on {self.link.settings.url}, {self._rate_hz:.0f} frames/s"
+        if problem is None and self.health.counts:
+            summary += f"; so far {', '.join(f'{count} {key}' for key, count in self.health.counts.items())}"
         return {
             "name": self.name,
             "kind": self.kind,
