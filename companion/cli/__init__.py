@@ -106,8 +106,9 @@ def _parser() -> Parser:
         "--listen",
         nargs="*",
         metavar="PORT",
-        help="tell who speaks on these ports (default: all that nobody holds) by listening at the usual speeds, up to"
-        " half a minute; not a byte is sent, but opening a port raises DTR, which starts an Arduino anew",
+        help="tell who speaks on these ports (default: all that nobody holds and no console uses) by listening at the"
+        " usual speeds, up to half a minute; not a byte is sent, but opening a port raises DTR, which starts an Arduino"
+        " anew",
     )
     add(
         "lua",

@@ -59,7 +59,8 @@ async def _listen(wanted: Sequence[str], found: Sequence[SerialPort]) -> dict[st
         except LinkError as error:
             return str(error)
 
-    names = list(wanted) or [port.stable_name or port.device for port in found]
+    # What is said to a console's port is a login, and what comes from it is no sensor.
+    names = list(wanted) or [port.stable_name or port.device for port in found if not port.is_console]
     if names:
         print(f"listening to {', '.join(names)}: up to half a minute", file=sys.stderr, flush=True)
     return dict(zip(names, await asyncio.gather(*map(one, names)), strict=True))

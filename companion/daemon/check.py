@@ -5,15 +5,15 @@ With a daemon running the ports are its, so it is asked; otherwise every port is
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 import os
 from pathlib import Path
 
 from companion.config import Config
 from companion.daemon.control import Object, ask, process_behind
-from companion.daemon.doctor import Diagnosis, sensor_findings, system_findings
+from companion.daemon.doctor import Diagnosis, sensor_findings, system_findings, where_it_may_be
 from companion.daemon.models import doubtful, not_in_this_version
+from companion.daemon.sensor_health import ABSENT
 from companion.daemon.service import Service
 from companion.errors import DaemonDeniedError, DaemonUnreachableError
 
@@ -49,7 +49,7 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
         pass
     is_running = status is not None
     if status is not None:
-        ours |= await asyncio.to_thread(process_behind, config.control.path)
+        ours |= process_behind(config.control.path)
         fault = status["fault"]
         findings.append(Finding("daemon", good=fault is None, words=fault or f"running, {status['state']}"))
     else:
@@ -60,8 +60,9 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
     findings += [Finding("warning", good=True, words=words) for words in doubtful(config)]
     vehicle = status["vehicle"]
     findings.append(Finding("autopilot", good=vehicle["system_id"] is not None, words=vehicle["summary"]))
-    findings += [Finding(device["name"], device["good"], device["summary"]) for device in status["devices"]]
-    diagnoses = await asyncio.to_thread(system_findings, config, list(ours))
+    elsewhere = where_it_may_be(config)
+    findings += [_device(device, elsewhere) for device in status["devices"]]
+    diagnoses = system_findings(config, list(ours))
     diagnoses += await sensor_findings(config, status, may_listen=not is_running)
     findings += map(_found, diagnoses)
     findings += [Finding("warning", good=True, words=words) for words in status["warnings"]]
@@ -76,6 +77,14 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
             without = {"gradienter": "gyros only", "compass": "gyro sigma widened by the Earth's rate"}[kind]
             findings.append(Finding(kind, good=True, words=f"not configured: {without}"))
     return findings
+
+
+def _device(device: Object, elsewhere: Diagnosis | None) -> Finding:
+    """How a device does by its own account; and where it may be, if it is not where it should."""
+    name, words, port = device["name"], device["summary"], device.get("port", "")
+    if device.get("trouble") == ABSENT and port.startswith("/") and not os.path.exists(port) and elsewhere is not None:
+        return Finding(name, good=False, words=f"{words}; {elsewhere.words}", remedy=elsewhere.remedy, port=port)
+    return Finding(name, device["good"], words, port=port)
 
 
 def _found(diagnosis: Diagnosis) -> Finding:

@@ -62,12 +62,27 @@ def configured_sensors(config: Config) -> list[Configured]:
     ]
 
 
+def _ports(config: Config) -> dict[str, str]:
+    """Ports of this machine, by the names of those that use them."""
+    ports = {sensor.name: sensor.port for sensor in configured_sensors(config) if sensor.is_serial}
+    if config.mavlink.url.startswith("serial:"):
+        ports["autopilot"] = config.mavlink.url.removeprefix("serial:").rpartition(":")[0]
+    return ports
+
+
+def where_it_may_be(config: Config, root: Path = ROOT) -> Diagnosis | None:
+    """Where a device may be whose port is not there; None where nothing else is plugged in."""
+    free = unnamed(list_ports(root), list(_ports(config).values()), root)
+    if not free:
+        return None
+    words = f"nobody names {', '.join(free)}: companion ports --listen tells who speaks there"
+    return Diagnosis("ports", good=False, words=words, remedy="companion ports --listen")
+
+
 def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> list[Diagnosis]:
     """What the system has against the configured ports."""
     sensors = configured_sensors(config)
-    ports = {sensor.name: sensor.port for sensor in sensors if sensor.is_serial}
-    if config.mavlink.url.startswith("serial:"):
-        ports["autopilot"] = config.mavlink.url.removeprefix("serial:").rpartition(":")[0]
+    ports = _ports(config)
     among = list_ports(root)
     fast = {sensor.name for sensor in sensors if sensor.kind == "imu"}
     found = [
@@ -78,12 +93,6 @@ def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> l
     for first, second, device in same_ports(ports, root):
         words = f"{first} and {second} are one and the same port, {device}"
         found.append(Diagnosis(second, good=False, words=f"{words}: give each its own", remedy="", port=device))
-    for name, port in ports.items():
-        if not (root / port.lstrip("/")).exists() and (free := unnamed(among, list(ports.values()), root)):
-            words = (
-                f"{port} is not there; nobody names {', '.join(free)}: companion ports --listen tells who speaks there"
-            )
-            found.append(Diagnosis(name, good=False, words=words, remedy="companion ports --listen", port=port))
     return found
 
 

@@ -85,6 +85,7 @@ class SensorWatch:
     def __init__(self, sensors: Sequence[SerialSensor], collector: RollingCollector) -> None:
         self._sensors, self._collector = sensors, collector
         self._witness = MotionWitness()
+        self._has_failed = False
 
     async def run(self) -> None:
         """Look until cancelled."""
@@ -93,8 +94,10 @@ class SensorWatch:
             try:
                 self.look(loop.time())
             except Exception:
-                # What merely watches must not end what is watched.
-                logger.exception("looking after the sensors failed")
+                # What merely watches must not end what is watched, nor fill the log.
+                if not self._has_failed:
+                    logger.exception("looking after the sensors failed")
+                self._has_failed = True
             await asyncio.sleep(PERIOD_S)
 
     def look(self, now_s: float) -> None:

@@ -76,6 +76,8 @@ class SensorRole:
         sensor = self._sensor
         problem, words = self.problem, sensor.words
         summary = problem or f"{sensor.protocol} on {sensor.link.settings.url}, {self._rate_hz:.0f} frames/s"
+        if problem is None and sensor.health.counts:
+            summary += f"; so far {', '.join(f'{count} {key}' for key, count in sensor.health.counts.items())}"
         others = [role.name for role in sensor.roles if role is not self]
         if others:
             summary += f" (shared with {', '.join(others)})"

@@ -113,7 +113,7 @@ def _modem_manager(device: str, port: SerialPort | None, holders: Sequence[Holde
     if pid is None or port is None:
         return
     remedy = (
-        "sudo companion install-service puts the udev rule against that, or: sudo systemctl disable --now ModemManager"
+        "keep it away by the udev rule of sudo companion install-service, or: sudo systemctl disable --now ModemManager"
     )
     if any(holder.pid == pid for holder in holders):
         yield PortFault(f"ModemManager (process {pid}) has {device} open, and sends commands to it", remedy)
@@ -139,7 +139,7 @@ def _timer(port: SerialPort, *, is_fast: bool) -> Iterator[PortFault]:
         name = port.device.removeprefix("/dev/")
         yield PortFault(
             f"the FTDI bridge collects bytes for {port.latency_timer_ms} ms, samples come in bunches",
-            f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{name}/latency_timer"
+            f"sudo sh -c 'echo 1 > /sys/bus/usb-serial/devices/{name}/latency_timer'"
             " (for good: sudo companion install-service)",
             good=not is_fast,
         )
@@ -151,7 +151,7 @@ def _name(port: str, found: SerialPort) -> Iterator[PortFault]:
     if found.stable_name is not None:
         remedy = f'set port = "{found.stable_name}"'
     else:
-        remedy = f"companion udev-rule --port {port} --name NAME makes one that stays"
+        remedy = f"a name that stays: companion udev-rule --port {port} --name NAME"
     yield PortFault(f"the name {port} changes with the order of plugging", remedy, good=True)
 
 

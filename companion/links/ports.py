@@ -15,7 +15,6 @@ from pathlib import Path
 ROOT = Path("/")
 _TEXT_LIMIT = 80
 _PASSING_NAME = re.compile(r"/dev/tty(?:USB|ACM)\d+$")
-_LASTING_FOLDER = re.compile(r"/dev/serial/by-(?:id|path)/")
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +78,6 @@ def lasting_name(device: str) -> str | None:
 
     None where the name is no passing one, or there is no better (no udev). What stands before /dev is kept.
     """
-    if _LASTING_FOLDER.search(device):
-        return device
     if (match := _PASSING_NAME.search(device)) is None:
         return None
     root = Path(device[: match.start()] or "/")

@@ -239,13 +239,12 @@ class StreamHealth:
 
 def _valueless(lately: _Mark) -> Trouble | None:
     """Whole frames without a value in them."""
-    for why, words in (
-        (NON_FINITE, "NaN in {n} whole frames: the device has no valid reading; switch its power off and on"),
-        (OVER_RANGE, "{n} readings are over range: level it"),
-    ):
-        count = lately.rejected[why]
-        if count and count >= _DAMAGED_SHARE * (lately.accepted + count):
-            return Trouble(why, words.format(n=count))
+    least = _DAMAGED_SHARE * max(lately.accepted, 1)
+    if (count := lately.rejected[NON_FINITE]) and count >= least:
+        words = f"NaN in {count} whole frames: the device has no valid reading; switch its power off and on"
+        return Trouble(NON_FINITE, words)
+    if (count := lately.rejected[OVER_RANGE]) and count >= least:
+        return Trouble(OVER_RANGE, f"{count} readings are over range: level it")
     return None
 
 

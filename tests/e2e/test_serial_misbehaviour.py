@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 
 from companion.daemon.sensor_health import RENEW_AFTER_S
+from companion.links import serial_port
 from companion.links.budget import BURST_BYTES, BYTES_PER_S
 from sim.uart import Setting
 from tests.support.chatter import RECOVERY_S, Chatter, Listening, compass_frame, imu_frame, listening, tilt_frame
@@ -111,6 +112,45 @@ def test_replugged_under_another_name_while_its_own_is_another_devices(
             assert one.sensor.decoder.rejected.total() <= rejected + 1
 
     asyncio.run(main())
+
+
+def test_a_device_that_was_replaced_for_good_is_taken_after_a_while(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serial_port, "FAITHFUL_S", 2.0)
+    name = tmp_path / "dev/serial/by-id/usb-FTDI_A-if00-port0"
+    first = tmp_path / "dev/ttyUSB0"
+    name.parent.mkdir(parents=True)
+    name.symlink_to("../../ttyUSB0")
+
+    async def main() -> None:
+        async with Chatter(first, tilt_frame) as device, listening("gradienter", "inclinometer_xy", first) as one:
+            await one.data()
+            await asyncio.sleep(0.6)
+            name.unlink()
+            device.unplug()
+            device.plug(first)  # another adapter, with another serial number
+            await one.until(lambda: "is another device now" in one.words)
+            await one.data(2.0 + RECOVERY_S)
+
+    asyncio.run(main())
+
+
+def test_a_slow_bridge_is_said_of_an_imu_when_it_is_opened(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def main(kind: str, protocol: str) -> dict[str, int]:
+        frame = imu_frame if kind == "imu" else tilt_frame
+        async with Chatter(path, frame, rate_hz=50.0), listening(kind, protocol, path) as one:
+            await one.data()
+            await asyncio.sleep(0.6)
+            return one.counts
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(serial_port, "latency_timer_ms", lambda _: 16)
+        assert asyncio.run(main("imu", "imu_line")) == {"slow bridge": 1}
+        assert asyncio.run(main("gradienter", "inclinometer_xy")) == {}
+        assert len(said(caplog, "own", "collects bytes for 16 ms")) == 1
+        patch.setattr(serial_port, "latency_timer_ms", lambda _: 1)
+        assert asyncio.run(main("imu", "imu_line")) == {}
 
 
 def test_two_devices_swapped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -150,9 +150,13 @@ def test_a_knock_in_a_still_stretch_costs_no_more_seconds_than_before() -> None:
 def turned(known: Lag, gradienter: bool = False) -> tuple[float, float]:
     """Error of the mean heading (or tilt) after a turn of 20 degrees (2 degrees) seen through a filter of 2 s."""
     collector = RollingCollector(
-        settings(), [imu()], gradienter=gradienter, compass=not gradienter,
-        **{"gradienter_lag" if gradienter else "compass_lag": known},
-    )  # fmt: skip
+        settings(),
+        [imu()],
+        gradienter=gradienter,
+        compass=not gradienter,
+        gradienter_lag=known if gradienter else AT_ONCE,
+        compass_lag=AT_ONCE if gradienter else known,
+    )
     feed = Feeder(collector)
     size, end_s = 2.0 if gradienter else 20.0, 1006.0
 

@@ -1,0 +1,83 @@
+"""What is wrong with a sensor reaches the big word, and nothing is measured with readings that lie."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+
+from companion.calibration.machine import State
+from companion.calibration.request import What
+from companion.protocols import stream_health
+from companion.protocols.stream_health import RAILS_DEG
+from sim.devices import Frame
+from tests.e2e.test_calibration import started
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+
+@contextlib.asynccontextmanager
+async def watched(rig: Rig) -> AsyncIterator[Rig]:
+    """The rig, with its sensors looked after as if their ports were open."""
+    async with rig.running():
+        for sensor in rig.service.sensors:
+            sensor.link._descriptor = -1
+        watch = asyncio.create_task(rig.service.sensor_watch.run())
+        try:
+            yield await rig.ready()
+        finally:
+            watch.cancel()
+            for sensor in rig.service.sensors:
+                sensor.link._descriptor = None
+
+
+def saying(rig: Rig, words: Callable[[int], bytes]) -> None:
+    """Let the gradienter say something else."""
+    device = rig.devices["gradienter"]
+    frames = device.frames_until
+
+    def otherwise(t_s: float) -> list[Frame]:
+        return [frame._replace(data=words(round(frame.sampled_s * 10))) for frame in frames(t_s)]
+
+    device.frames_until = otherwise  # type: ignore[method-assign]
+
+
+def test_a_silent_gradienter_is_the_headline_with_what_to_look_at(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with watched(Rig(tmp_path, at_arm="warn")) as rig:
+            rig.unplugged.add("gradienter")
+            answers = rig.service.answers
+            await rig.until(lambda: "silent (power? wiring?" in answers.status()["headline"]["reason"], 10.0)
+            headline = answers.status()["headline"]
+            assert headline["word"] == "NOT CALIBRATED"
+            assert headline["reason"].startswith("gradienter: /nowhere/gradienter at 9600 baud")
+            rig.unplugged.clear()
+            await rig.until(lambda: "silent" not in rig.service.answers.status()["headline"]["reason"], 3.0)
+
+    run_virtual(main())
+
+
+def test_no_calibration_is_made_with_a_gradienter_at_its_rail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The rail of a device whose family is here: what a LILY does in microradians.
+    monkeypatch.setattr(stream_health, "RAILS_DEG", {"inclinometer_xy": (3.3, RAILS_DEG["jewell"][1])})
+
+    async def main() -> None:
+        async with watched(Rig(tmp_path)) as rig:
+            saying(rig, lambda n: f"X=-03.300\r\nY=+04.{990 + n % 10:03d}\r\n".encode())
+            await asyncio.sleep(3.0)
+            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            await asyncio.sleep(60.0)
+            assert not job.finished.done()
+            assert rig.service.conductor.state is State.WAITING
+            device = next(one for one in rig.service.status()["devices"] if one["name"] == "gradienter")
+            assert device["trouble"] == "end of range"
+            assert device["counts"]["end of range"] == 1
+            saying(rig, lambda n: f"X=-03.{n % 10:03d}\r\nY=+04.{990 + n % 10:03d}\r\n".encode())
+            await rig.until(job.finished.done, 60.0)
+            assert job.record is not None
+            assert job.record.imus[0].accel_bias_m_s2 is not None
+
+    run_virtual(main())

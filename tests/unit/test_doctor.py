@@ -1,0 +1,232 @@
+"""What the system has against a port, read from made-up trees; and what is said about it."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from companion.config import Config, parse
+from companion.daemon.doctor import sensor_findings, system_findings, where_it_may_be
+from companion.links.port_faults import PortFault, port_faults, same_ports
+from companion.links.ports import lasting_name, latency_timer_ms
+from tests.support.usb_tree import UsbTree
+
+CONFIG = """
+[mavlink]
+url = "{autopilot}"
+[[imu]]
+name = "own"
+source = "serial"
+port = "{imu}"
+protocol = "vectornav"
+[gradienter]
+port = "{gradienter}"
+protocol = "inclinometer_xy"
+law = "slope"
+"""
+FTDI_ID = "/dev/serial/by-id/usb-FTDI_FT232R_A5-if00-port0"
+
+
+class Board(UsbTree):
+    """An FTDI bridge with a serial number, a CH340 without, and an on-board port; processes as a test needs them."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(root)
+        ftdi = self.device("1.1", vendor="0403", product="6001", serial="A5")
+        self.serial_port(ftdi, "ttyUSB0", driver="ftdi_sio")
+        ch340 = self.device("1.2", vendor="1a86", product="7523")
+        self.serial_port(ch340, "ttyUSB1", driver="ch341-uart")
+        self._timer("ttyUSB1").unlink()  # FTDI's own
+        (root / FTDI_ID[1:]).parent.mkdir(parents=True)
+        (root / FTDI_ID[1:]).symlink_to("../../ttyUSB0")
+        self.on_board("ttyS0", "bcm2835-aux-uart")
+        self.write("proc/cmdline", "root=/dev/mmcblk0p2 quiet\n")
+
+    def write(self, path: str, text: str) -> None:
+        file = self.root / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+
+    def on_board(self, name: str, driver: str) -> None:
+        place = f"sys/devices/platform/soc/3f215040.serial/{name}.port"
+        self._node(place, "platform", {"DRIVER": driver})
+        node = f"{place}/tty/{name}"
+        self._node(node, "tty", {"DEVNAME": name}, dev="4:64", type="4")
+        self._link(f"{node}/device", place)
+        self._link(f"sys/class/tty/{name}", node)
+        self.write(f"dev/{name}", "")
+
+    def process(self, pid: int, *words: str, opened: tuple[str, ...] = ()) -> None:
+        self.write(f"proc/{pid}/comm", words[0] + "\n")
+        self.write(f"proc/{pid}/cmdline", "\0".join(words) + "\0")
+        (self.root / f"proc/{pid}/fd").mkdir()
+        for number, target in enumerate(opened):
+            (self.root / f"proc/{pid}/fd/{number}").symlink_to(target)
+
+    def timer(self, name: str, milliseconds: int) -> None:
+        self._timer(name).write_text(f"{milliseconds}\n")
+
+    def _timer(self, name: str) -> Path:
+        (timer,) = (self.root / "sys/devices").rglob(f"{name}/latency_timer")
+        return timer
+
+
+@pytest.fixture
+def board(tmp_path: Path) -> Board:
+    made = Board(tmp_path)
+    made.timer("ttyUSB0", 1)
+    return made
+
+
+def faults(board: Board, port: str) -> list[str]:
+    return [str(fault) for fault in port_faults(port, root=board.root)]
+
+
+def config(
+    imu: str = FTDI_ID,
+    gradienter: str = "/dev/serial/by-path/platform-soc-usb-0:1.2:1.0-port0",
+    autopilot: str = "udpin:127.0.0.1:14550",
+) -> Config:
+    return parse(CONFIG.format(imu=imu, gradienter=gradienter, autopilot=autopilot), "test.toml")
+
+
+def test_a_board_in_order_has_nothing_to_say(board: Board) -> None:
+    assert system_findings(config(), [], board.root) == []
+    board.process(412, "agetty", "--noclear", "tty1", "linux", opened=("/dev/tty1",))
+    board.process(900, "companion", "run", opened=("/dev/ttyUSB0", "/dev/ttyUSB1"))
+    assert system_findings(config(), [900], board.root) == []
+
+
+def test_a_login_console_is_named_with_what_ends_it(board: Board) -> None:
+    board.process(412, "agetty", "-o", "-p", "--keep-baud", "115200,57600", "ttyS0", "vt220", opened=("/dev/ttyS0",))
+    (line,) = [line for line in faults(board, "/dev/ttyS0") if "console" in line]
+    assert line == (
+        "a login console runs on /dev/ttyS0 (agetty, process 412): "
+        "sudo systemctl disable --now serial-getty@ttyS0.service"
+    )
+    board.write("proc/cmdline", "console=ttyS0,115200 console=tty1\n")
+    (line,) = [line for line in faults(board, "/dev/ttyS0") if "login" in line]
+    assert "(agetty, process 412)" in line
+    assert "remove console=ttyS0,... from the kernel's command line" in line
+
+
+def test_a_console_is_found_by_its_command_line_where_we_may_not_look_into_it(board: Board) -> None:
+    board.process(77, "agetty", "/dev/ttyUSB1", "115200")
+    assert "sudo systemctl disable --now serial-getty@ttyUSB1.service" in faults(board, "/dev/ttyUSB1")[0]
+    assert not any("console" in line for line in faults(board, FTDI_ID))
+
+
+def test_the_kernels_own_messages(board: Board) -> None:
+    board.write("proc/cmdline", "console=ttyS0,115200\n")
+    assert any("the kernel's messages go to /dev/ttyS0" in line for line in faults(board, "/dev/ttyS0"))
+
+
+def test_modem_manager_is_said_where_it_may_probe_and_where_it_does(board: Board) -> None:
+    board.write("run/udev/data/c188:1", "E:ID_BUS=usb\n")
+    board.write("run/udev/data/c188:0", "E:ID_BUS=usb\nE:ID_MM_DEVICE_IGNORE=1\n")
+    assert not any("Modem" in line for line in faults(board, "/dev/ttyUSB1")), "it does not run"
+    board.process(600, "ModemManager")
+    assert any("ModemManager (process 600) may take /dev/ttyUSB1" in line for line in faults(board, "/dev/ttyUSB1"))
+    assert any("sudo companion install-service" in line for line in faults(board, "/dev/ttyUSB1"))
+    assert not any("Modem" in line for line in faults(board, FTDI_ID)), "udev keeps it away"
+    assert not any("Modem" in line for line in faults(board, "/dev/ttyS0")), "it leaves on-board ports alone"
+    (board.root / "proc/600/fd/7").symlink_to("/dev/ttyUSB1")
+    lines = faults(board, "/dev/ttyUSB1")
+    assert any("ModemManager (process 600) has /dev/ttyUSB1 open" in line for line in lines)
+    assert not any("open too" in line for line in lines), "one line is enough"
+
+
+def test_a_second_reader_is_named_unless_it_is_ours(board: Board) -> None:
+    board.process(900, "companion", "run", opened=("/dev/ttyUSB0",))
+    board.process(1234, "gpsd", "-n", opened=("/dev/null", "/dev/ttyUSB0"))
+    found = system_findings(config(), [900], board.root)
+    (finding,) = found
+    assert finding.name == "own"
+    assert not finding.good
+    assert finding.words.startswith("gpsd (process 1234) has /dev/ttyUSB0 open too")
+    assert finding.remedy.startswith("end it (sudo kill 1234)")
+    assert len(system_findings(config(), [], board.root)) == 2
+
+
+def test_the_ftdi_timer_is_wrong_for_an_imu_and_a_remark_for_a_gradienter(board: Board) -> None:
+    board.timer("ttyUSB0", 16)
+    assert latency_timer_ms(FTDI_ID, board.root) == 16
+    (fault,) = port_faults(FTDI_ID, is_fast=True, root=board.root)
+    assert not fault.good
+    assert "16 ms" in fault.words
+    assert "sudo sh -c 'echo 1 > /sys/bus/usb-serial/devices/ttyUSB0/latency_timer'" in fault.remedy
+    (fault,) = port_faults(FTDI_ID, root=board.root)
+    assert fault.good
+    (finding,) = system_findings(config(), [], board.root)
+    assert (finding.name, finding.good) == ("own", False)
+
+
+def test_a_name_that_changes_is_told_the_one_that_stays(board: Board) -> None:
+    (fault,) = port_faults("/dev/ttyUSB0", root=board.root)
+    assert fault.good, "it works today"
+    assert fault.remedy == f'set port = "{FTDI_ID}"'
+    # The CH340 has no serial number: where it is plugged in is what stays.
+    remedies = [fault.remedy for fault in port_faults("/dev/ttyUSB1", root=board.root) if "order of" in fault.words]
+    assert remedies == ['set port = "/dev/serial/by-path/platform-soc-usb-0:1.2:1.0-port0"']
+    assert lasting_name(f"{board.root}/dev/ttyUSB0") == f"{board.root}{FTDI_ID}"
+    assert lasting_name("/dev/ttyAMA0") is None
+
+
+def test_the_mini_uart_of_a_raspberry_pi(board: Board) -> None:
+    (fault,) = port_faults("/dev/ttyS0", root=board.root)
+    assert fault == PortFault(fault.words, fault.remedy, good=True)
+    assert "mini-UART" in fault.words
+    assert "dtoverlay=disable-bt" in fault.remedy
+
+
+def device(name: str, speaks: str | None, trouble: str | None = "undecodable") -> dict[str, object]:
+    return {"name": name, "trouble": trouble, "speaks": speaks}
+
+
+def test_what_a_running_daemon_has_understood_is_explained_without_opening_anything() -> None:
+    both = config(imu="tcp://127.0.0.1:4001")
+
+    def found(*devices: dict[str, object]) -> list[tuple[str, str]]:
+        findings = asyncio.run(sensor_findings(both, {"devices": list(devices)}, may_listen=False))
+        return [(finding.name, finding.words) for finding in findings]
+
+    assert found(device("own", None, None), device("gradienter", None, None)) == []
+    ((name, words),) = found(device("own", "inclinometer_xy"), device("gradienter", "vectornav"))
+    assert name == "ports"
+    assert words == ("own's port speaks inclinometer_xy, gradienter's port speaks vectornav: swap the two port lines")
+    ((name, words),) = found(device("own", "imu_line"), device("gradienter", None, None))
+    assert (name, words) == ("own", 'this is imu_line, not vectornav: set protocol = "imu_line" in [[imu]] "own"')
+    ((name, words),) = found(device("own", None, "damaged"), device("gradienter", None, "damaged"))
+    assert name == "gradienter", "of tcp:// there is no speed to try"
+    assert "sudo systemctl stop companion" in words
+
+
+def test_one_port_under_two_names(board: Board) -> None:
+    assert same_ports({"own": FTDI_ID, "gradienter": "/dev/ttyUSB0"}, board.root) == [
+        ("own", "gradienter", "/dev/ttyUSB0")
+    ]
+    found = system_findings(config(gradienter="/dev/ttyUSB0"), [], board.root)
+    assert any("own and gradienter are one and the same port, /dev/ttyUSB0" in one.words for one in found)
+
+
+def test_a_port_that_is_gone_is_told_which_are_there(board: Board) -> None:
+    gone = config(gradienter="/dev/ttyUSB7")
+    assert system_findings(gone, [], board.root) == [], "its own line says that it is gone"
+    found = where_it_may_be(gone, board.root)
+    assert found is not None
+    assert "platform-soc-usb-0:1.2:1.0-port0" in found.words
+    assert FTDI_ID not in found.words, "that one is the IMU's"
+    assert found.remedy == "companion ports --listen"
+
+
+def test_the_autopilots_port_is_looked_at_too(board: Board) -> None:
+    board.process(412, "agetty", "ttyS0", opened=("/dev/ttyS0",))
+    found = system_findings(config(autopilot="serial:/dev/ttyS0:921600"), [], board.root)
+    assert [one.name for one in found] == ["autopilot", "autopilot"]
+
+
+def test_a_machine_without_anything(tmp_path: Path) -> None:
+    assert port_faults("/dev/ttyUSB0", root=tmp_path) == []
+    assert system_findings(config(), [], tmp_path) == []

@@ -1,0 +1,141 @@
+"""A gradienter or compass that is stuck: found out by the IMU, which saw the aircraft move, and by nothing else."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from companion.protocols.stream_health import Trouble
+from companion.samples import CompassSample, ImuSample, Sample, TiltSample
+from tests.support.chatter import Listening
+from tests.support.virtual_time import run_virtual
+
+START_S = 1000.0
+
+
+class Bench:
+    """One pose sensor and an IMU, both fed by hand; the sensor's port counts as open."""
+
+    def __init__(self, kind: Literal["gradienter", "compass"]) -> None:
+        protocol = {"gradienter": "inclinometer_xy", "compass": "hmr3300"}[kind]
+        self.one = Listening(kind, protocol, "/nowhere")
+        self.one.sensor.link._descriptor = -1
+        self.random = np.random.default_rng(5)
+        self.now_s = START_S
+        self.resets: list[str] = []
+        reset = self.one.collector.reset
+
+        def told(why: str, imu: str | None = None) -> None:
+            self.resets.append(why)
+            reset(why, imu)
+
+        self.one.collector.reset = told  # type: ignore[method-assign]
+
+    def run(
+        self, seconds: float, sample: Callable[[float], Sample], *, pitch_deg: float = 0.0, turn_deg_s: float = 0.0,
+        bias_deg_s: float = 1.0,
+    ) -> Trouble | None:  # fmt: skip
+        """Feed both for some seconds; what is wrong at their end."""
+        found = None
+        for tick in range(round(seconds * 50)):
+            t_s = self.now_s + tick / 50
+            pitch = math.radians(pitch_deg)
+            noise = self.random.normal(0.0, 0.02, 3)
+            force = (9.8 * math.sin(pitch) + noise[0], noise[1], -9.8 * math.cos(pitch) + noise[2])
+            rate = math.radians(turn_deg_s + bias_deg_s)
+            self.one.collector.add_imu("fc", ImuSample(t_s, (0.0, 0.0, rate + noise[0] * 1e-3), force))
+            if tick % 5 == 0:
+                self.one.sensor.health.stream.took(b"x", [sample(t_s)], t_s)
+            if tick % 25 == 0:
+                self.one.watch.look(t_s)
+                found = self.one.sensor.health.trouble(t_s)
+        self.now_s += seconds
+        return found
+
+
+def tilt(t_s: float) -> TiltSample:
+    return TiltSample(t_s, 0.430, -0.084)
+
+
+def heading(t_s: float) -> CompassSample:
+    return CompassSample(t_s, 123.4, 18.6, -0.5)
+
+
+def on_the_clock(test: Callable[[], None]) -> None:
+    async def main() -> None:
+        test()
+
+    run_virtual(main())
+
+
+def test_a_gradienter_that_repeats_its_digits_while_all_stands_still_is_left_in_peace() -> None:
+    def check() -> None:
+        bench = Bench("gradienter")
+        assert bench.run(120.0, tilt) is None
+        assert bench.resets == []
+
+    on_the_clock(check)
+
+
+def test_a_gradienter_that_repeats_its_digits_while_the_aircraft_tilts_is_stuck(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+
+    def check() -> None:
+        bench = Bench("gradienter")
+        bench.run(10.0, tilt)
+        assert bench.run(2.0, tilt, pitch_deg=2.0) is None, "one second may be a jolt"
+        found = bench.run(8.0, tilt, pitch_deg=8.0)
+        assert found is not None
+        assert (found.key, found.lies) == ("stuck", True)
+        assert "while the aircraft tilted by 8 deg" in found.words
+        assert bench.resets, "nothing may be measured with it"
+        assert bench.one.counts == {"stuck": 1}
+        assert bench.run(2.0, lambda t_s: TiltSample(t_s, 0.43, 8.0 + 1e-3 * (t_s % 3)), pitch_deg=8.0) is None
+        count = len(bench.resets)
+        assert bench.run(5.0, lambda t_s: TiltSample(t_s, 0.43, 8.0 + 1e-3 * (t_s % 3)), pitch_deg=8.0) is None
+        assert len(bench.resets) == count
+
+    on_the_clock(check)
+    warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert len(warnings) == 1
+    assert warnings[0].startswith("gradienter: /nowhere at 9600 baud")
+    assert any("gradienter: good again after" in record.getMessage() for record in caplog.records)
+
+
+def test_a_compass_is_stuck_when_the_aircraft_turned_and_not_when_a_gyro_is_biased() -> None:
+    def check() -> None:
+        bench = Bench("compass")
+        assert bench.run(60.0, heading, bias_deg_s=8.0) is None, "480 deg of bias"
+        assert bench.run(10.0, heading, pitch_deg=10.0) is None, "a heading may stay when it tilts"
+        found = bench.run(4.0, heading, turn_deg_s=30.0)
+        assert found is not None
+        assert "turned by" in found.words
+        assert bench.run(2.0, lambda t_s: CompassSample(t_s, t_s % 360.0)) is None
+
+    on_the_clock(check)
+
+
+def test_one_imu_that_is_broken_convicts_nobody() -> None:
+    def check() -> None:
+        bench = Bench("gradienter")
+        add = bench.one.collector.add_imu
+        from tests.support.still_aircraft import imu
+
+        bench.one.collector.set_imu(imu("second"))
+
+        def both(name: str, sample: ImuSample) -> None:
+            add(name, sample)
+            add("second", ImuSample(sample.t_s, (0.0, 0.0, sample.gyro_rad_s[2]), (0.0, 0.0, -9.8)))
+
+        bench.one.collector.add_imu = both  # type: ignore[method-assign]
+        bench.run(5.0, tilt)
+        assert bench.run(10.0, tilt, pitch_deg=20.0) is None
+
+    on_the_clock(check)

@@ -1,0 +1,149 @@
+"""What a stream tells of itself, at times that a test makes up."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from companion.protocols.base import NON_FINITE
+from companion.protocols.imu_line import ImuLineDecoder
+from companion.protocols.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.stream_health import RAILS_DEG, SILENT_AFTER_S, StreamHealth
+from companion.samples import CompassSample, ImuSample, TiltSample
+from tests.support.chatter import imu_frame, tilt_frame
+
+
+def imu(t_s: float, clock_s: float | None = None, x: float = 0.0) -> ImuSample:
+    return ImuSample(t_s, (x, 0.0, 0.0), (0.0, 0.0, -9.8), None, None, clock_s)
+
+
+def test_a_lily_at_its_rail_is_no_tilt() -> None:
+    rail_deg = math.degrees(330e-6)
+    health = StreamHealth("jewell", InclinometerXyDecoder())
+    for second in range(4):
+        # As in the log of a LILY: -202.490,-330.000 microradians.
+        health.took(b"x", [TiltSample(second, math.degrees(-202.49e-6) + second * 1e-5, -rail_deg)], float(second))
+    found = health.trouble(3.1)
+    assert found is not None
+    assert (found.key, found.lies) == ("end of range", True)
+    assert "330 microradians" in found.words
+    health.took(b"x", [TiltSample(4.0, 0.001, -rail_deg + 5e-5)], 4.0)
+    assert health.trouble(4.1) is None
+    other = StreamHealth("inclinometer_xy", InclinometerXyDecoder())
+    for second in range(4):
+        other.took(b"x", [TiltSample(second, 0.1 * second, -rail_deg)], float(second))
+    assert other.trouble(3.1) is None, "only a LILY has that rail"
+    assert set(RAILS_DEG) == {"jewell"}
+
+
+def test_equal_digits_of_a_still_gradienter_or_compass_prove_nothing() -> None:
+    for sample in (TiltSample(0.0, 0.43, -0.084), CompassSample(0.0, 123.4, 18.6, -0.5)):
+        health = StreamHealth("any", InclinometerXyDecoder())
+        for tick in range(3000):
+            health.took(b"x", [sample], 0.1 * tick)
+        assert health.trouble(300.0) is None
+        assert health.unchanged_since_s == 0.0
+
+
+def test_equal_readings_of_an_imu_do_after_a_second_and_twenty() -> None:
+    fast = StreamHealth("imu_line", ImuLineDecoder())
+    for tick in range(60):
+        fast.took(b"x", [imu(0.001 * tick)], 0.001 * tick)
+    assert fast.trouble(0.06) is None, "60 samples, but not a second"
+    slow = StreamHealth("imu_line", ImuLineDecoder())
+    for tick in range(40):
+        slow.took(b"x", [imu(0.25 * tick)], 0.25 * tick)
+        found = slow.trouble(0.25 * tick)
+        assert (found is not None) == (tick >= 20), tick
+    slow.took(b"x", [imu(10.0, x=1e-6)], 10.0)
+    assert slow.trouble(10.0) is None
+
+
+@pytest.mark.parametrize(
+    ("before_s", "after_s", "went_back"),
+    [
+        (100.0, 0.1, True),
+        (100.0, 99.9, False),  # a jitter of some stack of its own; the order of samples is others' business
+        (100.0, 100.02, False),
+        (4294.96, 0.01, False),  # microseconds in 32 bits
+        (65.5, 0.02, False),  # milliseconds in 16 bits
+        (429496.7, 0.0, False),  # 0.1 ms in 32 bits
+        (4000.0, 0.01, True),
+    ],
+)
+def test_a_clock_that_goes_back_and_one_that_begins_again(before_s: float, after_s: float, went_back: bool) -> None:
+    health = StreamHealth("imu_line", ImuLineDecoder())
+    health.took(b"x", [imu(1.0, before_s)], 1.0)
+    health.took(b"x", [imu(1.02, after_s)], 1.02)
+    assert [event.key for event in health.events] == (["clock back"] if went_back else [])
+
+
+def test_after_a_reconnection_the_clock_may_be_another() -> None:
+    health = StreamHealth("imu_line", ImuLineDecoder())
+    health.took(b"x", [imu(1.0, 100.0)], 1.0)
+    health.opened()
+    health.took(b"x", [imu(2.0, 0.1)], 2.0)
+    assert health.events == []
+
+
+def test_a_pause_without_words_is_no_restart_and_words_without_a_pause_neither() -> None:
+    decoder = InclinometerXyDecoder()
+    health = StreamHealth("inclinometer_xy", decoder)
+
+    def take(data: bytes, t_s: float) -> None:
+        health.took(data, decoder.feed(data, t_s), t_s)
+
+    for tick in range(30):
+        take(tilt_frame(tick), 0.1 * tick)
+    take(tilt_frame(1)[:9], 3.5)  # the loop was busy
+    take(tilt_frame(1)[9:], 4.5)
+    take(b"DPL2 V1.8.0\r\n", 4.52)
+    take(tilt_frame(2), 4.6)
+    assert health.events == []
+    take(b"DPL2 V1.8.0\r\nSN:1234\r\n", 6.0)
+    take(tilt_frame(3), 6.1)
+    (event,) = health.events
+    assert event.key == "restarted"
+    assert "'DPL2 V1.8.0'" in event.words
+
+
+def test_what_was_damaged_two_seconds_ago_is_over() -> None:
+    decoder = ImuLineDecoder()
+    health = StreamHealth("imu_line", decoder)
+    now_s = 0.0
+    for tick in range(500):
+        now_s = 0.02 * tick
+        frame = imu_frame(tick)
+        if 200 <= tick < 300 and tick % 3 == 0:
+            frame = frame.replace(b"-9.8", b"-9.7")
+        health.took(frame, decoder.feed(frame, now_s), now_s)
+        found = health.trouble(now_s)
+        if tick < 200 or tick > 300 + 130:
+            assert found is None, (tick, found)
+        if 260 <= tick < 300:
+            assert found is not None
+            assert found.key == "damaged"
+            assert "checksum" in found.words
+    assert now_s > 9.9
+
+
+def test_silence_beats_everything_that_was_said_before() -> None:
+    decoder = ImuLineDecoder()
+    health = StreamHealth("imu_line", decoder)
+    frame = imu_frame(1, rate="nan")
+    health.took(frame, decoder.feed(frame, 0.0), 0.0)
+    assert decoder.rejected[NON_FINITE] == 1
+    found = health.trouble(SILENT_AFTER_S + 0.1)
+    assert found is not None
+    assert found.key == "silent"
+
+
+def test_the_tail_is_bounded() -> None:
+    decoder = InclinometerXyDecoder()
+    health = StreamHealth("inclinometer_xy", decoder)
+    for _ in range(1000):
+        health.took(b"\x00" * 4096, [], 1.0)
+        health.trouble(4.0)
+    assert len(health._tail) <= 1024
+    assert len(health._marks) < 20
