@@ -82,7 +82,7 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
         # WitMotion prints 0.2 deg for the WT9011; the SINxT are sold as better.
         "witmotion": ProtocolInfo("witmotion", 9600, "none", WitMotionDecoder, sigma_deg=0.2, law="euler"),
         # The slowest of its filters, 16 Hz at -3 dB: 1 / (2 pi 16 Hz).
-        "stim300": ProtocolInfo("stim300", 921600, "none", Stim300Decoder, lag_s=0.01),
+        "stim300": ProtocolInfo("stim300", 921600, "none", Stim300Decoder, lag_s=0.01, law="axis"),
         "nmea": ProtocolInfo("nmea", 19200, "none", NmeaDecoder, Hmr3000Dialogue, lag_s=0.29, law="axis"),
         "os5000": ProtocolInfo("os5000", 19200, "none", Os5000Decoder),
     },
@@ -91,13 +91,13 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
         "hmr3300": ProtocolInfo(
             "hmr3300", 19200, "none", Hmr3300Decoder, Hmr3300Dialogue, sigma_deg=1.0, tilted_sigma_deg=3.0
         ),
-        # 38400 is what public drivers of the TRAX open; no document of PNI's that says so was found.
-        "pni": ProtocolInfo("pni", 38400, "none", PniDecoder, PniDialogue),
-        "rion": ProtocolInfo("rion", 9600, "none", RionDecoder, RionDialogue),
         # An HMR3000, with its first filter's usual time constant of 4 steps of 72 ms. NMEA 0183 itself has 4800 baud.
         "nmea": ProtocolInfo("nmea", 19200, "none", NmeaDecoder, Hmr3000Dialogue, lag_s=0.29),
         # OceanServer: 0.5 deg rms level, 1 deg to 30 deg of tilt.
         "os5000": ProtocolInfo("os5000", 19200, "none", Os5000Decoder, sigma_deg=0.5, tilted_sigma_deg=1.0),
+        # 38400 is what public drivers of the TRAX open; no document of PNI's that says so was found.
+        "pni": ProtocolInfo("pni", 38400, "none", PniDecoder, PniDialogue),
+        "rion": ProtocolInfo("rion", 9600, "none", RionDecoder, RionDialogue),
     },
 }
 

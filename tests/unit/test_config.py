@@ -118,7 +118,10 @@ bind = "127.0.0.1:8080"
             "[[imu]]\nname = 'b'\nsource = 'serial'\nprotocol = 'imu_line'",
             ["imu[1].port", "missing", "tcp://HOST:PORT"],
         ),
-        (SERIAL.replace("vectornav", "vectonav"), ["imu[1].protocol", "'vectonav'", '"vectornav", "imu_line", "mip"']),
+        (
+            SERIAL.replace("vectornav", "vectonav"),
+            ["imu[1].protocol", "'vectonav'", '"vectornav", "imu_line", "witmotion", "mip"'],
+        ),
         (SERIAL.replace("own", "fc"), ["imu[1].name", "found 'fc'", "imu[0]", "a name of its own"]),
         (SERIAL + "mounting = 'ROTATION_YAW_91'", ["imu[1].mounting", "ROTATION_YAW_91", "did you mean"]),
         (SERIAL + "mounting = [1, 2]", ["imu[1].mounting", "found [1, 2]", "[number, number, number]"]),
