@@ -53,10 +53,12 @@ def test_each_is_recognised_wherever_one_begins_to_listen(name: str, cut: int) -
     assert [one.protocol for one in candidates(stream(name)[cut:]) if one.likely] == [name]
 
 
-FAMILIES = [*families.IMUS, *families.GRADIENTERS, *families.COMPASSES]
+SILENT = {"pni", "rion"}
+"""They speak only when they are asked, and whoever guesses asks nothing."""
+FAMILIES = {*families.IMUS, *families.GRADIENTERS, *families.COMPASSES} - SILENT
 
 
-@pytest.mark.parametrize("name", dict.fromkeys(FAMILIES))
+@pytest.mark.parametrize("name", sorted(FAMILIES))
 def test_every_simulated_family_is_recognised(name: str) -> None:
     scenario = demo(seed=3)
     device = (
@@ -66,8 +68,6 @@ def test_every_simulated_family_is_recognised(name: str) -> None:
     )
     device.power_on(0.0)
     data = b"".join(frame.data for frame in device.frames_until(6.0))
-    if not data:
-        pytest.skip("it speaks only when it is asked")
     found = likeliest(data[:4096])
     assert found is not None
     assert found.protocol == name
