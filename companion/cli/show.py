@@ -87,6 +87,7 @@ def status_lines(status: Object) -> list[str]:
     vehicle = status["vehicle"]
     lines.append(f"autopilot: {vehicle['summary']}")
     lines += [f"{device['name']}: {device['summary']}" for device in status["devices"]]
+    lines += _reading_lines(status)
     lines += [f"warning: {warning}" for warning in status["warnings"]]
     if not status["ground_stations"]["good"]:
         lines.append(f"ground stations: {status['ground_stations']['summary']}")
@@ -101,6 +102,26 @@ def status_lines(status: Object) -> list[str]:
     if status["page"] is not None:
         lines.append(f"page: {'' if status['page']['good'] else 'none: '}{status['page']['summary']}")
     lines.append(_last_line(status))
+    return lines
+
+
+def _reading_lines(status: Object) -> list[str]:
+    """What gradienter and compass say at this moment, and whose zero the gradienter's is."""
+    lines, readings, alignment = [], status["readings"], status["alignment"]
+    if readings["gradienter_x_deg"] is not None:
+        lines.append(
+            f"gradienter reads: x {readings['gradienter_x_deg']:+.3f}  y {readings['gradienter_y_deg']:+.3f} deg"
+        )
+    if readings["compass_deg"] is not None:
+        lines.append(f"compass reads: {readings['compass_deg']:.1f} deg")
+    if alignment is not None and alignment["in_force"]:
+        x, y = alignment["offset_deg"]
+        lines.append(
+            f"gradienter zero: x {x:+.3f}  y {y:+.3f} deg, sigma {alignment['sigma_deg']:.3f}, measured"
+            f" {alignment['measured_at'][:10]}"
+        )
+    elif alignment is not None:
+        lines.append(f"alignment not used: {alignment['unused_because']}")
     return lines
 
 

@@ -26,6 +26,7 @@ from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity, Weight
 from companion.config import Config
 from companion.daemon import estimating, models
+from companion.daemon.alignment import AlignmentInForce
 from companion.daemon.autopilot_imu import AutopilotImu
 from companion.daemon.dither import Ditherer
 from companion.daemon.job import Job, JobCancelledError
@@ -65,10 +66,11 @@ class Course:
         offload: Offload,
         reboot: Reboot,
         ditherer: Ditherer,
+        alignment: AlignmentInForce,
     ) -> None:
         self._config, self._vehicle, self._collector, self._imus = config, vehicle, collector, imus
         self._pusher, self._ditherer, self._reboot = pusher, ditherer, reboot
-        self._say, self._offload = say, offload
+        self._say, self._offload, self._alignment = say, offload, alignment
         self.machine = Machine()
         """Where it stands."""
         self.settings = models.settings(config)
@@ -141,10 +143,11 @@ class Course:
             solve_at,
             window,
             where,
-            models.gradienter_model(self._config.gradienter),
+            self._alignment.model(),
             models.compass_model(self._config.compass),
             job.what,
         )
+        draft.alignment = self._alignment.used
         draft.solution, draft.measured_s = solution, (measured.start_s, measured.end_s)
         self.on_solved(measured, window, where, job.what)
         plan = await self._pusher.plan(solution, draft)
