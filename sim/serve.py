@@ -14,9 +14,10 @@ from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
 
 from sim.aircraft import Pose
+from sim.hands import HELP, Hands, take_lines
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.pty_device import PtyDevice
-from sim.scenario import DEMO_POSE, Scenario, demo
+from sim.scenario import DEMO_POSE, GRADIENTER_OFFSET_DEG, Scenario, demo
 from sim.udp import open_udp
 
 DEFAULT_UDP = "127.0.0.1:14550"
@@ -61,6 +62,11 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument(
                 "--gyr-cal", action="store_true", help="INS_GYR_CAL = 1: ArduPilot calibrates its gyros at boot"
             )
+        command.add_argument("--hands", action="store_true", help=f"move the aircraft by lines typed here: {HELP}")
+        command.add_argument(
+            "--zero", type=float, nargs=2, metavar=("X", "Y"), default=GRADIENTER_OFFSET_DEG,
+            help="what the gradienter shows too much, degrees (default 0.003 -0.002)",
+        )  # fmt: skip
     commands.add_parser("demo", help="the whole chain, with a result to look at")
     for name, text in FIRMWARE_COMMANDS.items():
         commands.add_parser(name, help=text)
@@ -114,7 +120,8 @@ def configuration(scenario: Scenario, *, directory: Path | None, udp: tuple[str,
     lines.append(f'profile = "{_PROFILES.get(scenario.serial_imu.spec.name, scenario.serial_imu.spec.name)}"')
     lines += ["", "[gradienter]", f'port = "{directory / "gradienter"}"']
     lines += [f'protocol = "{scenario.gradienter.protocol}"', f'law = "{scenario.gradienter_law}"']
-    lines += ["sigma_deg = 0.005", "", "[compass]", f'port = "{directory / "compass"}"']
+    known = max(map(abs, scenario.gradienter.offset_deg)) < 0.01
+    lines += [f"sigma_deg = {0.005 if known else 0.1}", "", "[compass]", f'port = "{directory / "compass"}"']
     lines += [f'protocol = "{scenario.compass.protocol}"', 'reference = "magnetic"', "sigma_deg = 1.0"]
     # Beside the ports, so that no root is needed to try.
     lines += ["", "[control]", f'socket = "{directory / "control.sock"}"']
@@ -151,6 +158,7 @@ async def serve(
     udp: tuple[str, int] | None = None,
     ground: tuple[str, int] | None = None,
     started: asyncio.Event | None = None,
+    hands: Hands | None = None,
 ) -> None:
     """Serve until cancelled: devices if there is a directory, the autopilot if there is an address to send to."""
     async with contextlib.AsyncExitStack() as stack:
@@ -171,6 +179,9 @@ async def serve(
         if udp is not None and ground is not None:
             station = await open_udp(scenario.autopilot.ground, target=ground)
             stack.callback(station.close)
+        if hands is not None:
+            told = take_lines(hands, scenario.aircraft, lambda words: print(f"# {words}", flush=True))
+            running.append(asyncio.create_task(told, name="hands"))
         if started is not None:
             started.set()
         try:
@@ -191,6 +202,7 @@ def main(argv: Sequence[str]) -> int:
         seed=arguments.seed,
         unix_s=time.time(),
         law=arguments.law,
+        gradienter_offset_deg=(arguments.zero[0], arguments.zero[1]),
         gyr_cal_at_boot=autopilot and arguments.gyr_cal,
         firmware=arguments.firmware if autopilot else "ardupilot",
     )
@@ -201,11 +213,14 @@ def main(argv: Sequence[str]) -> int:
     udp = arguments.udp if autopilot else None
     text = describe(scenario, devices=devices, autopilot=autopilot)
     text += configuration(scenario, directory=directory, udp=udp)
+    hands = Hands(scenario.aircraft, placement_deg=0.02, seed=arguments.seed) if arguments.hands else None
     try:
         ground = arguments.ground if autopilot else None
         return asyncio.run(
             run_until_stopped(
-                lambda started: serve(scenario, directory=directory, udp=udp, ground=ground, started=started),
+                lambda started: serve(
+                    scenario, directory=directory, udp=udp, ground=ground, started=started, hands=hands
+                ),
                 lambda: text,
             )
         )

@@ -30,7 +30,7 @@ _CONVERGED: Final = 1e-6
 """Of the prior sigma of each parameter."""
 W_LIMIT: Final = 4.5
 """|w| of one residual: passed by chance once in some thousand alignments of a hundred readings."""
-DETERMINED: Final = 0.5
+DETERMINED: Final = 0.2
 """A figure counts as determined where its sigma is below this share of what was known before."""
 _LEAST_REDUNDANCY: Final = 1e-3
 LEVEL: Final = -DOWN
@@ -118,14 +118,16 @@ def align(
         at = model.begin([_first_attitude(law, vehicle_from_sensor, stand) for stand in stands])
         at, residual, scaled, rows = _solve(model, at)
     except (ValueError, np.linalg.LinAlgError) as error:
-        raise CalibrationRefusedError(f"the readings do not belong together: {error}") from None
+        raise CalibrationRefusedError(
+            f"the readings do not belong together ({error}): check the gradienter's law and mounting"
+        ) from None
     sought = model.sigma > 0.0
     inverse = np.linalg.inv(scaled.T @ scaled)
-    chi_square, freedom = float(residual @ residual), len(residual) - int(sought.sum())
+    chi_square, freedom = float(residual @ residual), len(residual) - int(sought.sum()) - model.damped
     complaint, checked = _worst(residual, scaled @ inverse, scaled, rows, model)
     covariance = np.zeros((model.size, model.size))
-    # More scatter than the sigmas allow for widens; less of it proves nothing.
-    spread = max(1.0, chi_square / freedom) if freedom > 0 else 1.0
+    # More scatter than chance makes of the sigmas widens them; less of it proves nothing.
+    spread = chi_square / freedom if freedom > 0 and chi_square > _by_chance(freedom) else 1.0
     sigma = model.sigma[sought]
     covariance[np.ix_(sought, sought)] = spread * inverse * np.outer(sigma, sigma)
     return Alignment(
@@ -169,6 +171,12 @@ def in_words(complaint: Complaint) -> str:
     if row.group == "gyro":
         return f"stand {row.stand}: gyro {row.name} does not fit the other stands ({by}): still warming up? Begin again"
     return f"the stands do not fit what is known of the sensors ({by}): begin again"
+
+
+def _by_chance(freedom: int) -> float:
+    """The 99 % point of chi square (Wilson and Hilferty, PNAS 17, 684, 1931)."""
+    part = 2.0 / (9.0 * freedom)
+    return float(freedom * (1.0 - part + 2.326 * math.sqrt(part)) ** 3)
 
 
 def _first_attitude(law: Law, mounting: Matrix, stand: Stand) -> Matrix:

@@ -32,7 +32,7 @@ from companion.physics.gradienter import Law, readings_from_up, up_jacobian
 from companion.physics.units import DEG, MG
 
 DOWN: Final = np.array([0.0, 0.0, 1.0])
-Group = Literal["gradienter", "accelerometer", "gyro", "compass", "spot", "zero", "prior"]
+Group = Literal["gradienter", "accelerometer", "gyro", "compass", "spot", "zero", "prior", "nothing"]
 
 _SHEAR: Final = np.array([[[0, 1, 0], [1, 0, 0], [0, 0, 0]], [[0, 0, 1], [0, 0, 0], [1, 0, 0]],
                           [[0, 0, 0], [0, 0, 1], [0, 1, 0]]], dtype=np.float64)  # fmt: skip
@@ -145,8 +145,12 @@ class Model:
         self.size = self._first_imu + 15 * count
         sigma = np.full(self.size, _ANYHOW_RAD)
         sigma[self.offset] = priors.offset_deg * DEG
+        if not any(stand.on_spot for stand in stands):
+            sigma[self.spot] = 0.0
         sigma[self.gravity] = ground.gravity_sigma_m_s2
         sigma[self.rate] = np.sqrt(np.diag(ground.rate_covariance))
+        self.damped = 3 * len(stands) + (2 if sigma[2] > 0.0 else 0)
+        """How many parameters only the readings determine."""
         for k in range(count):
             sigma[self.misalignment(k)] = priors.misalignment_deg * DEG
             sigma[self.scale(k)] = priors.scale
@@ -265,7 +269,11 @@ class Model:
         for part in (slice(p, p + 1) for p in range(self.size)):
             if self.sigma[part] > 0.0:
                 is_zero = part.start < self.offset.stop
-                with rows.add(Row("zero" if is_zero else "prior"), -values[part], self.sigma[part]) as by:
+                of_readings = self.spot.start <= part.start < self.spot.stop or (
+                    self._poses <= part.start < self._first_imu
+                )
+                row = Row("zero" if is_zero else "nothing" if of_readings else "prior")
+                with rows.add(row, -values[part], self.sigma[part]) as by:
                     by[0, part] = 1.0
         return rows.stacked()
 

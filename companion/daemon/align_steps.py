@@ -18,7 +18,7 @@ from companion.physics.units import DEG
 
 TURN_TOLERANCE_DEG: Final = 30.0
 QUARTER_DEG: Final = 90.0
-LEAST_TILT_DEG: Final = 10.0
+LEAST_TILT_DEG: Final = 15.0
 """A tilt tells scale and misalignment from bias by what a cosine loses: little, below this."""
 APART_DEG: Final = 45.0
 """Two tilts to sides less apart than this tell the same."""
@@ -65,7 +65,7 @@ def request(plan: Plan, taken: Sequence[Seen]) -> str:
     if number >= plan.on_spot:
         done = [_side(taken[0].up, seen.up) for seen in taken[plan.on_spot :]]
         already = f", not {' or '.join(done)} again" if done else ": nose up, nose down, left or right side down"
-        return f"tilt it 15 to 25 deg and prop it up{already}"
+        return f"tilt it 20 to 28 deg and prop it up{already}"
     if plan.on_spot == HEADINGS:
         return "turn it by 90 deg on the same spot"
     if number == 1:
@@ -93,7 +93,7 @@ def objection(plan: Plan, taken: Sequence[Seen], now: Seen) -> str | None:
         return None
     tilt_deg = math.degrees(math.acos(float(np.clip(now.up @ first.up, -1.0, 1.0))))
     if tilt_deg < LEAST_TILT_DEG:
-        return f"tilted by {tilt_deg:.0f} deg only: make it 15 to 25"
+        return f"tilted by {tilt_deg:.0f} deg only: make it 20 to 28"
     for seen in taken[plan.on_spot :]:
         apart = abs(_wrapped(_azimuth(first.up, seen.up) - _azimuth(first.up, now.up)))
         if apart < APART_DEG:

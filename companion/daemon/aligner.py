@@ -52,9 +52,12 @@ SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
 
 
+_CHANGED: Final = "the offsets of imu {} were changed in between: align again"
+
+
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Taken:
-    """One stand, measured."""
+    """One stand, measured; its heading counts from the compass' own north."""
 
     window: Window
     seen: Seen
@@ -91,21 +94,27 @@ class Aligner:
         settings = self.alignment.settings()
         if model is None or settings is None:
             raise CalibrationRefusedError("there is no gradienter to align: none is configured")
-        where = models.whereabouts(self._config, self._vehicle)
-        local: LocalEarth = await self._offload(local_earth, where)
+        local: LocalEarth | None = None
         taken: list[_Taken] = []
         result: Alignment | None = None
         while len(taken) < plan.total:
-            taken.append(await self._stand(job, plan, model, taken, local))
+            taken.append(await self._stand(job, plan, model, taken))
             self._machine.on(Event.ENOUGH)
             if len(taken) >= min(3, plan.total):
                 # What does not fit is said at once, not after five more stands.
+                for name, imu in self._imus.items():
+                    # Somebody may have changed its offsets without a word.
+                    if not await imu.refresh():
+                        raise CalibrationRefusedError(_CHANGED.format(name))
+                where = models.whereabouts(self._config, self._vehicle)
+                local = await self._offload(local_earth, where)
                 result = await self._offload(self._solve, plan, model, taken, local)
                 if result.complaint is not None:
                     raise CalibrationRefusedError(in_words(result.complaint))
             if len(taken) < plan.total:
                 self._machine.on(Event.MOVED)
         assert result is not None
+        assert local is not None
         job.alignment = record = self._record(plan, result, taken, local)
         await self.alignment.keep(record)
         self._machine.on(Event.NOTHING_TO_WRITE)
@@ -114,9 +123,7 @@ class Aligner:
 
     # --- one stand
 
-    async def _stand(
-        self, job: Job, plan: Plan, model: GradienterModel, taken: list[_Taken], local: LocalEarth
-    ) -> _Taken:
+    async def _stand(self, job: Job, plan: Plan, model: GradienterModel, taken: list[_Taken]) -> _Taken:
         """Wait until it stands as it should, and measure.
 
         Raises:
@@ -127,7 +134,8 @@ class Aligner:
         number, seen = len(taken) + 1, [one.seen for one in taken]
         wish = align_steps.request(plan, seen)
         self._say(Severity.NOTICE, f"Align {number}/{plan.total}: {wish}", Weight.NEWS)
-        since_s = taken[-1].window.end_s if taken else -math.inf
+        # Whoever asks may yet put it down on a better spot: what was before that does not count.
+        since_s = taken[-1].window.end_s if taken else loop.time()
         moved, why = not taken, ""
         while True:
             now_s = loop.time()
@@ -149,7 +157,7 @@ class Aligner:
             self._show(measuring=share > 0.0)
             job.progress(100.0 * (number - 1 + share) / plan.total, f"{number} of {plan.total}: {words}")
             if moved and waiting_for is None and still_s >= self._stand_s:
-                found = await self._measure(model, taken, local, since_s)
+                found = await self._measure(model, taken, since_s)
                 objection = align_steps.objection(plan, seen, found.seen)
                 if objection is None:
                     return found
@@ -174,7 +182,7 @@ class Aligner:
             return
         for name, offsets in self._offsets().items():
             if taken[0].offsets.get(name, offsets) != offsets:
-                raise CalibrationRefusedError(f"the offsets of imu {name} were changed in between: align again")
+                raise CalibrationRefusedError(_CHANGED.format(name))
 
     def _not_ready(self) -> str | None:
         if (conflict := self._vehicle.conflict) is not None:
@@ -194,10 +202,8 @@ class Aligner:
             if found is not None
         }
 
-    async def _measure(self, model: GradienterModel, taken: list[_Taken], local: LocalEarth, since_s: float) -> _Taken:
-        window = await estimating.window(
-            self._collector, self._offload, since_s=since_s + SETTLE_S if math.isfinite(since_s) else None
-        )
+    async def _measure(self, model: GradienterModel, taken: list[_Taken], since_s: float) -> _Taken:
+        window = await estimating.window(self._collector, self._offload, since_s=since_s + SETTLE_S)
         if window.tilt is None:
             raise CalibrationRefusedError("no reading of the gradienter in this stand")
         try:
@@ -207,7 +213,6 @@ class Aligner:
         compass = models.compass_model(self._config.compass)
         if compass is not None and window.heading is not None:
             heading = vehicle_heading_rad(compass, window.heading.heading_deg, up) / DEG
-            heading += local.declination_deg if compass.magnetic else 0.0
             sigma = math.hypot(compass.sigma_deg, window.heading.sigma_deg)
         elif taken:
             heading = taken[-1].seen.heading_deg + self._turned_deg(taken[-1].window, window)
@@ -241,10 +246,15 @@ class Aligner:
         ]
         if not names:
             raise CalibrationRefusedError("no IMU whose accelerometers can be read")
-        stands = [self._as_stand(one, names, on_spot=k < plan.on_spot) for k, one in enumerate(taken)]
+        stands = self._as_stands(plan, taken, names, local)
         return align(model.law, model.vehicle_from_sensor, stands, self._ground(local))
 
-    def _as_stand(self, taken: _Taken, names: list[str], *, on_spot: bool) -> Stand:
+    def _as_stands(self, plan: Plan, taken: list[_Taken], names: list[str], local: LocalEarth) -> list[Stand]:
+        compass = self._config.compass
+        north_deg = local.declination_deg if compass is not None and compass.reference == "magnetic" else 0.0
+        return [self._as_stand(one, names, north_deg, on_spot=k < plan.on_spot) for k, one in enumerate(taken)]
+
+    def _as_stand(self, taken: _Taken, names: list[str], north_deg: float, *, on_spot: bool) -> Stand:
         window, tilt, configured = taken.window, taken.window.tilt, self._configured
         assert tilt is not None
         imus = {imu.name: imu for imu in window.imus}
@@ -264,7 +274,7 @@ class Aligner:
                 math.hypot(READING_SIGMA_DEG, tilt.x_sigma_deg),
                 math.hypot(READING_SIGMA_DEG, tilt.y_sigma_deg),
             ),
-            heading_rad=taken.seen.heading_deg * DEG,
+            heading_rad=(taken.seen.heading_deg + north_deg) * DEG,
             heading_sigma_rad=taken.heading_sigma_deg * DEG,
             on_spot=on_spot,
         )
@@ -287,7 +297,7 @@ class Aligner:
         settings = self.alignment.settings()
         assert settings is not None
         names = [imu.name for imu in result.imus]
-        stands = [self._as_stand(one, names, on_spot=k < plan.on_spot) for k, one in enumerate(taken)]
+        stands = self._as_stands(plan, taken, names, local)
         degrees = {imu.name: imu.temperature_degc for imu in taken[0].window.imus}
         offset, covariance = result.offset_deg, result.offset_covariance_deg2
         tilt = taken[0].window.tilt

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from companion.calibration.record import Record
-from companion.component.service import JobResult
+from companion.calibration.request import What
+from companion.component.service import JobResult, Refusal
 from companion.daemon.align_steps import Plan
 from companion.daemon.job import Job
 from sim.aircraft import Pose
+from sim.autopilot import offset_names
 from sim.devices import HMR3300, Gradienter
 from sim.hands import Hands
 from sim.imu_model import MG
@@ -35,8 +39,6 @@ def rig(folder: Path, *, seed: int = 1, placement_deg: float = 0.02, **more: Any
 
 
 def replaced(config: Any, **sections: dict[str, Any]) -> Any:
-    import msgspec
-
     changed = {name: msgspec.structs.replace(getattr(config, name), **keys) for name, keys in sections.items()}
     return msgspec.structs.replace(config, **changed)
 
@@ -95,5 +97,227 @@ def test_the_horizontal_accelerometers_become_as_good_as_the_turn(tmp_path: Path
             assert sigma_mg <= TARGET_MG
             assert off_mg < 2.5 * sigma_mg
             assert made.service.status()["alignment"]["in_force"] is True
+
+    run_virtual(main())
+
+
+async def moved(rig: Rig, hands: Hands, job: Job, stand: int, degrees: float) -> None:
+    """Wait for the words that ask for that stand, and turn."""
+    await rig.until(lambda: job.words.startswith(f"{stand} of") and "waiting for it to move" in job.words, 60.0)
+    hands.turn(rig.aircraft.time_at(rig.now_s), degrees)
+
+
+def test_a_spot_that_moved_is_refused_in_words_and_the_old_zero_stays(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            job = started(made.service.conductor.start_alignment(Plan("zero"), "test", 900.0))
+            await moved(made, hands, job, 2, 180.0)
+            hands.bump(0.3, 0.0)
+            await moved(made, hands, job, 3, 180.0)
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "the spot moved" in result.reason
+            assert made.service.alignment.used is None
+            assert not (tmp_path / "alignment.json").exists()
+            await asyncio.sleep(10.0)
+            assert "the spot moved" in "".join(made.ground.texts())
+
+    run_virtual(main())
+
+
+def test_tilts_tell_bias_and_scale_apart(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+    tilts = [(20.0, 0.0), (0.0, 20.0), (-20.0, 0.0), (0.0, -20.0)]
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            job = started(made.service.conductor.start_alignment(Plan("tilts"), "test", 900.0))
+            for stand in (2, 3, 4):
+                await moved(made, hands, job, stand, 90.0)
+            said: list[str] = []
+            for stand, tilt in enumerate(tilts, 5):
+                await made.until(lambda s=stand: job.words.startswith(f"{s} of 8") and "to move" in job.words, 60.0)  # type: ignore[misc]
+                said.append(job.words)
+                hands.tilt(made.aircraft.time_at(made.now_s), *tilt)
+            result = await job.finished
+            assert result.outcome == "done", result
+            assert "not nose up or right side down again" in said[2]
+            record = made.service.alignment.record
+            assert record is not None
+            assert np.abs(np.subtract(record.offset_deg, ZERO_DEG)).max() < 2.5 * record.sigma_deg
+            (imu,) = record.imus
+            assert imu.accel_scale.known == (True, True, True)
+            assert (np.abs(imu.accel_scale.value) < 3.0 * np.array(imu.accel_scale.sigma)).all()
+            assert max(imu.accel_scale.sigma) < 1e-3
+            true_mg = made.model.true_bias(made.aircraft.time_at(made.now_s)).accel_m_s2 / MG
+            assert imu.accel_bias_mg.known == (True, True, True)
+            off = np.abs(np.subtract(imu.accel_bias_mg.value, true_mg))
+            assert (off < 3.0 * np.array(imu.accel_bias_mg.sigma)).all()
+            assert imu.accel_bias_mg.sigma[2] < 2.0
+
+    run_virtual(main())
+
+
+def test_without_a_compass_the_gyros_tell_the_turn(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+    made.config = msgspec.structs.replace(made.config, compass=None)
+    del made.devices["compass"]
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            job = started(made.service.conductor.start_alignment(Plan("zero"), "test", 900.0))
+            await moved(made, hands, job, 2, 100.0)
+            await made.until(lambda: "turn it by" in job.words and "deg more" in job.words, 60.0)
+            assert re.search(r"stands (99|100|101) deg from where it stood first, should be 180", job.words)
+            hands.turn(made.aircraft.time_at(made.now_s), 80.0)
+            await moved(made, hands, job, 3, -180.0)
+            result = await job.finished
+            assert result.outcome == "done", result
+            record = made.service.alignment.record
+            assert record is not None
+            headings = [stand.heading_deg for stand in record.stands]
+            assert abs(headings[1] - 180.0) < 2.0
+            assert np.abs(np.subtract(record.offset_deg, ZERO_DEG)).max() < 2.5 * record.sigma_deg
+            assert record.sigma_deg < 0.03
+
+    run_virtual(main())
+
+
+def test_it_outlives_a_restart_and_is_not_used_with_another_configuration(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+
+    async def measure() -> None:
+        async with made.running():
+            await made.ready()
+            assert (await aligned(made, hands, Plan("zero"))).outcome == "done"
+
+    run_virtual(measure())
+
+    async def again(changes: dict[str, Any], words: str | None, *, forget: bool = False) -> tuple[float, Record | None]:
+        fresh, _ = rig(tmp_path, placement_deg=0.0)
+        fresh.config = replaced(fresh.config, gradienter=changes)
+        async with fresh.running():
+            await fresh.ready()
+            status = fresh.service.status()["alignment"]
+            if words is None:
+                assert status["in_force"] is True
+            else:
+                assert status["in_force"] is False
+                assert words in status["unused_because"]
+            result, record = await calibrated(fresh)
+            assert result.outcome == "done", result
+            assert (record.alignment is None) == (words is not None)
+            if forget:
+                replies = [r async for r in fresh.service.answers.answer({"command": "align", "action": "forget"})]
+                assert replies[-1]["state"] == "done"
+                assert fresh.service.status()["alignment"] is None
+                assert not (tmp_path / "alignment.json").exists()
+            return worst_horizontal(record, fresh)[1], record
+
+    assert run_virtual(again({}, None))[0] <= TARGET_MG
+    sigma_mg, _ = run_virtual(again({"offset_deg": (0.1, -0.1)}, "another gradienter.offset_deg"))
+    assert sigma_mg > 1.7
+    run_virtual(again({"mounting": "ROTATION_YAW_180", "port": "/elsewhere"}, "gradienter.port, gradienter.mounting"))
+    run_virtual(again({}, None, forget=True))
+
+
+def test_a_file_that_cannot_be_read_is_said_and_not_used(tmp_path: Path) -> None:
+    (tmp_path / "alignment.json").write_text('{"format_version": 1, "offset_deg": [nan', encoding="utf-8")
+    made, _ = rig(tmp_path)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            status = made.service.status()["alignment"]
+            assert status["in_force"] is False
+            assert "not a readable alignment" in status["unused_because"]
+
+    run_virtual(main())
+
+
+def test_who_may_start_one_and_how_it_ends(tmp_path: Path) -> None:
+    made, _ = rig(tmp_path)
+
+    async def main() -> None:
+        async with made.running():
+            conductor = made.service.conductor
+            await made.ready()
+            # A calibration and an alignment exclude each other.
+            job = started(conductor.start_alignment(Plan("zero"), "test", 900.0))
+            refused = conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(refused, Refusal)
+            assert "a gradienter alignment is running (1 of 3" in refused.reason or "waiting" in refused.reason
+            await made.until(lambda: "waiting for it to move" in job.words, 60.0)
+            assert conductor.cancel("the test")
+            assert (await job.finished).outcome == "cancelled"
+            running = started(conductor.start_calibration(What.BOTH, "test"))
+            refused = conductor.start_alignment(Plan("zero"), "test", 900.0)
+            assert isinstance(refused, Refusal)
+            assert "a calibration is running" in refused.reason
+            conductor.cancel("the test")
+            await running.finished
+            # Nobody turns it: it ends by itself, and says where it was.
+            job = started(conductor.start_alignment(Plan("zero"), "test", 40.0))
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "not finished in the time given: 2 of 3" in result.reason
+            # Armed in the middle.
+            job = started(conductor.start_alignment(Plan("zero"), "test", 900.0))
+            await made.until(lambda: "measuring" in job.words, 60.0)
+            made.double.arm()
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "armed during the alignment" in result.reason
+            refused = conductor.start_alignment(Plan("zero"), "test", 900.0)
+            assert isinstance(refused, Refusal)
+            assert refused.kind == "armed"
+
+    run_virtual(main())
+
+
+def test_a_client_that_vanishes_stops_nothing(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            replies = made.service.answers.answer({"command": "align", "action": "zero"})
+            first = await anext(replies)
+            assert first["kind"] == "progress"
+            await replies.aclose()  # type: ignore[attr-defined]
+            job = made.service.conductor.job
+            assert job is not None
+            result = await follow(made, hands, job)
+            assert result.outcome == "done", result
+            shown = [r async for r in made.service.answers.answer({"command": "align", "action": "show"})]
+            assert shown[-1]["state"] == "in force"
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_offsets_that_somebody_changes_in_between_are_noticed(tmp_path: Path, told: bool) -> None:
+    made, hands = rig(tmp_path)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            job = started(made.service.conductor.start_alignment(Plan("zero"), "test", 900.0))
+            await made.until(lambda: "waiting for it to move" in job.words, 60.0)
+            if told:
+                made.double.write_as_another_station(offset_names(1, "accel")[0], 0.03)
+            else:
+                made.double.set_parameter(offset_names(1, "accel")[0], 0.03)
+                await moved(made, hands, job, 2, 180.0)
+                await moved(made, hands, job, 3, 180.0)
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "were changed in between: align again" in result.reason
+            assert made.service.alignment.record is None
 
     run_virtual(main())
