@@ -222,7 +222,12 @@ def _worst(
     if abs(w[k]) <= W_LIMIT:
         return None, checked
     units = _units(model, rows[k])
-    return Complaint(rows[k], abs(float(w[k])), abs(float(residual[k] / redundancy[k])) * units), checked
+    # All axes of that reading together: what one axis says depends on how the aircraft is turned.
+    axes = [j for j, row in enumerate(rows) if row == rows[k] and usable[j] and row.group not in ("zero", "prior")] or [
+        k
+    ]
+    size = float(np.linalg.norm(residual[axes] / redundancy[axes])) * units
+    return Complaint(rows[k], abs(float(w[k])), size), checked
 
 
 def _units(model: Model, row: Row) -> float:

@@ -21,7 +21,13 @@ def add_command(
     """Add it to the parser of the command line."""
     parser = add("align", align, "measure the gradienter's zero (turn by 180 degrees), or how it sits (tilts)")
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("what", nargs="?", choices=("zero", "tilts"), help="zero: on one spot; tilts: that, and 4 tilts")
+    what.add_argument(
+        "what",
+        nargs="?",
+        choices=("zero", "tilts"),
+        metavar="zero|tilts",
+        help="zero: on one spot; tilts: that, and 4 tilts",
+    )
     what.add_argument("--show", action="store_true", help="the alignment that is kept")
     what.add_argument("--forget", action="store_true", help="go back to the configuration's zero and sigma")
     parser.add_argument(
@@ -82,7 +88,7 @@ def alignment_lines(record: Object) -> list[str]:
     when, stands, worth_mg = record["measured_at"][:19], len(record["stands"]), 1e3 * math.radians(sigma)
     lines = [
         f"measured {when} UTC in {stands} stands; the spot slopes by {record['slope_deg']:.2f} deg",
-        f"gradienter zero: x {x:+.4f}  y {y:+.4f} deg, sigma {sigma:.4f} deg, {worth_mg:.2f} mg horizontally",
+        f"gradienter zero: x {x:+.4f} y {y:+.4f} deg, sigma {sigma:.4f} deg, {worth_mg:.2f} mg horizontally",
     ]
     for imu in record["imus"]:
         lines.append(f"{imu['name']}:")
@@ -94,8 +100,8 @@ def alignment_lines(record: Object) -> list[str]:
             ("gyro bias", "deg/h", "gyro_bias_deg_h", ".1f", 1.0),
         ):
             found = imu[key]
-            if any(found["known"]):
-                lines.append(_axes(words, unit, found["value"], found["sigma"], form, scale, found["known"]))
+            if all(found["known"]):
+                lines.append(_axes(words, unit, found["value"], found["sigma"], form, scale))
     lines += [f"warning: {words}" for words in record["warnings"]]
     configured = record["gradienter"]["offset_deg"]
     lines += [
@@ -107,11 +113,9 @@ def alignment_lines(record: Object) -> list[str]:
     return lines
 
 
-def _axes(
-    words: str, unit: str, values: list[float], sigmas: list[float], form: str, scale: float, known: Any = (True,) * 3
-) -> str:
+def _axes(words: str, unit: str, values: list[float], sigmas: list[float], form: str, scale: float) -> str:
     axes = "  ".join(
-        f"{axis} {value * scale:+{form}} +- {sigma * scale:{form}}" if is_known else f"{axis} not determined"
-        for axis, value, sigma, is_known in zip("xyz", values, sigmas, known, strict=True)
+        f"{axis} {value * scale:+{form}} +- {sigma * scale:{form}}"
+        for axis, value, sigma in zip("xyz", values, sigmas, strict=True)
     )
     return f"  {words:16} {unit:6} {axes}"

@@ -110,14 +110,14 @@ def _reading_lines(status: Object) -> list[str]:
     lines, readings, alignment = [], status["readings"], status["alignment"]
     if readings["gradienter_x_deg"] is not None:
         lines.append(
-            f"gradienter reads: x {readings['gradienter_x_deg']:+.3f}  y {readings['gradienter_y_deg']:+.3f} deg"
+            f"gradienter reads: x {readings['gradienter_x_deg']:+.3f} y {readings['gradienter_y_deg']:+.3f} deg"
         )
     if readings["compass_deg"] is not None:
         lines.append(f"compass reads: {readings['compass_deg']:.1f} deg")
     if alignment is not None and alignment["in_force"]:
         x, y = alignment["offset_deg"]
         lines.append(
-            f"gradienter zero: x {x:+.3f}  y {y:+.3f} deg, sigma {alignment['sigma_deg']:.3f}, measured"
+            f"gradienter zero: x {x:+.3f} y {y:+.3f} deg, sigma {alignment['sigma_deg']:.3f}, measured"
             f" {alignment['measured_at'][:10]}"
         )
     elif alignment is not None:

@@ -52,7 +52,8 @@ SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
 
 
-_CHANGED: Final = "the offsets of imu {} were changed in between: align again"
+def _changed(name: str) -> CalibrationRefusedError:
+    return CalibrationRefusedError(f"the offsets of imu {name} were changed in between: align again")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +106,7 @@ class Aligner:
                 for name, imu in self._imus.items():
                     # Somebody may have changed its offsets without a word.
                     if not await imu.refresh():
-                        raise CalibrationRefusedError(_CHANGED.format(name))
+                        raise _changed(name)
                 where = models.whereabouts(self._config, self._vehicle)
                 local = await self._offload(local_earth, where)
                 result = await self._offload(self._solve, plan, model, taken, local)
@@ -119,7 +120,7 @@ class Aligner:
         await self.alignment.keep(record)
         self._machine.on(Event.NOTHING_TO_WRITE)
         x_deg, y_deg = record.offset_deg
-        return f"zero x {x_deg:+.3f} y {y_deg:+.3f} deg, sigma {record.sigma_deg:.3f}; now calibrate"
+        return f"zero x {x_deg:+.3f} y {y_deg:+.3f} deg, sigma {record.sigma_deg:.3f}; now: companion calibrate"
 
     # --- one stand
 
@@ -151,7 +152,8 @@ class Aligner:
             if not moved:
                 words = f"{why or f'{number - 1} done. Now {wish}'}; waiting for it to move"
             elif waiting_for is not None:
-                words = f"{wish}; {waiting_for}"
+                # Once it stands again, what to do is said by itself.
+                words = waiting_for if waiting_for.startswith("hold still") else f"{why or wish}; {waiting_for}"
             else:
                 words = f"measuring, {max(still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
             self._show(measuring=share > 0.0)
@@ -182,7 +184,7 @@ class Aligner:
             return
         for name, offsets in self._offsets().items():
             if taken[0].offsets.get(name, offsets) != offsets:
-                raise CalibrationRefusedError(_CHANGED.format(name))
+                raise _changed(name)
 
     def _not_ready(self) -> str | None:
         if (conflict := self._vehicle.conflict) is not None:

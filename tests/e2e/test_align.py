@@ -16,6 +16,8 @@ from companion.calibration.request import What
 from companion.component.service import JobResult, Refusal
 from companion.daemon.align_steps import Plan
 from companion.daemon.job import Job
+from companion.recording.walk import Recording
+from companion.replay.engine import Replay
 from sim.aircraft import Pose
 from sim.autopilot import offset_names
 from sim.devices import HMR3300, Gradienter
@@ -321,3 +323,21 @@ def test_offsets_that_somebody_changes_in_between_are_noticed(tmp_path: Path, to
             assert made.service.alignment.record is None
 
     run_virtual(main())
+
+
+def test_a_recording_replays_with_the_zero_that_was_in_force(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path, recordings_mb=64)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            assert (await aligned(made, hands, Plan("zero"))).outcome == "done"
+            result, _ = await calibrated(made)
+            assert result.outcome == "done"
+            await asyncio.sleep(2.0)
+
+    run_virtual(main())
+    paths = sorted((tmp_path / "recordings").glob("0*.mcap"))
+    (found,) = [each for path in paths for each in Replay(Recording(path)).run().calibrations]
+    assert found.record.alignment is not None
+    assert found.differences == []
