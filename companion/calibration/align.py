@@ -30,6 +30,8 @@ _CONVERGED: Final = 1e-6
 """Of the prior sigma of each parameter."""
 W_LIMIT: Final = 4.5
 """|w| of one residual: passed by chance once in some thousand alignments of a hundred readings."""
+SPOT_W_LIMIT: Final = 3.9
+"""Of a placement, of which there are few: likewise once in some thousand."""
 DETERMINED: Final = 0.2
 """A figure counts as determined where its sigma is below this share of what was known before."""
 _LEAST_REDUNDANCY: Final = 1e-3
@@ -218,8 +220,9 @@ def _worst(
     # A stand's placement is checked where the other stands foretell it: what they leave of it is its redundancy.
     on_spot = np.array([row.group == "spot" for row in rows])
     checked = bool((redundancy[on_spot] > 0.1).any())
-    k = int(np.argmax(np.abs(w)))
-    if abs(w[k]) <= W_LIMIT:
+    beyond = np.abs(w) / np.where(on_spot, SPOT_W_LIMIT, W_LIMIT)
+    k = int(np.argmax(beyond))
+    if beyond[k] <= 1.0:
         return None, checked
     units = _units(model, rows[k])
     # All axes of that reading together: what one axis says depends on how the aircraft is turned.

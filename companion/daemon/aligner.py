@@ -29,7 +29,7 @@ from companion.config import Config
 from companion.daemon import align_steps, estimating, models
 from companion.daemon.align_steps import Plan, Seen
 from companion.daemon.alignment import AlignmentInForce
-from companion.daemon.autopilot_imu import AutopilotImu
+from companion.daemon.autopilot_imu import AutopilotImu, not_ready
 from companion.daemon.job import Job
 from companion.daemon.ledger import Offload
 from companion.errors import CalibrationRefusedError
@@ -147,7 +147,7 @@ class Aligner:
             if moving:
                 moved, since_s = True, now_s
             still_s = min(status.still_s, now_s - since_s - SETTLE_S)
-            waiting_for = self._not_ready() or status.waiting_for
+            waiting_for = not_ready(self._vehicle, self._imus) or status.waiting_for
             share = min(max(still_s, 0.0) / self._stand_s, 1.0) if moved and waiting_for is None else 0.0
             if not moved:
                 words = f"{why or f'{number - 1} done. Now {wish}'}; waiting for it to move"
@@ -185,16 +185,6 @@ class Aligner:
         for name, offsets in self._offsets().items():
             if taken[0].offsets.get(name, offsets) != offsets:
                 raise _changed(name)
-
-    def _not_ready(self) -> str | None:
-        if (conflict := self._vehicle.conflict) is not None:
-            return f"waiting: {conflict}"
-        if self._vehicle.arm_state is ArmState.UNKNOWN:
-            return "waiting for the autopilot's heartbeat"
-        for imu in self._imus.values():
-            if imu.stream.problem or imu.calibration is None:
-                return f"waiting for imu {imu.name}: {imu.stream.problem or imu.problem}"
-        return None
 
     def _offsets(self) -> dict[str, tuple[Vector, Vector]]:
         known = {name: imu.calibration for name, imu in self._imus.items()}

@@ -27,7 +27,7 @@ from companion.component.statustext import Severity, Weight
 from companion.config import Config
 from companion.daemon import estimating, models
 from companion.daemon.alignment import AlignmentInForce
-from companion.daemon.autopilot_imu import AutopilotImu
+from companion.daemon.autopilot_imu import AutopilotImu, not_ready
 from companion.daemon.dither import Ditherer
 from companion.daemon.job import Job, JobCancelledError
 from companion.daemon.ledger import Offload
@@ -242,7 +242,7 @@ class Course:
                     raise AutopilotError(f"imu {name}: {imu.problem}")
             await estimating.catch_up(self._collector, self._offload)
             status = self._collector.status(now_s)
-            waiting_for = self._not_ready() or status.waiting_for
+            waiting_for = not_ready(self._vehicle, self._imus) or status.waiting_for
             if waiting_for is not None:
                 if self.machine.state is State.COLLECTING:
                     self.machine.on(Event.MOVED)
@@ -261,17 +261,6 @@ class Course:
             if job.deadline_s is not None and now_s >= job.deadline_s:
                 raise CalibrationRefusedError(f"not finished in the time given: {job.words}")
             await job.pause(POLL_S)
-
-    def _not_ready(self) -> str | None:
-        """What of the autopilot is missing for a measurement, in one line."""
-        if (conflict := self._vehicle.conflict) is not None:
-            return f"waiting: {conflict}"
-        if self._vehicle.arm_state is ArmState.UNKNOWN:
-            return "waiting for the autopilot's heartbeat"
-        for imu in self._imus.values():
-            if imu.stream.problem or imu.calibration is None:
-                return f"waiting for imu {imu.name}: {imu.stream.problem or imu.problem}"
-        return None
 
 
 def in_words(solution: Solution | None) -> str:
