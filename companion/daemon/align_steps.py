@@ -61,16 +61,16 @@ def request(plan: Plan, taken: Sequence[Seen]) -> str:
     """What the person at the aircraft should do now."""
     number = len(taken)
     if number == 0:
-        return "stand it level on a firm spot, mark where it stands, hands off"
+        return "stand it on a firm, marked spot, hands off"
     if number >= plan.on_spot:
         done = [_side(taken[0].up, seen.up) for seen in taken[plan.on_spot :]]
         already = f", not {' or '.join(done)} again" if done else ": nose up, nose down, left or right side down"
         return f"tilt it 20 to 28 deg and prop it up{already}"
     if plan.on_spot == HEADINGS:
-        return "turn it by 90 deg on the same spot"
+        return "turn it by 90 deg on its spot"
     if number == 1:
-        return "turn it by 180 deg on the same spot, onto its marks"
-    return "turn it back, as it stood first, onto its marks"
+        return "turn it by 180 deg, onto its marks"
+    return "turn it back onto its first marks"
 
 
 def objection(plan: Plan, taken: Sequence[Seen], now: Seen) -> str | None:

@@ -34,7 +34,7 @@ def test_how_many_stands(plan: Plan, total: int, on_spot: int) -> None:
 
 def test_there_and_back() -> None:
     plan = Plan("zero")
-    assert "mark where it stands" in request(plan, [])
+    assert "marked spot" in request(plan, [])
     assert objection(plan, [], LEVEL) is None
     assert "by 180 deg" in request(plan, [LEVEL])
     for heading in (170.0, 150.0, 195.0):
