@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from collections.abc import Callable
 
 from companion.calibration.align_record import AlignmentRecord, GradienterSettings
 from companion.calibration.record import AlignmentUsed
@@ -27,6 +28,8 @@ class AlignmentInForce:
         """What is kept, whether or not it is used."""
         self.unused: str | None = None
         """Why what is kept is not used, in one line; None while it is used, or nothing is kept."""
+        self.on_change: Callable[[], None] = lambda: None
+        """Told when another zero is in force."""
 
     def load(self) -> None:
         """Read what was kept before this start; blocking. What cannot be read is said and not used."""
@@ -45,6 +48,7 @@ class AlignmentInForce:
         """
         await self._offload(self._store.write, record)
         self._take(record)
+        self.on_change()
 
     async def forget(self) -> bool:
         """Go back to what the configuration says; whether there was anything to forget.
@@ -55,6 +59,8 @@ class AlignmentInForce:
         was = self.record is not None or self.unused is not None
         await self._offload(self._store.clear)
         self._take(None)
+        if was:
+            self.on_change()
         return was
 
     def settings(self) -> GradienterSettings | None:

@@ -48,7 +48,7 @@ logger = logging.getLogger(__name__)
 _ZERO: Final[Axes] = (0.0, 0.0, 0.0)
 # Causes that a measurement settles. What the pilot undid and what somebody else chose is theirs until asked for, and
 # what a boot replaced is pushed again.
-_SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED})
+_SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED})
 SETTLED_EVERY_S: Final = 5
 """So often the output is looked at while nothing speaks against what is in force; else every second."""
 Key = tuple[str, Triad]
@@ -211,6 +211,13 @@ class InForce:
                 if imu.name in self._sources:
                     self._take(imu, asyncio.get_running_loop().time())
                     self._written[imu.name] = {name: one.after for name, one in imu.written.items()}
+
+    def realigned(self) -> None:
+        """The gradienter has another zero from now on: accelerometers calibrated with the old one must be seen anew."""
+        for key, held in self._held.items():
+            if key[1] == "accel" and isinstance(held, Held):
+                self._held[key] = Why.ALIGNED
+        self._forget()
 
     def _take(self, imu: ImuRecord, now_s: float) -> None:
         """Hold what a calibration has found in one IMU."""

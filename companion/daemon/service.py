@@ -147,6 +147,7 @@ class Service:
         self.reach = Reach(self.link, self.vehicle, self.parameters)
         self.in_force = InForce(config, self.vehicle, self.collector, self.imus, offload)
         self.in_force.gradienter = self.alignment.model
+        self.alignment.on_change = self.in_force.realigned
         self.readiness = Readiness(self.vehicle, self.collector, self.conductor, self.mender, self.in_force)
         self.readiness.reboot_owed = lambda: reboot.owed
         self.automatic = Automatic(

@@ -228,6 +228,27 @@ def test_it_outlives_a_restart_and_is_not_used_with_another_configuration(tmp_pa
     run_virtual(again({}, None, forget=True))
 
 
+def test_what_was_calibrated_with_the_old_zero_is_calibrated_anew_by_itself(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path, at_arm="warn")
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            conductor, in_force = made.service.conductor, made.service.in_force
+            await made.until(lambda: conductor.last is not None and not in_force.findings(made.now_s), 200.0)
+            assert conductor.last is not None
+            assert conductor.last.alignment is None
+            assert (await aligned(made, hands, Plan("zero"))).outcome == "done"
+            assert [finding.words for finding in in_force.findings(made.now_s)] == ["gradienter aligned since then"]
+            await made.until(lambda: conductor.last is not None and conductor.last.alignment is not None, 150.0)
+            await made.until(lambda: not in_force.findings(made.now_s), 60.0)
+            off_mg, sigma_mg = worst_horizontal(conductor.last, made)
+            assert sigma_mg <= TARGET_MG
+            assert off_mg < 2.5 * sigma_mg
+
+    run_virtual(main())
+
+
 def test_a_file_that_cannot_be_read_is_said_and_not_used(tmp_path: Path) -> None:
     (tmp_path / "alignment.json").write_text('{"format_version": 1, "offset_deg": [nan', encoding="utf-8")
     made, _ = rig(tmp_path)
