@@ -16,9 +16,10 @@ from pathlib import Path
 from sim.aircraft import Pose
 from sim.devices import SerialDevice
 from sim.families import COMPASSES, GRADIENTERS, IMUS, Devices, fit
+from sim.hands import HELP, Hands, take_lines
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.pty_device import PtyDevice
-from sim.scenario import DEMO_DEVICES, DEMO_POSE, Scenario, demo
+from sim.scenario import DEMO_DEVICES, DEMO_POSE, GRADIENTER_OFFSET_DEG, Scenario, demo
 from sim.udp import open_udp
 
 DEFAULT_UDP = "127.0.0.1:14550"
@@ -69,6 +70,11 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument(
                 "--gyr-cal", action="store_true", help="INS_GYR_CAL = 1: ArduPilot calibrates its gyros at boot"
             )
+        command.add_argument("--hands", action="store_true", help=f"move the aircraft by lines typed here: {HELP}")
+        command.add_argument(
+            "--zero", type=float, nargs=2, metavar=("X", "Y"), default=GRADIENTER_OFFSET_DEG,
+            help="what the gradienter shows too much, degrees (default 0.003 -0.002)",
+        )  # fmt: skip
     commands.add_parser("demo", help="the whole chain, with a result to look at")
     for name, text in FIRMWARE_COMMANDS.items():
         commands.add_parser(name, help=text)
@@ -140,7 +146,10 @@ def _device_lines(scenario: Scenario, directory: Path, role: str) -> list[str]:
     lines = [f'port = "{directory / port}"', f"baud = {device.baud}", f'protocol = "{device.protocol}"']
     if any(fitting.mounting_deg):
         lines.append(f"mounting = {list(fitting.mounting_deg)}")
-    if fitting.sigma_deg is not None:
+    if max(map(abs, getattr(device, "offset_deg", ()) or (0.0,))) > 0.01:
+        # A zero that nobody has measured: that is for `companion align` to do.
+        lines.append("sigma_deg = 0.1")
+    elif fitting.sigma_deg is not None:
         lines.append(f"sigma_deg = {fitting.sigma_deg:g}")
     return lines
 
@@ -170,6 +179,7 @@ async def serve(
     udp: tuple[str, int] | None = None,
     ground: tuple[str, int] | None = None,
     started: asyncio.Event | None = None,
+    hands: Hands | None = None,
 ) -> None:
     """Serve until cancelled: devices if there is a directory, the autopilot if there is an address to send to."""
     async with contextlib.AsyncExitStack() as stack:
@@ -186,6 +196,9 @@ async def serve(
         if udp is not None and ground is not None:
             station = await open_udp(scenario.autopilot.ground, target=ground)
             stack.callback(station.close)
+        if hands is not None:
+            told = take_lines(hands, scenario.aircraft, lambda words: print(f"# {words}", flush=True))
+            running.append(asyncio.create_task(told, name="hands"))
         if started is not None:
             started.set()
         try:
@@ -206,6 +219,7 @@ def main(argv: Sequence[str]) -> int:
         seed=arguments.seed,
         unix_s=time.time(),
         law=arguments.law,
+        gradienter_offset_deg=(arguments.zero[0], arguments.zero[1]),
         gyr_cal_at_boot=autopilot and arguments.gyr_cal,
         firmware=arguments.firmware if autopilot else "ardupilot",
         devices=(arguments.imu, arguments.gradienter, arguments.compass) if devices else DEMO_DEVICES,
@@ -217,11 +231,14 @@ def main(argv: Sequence[str]) -> int:
     udp = arguments.udp if autopilot else None
     text = describe(scenario, devices=devices, autopilot=autopilot)
     text += configuration(scenario, directory=directory, udp=udp)
+    hands = Hands(scenario.aircraft, placement_deg=0.02, seed=arguments.seed) if arguments.hands else None
     try:
         ground = arguments.ground if autopilot else None
         return asyncio.run(
             run_until_stopped(
-                lambda started: serve(scenario, directory=directory, udp=udp, ground=ground, started=started),
+                lambda started: serve(
+                    scenario, directory=directory, udp=udp, ground=ground, started=started, hands=hands
+                ),
                 lambda: text,
             )
         )

@@ -144,6 +144,15 @@ class Arming(msgspec.Struct, frozen=True, kw_only=True):
     accel_sigma_use_m_s2: float | None
 
 
+class AlignmentUsed(msgspec.Struct, frozen=True, kw_only=True):
+    """The alignment of the gradienter that was in force: its zero on top of the configured one, and its sigma."""
+
+    measured_at: str
+    """UTC, ISO 8601."""
+    offset_deg: tuple[float, float]
+    sigma_deg: float
+
+
 class Record(msgspec.Struct, frozen=True, kw_only=True):
     """One calibration, finished in whatever way."""
 
@@ -159,6 +168,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     imus: tuple[ImuRecord, ...]
     system_id: int | None = None
     """MAVLink system of the vehicle; None while it had not been heard."""
+    alignment: AlignmentUsed | None = None
+    """None: the gradienter's zero and sigma were those of the configuration."""
     undone_at: str | None = None
     """UTC, ISO 8601: when what this calibration has written was put back on request."""
     magnetic: Magnetic | None = None

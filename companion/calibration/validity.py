@@ -44,6 +44,7 @@ class Why(enum.Enum):
     UNDONE = "calibration was undone"
     REBOOTED = "autopilot restarted"
     REPLACED = "boot reset gyro offsets"
+    ALIGNED = "gradienter aligned since then"
     CHANGED = "changed by someone else"
     FAILED = "last calibration failed"
     UNSEEN = "offsets written but not seen to work"

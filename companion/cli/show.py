@@ -99,6 +99,7 @@ def status_lines(status: Object) -> list[str]:
     vehicle = status["vehicle"]
     lines.append(f"autopilot: {vehicle['summary']}")
     lines += [f"{device['name']}: {device['summary']}{_counts(device)}" for device in status["devices"]]
+    lines += _reading_lines(status)
     lines += [f"warning: {warning}" for warning in status["warnings"]]
     if not status["ground_stations"]["good"]:
         lines.append(f"ground stations: {status['ground_stations']['summary']}")
@@ -128,6 +129,26 @@ def _counts(device: Object) -> str:
         "clock jumps": device.get("clock_jumps"),
     }
     return "".join(f"; {number} {what}" for what, number in words.items() if number)
+
+
+def _reading_lines(status: Object) -> list[str]:
+    """What gradienter and compass say at this moment, and whose zero the gradienter's is."""
+    lines, readings, alignment = [], status["readings"], status["alignment"]
+    if readings["gradienter_x_deg"] is not None:
+        lines.append(
+            f"gradienter reads: x {readings['gradienter_x_deg']:+.3f} y {readings['gradienter_y_deg']:+.3f} deg"
+        )
+    if readings["compass_deg"] is not None:
+        lines.append(f"compass reads: {readings['compass_deg']:.1f} deg")
+    if alignment is not None and alignment["in_force"]:
+        x, y = alignment["offset_deg"]
+        lines.append(
+            f"gradienter zero: x {x:+.3f} y {y:+.3f} deg, sigma {alignment['sigma_deg']:.3f}, measured"
+            f" {alignment['measured_at'][:10]}"
+        )
+    elif alignment is not None:
+        lines.append(f"alignment not used: {alignment['unused_because']}")
+    return lines
 
 
 def headline_line(status: Object) -> str:

@@ -13,6 +13,8 @@ from companion.calibration.record import Record
 from companion.calibration.request import What
 from companion.calibration.rolling import RollingCollector
 from companion.component.service import Refusal
+from companion.daemon.align_answers import answer_align
+from companion.daemon.alignment import AlignmentInForce
 from companion.daemon.armings import Armings, with_armings
 from companion.daemon.automatic import Automatic
 from companion.daemon.conductor import Conductor
@@ -76,12 +78,13 @@ class Answers:
         link: MavlinkLink,
         pose: PoseNow,
         trouble: Callable[[], str | None],
+        alignment: AlignmentInForce,
     ) -> None:
         self._conductor, self._vehicle, self._collector, self._devices = conductor, vehicle, collector, devices
         self._store, self._offload, self._mavlink_url = store, offload, mavlink_url
         self._rivalry, self._reach, self._mender, self._readiness = rivalry, reach, mender, readiness
         self._armings, self._gate_setup, self._automatic = armings, gate_setup, automatic
-        self._recorder, self._link, self._pose = recorder, link, pose
+        self._recorder, self._link, self._pose, self._alignment = recorder, link, pose, alignment
         self._headlines = Headlines(vehicle, collector, conductor, mender, readiness, automatic, mavlink_url, trouble)
         self.page: Callable[[], Object | None] = lambda: None
         """What is to be said of the page; None where none is configured."""
@@ -100,6 +103,9 @@ class Answers:
             yield {"kind": "result", "status": await self.look()}
         elif command == "calibrate":
             async for reply in self._answer_calibrate(request, face):
+                yield reply
+        elif command == "align":
+            async for reply in answer_align(self._conductor, self._alignment, request, face):
                 yield reply
         elif command == "cancel":
             running = self._conductor.cancel(f"{face} cancel")
@@ -190,6 +196,8 @@ class Answers:
                 "not_sent": self._link.dropped,
             },
             "pose": self._pose.now(),
+            "readings": self._pose.readings(),
+            "alignment": self._alignment.status(),
             "warnings": self._rivalry.warnings,
             "ground_stations": dict(zip(("good", "summary"), self._reach.words(), strict=True)),
             "fault": self._mender.fault,

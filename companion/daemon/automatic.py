@@ -119,9 +119,9 @@ class Automatic:
         return None
 
     def _is_urgent(self) -> bool:
-        """A boot that threw our values away is not answered with patience; failures are."""
+        """A boot that threw our values away, or a new zero, is not answered with patience; failures are."""
         whys = {finding.why for finding in self._in_force.findings(asyncio.get_running_loop().time())}
-        return Why.REPLACED in whys and self._failures == 0
+        return bool(whys & {Why.REPLACED, Why.ALIGNED}) and self._failures == 0
 
     def _writes_this_boot(self) -> int:
         boots, writes = self._this_boot

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
 import numpy as np
@@ -20,7 +20,7 @@ from companion.autopilot.imu_stream import ImuStream, StreamKind
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.px4_slots import SlotMemory
 from companion.autopilot.rivals import rivals_of
-from companion.autopilot.vehicle import Vehicle, VehicleEvent
+from companion.autopilot.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.errors import AutopilotError
 from companion.links.mavlink import MavlinkLink
 from companion.samples import ImuSample
@@ -200,6 +200,18 @@ class AutopilotImu:
             "summary": problem or f"autopilot IMU {self.instance}, {kind.message if kind else 'no message'}",
             "frames": self.stream.samples,
         }
+
+
+def not_ready(vehicle: Vehicle, imus: Mapping[str, AutopilotImu]) -> str | None:
+    """What of the autopilot is missing for a measurement, in one line."""
+    if (conflict := vehicle.conflict) is not None:
+        return f"waiting: {conflict}"
+    if vehicle.arm_state is ArmState.UNKNOWN:
+        return "waiting for the autopilot's heartbeat"
+    for imu in imus.values():
+        if imu.stream.problem or imu.calibration is None:
+            return f"waiting for imu {imu.name}: {imu.stream.problem or imu.problem}"
+    return None
 
 
 def _same(one: ImuCalibration, other: ImuCalibration) -> bool:

@@ -24,8 +24,10 @@ from companion.calibration.trace import Snapshot
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.config import Config
+from companion.daemon.align_steps import Plan
+from companion.daemon.aligner import Aligner
 from companion.daemon.course import Course, Say, Stage, in_words
-from companion.daemon.job import Job, JobCancelledError
+from companion.daemon.job import ALIGNMENT, Job, JobCancelledError
 from companion.daemon.ledger import Offload
 from companion.daemon.mend import Mender
 from companion.daemon.push import Pusher
@@ -50,7 +52,9 @@ class Conductor:
         store: RecordStore,
         say: Say,
         offload: Offload,
+        aligner: Aligner,
     ) -> None:
+        self._aligner = aligner
         self._config, self._vehicle, self._collector, self._course = config, vehicle, collector, course
         self._pusher, self._mender, self._store = pusher, mender, store
         self._say, self._offload = say, offload
@@ -144,6 +148,16 @@ class Conductor:
         job = Job(kind, what, requester, deadline_s, reboot=reboot)
         job.automatic = automatic
         return self._start(job, Event.REQUEST, self._calibrate(job))
+
+    def start_alignment(self, plan: Plan, requester: str, timeout_s: float) -> Job | Refusal:
+        """Start measuring the gradienter's zero, or say why not."""
+        refusal = self._refusal()
+        if refusal is not None:
+            return refusal
+        if self._config.gradienter is None:
+            return Refusal("other", "there is no gradienter to align: none is configured")
+        job = Job(ALIGNMENT, What.BOTH, requester, asyncio.get_running_loop().time() + timeout_s)
+        return self._start(job, Event.REQUEST, self._align(job, plan))
 
     def start_undo(self, requester: str, *, force: bool = False) -> Job | Refusal:
         """Start putting back the values from before the last calibration, or say why not; `force` as `Mender.undo`."""
@@ -296,6 +310,19 @@ class Conductor:
             logger.exception("the readings of this calibration cannot be kept")
             trace = None
         self._store.save(record, trace)
+
+    async def _align(self, job: Job, plan: Plan) -> None:
+        try:
+            words = await self._aligner.run(job, plan)
+        except JobCancelledError as cancelled:
+            self._end(job, Event.CANCEL, JobResult("cancelled", str(cancelled)))
+        except CompanionError as error:
+            self._end(job, Event.FAULT, JobResult("failed", str(error)))
+        except Exception as error:
+            logger.exception("the alignment met a fault of the program")
+            self._end(job, Event.FAULT, JobResult("failed", f"internal error: {error!r}; the log has the details"))
+        else:
+            self._end(job, None, JobResult("done", words))
 
     # --- an undo
 

@@ -26,7 +26,8 @@ from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity, Weight
 from companion.config import Config
 from companion.daemon import estimating, models
-from companion.daemon.autopilot_imu import AutopilotImu
+from companion.daemon.alignment import AlignmentInForce
+from companion.daemon.autopilot_imu import AutopilotImu, not_ready
 from companion.daemon.dither import Ditherer
 from companion.daemon.job import Job, JobCancelledError
 from companion.daemon.ledger import Offload
@@ -65,10 +66,11 @@ class Course:
         offload: Offload,
         reboot: Reboot,
         ditherer: Ditherer,
+        alignment: AlignmentInForce,
     ) -> None:
         self._config, self._vehicle, self._collector, self._imus = config, vehicle, collector, imus
         self._pusher, self._ditherer, self._reboot = pusher, ditherer, reboot
-        self._say, self._offload = say, offload
+        self._say, self._offload, self._alignment = say, offload, alignment
         self.machine = Machine()
         """Where it stands."""
         self.settings = models.settings(config)
@@ -141,10 +143,11 @@ class Course:
             solve_at,
             window,
             where,
-            models.gradienter_model(self._config.gradienter),
+            self._alignment.model(),
             models.compass_model(self._config.compass),
             job.what,
         )
+        draft.alignment = self._alignment.used
         draft.solution, draft.measured_s = solution, (measured.start_s, measured.end_s)
         self.on_solved(measured, window, where, job.what)
         plan = await self._pusher.plan(solution, draft)
@@ -239,7 +242,7 @@ class Course:
                     raise AutopilotError(f"imu {name}: {imu.problem}")
             await estimating.catch_up(self._collector, self._offload)
             status = self._collector.status(now_s)
-            waiting_for = self._not_ready() or status.waiting_for
+            waiting_for = not_ready(self._vehicle, self._imus) or status.waiting_for
             if waiting_for is not None:
                 if self.machine.state is State.COLLECTING:
                     self.machine.on(Event.MOVED)
@@ -258,17 +261,6 @@ class Course:
             if job.deadline_s is not None and now_s >= job.deadline_s:
                 raise CalibrationRefusedError(f"not finished in the time given: {job.words}")
             await job.pause(POLL_S)
-
-    def _not_ready(self) -> str | None:
-        """What of the autopilot is missing for a measurement, in one line."""
-        if (conflict := self._vehicle.conflict) is not None:
-            return f"waiting: {conflict}"
-        if self._vehicle.arm_state is ArmState.UNKNOWN:
-            return "waiting for the autopilot's heartbeat"
-        for imu in self._imus.values():
-            if imu.stream.problem or imu.calibration is None:
-                return f"waiting for imu {imu.name}: {imu.stream.problem or imu.problem}"
-        return None
 
 
 def in_words(solution: Solution | None) -> str:

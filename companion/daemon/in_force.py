@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Final
 
 import msgspec
@@ -22,7 +22,7 @@ from companion.calibration.allan import noise_profile
 from companion.calibration.record import ImuRecord, Record
 from companion.calibration.request import What
 from companion.calibration.rolling import RollingCollector
-from companion.calibration.solve import Solution, solve_at
+from companion.calibration.solve import GradienterModel, Solution, solve_at
 from companion.calibration.validity import (
     Axes,
     Finding,
@@ -39,7 +39,7 @@ from companion.component.service import JobResult
 from companion.config import Config, Imu
 from companion.daemon import estimating, models
 from companion.daemon.autopilot_imu import AutopilotImu
-from companion.daemon.job import Job
+from companion.daemon.job import ALIGNMENT, Job
 from companion.daemon.ledger import Offload
 from companion.errors import CalibrationRefusedError
 
@@ -48,7 +48,7 @@ logger = logging.getLogger(__name__)
 _ZERO: Final[Axes] = (0.0, 0.0, 0.0)
 # Causes that a measurement settles. What the pilot undid and what somebody else chose is theirs until asked for, and
 # what a boot replaced is pushed again.
-_SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED})
+_SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED})
 SETTLED_EVERY_S: Final = 5
 """So often the output is looked at while nothing speaks against what is in force; else every second."""
 Key = tuple[str, Triad]
@@ -83,6 +83,8 @@ class InForce:
     ) -> None:
         self._config, self._vehicle, self._collector = config, vehicle, collector
         self._imus, self._offload = imus, offload
+        self.gradienter: Callable[[], GradienterModel | None] = lambda: models.gradienter_model(config.gradienter)
+        """The gradienter's model as it is in force."""
         wanted = config.calibration
         self._limits = Limits(
             max_age_s=60.0 * wanted.max_age_min, max_temperature_change_k=wanted.max_temperature_change_degc
@@ -199,7 +201,7 @@ class InForce:
                 self.undone, self.calibration = True, None
                 self._held = dict.fromkeys(self._held, Why.UNDONE)
             return
-        if not job.automatic:
+        if not job.automatic and job.kind != ALIGNMENT:
             self.foreign = None
         if done and job.record is not None:
             self.undone = False
@@ -209,6 +211,13 @@ class InForce:
                 if imu.name in self._sources:
                     self._take(imu, asyncio.get_running_loop().time())
                     self._written[imu.name] = {name: one.after for name, one in imu.written.items()}
+
+    def realigned(self) -> None:
+        """The gradienter has another zero from now on: accelerometers calibrated with the old one must be seen anew."""
+        for key, held in self._held.items():
+            if key[1] == "accel" and isinstance(held, Held):
+                self._held[key] = Why.ALIGNED
+        self._forget()
 
     def _take(self, imu: ImuRecord, now_s: float) -> None:
         """Hold what a calibration has found in one IMU."""
@@ -324,7 +333,7 @@ class InForce:
                 solve_at,
                 window,
                 models.whereabouts(self._config, self._vehicle),
-                models.gradienter_model(self._config.gradienter),
+                self.gradienter(),
                 models.compass_model(self._config.compass),
                 self.what,
             )

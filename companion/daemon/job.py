@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+from typing import Final
 
+from companion.calibration.align_record import AlignmentRecord
 from companion.calibration.record import Record, WrittenParameter
 from companion.calibration.request import What
 from companion.component.service import JobResult
+
+ALIGNMENT: Final = "gradienter alignment"
+"""The kind of job that calibrates nothing."""
 
 
 class JobCancelledError(Exception):
@@ -28,6 +33,7 @@ class Job:
         """Loop time until which measuring may take; None: no limit."""
         self.finished: asyncio.Future[JobResult] = asyncio.get_running_loop().create_future()
         self.record: Record | None = None
+        self.alignment: AlignmentRecord | None = None
         self.written: dict[str, WrittenParameter] = {}
         self.words = ""
         """What is going on now, for people."""

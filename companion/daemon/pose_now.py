@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Callable
 from typing import Any, Final
 
 from companion.autopilot.vehicle import Vehicle
 from companion.calibration.rolling import RollingCollector
 from companion.calibration.site import Whereabouts, local_earth
-from companion.calibration.solve import up_in_vehicle, vehicle_heading_rad
+from companion.calibration.solve import GradienterModel, up_in_vehicle, vehicle_heading_rad
 from companion.config import Config
 from companion.daemon import models
 from companion.daemon.ledger import Offload
@@ -31,7 +32,8 @@ class PoseNow:
 
     def __init__(self, config: Config, vehicle: Vehicle, collector: RollingCollector, offload: Offload) -> None:
         self._config, self._vehicle, self._collector, self._offload = config, vehicle, collector, offload
-        self._gradienter = models.gradienter_model(config.gradienter)
+        self.gradienter: Callable[[], GradienterModel | None] = lambda: models.gradienter_model(config.gradienter)
+        """The gradienter's model as it is in force."""
         self._compass = models.compass_model(config.compass)
         self._tilt: TiltSample | None = None
         self._heading: CompassSample | None = None
@@ -58,10 +60,11 @@ class PoseNow:
         """
         now_s = asyncio.get_running_loop().time()
         tilt, heading = self._tilt, self._heading
-        if self._gradienter is None or tilt is None or now_s - tilt.t_s > OLDEST_S:
+        gradienter = self.gradienter()
+        if gradienter is None or tilt is None or now_s - tilt.t_s > OLDEST_S:
             return None
         try:
-            up = up_in_vehicle(self._gradienter, tilt.x_deg, tilt.y_deg)
+            up = up_in_vehicle(gradienter, tilt.x_deg, tilt.y_deg)
         except ValueError:
             return None
         roll, pitch = roll_pitch_from_up(up)
@@ -85,6 +88,17 @@ class PoseNow:
                 "source": "gradienter and compass",
             }
         return pose
+
+    def readings(self) -> dict[str, float | None]:
+        """What gradienter and compass themselves say at this moment, before any offset; None where nothing fresh."""
+        now_s = asyncio.get_running_loop().time()
+        tilt = self._tilt if self._tilt is not None and now_s - self._tilt.t_s <= OLDEST_S else None
+        heading = self._heading if self._heading is not None and now_s - self._heading.t_s <= OLDEST_S else None
+        return {
+            "gradienter_x_deg": None if tilt is None else round(tilt.x_deg, 4),
+            "gradienter_y_deg": None if tilt is None else round(tilt.y_deg, 4),
+            "compass_deg": None if heading is None else round(heading.heading_deg, 3),
+        }
 
     async def _look_up(self, now_s: float) -> None:
         """Looked up rarely: the aircraft does not get far in a minute, and the magnetic model takes its time."""

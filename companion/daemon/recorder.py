@@ -17,7 +17,7 @@ from typing import Final
 import msgspec
 
 from companion.autopilot.vehicle import Vehicle
-from companion.calibration.record import Record
+from companion.calibration.record import AlignmentUsed, Record
 from companion.calibration.request import What
 from companion.calibration.rolling import RollingCollector, Window
 from companion.calibration.site import Whereabouts
@@ -95,6 +95,8 @@ class Recorder:
         self._on_request: _OnRequest | None = None
         self._flushing = asyncio.Lock()
         self._solved: object = None
+        self.alignment: Callable[[], AlignmentUsed | None] = lambda: None
+        """What is in force of the gradienter's alignment."""
         self._around = Surroundings(config, vehicle, imus)
         link.tap = self._on_mavlink
         for sensor in self._sensors.values():
@@ -120,6 +122,7 @@ class Recorder:
                 "where": where,
                 "what": what.name,
                 "offsets": self._around.read_offsets(),
+                "alignment": None if (used := self.alignment()) is None else (*used.offset_deg, used.sigma_deg),
             }
         )
         self._journal.event(asyncio.get_running_loop().time(), "solved", self._solved)

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from companion.calibration.record import Axes, ImuRecord, Record, WrittenParameter
+from companion.calibration.record import AlignmentUsed, Axes, ImuRecord, Record, WrittenParameter
 from companion.calibration.solve import ImuSolution, Solution
 from companion.physics.frames import Array, Matrix
 
@@ -29,6 +29,8 @@ class Draft:
     """Start and end of the window behind the solution, on the loop's clock."""
     notes: list[str] = dataclasses.field(default_factory=list)
     """What belongs into the reason besides the figures."""
+    alignment: AlignmentUsed | None = None
+    """What was in force of the gradienter's alignment."""
     imu_warnings: dict[str, list[str]] = dataclasses.field(default_factory=dict)
 
     def warn(self, imu: str, words: str) -> None:
@@ -58,6 +60,7 @@ class Draft:
             site=solution.site if solution else None,
             system_id=self.system_id,
             magnetic=solution.magnetic if solution else None,
+            alignment=self.alignment,
             imus=tuple(self._imu(estimate) for estimate in solution.imus) if solution else (),
         )
 

@@ -18,6 +18,8 @@ from companion.component.component import Component
 from companion.component.service import JobResult
 from companion.config import Config, Imu
 from companion.daemon import models
+from companion.daemon.aligner import Aligner
+from companion.daemon.alignment import AlignmentInForce
 from companion.daemon.answers import Answers
 from companion.daemon.armings import Armings
 from companion.daemon.automatic import Automatic
@@ -31,7 +33,7 @@ from companion.daemon.firmware_calibration import FirmwareCalibration
 from companion.daemon.flight_line import define_parameters
 from companion.daemon.gate_setup import GateSetup
 from companion.daemon.in_force import InForce
-from companion.daemon.job import Job
+from companion.daemon.job import ALIGNMENT, Job
 from companion.daemon.ledger import Ledger, Offload
 from companion.daemon.mend import Mender
 from companion.daemon.plan import Planner
@@ -106,6 +108,7 @@ class Service:
             config, self.collector, self.link, self.vehicle, self.imus.values(), self.sensors, offload
         )
         self.store = RecordStore(config.storage.path)
+        self.alignment = AlignmentInForce(config, offload)
         self.ledger = Ledger(ChangeLog(config.storage.path), offload)
         writer = ParameterWriter(self.parameters, self.vehicle)
         far = FarStepWatch(self.link, self.vehicle, self.slots)
@@ -137,14 +140,21 @@ class Service:
             offload,
             reboot,
             Ditherer(config, self.vehicle, self.parameters, self.imus, self.collector, writer, self.ledger),
+            self.alignment,
+        )
+        aligner = Aligner(
+            config, self.vehicle, self.collector, self.imus, course.machine, self.alignment, self._say, offload
         )
         self.conductor = Conductor(
-            config, self.vehicle, self.collector, course, pusher, self.mender, self.store, self._say, offload
+            config, self.vehicle, self.collector, course, pusher, self.mender, self.store, self._say, offload, aligner
         )
         course.on_solved = self.recorder.on_solved
+        self.recorder.alignment = lambda: self.alignment.used
         self.recorder.is_busy = lambda: self.conductor.state.busy
         self.reach = Reach(self.link, self.vehicle, self.parameters)
         self.in_force = InForce(config, self.vehicle, self.collector, self.imus, offload)
+        self.in_force.gradienter = self.alignment.model
+        self.alignment.on_change = self.in_force.realigned
         self.readiness = Readiness(self.vehicle, self.collector, self.conductor, self.mender, self.in_force)
         self.readiness.reboot_owed = lambda: reboot.owed
         self.automatic = Automatic(
@@ -164,6 +174,7 @@ class Service:
         self.component = Component(self.link, self.vehicle, self.conductor, self.readiness)
         define_parameters(self.component.parameters, config, self.conductor)
         self.pose = PoseNow(config, self.vehicle, self.collector, offload)
+        self.pose.gradienter = self.alignment.model
         self.answers = Answers(
             self.conductor,
             self.vehicle,
@@ -183,6 +194,7 @@ class Service:
             link=self.link,
             pose=self.pose,
             trouble=self.sensor_watch.worst,
+            alignment=self.alignment,
         )
         self.mqtt = self._mqtt_face(offload)
         self.page = self._page(offload)
@@ -211,7 +223,8 @@ class Service:
 
     def _on_ended(self, job: Job, result: JobResult) -> None:
         self.in_force.on_ended(job, result)
-        self.automatic.on_ended(job, result)
+        if job.kind != ALIGNMENT:
+            self.automatic.on_ended(job, result)
         if job.record is not None:
             self.recorder.on_record(job.record)
 
@@ -279,6 +292,7 @@ class Service:
             ports: open the serial ports (else somebody hands their bytes to `sensors`).
         """
         self.ledger.load()
+        self.alignment.load()
         if self.ledger.fault is not None:
             # Stay and say so: a daemon that is gone is harder to understand from the field.
             logger.error("%s", self.ledger.fault)

@@ -60,6 +60,23 @@ def up_in_sensor(law: Law, x_deg: float, y_deg: float) -> Array:
     return np.array([math.sin(theta), -math.sin(gamma) * math.cos(theta), -math.cos(gamma) * math.cos(theta)])
 
 
+def readings_from_up(law: Law, up: Array) -> tuple[float, float]:
+    """The two readings (qx, qy) in degrees that a gradienter of this law gives; the inverse of `up_in_sensor`.
+
+    Args:
+        law: of the sensor.
+        up: unit vector of specific force at rest in the sensor's own FRD axes, shape (3,).
+    """
+    x, y, z = (float(value) for value in up)
+    if law == "axis":
+        return math.asin(max(-1.0, min(1.0, -y))) / DEG, math.asin(max(-1.0, min(1.0, x))) / DEG
+    gamma = math.atan2(-y, -z)
+    if law == "slope":
+        # tan theta / cos gamma, without dividing by the cosine.
+        return gamma / DEG, math.atan2(x, math.hypot(y, z) * math.cos(gamma)) / DEG
+    return gamma / DEG, math.atan2(x, math.hypot(y, z)) / DEG
+
+
 def up_jacobian(law: Law, x_deg: float, y_deg: float) -> Matrix:
     """The Jacobian d up / d (qx, qy), shape (3, 2), per radian of reading; analytic for each law.
 

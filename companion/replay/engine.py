@@ -18,13 +18,14 @@ import msgspec
 from companion.autopilot import imu_messages
 from companion.autopilot.imu_calibration import ImuCalibration
 from companion.autopilot.imu_messages import ImuMessage, Reading
-from companion.calibration.record import ImuRecord, Record, from_json
+from companion.calibration.record import AlignmentUsed, ImuRecord, Record, from_json
 from companion.calibration.request import What
 from companion.calibration.rolling import RollingCollector, Window
 from companion.calibration.site import Whereabouts
 from companion.calibration.solve import Solution, solve_at
 from companion.config import Config
 from companion.daemon import models
+from companion.daemon.alignment import aligned
 from companion.daemon.course import in_words
 from companion.daemon.plan import whole_of
 from companion.daemon.report import Draft
@@ -100,6 +101,7 @@ class Replay:
         self._solved_with: dict[str, ImuCalibration | None] = {}
         """The offsets in force when that was measured; by now others may have been written."""
         self._no_solution = ""
+        self._alignment: AlignmentUsed | None = None
         self._handlers: dict[str, Callable[[bytes], None] | None] = {}
         self._calibrations: list[Replayed] = []
         self._notes: list[str] = []
@@ -308,6 +310,10 @@ class Replay:
         self._solution, self._no_solution = None, ""
         window = self._windows.get(detail["window"])
         self._where, self._solved_with = detail["where"], detail["offsets"]
+        used = detail.get("alignment")
+        self._alignment = (
+            AlignmentUsed(measured_at="", offset_deg=(used[0], used[1]), sigma_deg=used[2]) if used else None
+        )
         if window is None:
             self._no_solution = "its measurement is not in the recording"
             return
@@ -321,7 +327,8 @@ class Replay:
     def _solved(self, window: Window, what: What) -> Solution:
         config = self._config
         assert config is not None
-        gradienter, compass = models.gradienter_model(config.gradienter), models.compass_model(config.compass)
+        gradienter = aligned(models.gradienter_model(config.gradienter), self._alignment)
+        compass = models.compass_model(config.compass)
         return solve_at(window, self._where, gradienter, compass, what)
 
     def _take_record(self, data: bytes) -> None:
@@ -359,6 +366,7 @@ class Replay:
         return msgspec.structs.replace(
             again,
             started_at=recorded.started_at,
+            alignment=recorded.alignment,
             duration_s=recorded.duration_s,
             warnings=_with_rest(again.warnings, recorded.warnings),
             imus=tuple(_imu_again(imu, before.get(imu.name)) for imu in again.imus),

@@ -1,4 +1,4 @@
-"""The way to a gradienter's zero that docs/guide.md describes, against the zero that the virtual one really has."""
+"""The level reversal behind docs/alignment.md by hand, against the zero that the virtual gradienter really has."""
 
 from __future__ import annotations
 

@@ -14,9 +14,12 @@ import pytest
 from companion.calibration.bias import accelerometer_bias, gyro_bias
 from companion.physics import earth
 from companion.physics.frames import FRD_FROM_RFU, body_from_ned, roll_pitch_from_up, rotation_matrix, skew
-from companion.physics.gradienter import Law, attitude_from_readings, up_in_sensor, up_jacobian
+from companion.physics.gradienter import Law, attitude_from_readings, readings_from_up, up_in_sensor, up_jacobian
 from companion.physics.units import DEG, DEG_H, MG
 from companion.rotations import ROTATION_NAMES
+from sim.aircraft import Pose, VirtualAircraft
+from sim.devices import Gradienter as SimGradienter
+from sim.scenario import site_at
 
 CASES = json.loads((Path(__file__).parents[1] / "vectors" / "method.json").read_text())["cases"]
 
@@ -164,3 +167,14 @@ def test_rotation_numbers_are_mavlinks() -> None:
     described = ardupilotmega.enums["MAV_SENSOR_ORIENTATION"]
     for number, name in enumerate(ROTATION_NAMES):
         assert described[number].name == name.replace("ROTATION_", "MAV_SENSOR_ROTATION_")
+
+
+@pytest.mark.parametrize("law", ["axis", "slope", "euler"])
+def test_readings_are_those_of_the_simulator_and_lead_back(law: Law) -> None:
+    rng = np.random.default_rng(8)
+    for pitch, roll in rng.uniform(-35.0, 35.0, (50, 2)):
+        aircraft = VirtualAircraft(Pose(pitch, roll, 12.0), site_at(40.0, 116.0, 50.0))
+        up = aircraft.truth_at(0.0).force_m_s2 / aircraft.site.gravity_m_s2
+        readings = readings_from_up(law, up)
+        assert readings == pytest.approx(SimGradienter(aircraft, law=law).tilt_deg(np.array([0.0]))[0], abs=1e-9)
+        assert up_in_sensor(law, *readings) == pytest.approx(up, abs=1e-12)

@@ -1,0 +1,358 @@
+"""The model behind `align`: what every reading of every stand should be, and how it changes with what is sought.
+
+A *stand* is one still window. Sought are, for all stands together: the gradienter's zero; for every IMU its
+misalignment against the gradienter, accelerometer scale, shear and bias, and gyro bias; gravity and the Earth's rate
+within what the place leaves open; the plane of the spot; and how the aircraft stood each time.
+
+With u = C_k (0, 0, -1) (up in the vehicle), g, and the Earth's rate W in the ground frame (NED, or, without a north,
+turned about the vertical):
+
+    gradienter     reading = law(M^T u) + zero                          M: vehicle from sensor
+    accelerometer  f = (I + S) (I - [m x]) g u + b                      S: scale on the diagonal, shear beside it
+    gyro           w = C_k W + b_w
+    compass        heading of C_k
+    spot           down of the vehicle, seen from the ground, is the normal of the spot: C_k^T z = n + placement
+
+The last line is the level reversal (method section 3, "two headings"): the spot's true tilt is the same in the
+ground's frame, however the aircraft is turned on it. "Level" is what is parallel to the plane on which it is turned.
+All derivatives are analytic; an attitude error eps is C = (I - [eps x]) C_0, as in `bias`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import Final, Literal
+
+import numpy as np
+
+from companion.physics.frames import Array, Matrix, skew
+from companion.physics.gradienter import Law, readings_from_up, up_jacobian
+from companion.physics.units import DEG, MG
+
+DOWN: Final = np.array([0.0, 0.0, 1.0])
+Group = Literal["gradienter", "accelerometer", "gyro", "compass", "spot", "zero", "prior", "nothing"]
+
+_SHEAR: Final = np.array([[[0, 1, 0], [1, 0, 0], [0, 0, 0]], [[0, 0, 1], [0, 0, 0], [1, 0, 0]],
+                          [[0, 0, 0], [0, 0, 1], [0, 1, 0]]], dtype=np.float64)  # fmt: skip
+_ANYHOW_RAD: Final = 1.0
+"""Sigma about the first guess of what only the readings determine: it keeps the equations solvable."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class ImuStand:
+    """Means of one IMU in one stand, vehicle FRD, with one sigma per axis (`sigma_use`); shapes (3,)."""
+
+    name: str
+    accel_m_s2: Array
+    accel_sigma_m_s2: Array
+    gyro_rad_s: Array
+    gyro_sigma_rad_s: Array
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Stand:
+    """One still window.
+
+    `heading_rad` counts from the same north in all stands, which need not be the true one (`Ground.north_known`).
+    """
+
+    imus: tuple[ImuStand, ...]
+    tilt_deg: tuple[float, float] | None
+    """The gradienter's readings less the configured offset; None where it was out of its range."""
+    tilt_sigma_deg: tuple[float, float]
+    heading_rad: float
+    heading_sigma_rad: float
+    on_spot: bool
+    """On the one spot on which the aircraft was turned."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """Gravity and the Earth's rate at the place, and what is open of them."""
+
+    gravity_m_s2: float
+    gravity_sigma_m_s2: float
+    rate_rad_s: Array
+    """Shape (3,), in the frame from whose x axis headings count."""
+    rate_covariance: Matrix
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Priors:
+    """One sigma of what is known before; 0: taken as it is and not sought (method section 3, joint MAP covariance)."""
+
+    offset_deg: float = 1.0
+    placement_deg: float = 0.02
+    """Of each time that the aircraft is put onto the spot, each axis."""
+    scale: float = 0.005
+    shear: float = 0.002
+    misalignment_deg: float = 1.0
+    accel_bias_m_s2: float = 30.0 * MG
+    gyro_bias_rad_s: float = 5.0 * DEG
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Row:
+    """Whose residual a row is: a group, the stand (from 1; 0: none) and the name of an IMU where there is one."""
+
+    group: Group
+    stand: int = 0
+    name: str = ""
+
+
+@dataclasses.dataclass(slots=True, eq=False)
+class Unknowns:
+    """Everything that is sought, at its present value."""
+
+    offset_rad: Array
+    spot: Array
+    gravity_m_s2: float
+    rate_rad_s: Array
+    attitudes: list[Matrix]
+    """C_k, body from ground."""
+    misalignment_rad: Array
+    """(imus, 3)."""
+    scale: Array
+    shear: Array
+    """(imus, 3): xy, xz, yz."""
+    accel_bias: Array
+    gyro_bias: Array
+
+
+class Model:
+    """Residuals and their derivatives, every one divided by its sigma.
+
+    Args:
+        law: of the gradienter.
+        vehicle_from_sensor: its mounting.
+        stands: at least one; every one has the same IMUs in the same order.
+        ground: where it stands.
+        priors: what is known before.
+    """
+
+    def __init__(
+        self, law: Law, vehicle_from_sensor: Matrix, stands: Sequence[Stand], ground: Ground, priors: Priors
+    ) -> None:
+        self._law, self._mounting = law, vehicle_from_sensor
+        self.stands, self.ground, self.priors = stands, ground, priors
+        self.names = [imu.name for imu in stands[0].imus]
+        count = len(self.names)
+        self.offset, self.spot, self.gravity, self.rate = slice(0, 2), slice(2, 4), slice(4, 5), slice(5, 8)
+        self._poses = 8
+        self._first_imu = 8 + 3 * len(stands)
+        self.size = self._first_imu + 15 * count
+        sigma = np.full(self.size, _ANYHOW_RAD)
+        sigma[self.offset] = priors.offset_deg * DEG
+        if not any(stand.on_spot for stand in stands):
+            sigma[self.spot] = 0.0
+        sigma[self.gravity] = ground.gravity_sigma_m_s2
+        sigma[self.rate] = np.sqrt(np.diag(ground.rate_covariance))
+        self.damped = 3 * len(stands) + (2 if sigma[2] > 0.0 else 0)
+        """How many parameters only the readings determine."""
+        for k in range(count):
+            sigma[self.misalignment(k)] = priors.misalignment_deg * DEG
+            sigma[self.scale(k)] = priors.scale
+            sigma[self.shear(k)] = priors.shear
+            sigma[self.accel_bias(k)] = priors.accel_bias_m_s2
+            sigma[self.gyro_bias(k)] = priors.gyro_bias_rad_s
+        self.sigma = sigma
+        """Of every parameter before any reading; 0: not sought."""
+
+    # --- where each parameter stands in the vector
+
+    def pose(self, stand: int) -> slice:
+        """Attitude error of a stand, counted from 0."""
+        return slice(self._poses + 3 * stand, self._poses + 3 * stand + 3)
+
+    def _imu(self, imu: int, part: int) -> slice:
+        start = self._first_imu + 15 * imu + 3 * part
+        return slice(start, start + 3)
+
+    def misalignment(self, imu: int) -> slice:
+        """Of an IMU, counted from 0; likewise the others."""
+        return self._imu(imu, 0)
+
+    def scale(self, imu: int) -> slice:
+        """Of x, y, z."""
+        return self._imu(imu, 1)
+
+    def shear(self, imu: int) -> slice:
+        """xy, xz, yz."""
+        return self._imu(imu, 2)
+
+    def accel_bias(self, imu: int) -> slice:
+        """Of x, y, z."""
+        return self._imu(imu, 3)
+
+    def gyro_bias(self, imu: int) -> slice:
+        """Of x, y, z."""
+        return self._imu(imu, 4)
+
+    # --- values
+
+    def begin(self, attitudes: list[Matrix]) -> Unknowns:
+        """A first guess from attitudes alone."""
+        count = len(self.names)
+        spots = [a.T @ DOWN for a, stand in zip(attitudes, self.stands, strict=True) if stand.on_spot]
+        return Unknowns(
+            offset_rad=np.zeros(2),
+            spot=np.mean(spots, axis=0)[:2] if spots else np.zeros(2),
+            gravity_m_s2=self.ground.gravity_m_s2,
+            rate_rad_s=self.ground.rate_rad_s.copy(),
+            attitudes=list(attitudes),
+            misalignment_rad=np.zeros((count, 3)),
+            scale=np.zeros((count, 3)),
+            shear=np.zeros((count, 3)),
+            accel_bias=np.zeros((count, 3)),
+            gyro_bias=np.zeros((count, 3)),
+        )
+
+    def step(self, at: Unknowns, by: Array) -> None:
+        """Change everything by one step."""
+        at.offset_rad = at.offset_rad + by[self.offset]
+        at.spot = at.spot + by[self.spot]
+        at.gravity_m_s2 += float(by[self.gravity][0])
+        at.rate_rad_s = at.rate_rad_s + by[self.rate]
+        for k in range(len(self.stands)):
+            at.attitudes[k] = _turned(-by[self.pose(k)]) @ at.attitudes[k]
+        for k in range(len(self.names)):
+            at.misalignment_rad[k] += by[self.misalignment(k)]
+            at.scale[k] += by[self.scale(k)]
+            at.shear[k] += by[self.shear(k)]
+            at.accel_bias[k] += by[self.accel_bias(k)]
+            at.gyro_bias[k] += by[self.gyro_bias(k)]
+
+    def _values(self, at: Unknowns) -> Array:
+        """The parameters that have a prior, as they are; zero for the others."""
+        values = np.zeros(self.size)
+        values[self.offset] = at.offset_rad
+        values[self.gravity] = at.gravity_m_s2 - self.ground.gravity_m_s2
+        values[self.rate] = at.rate_rad_s - self.ground.rate_rad_s
+        for k in range(len(self.names)):
+            values[self.misalignment(k)] = at.misalignment_rad[k]
+            values[self.scale(k)] = at.scale[k]
+            values[self.shear(k)] = at.shear[k]
+            values[self.accel_bias(k)] = at.accel_bias[k]
+            values[self.gyro_bias(k)] = at.gyro_bias[k]
+        return values
+
+    # --- residuals
+
+    def linearise(self, at: Unknowns) -> tuple[Array, Matrix, list[Row]]:
+        """Residuals (n,), their derivatives (n, size), both over sigma, and whose each is.
+
+        Raises:
+            ValueError: the readings cannot belong together.
+        """
+        rows = _Rows(self.size)
+        for k, stand in enumerate(self.stands):
+            attitude = at.attitudes[k]
+            up = -attitude @ DOWN
+            self._gradienter(rows, at, k, up)
+            for i, imu in enumerate(stand.imus):
+                self._accelerometer(rows, at, (k, i), imu, up)
+                self._gyro(rows, at, (k, i), imu)
+            forward = attitude.T[:, 0]
+            turn = attitude.T @ -skew(np.array([1.0, 0.0, 0.0]))
+            across = forward[0] ** 2 + forward[1] ** 2
+            off = math.remainder(stand.heading_rad - math.atan2(forward[1], forward[0]), 2.0 * math.pi)
+            with rows.add(Row("compass", k + 1), np.array([off]), np.array([stand.heading_sigma_rad])) as by:
+                by[:, self.pose(k)] = (forward[0] * turn[1] - forward[1] * turn[0]) / max(across, 1e-6)
+            if stand.on_spot:
+                placement = np.full(2, self.priors.placement_deg * DEG)
+                with rows.add(Row("spot", k + 1), at.spot - (attitude.T @ DOWN)[:2], placement) as by:
+                    by[:, self.pose(k)] = (attitude.T @ -skew(DOWN))[:2]
+                    by[:, self.spot] = -np.eye(2)
+        values = self._values(at)
+        for part in (slice(p, p + 1) for p in range(self.size)):
+            if self.sigma[part] > 0.0:
+                is_zero = part.start < self.offset.stop
+                of_readings = self.spot.start <= part.start < self.spot.stop or (
+                    self._poses <= part.start < self._first_imu
+                )
+                row = Row("zero" if is_zero else "nothing" if of_readings else "prior")
+                with rows.add(row, -values[part], self.sigma[part]) as by:
+                    by[0, part] = 1.0
+        return rows.stacked()
+
+    def _gradienter(self, rows: _Rows, at: Unknowns, k: int, up: Array) -> None:
+        stand = self.stands[k]
+        if stand.tilt_deg is None:
+            return
+        x_deg, y_deg = readings_from_up(self._law, self._mounting.T @ up)
+        read = np.array([math.remainder(a - b, 360.0) for a, b in zip(stand.tilt_deg, (x_deg, y_deg), strict=True)])
+        # On the sphere of directions the readings' Jacobian is the left inverse of that of the direction.
+        by_up = np.linalg.pinv(up_jacobian(self._law, x_deg, y_deg)) @ self._mounting.T
+        sigma = np.array(stand.tilt_sigma_deg) * DEG
+        with rows.add(Row("gradienter", k + 1), read * DEG - at.offset_rad, sigma) as by:
+            by[:, self.offset] = np.eye(2)
+            by[:, self.pose(k)] = by_up @ skew(up)
+
+    def _accelerometer(self, rows: _Rows, at: Unknowns, where: tuple[int, int], imu: ImuStand, up: Array) -> None:
+        k, i = where
+        stretch = np.eye(3) + np.diag(at.scale[i]) + np.tensordot(at.shear[i], _SHEAR, axes=1)
+        aligned = up - np.cross(at.misalignment_rad[i], up)
+        gravity = at.gravity_m_s2
+        read = imu.accel_m_s2 - stretch @ aligned * gravity - at.accel_bias[i]
+        with rows.add(Row("accelerometer", k + 1, imu.name), read, imu.accel_sigma_m_s2) as by:
+            by[:, self.pose(k)] = gravity * stretch @ (np.eye(3) - skew(at.misalignment_rad[i])) @ skew(up)
+            by[:, self.misalignment(i)] = gravity * stretch @ skew(up)
+            by[:, self.scale(i)] = gravity * np.diag(aligned)
+            by[:, self.shear(i)] = gravity * (_SHEAR @ aligned).T
+            by[:, self.accel_bias(i)] = np.eye(3)
+            by[:, self.gravity] = (stretch @ aligned)[:, None]
+
+    def _gyro(self, rows: _Rows, at: Unknowns, where: tuple[int, int], imu: ImuStand) -> None:
+        k, i = where
+        rate = at.attitudes[k] @ at.rate_rad_s
+        read = imu.gyro_rad_s - rate - at.gyro_bias[i]
+        with rows.add(Row("gyro", k + 1, imu.name), read, imu.gyro_sigma_rad_s) as by:
+            by[:, self.pose(k)] = skew(rate)
+            by[:, self.rate] = at.attitudes[k]
+            by[:, self.gyro_bias(i)] = np.eye(3)
+
+
+class _Rows:
+    """Residuals and derivatives as they are collected."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._residuals: list[Array] = []
+        self._derivatives: list[Matrix] = []
+        self._labels: list[Row] = []
+
+    def add(self, row: Row, residual: Array, sigma: Array) -> _Filling:
+        """Add rows; their derivatives are filled in by whoever enters what this returns."""
+        derivative = np.zeros((len(residual), self._size))
+        self._labels += [row] * len(residual)
+
+        def close() -> None:
+            self._residuals.append(residual / sigma)
+            self._derivatives.append(derivative / sigma[:, None])
+
+        return _Filling(derivative, close)
+
+    def stacked(self) -> tuple[Array, Matrix, list[Row]]:
+        return np.concatenate(self._residuals), np.vstack(self._derivatives), self._labels
+
+
+class _Filling:
+    def __init__(self, derivative: Matrix, close: Callable[[], None]) -> None:
+        self._derivative, self._close = derivative, close
+
+    def __enter__(self) -> Matrix:
+        return self._derivative
+
+    def __exit__(self, *_: object) -> None:
+        self._close()
+
+
+def _turned(vector_rad: Array) -> Matrix:
+    """Rodrigues: the rotation exp([v x])."""
+    angle = float(np.linalg.norm(vector_rad))
+    cross = skew(vector_rad)
+    if angle < 1e-8:
+        return np.eye(3) + cross
+    return np.asarray(np.eye(3) + math.sin(angle) / angle * cross + (1.0 - math.cos(angle)) / angle**2 * cross @ cross)

@@ -1,0 +1,388 @@
+"""`companion align` on the whole daemon: the zero that it finds, what it is good for, and what it refuses."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from companion.calibration.record import Record
+from companion.calibration.request import What
+from companion.component.service import JobResult, Refusal
+from companion.daemon.align_steps import Plan
+from companion.daemon.job import Job
+from companion.recording.walk import Recording
+from companion.replay.engine import Replay
+from sim.aircraft import Pose
+from sim.autopilot import offset_names
+from sim.devices import HMR3300, Gradienter
+from sim.hands import Hands
+from sim.imu_model import MG
+from tests.e2e.test_calibration import calibrated, started
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+SPOT = Pose(pitch_deg=0.5, roll_deg=-0.4, heading_deg=40.0)
+ZERO_DEG = (0.117, -0.083)
+TARGET_MG = 0.25
+
+
+def rig(folder: Path, *, seed: int = 1, placement_deg: float = 0.02, **more: Any) -> tuple[Rig, Hands]:
+    made = Rig(folder, pose=SPOT, seed=seed, **more)
+    made.config = replaced(made.config, gradienter={"sigma_deg": 0.1})
+    made.devices["gradienter"] = Gradienter(made.aircraft, seed=seed, law="slope", offset_deg=ZERO_DEG)
+    made.devices["compass"] = HMR3300(made.aircraft, seed=seed, heading_error_deg=0.7)
+    return made, Hands(made.aircraft, placement_deg=placement_deg, seed=seed)
+
+
+def replaced(config: Any, **sections: dict[str, Any]) -> Any:
+    changed = {name: msgspec.structs.replace(getattr(config, name), **keys) for name, keys in sections.items()}
+    return msgspec.structs.replace(config, **changed)
+
+
+def worst_horizontal(record: Record, rig: Rig) -> tuple[float, float]:
+    """Largest error of the two horizontal accelerometers against the truth, and their largest sigma_use, in mg."""
+    (imu,) = record.imus
+    assert imu.accel_bias_m_s2 is not None
+    assert imu.accel_sigma_use_m_s2 is not None
+    true = rig.model.true_bias(rig.aircraft.time_at(rig.now_s)).accel_m_s2
+    off = np.abs(np.subtract(imu.accel_bias_m_s2, true))[:2] / MG
+    return float(off.max()), float(max(imu.accel_sigma_use_m_s2[:2])) / MG
+
+
+async def follow(rig: Rig, hands: Hands, job: Job) -> JobResult:
+    """Turn the aircraft whenever the words ask for it."""
+    done = 1
+    while not job.finished.done():
+        if job.words.startswith(f"{done + 1} of") and "waiting for it to move" in job.words:
+            done += 1
+            now_s = rig.aircraft.time_at(rig.now_s)
+            hands.turn(now_s, 90.0 if "by 90" in job.words else 180.0)
+        await asyncio.sleep(0.5)
+    return job.finished.result()
+
+
+async def aligned(rig: Rig, hands: Hands, plan: Plan) -> JobResult:
+    return await follow(rig, hands, started(rig.service.conductor.start_alignment(plan, "test", 900.0)))
+
+
+@pytest.mark.parametrize("plan", [Plan("zero"), Plan("zero", headings=4)], ids=["there-and-back", "four"])
+def test_the_horizontal_accelerometers_become_as_good_as_the_turn(tmp_path: Path, plan: Plan) -> None:
+    made, hands = rig(tmp_path)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            result, before = await calibrated(made)
+            assert result.outcome == "done", result
+            assert before.alignment is None
+            off_mg, sigma_mg = worst_horizontal(before, made)
+            assert 1.7 < sigma_mg < 1.8
+            assert 1.0 < off_mg < 2.5
+            result = await aligned(made, hands, plan)
+            assert result.outcome == "done", result
+            record = made.service.alignment.record
+            assert record is not None
+            assert record.checked
+            off = np.abs(np.subtract(record.offset_deg, ZERO_DEG))
+            assert off.max() < 2.5 * record.sigma_deg
+            result, after = await calibrated(made)
+            assert result.outcome == "done", result
+            assert after.alignment is not None
+            assert after.alignment.offset_deg == record.offset_deg
+            off_mg, sigma_mg = worst_horizontal(after, made)
+            assert sigma_mg <= TARGET_MG
+            assert off_mg < 2.5 * sigma_mg
+            assert made.service.status()["alignment"]["in_force"] is True
+
+    run_virtual(main())
+
+
+async def moved(rig: Rig, hands: Hands, job: Job, stand: int, degrees: float) -> None:
+    """Wait for the words that ask for that stand, and turn."""
+    await rig.until(lambda: job.words.startswith(f"{stand} of") and "waiting for it to move" in job.words, 60.0)
+    hands.turn(rig.aircraft.time_at(rig.now_s), degrees)
+
+
+def test_a_spot_that_moved_is_refused_in_words_and_the_old_zero_stays(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            job = started(made.service.conductor.start_alignment(Plan("zero"), "test", 900.0))
+            await moved(made, hands, job, 2, 180.0)
+            hands.bump(0.3, 0.0)
+            await moved(made, hands, job, 3, 180.0)
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "the spot moved" in result.reason
+            assert made.service.alignment.used is None
+            assert not (tmp_path / "alignment.json").exists()
+            await asyncio.sleep(10.0)
+            assert "the spot moved" in "".join(made.ground.texts())
+
+    run_virtual(main())
+
+
+def test_tilts_tell_bias_and_scale_apart(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+    tilts = [(20.0, 0.0), (0.0, 20.0), (-20.0, 0.0), (0.0, -20.0)]
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            job = started(made.service.conductor.start_alignment(Plan("tilts"), "test", 900.0))
+            for stand in (2, 3, 4):
+                await moved(made, hands, job, stand, 90.0)
+            said: list[str] = []
+            for stand, tilt in enumerate(tilts, 5):
+                await made.until(lambda s=stand: job.words.startswith(f"{s} of 8") and "to move" in job.words, 60.0)  # type: ignore[misc]
+                said.append(job.words)
+                hands.tilt(made.aircraft.time_at(made.now_s), *tilt)
+            result = await job.finished
+            assert result.outcome == "done", result
+            assert "not nose up or right side down again" in said[2]
+            record = made.service.alignment.record
+            assert record is not None
+            assert np.abs(np.subtract(record.offset_deg, ZERO_DEG)).max() < 2.5 * record.sigma_deg
+            (imu,) = record.imus
+            assert imu.accel_scale.known == (True, True, True)
+            assert (np.abs(imu.accel_scale.value) < 3.0 * np.array(imu.accel_scale.sigma)).all()
+            assert max(imu.accel_scale.sigma) < 1e-3
+            true_mg = made.model.true_bias(made.aircraft.time_at(made.now_s)).accel_m_s2 / MG
+            assert imu.accel_bias_mg.known == (True, True, True)
+            off = np.abs(np.subtract(imu.accel_bias_mg.value, true_mg))
+            assert (off < 3.0 * np.array(imu.accel_bias_mg.sigma)).all()
+            assert imu.accel_bias_mg.sigma[2] < 2.0
+
+    run_virtual(main())
+
+
+def test_without_a_compass_the_gyros_tell_the_turn(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+    made.config = msgspec.structs.replace(made.config, compass=None)
+    del made.devices["compass"]
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            job = started(made.service.conductor.start_alignment(Plan("zero"), "test", 900.0))
+            await moved(made, hands, job, 2, 100.0)
+            await made.until(lambda: "turn it by" in job.words and "deg more" in job.words, 60.0)
+            assert re.search(r"stands (99|100|101) deg from where it stood first, should be 180", job.words)
+            hands.turn(made.aircraft.time_at(made.now_s), 80.0)
+            await moved(made, hands, job, 3, -180.0)
+            result = await job.finished
+            assert result.outcome == "done", result
+            record = made.service.alignment.record
+            assert record is not None
+            headings = [stand.heading_deg for stand in record.stands]
+            assert abs(headings[1] - 180.0) < 2.0
+            assert np.abs(np.subtract(record.offset_deg, ZERO_DEG)).max() < 2.5 * record.sigma_deg
+            assert record.sigma_deg < 0.03
+
+    run_virtual(main())
+
+
+def test_it_outlives_a_restart_and_is_not_used_with_another_configuration(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+
+    async def measure() -> None:
+        async with made.running():
+            await made.ready()
+            assert (await aligned(made, hands, Plan("zero"))).outcome == "done"
+
+    run_virtual(measure())
+
+    async def again(changes: dict[str, Any], words: str | None, *, forget: bool = False) -> tuple[float, Record | None]:
+        fresh, _ = rig(tmp_path, placement_deg=0.0)
+        fresh.config = replaced(fresh.config, gradienter=changes)
+        async with fresh.running():
+            await fresh.ready()
+            status = fresh.service.status()["alignment"]
+            if words is None:
+                assert status["in_force"] is True
+            else:
+                assert status["in_force"] is False
+                assert words in status["unused_because"]
+            result, record = await calibrated(fresh)
+            assert result.outcome == "done", result
+            assert (record.alignment is None) == (words is not None)
+            if forget:
+                replies = [r async for r in fresh.service.answers.answer({"command": "align", "action": "forget"})]
+                assert replies[-1]["state"] == "done"
+                assert fresh.service.status()["alignment"] is None
+                assert not (tmp_path / "alignment.json").exists()
+            return worst_horizontal(record, fresh)[1], record
+
+    assert run_virtual(again({}, None))[0] <= TARGET_MG
+    sigma_mg, _ = run_virtual(again({"offset_deg": (0.1, -0.1)}, "another gradienter.offset_deg"))
+    assert sigma_mg > 1.7
+    run_virtual(again({"mounting": "ROTATION_YAW_180", "port": "/elsewhere"}, "gradienter.port, gradienter.mounting"))
+    run_virtual(again({}, None, forget=True))
+
+
+def test_what_was_calibrated_with_the_old_zero_is_calibrated_anew_by_itself(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path, at_arm="warn")
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            conductor, in_force = made.service.conductor, made.service.in_force
+            await made.until(lambda: conductor.last is not None and not in_force.findings(made.now_s), 200.0)
+            assert conductor.last is not None
+            assert conductor.last.alignment is None
+            assert (await aligned(made, hands, Plan("zero"))).outcome == "done"
+            assert [finding.words for finding in in_force.findings(made.now_s)] == ["gradienter aligned since then"]
+            await made.until(lambda: conductor.last is not None and conductor.last.alignment is not None, 150.0)
+            await made.until(lambda: not in_force.findings(made.now_s), 60.0)
+            off_mg, sigma_mg = worst_horizontal(conductor.last, made)
+            assert sigma_mg <= TARGET_MG
+            assert off_mg < 2.5 * sigma_mg
+
+    run_virtual(main())
+
+
+def test_a_file_that_cannot_be_read_is_said_and_not_used(tmp_path: Path) -> None:
+    (tmp_path / "alignment.json").write_text('{"format_version": 1, "offset_deg": [nan', encoding="utf-8")
+    made, _ = rig(tmp_path)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            status = made.service.status()["alignment"]
+            assert status["in_force"] is False
+            assert "not a readable alignment" in status["unused_because"]
+
+    run_virtual(main())
+
+
+def test_who_may_start_one_and_how_it_ends(tmp_path: Path) -> None:
+    made, _ = rig(tmp_path)
+
+    async def main() -> None:
+        async with made.running():
+            conductor = made.service.conductor
+            await made.ready()
+            # A calibration and an alignment exclude each other.
+            job = started(conductor.start_alignment(Plan("zero"), "test", 900.0))
+            refused = conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(refused, Refusal)
+            assert "a gradienter alignment is running (1 of 3" in refused.reason or "waiting" in refused.reason
+            await made.until(lambda: "waiting for it to move" in job.words, 60.0)
+            assert conductor.cancel("the test")
+            assert (await job.finished).outcome == "cancelled"
+            running = started(conductor.start_calibration(What.BOTH, "test"))
+            refused = conductor.start_alignment(Plan("zero"), "test", 900.0)
+            assert isinstance(refused, Refusal)
+            assert "a calibration is running" in refused.reason
+            conductor.cancel("the test")
+            await running.finished
+            # Nobody turns it: it ends by itself, and says where it was.
+            job = started(conductor.start_alignment(Plan("zero"), "test", 40.0))
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "not finished in the time given: 2 of 3" in result.reason
+            # Armed in the middle.
+            job = started(conductor.start_alignment(Plan("zero"), "test", 900.0))
+            await made.until(lambda: "measuring" in job.words, 60.0)
+            made.double.arm()
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "armed during the alignment" in result.reason
+            refused = conductor.start_alignment(Plan("zero"), "test", 900.0)
+            assert isinstance(refused, Refusal)
+            assert refused.kind == "armed"
+
+    run_virtual(main())
+
+
+def test_a_client_that_vanishes_stops_nothing(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            replies = made.service.answers.answer({"command": "align", "action": "zero"})
+            first = await anext(replies)
+            assert first["kind"] == "progress"
+            await replies.aclose()  # type: ignore[attr-defined]
+            job = made.service.conductor.job
+            assert job is not None
+            result = await follow(made, hands, job)
+            assert result.outcome == "done", result
+            shown = [r async for r in made.service.answers.answer({"command": "align", "action": "show"})]
+            assert shown[-1]["state"] == "in force"
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_offsets_that_somebody_changes_in_between_are_noticed(tmp_path: Path, told: bool) -> None:
+    made, hands = rig(tmp_path)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            job = started(made.service.conductor.start_alignment(Plan("zero"), "test", 900.0))
+            await made.until(lambda: "waiting for it to move" in job.words, 60.0)
+            if told:
+                made.double.write_as_another_station(offset_names(1, "accel")[0], 0.03)
+            else:
+                made.double.set_parameter(offset_names(1, "accel")[0], 0.03)
+                await moved(made, hands, job, 2, 180.0)
+                await moved(made, hands, job, 3, 180.0)
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "were changed in between: align again" in result.reason
+            assert made.service.alignment.record is None
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("mounting_deg", [(0.0, 0.0, 0.0), (0.0, 0.0, 90.0)], ids=["straight", "turned"])
+def test_px4_and_an_imu_of_our_own(tmp_path: Path, mounting_deg: tuple[float, float, float]) -> None:
+    made, hands = rig(tmp_path, firmware="px4", own_imu=True)
+    made.config = replaced(made.config, gradienter={"mounting": mounting_deg})
+    made.devices["gradienter"] = Gradienter(
+        made.aircraft, seed=1, law="slope", offset_deg=ZERO_DEG, mounting_deg=mounting_deg
+    )
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            result = await aligned(made, hands, Plan("zero"))
+            assert result.outcome == "done", result
+            record = made.service.alignment.record
+            assert record is not None
+            assert [imu.name for imu in record.imus] == ["fc", "own"]
+            assert np.abs(np.subtract(record.offset_deg, ZERO_DEG)).max() < 2.5 * record.sigma_deg
+            true_mg = made.own_model.true_bias(made.aircraft.time_at(made.now_s)).accel_m_s2 / MG
+            own = record.imus[1]
+            assert (np.abs(np.subtract(own.level_bias_mg, true_mg)) < 3.0 * np.array(own.level_sigma_mg)).all()
+
+    run_virtual(main())
+
+
+def test_a_recording_replays_with_the_zero_that_was_in_force(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path, recordings_mb=64)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            assert (await aligned(made, hands, Plan("zero"))).outcome == "done"
+            result, _ = await calibrated(made)
+            assert result.outcome == "done"
+            await asyncio.sleep(2.0)
+
+    run_virtual(main())
+    paths = sorted((tmp_path / "recordings").glob("0*.mcap"))
+    (found,) = [each for path in paths for each in Replay(Recording(path)).run().calibrations]
+    assert found.record.alignment is not None
+    assert found.differences == []
