@@ -268,9 +268,9 @@ def heard_lines(port: str, heard: Heard | str) -> list[str]:
         return [f"# {port}: {heard.bytes_heard} bytes, at no usual speed anything known (levels? another protocol?)"]
     lines = [f"# {port} at {heard.line}: {heard.candidate.protocol}, {heard.candidate.accepted} frames"]
     for number, kind in enumerate(heard.candidate.kinds):
-        if number:
-            lines.append("# or")
-        lines += _section_lines(port, heard.candidate, kind, heard.line)
+        section = _section_lines(port, heard.candidate, kind, heard.line)
+        # One device in two sections is seldom what is wanted: the second is there to be uncommented.
+        lines += ["# at a pinch also:", *(f"# {line}" for line in section)] if number else section
     return lines
 
 
@@ -281,5 +281,9 @@ def _section_lines(port: str, candidate: Candidate, kind: str, line: Line) -> li
         lines.append(f'parity = "{line.parity}"')
     lines.append(f'protocol = "{candidate.protocol}"')
     if kind == "gradienter":
-        lines.append('law = "axis"  # or "slope", "euler": its data sheet, or docs/calibration.md, tells')
+        from companion.protocols.registry import PROTOCOLS
+
+        known = PROTOCOLS["gradienter"][candidate.protocol].law
+        hint = "" if known else '  # or "slope", "euler": its data sheet, or docs/calibration.md, tells'
+        lines.append(f'law = "{known or "axis"}"{hint}')
     return lines

@@ -16,7 +16,7 @@ from companion.links.listening import Heard, listen
 from companion.links.port_faults import PortFault, port_faults, same_ports, unnamed
 from companion.links.ports import ROOT, list_ports
 from companion.protocols.guess import Line
-from companion.protocols.registry import PROTOCOLS, Kind
+from companion.protocols.registry import PROTOCOLS, Kind, main_kind
 
 STOP_FIRST: Final = "to try other speeds: sudo systemctl stop companion, then companion check again"
 _TO_BE_TRIED: Final = ("undecodable", "damaged")
@@ -200,7 +200,10 @@ def _line_keys(sensor: Configured, line: Line) -> list[str]:
 
 
 def _other_protocol(sensor: Configured, protocol: str) -> tuple[str, str]:
+    change = f'set protocol = "{protocol}" in {sensor.section}'
+    main, right = main_kind(protocol), f"give {sensor.section} the port of the {sensor.kind}"
+    if main == sensor.kind:
+        return f"this is {protocol}, not {sensor.protocol}", change
     if protocol in PROTOCOLS[sensor.kind]:
-        return f"this is {protocol}, not {sensor.protocol}", f'set protocol = "{protocol}" in {sensor.section}'
-    kinds = " or ".join(kind for kind, protocols in PROTOCOLS.items() if protocol in protocols)
-    return f"this is {protocol}, a device for {kinds}", f"give {sensor.section} the port of the {sensor.kind}"
+        return f"this is {protocol}, a device for {main}", f"{right}; or, to make do with it as {sensor.kind}, {change}"
+    return f"this is {protocol}, a device for {main}", right

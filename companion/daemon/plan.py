@@ -23,7 +23,11 @@ from companion.daemon.report import Draft
 from companion.daemon.rivalry import Rivalry
 from companion.errors import AutopilotError
 from companion.physics.frames import Array
+from companion.physics.units import MG
 from companion.samples import Vector
+
+COARSE_ACCEL_MG: Final = 5.0
+"""What the autopilots' own calibrations reach on a level table; a new offset known worse than that is worth a word."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -116,6 +120,13 @@ class Planner:
                 draft.warn(found.name, warning)
             changes = changes_for(calibration, _vector(gyro), _vector(accel))
             if push:
+                coarse_mg = float(found.accel_sigma_use_m_s2.max()) / MG if accel is not None else 0.0
+                if coarse_mg > COARSE_ACCEL_MG:
+                    draft.warn(
+                        found.name,
+                        f"accel {found.name} is known to {coarse_mg:.0f} mg only: the gradienter is too coarse for it"
+                        " (companion align, or calibrate --gyros)",
+                    )
                 for warning in warnings_about(calibration, changes):
                     draft.warn(found.name, warning)
                 kind = imu.stream.kind if imu is not None else None

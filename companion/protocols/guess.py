@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
-from companion.protocols.registry import PROTOCOLS, Kind
+from companion.protocols.registry import PROTOCOLS, Kind, main_kind
 
 Parity = Literal["none", "even", "odd"]
 
@@ -47,7 +47,7 @@ class Candidate:
 
     protocol: str
     kinds: tuple[Kind, ...]
-    """What a device with this protocol may serve as."""
+    """What a device with this protocol may serve as, what it is bought as first."""
     accepted: int
     """Frames that gave samples."""
     rejected: int
@@ -77,6 +77,7 @@ def candidates(data: bytes, seconds_per_byte: float = 0.0) -> list[Candidate]:
         decoder.feed(data, 0.0)
         if decoder.accepted:
             rejected = max(decoder.rejected.total() - 1, 0)
+            serves.sort(key=lambda kind: kind != main_kind(name))
             found.append(Candidate(name, tuple(serves), decoder.accepted, rejected))
     return sorted(found, key=lambda one: (one.likely, one.accepted - 2 * one.rejected), reverse=True)
 

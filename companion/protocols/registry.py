@@ -102,6 +102,21 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
 }
 
 
+def main_kind(name: str) -> Kind:
+    """What a device of this protocol is bought as; another role that it has is a help at a pinch.
+
+    Raises:
+        ConfigError: there is no such protocol.
+    """
+    kinds: tuple[Kind, ...] = ("compass", "imu", "gradienter")
+    for kind in kinds:
+        if name in PROTOCOLS[kind]:
+            return kind
+    raise ConfigError(
+        f"found protocol {name!r}; allowed: {', '.join(sorted({n for o in PROTOCOLS.values() for n in o}))}"
+    )
+
+
 def make_decoder(kind: Kind, name: str, seconds_per_byte: float = 0.0) -> Decoder:
     """A new decoder for a kind of device and a protocol name.
 

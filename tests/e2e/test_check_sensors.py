@@ -120,6 +120,8 @@ def test_a_device_of_another_kind(tmp_path: Path) -> None:
             gradienter.frame = compass_frame
             (finding,) = of(await found(text(tmp_path)), "gradienter")
             assert "this is hmr3300, a device for compass" in finding.words
+            assert finding.remedy is not None
+            assert finding.remedy.startswith("give [gradienter] the port of the gradienter")
 
     asyncio.run(main())
 
@@ -209,6 +211,7 @@ def test_ports_listen_prints_lines_that_are_a_configuration(tmp_path: Path) -> N
             assert (written.gradienter.baud, written.gradienter.parity) == (9600, "even")
             assert written.gradienter.protocol == "inclinometer_xy"
             assert (written.compass.baud, written.compass.protocol) == (19200, "hmr3300")
+            assert '# law = "euler"\n' in said.out
             assert [sent_to(one), sent_to(other)] == [b"", b""]
 
     asyncio.run(main())

@@ -92,7 +92,7 @@ def test_every_family_of_the_registry_has_a_go(monkeypatch: pytest.MonkeyPatch) 
 
 def test_one_family_for_two_kinds_is_one_candidate() -> None:
     (found,) = candidates(stream("hmr3300"))
-    assert found.kinds == ("gradienter", "compass")
+    assert found.kinds == ("compass", "gradienter")
 
 
 @pytest.mark.parametrize("seed", range(8))
