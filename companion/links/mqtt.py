@@ -156,6 +156,10 @@ class MqttLink:
                 await self._serve()
             except* Exception as group:  # noqa: BLE001 - whatever it is, it costs the connection and nothing else
                 self._lost(group, began_s, reached=self.connections > before)
+            task = asyncio.current_task()
+            if task is not None and task.cancelling():
+                # A task group that has errors to tell forgets that it was cancelled meanwhile (CPython before 3.13).
+                raise asyncio.CancelledError
             if (protocol, self._protocol) == (MQTT_5, MQTT_3_1_1):
                 continue
             if loop.time() - began_s >= WORTH_S:
