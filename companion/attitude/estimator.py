@@ -98,7 +98,8 @@ class AttitudeEstimator:
         self._aligned = False
         self._still_s = 0.0
         self._still_angle = np.zeros(3)
-        self._waiting_s = self._turned_rad = self._missing_s = 0.0
+        self._waiting_s = self._missing_s = 0.0
+        self._turned_rad: Triple = (0.0, 0.0, 0.0)
         self._settle(settings)
         self._leveller = Leveller(settings.gravity_m_s2)
 
@@ -142,7 +143,8 @@ class AttitudeEstimator:
         self._uncertainty.restart(np.asarray(covariance))
         self._history.clear()
         self._forget_rest()
-        self._waiting_s = self._turned_rad = self._missing_s = 0.0
+        self._waiting_s = self._missing_s = 0.0
+        self._turned_rad = (0.0, 0.0, 0.0)
         self._aligned = True
 
     @property
@@ -202,14 +204,16 @@ class AttitudeEstimator:
         believed = leveller.update(force, span_s, tau_s)
         self._remember(stretch)
         rx, ry, rz = stretch.rate_rad_s
+        tx, ty, tz = self._turned_rad
+        self._turned_rad = (tx + rx * span_s, ty + ry * span_s, tz + rz * span_s)
         self._waiting_s += span_s
-        self._turned_rad += math.sqrt(rx * rx + ry * ry + rz * rz) * span_s
         self._missing_s += stretch.missing_s
         if self._waiting_s >= COVARIANCE_STEP_S:
             ned_from_sensor = to_matrix(multiply(leveller.ned_from_e, stretch.orientation))
-            self._uncertainty.propagate(self._waiting_s, ned_from_sensor, self._turned_rad, self._missing_s)
+            self._uncertainty.propagate(self._waiting_s, ned_from_sensor, np.asarray(self._turned_rad), self._missing_s)
             self._uncertainty.level(self._waiting_s, tau_s, believed, leveller.doubt, phase)
-            self._waiting_s = self._turned_rad = self._missing_s = 0.0
+            self._waiting_s = self._missing_s = 0.0
+            self._turned_rad = (0.0, 0.0, 0.0)
         if still and phase == "ground" and not stretch.missing_s:
             self._rest(stretch)
         else:

@@ -20,6 +20,10 @@ TURN_S: Final = 0.004
 direction keeps half, for as long as the turn lasts."""
 GAP_S: Final = 0.1
 """A longer silence is bridged with the last rate, which then is a guess; it is told as `missing_s`."""
+_ROUNDING_S: Final = 1e-6
+_ANGLE_SQUARE: Final = 1e6
+_FORCE_SQUARE: Final = 1e8
+"""Of one sample; ten times what decoders let through, so that nothing overflows here whoever calls."""
 LOST_S: Final = 1.0
 """After a longer one the attitude is not known any more."""
 
@@ -56,6 +60,8 @@ class Strapdown:
         self.last_rate_rad_s: Triple = (0.0, 0.0, 0.0)
         self.out_of_order = 0
         """Samples that were not later than the one before: left out."""
+        self.implausible = 0
+        """Samples that no sensor can mean: left out."""
         self.lost = False
         """Nothing came for longer than `LOST_S`: `orientation` means nothing until it is set again."""
         self._previous: Triple = (0.0, 0.0, 0.0)
@@ -114,8 +120,12 @@ class Strapdown:
             rx = ax + (py * az - pz * ay) * 0.08333333333333333
             ry = ay + (pz * ax - px * az) * 0.08333333333333333
             rz = az + (px * ay - py * ax) * 0.08333333333333333
-            px, py, pz = ax, ay, az
             square = rx * rx + ry * ry + rz * rz
+            if not (square < _ANGLE_SQUARE and fx * fx + fy * fy + fz * fz < _FORCE_SQUARE):
+                self.implausible += 1
+                missing += dt
+                continue
+            px, py, pz = ax, ay, az
             if square < 0.04:
                 # cos and half the sinc of the half angle; the next terms are below 2e-9.
                 c = 1.0 - square * (0.125 - square * 0.0026041666666666665)
@@ -137,14 +147,14 @@ class Strapdown:
             sz += (fz - cz) * dt
             turn_s += dt
             span += dt
-            if turn_s >= TURN_S:
+            if turn_s > TURN_S - _ROUNDING_S:
                 # `rotate`, written out: this is the inside of the hottest loop of all.
                 tx, ty, tz = 2.0 * (y * sz - z * sy), 2.0 * (z * sx - x * sz), 2.0 * (x * sy - y * sx)
                 vx += sx + w * tx + y * tz - z * ty
                 vy += sy + w * ty + z * tx - x * tz
                 vz += sz + w * tz + x * ty - y * tx
                 sx = sy = sz = turn_s = 0.0
-                if span >= STEP_S:
+                if span > STEP_S - _ROUNDING_S:
                     half = -0.5 * span
                     w, x, y, z = normalised(multiply((1.0, half * ex, half * ey, half * ez), (w, x, y, z)))
                     mean = 1.0 / span

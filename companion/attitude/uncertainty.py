@@ -16,7 +16,8 @@ from companion.calibration.allan import AllanModel
 from companion.physics.frames import Array, Matrix
 
 SCALE_SHARE: Final = 0.003
-"""Scale error and misalignment of a consumer gyro after its factory's trim; a turn of a radian leaves so much."""
+"""Scale error and misalignment of a consumer gyro after its factory's trim. Turning to and fro takes it back, turning
+on in circles piles it up: it is counted by the net turn since the last correction."""
 GAP_RATE_RAD_S: Final = math.radians(20.0)
 """What the rate may have been off by while samples were missing."""
 MANOEUVRE_M_S2: Final = {"ground": 0.05, "flight": 0.6}
@@ -47,6 +48,7 @@ class Uncertainty:
         self._bias_start = np.asarray(bias_covariance, dtype=np.float64)
         self._covariance = np.zeros((6, 6))
         self._levelled = 0.0
+        self._turned = np.zeros(3)
         self.restart(np.eye(3) * HEADING_UNKNOWN_RAD**2)
 
     def restart(self, attitude_covariance: Matrix) -> None:
@@ -55,16 +57,19 @@ class Uncertainty:
         self._covariance[:3, :3] = attitude_covariance
         self._covariance[3:, 3:] = self._bias_start
         self._levelled = 0.0
+        self._turned = np.zeros(3)
 
-    def propagate(self, span_s: float, ned_from_sensor: Matrix, turned_rad: float, missing_s: float) -> None:
-        """Let `span_s` pass at this attitude, having turned by so much in all."""
+    def propagate(self, span_s: float, ned_from_sensor: Matrix, turned_rad: Array, missing_s: float) -> None:
+        """Let `span_s` pass at this attitude, having turned by `turned_rad` (3,) about the sensor's axes."""
         step = np.eye(6)
         step[:3, 3:] = -span_s * ned_from_sensor
         self._covariance = step @ self._covariance @ step.T
         white = self._noise.white**2 * span_s
-        turning = (SCALE_SHARE * turned_rad) ** 2 + (GAP_RATE_RAD_S * missing_s) ** 2
+        turned = ned_from_sensor @ turned_rad
+        self._turned += turned
+        guessed = (GAP_RATE_RAD_S * missing_s) ** 2
         wander = (self._noise.walk**2 + self._noise.floor**2 / _BIAS_WANDERS_S) * span_s
-        self._covariance[range(6), range(6)] += [white + turning] * 3 + [wander] * 3
+        self._covariance[range(6), range(6)] += [white + guessed] * 3 + [wander] * 3
 
     def level(self, span_s: float, tau_s: float, believed: float, doubt: float, phase: str) -> None:
         """The leveller has worked for `span_s`, believing so much."""
@@ -75,12 +80,14 @@ class Uncertainty:
         variance = (acceleration / self._gravity) ** 2 * 2.0 * MANOEUVRE_LASTS_S / span_s
         self._covariance = keep @ self._covariance @ keep.T
         self._covariance[range(2), range(2)] += gain**2 * variance
+        self._turned[:2] *= 1.0 - gain
         self._levelled += (1.0 - self._levelled) * gain
 
     def head(self, gain: float, sigma_rad: float) -> None:
         """The heading was turned towards a reading with this sigma."""
         keep = np.eye(6)
         keep[2, 2] = 1.0 - gain
+        self._turned[2] *= 1.0 - gain
         self._covariance = keep @ self._covariance @ keep.T
         # A compass is wrong in the same way for minutes: its share of the error is sigma, however often it is read.
         known = math.sqrt(max(self._covariance[2, 2], 0.0))
@@ -100,12 +107,14 @@ class Uncertainty:
         """(3, 3) covariance of the attitude error in NED, rad^2."""
         result = self._covariance[:3, :3].copy()
         result[range(2), range(2)] += self._levelled**2 * self._level_variance
+        result[range(3), range(3)] += np.square(SCALE_SHARE * self._turned)
         return np.asarray(result)
 
     @property
     def heading_sigma_rad(self) -> float:
         """Of the heading alone; at most that of an unknown one."""
-        return min(math.sqrt(max(float(self._covariance[2, 2]), 0.0)), HEADING_UNKNOWN_RAD)
+        variance = float(self._covariance[2, 2]) + (SCALE_SHARE * float(self._turned[2])) ** 2
+        return min(math.sqrt(max(variance, 0.0)), HEADING_UNKNOWN_RAD)
 
     @property
     def bias_sigma_rad_s(self) -> Array:
