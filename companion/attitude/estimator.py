@@ -46,6 +46,8 @@ STEADY_RAD_S: Final = math.radians(20.0)
 """... and nothing turns faster."""
 COVARIANCE_STEP_S: Final = 0.2
 REST_S: Final = 1.0
+REST_SIGMAS: Final = 5.0
+"""A second of rest that tells more than this of bias was none: nobody knows at once that a movement has begun."""
 KEPT_S: Final = 2.0
 """Orientations are remembered for so long, for compass readings that come late."""
 
@@ -245,6 +247,9 @@ class AttitudeEstimator:
             return
         sensor_from_ned = conjugate(multiply(self._leveller.ned_from_e, stretch.orientation))
         left = self._still_angle / self._still_s - np.asarray(rotate(sensor_from_ned, self._earth))
+        if np.any(np.abs(left) > REST_SIGMAS * self._uncertainty.rest_sigma(self._still_s)):
+            self._forget_rest()
+            return
         gain = self._uncertainty.rest(self._still_s)
         # Both states are truth against estimate: what is found is added to the bias, and turns the attitude.
         found = gain @ left

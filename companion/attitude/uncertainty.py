@@ -93,9 +93,17 @@ class Uncertainty:
         known = math.sqrt(max(self._covariance[2, 2], 0.0))
         self._covariance[2, 2] = (known + gain * sigma_rad) ** 2
 
+    def _rest_variance(self, seconds: float) -> float:
+        """Of one axis' mean rate over so many seconds."""
+        return self._noise.white**2 / seconds + self._noise.floor**2
+
+    def rest_sigma(self, seconds: float) -> Array:
+        """(3,) of the mean rate that is left after so long at rest, sensor axes."""
+        return np.sqrt(np.maximum(np.diag(self._covariance)[3:], 0.0) + self._rest_variance(seconds))
+
     def rest(self, seconds: float) -> Matrix:
         """The aircraft has stood still for so long: gain (6, 3) for the mean rate that was left, sensor axes."""
-        variance = self._noise.white**2 / seconds + self._noise.floor**2
+        variance = self._rest_variance(seconds)
         part = self._covariance[:, 3:]
         gain = np.linalg.solve(self._covariance[3:, 3:] + np.eye(3) * variance, part.T).T
         self._covariance = self._covariance - gain @ part.T

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from companion.config import Config
 from companion.daemon.control import Object, ask
-from companion.daemon.models import not_in_this_version
+from companion.daemon.models import cannot_work
 from companion.daemon.service import Service
 from companion.errors import DaemonDeniedError, DaemonUnreachableError
 
@@ -47,7 +47,7 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
         findings.append(Finding("daemon", good=True, words="not running: ports opened by this check"))
         findings.append(_storage(config.storage.path))
         status = await _listen(config, seconds)
-    findings += [Finding("configuration", good=False, words=words) for words in not_in_this_version(config)]
+    findings += [Finding("configuration", good=False, words=words) for words in cannot_work(config)]
     vehicle = status["vehicle"]
     findings.append(Finding("autopilot", good=vehicle["system_id"] is not None, words=vehicle["summary"]))
     findings += [Finding(device["name"], device["good"], device["summary"]) for device in status["devices"]]

@@ -55,10 +55,12 @@ def imu_rate_hz(config: Config) -> float:
     return max(LEAST_IMU_RATE_HZ, min(IMU_RATE_HZ, LINE_SHARE * bytes_per_s / each_time))
 
 
-def not_in_this_version(config: Config) -> list[str]:
-    """What the configuration may ask for that this version does not do: said at start, never silently ignored."""
-    asked = ((config.push.attitude != "off", f'push.attitude = "{config.push.attitude}": attitude is not pushed yet'),)
-    return [words for is_asked, words in asked if is_asked]
+def cannot_work(config: Config) -> list[str]:
+    """What the configuration asks for and cannot come about: said at start, never silently ignored."""
+    found = []
+    if config.push.attitude != "off" and config.compass is None:
+        found.append(f'push.attitude = "{config.push.attitude}" needs [compass]: without one no heading is known')
+    return found
 
 
 def imu_input(imu: Imu, kind: StreamKind | None, grid: tuple[float, float] = (0.0, 0.0)) -> ImuInput:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Callable
 from typing import Any, Final
 
 from companion.autopilot.vehicle import Vehicle
@@ -33,6 +34,8 @@ class PoseNow:
         self._config, self._vehicle, self._collector, self._offload = config, vehicle, collector, offload
         self._gradienter = models.gradienter_model(config.gradienter)
         self._compass = models.compass_model(config.compass)
+        self.carried: Callable[[], dict[str, Any] | None] = lambda: None
+        """The attitude that is right in flight, too, while one is carried."""
         self._tilt: TiltSample | None = None
         self._heading: CompassSample | None = None
         self._declination_deg: float | None = None
@@ -56,6 +59,8 @@ class PoseNow:
 
         The heading is magnetic as long as the declination has not been looked up.
         """
+        if (carried := self.carried()) is not None:
+            return carried
         now_s = asyncio.get_running_loop().time()
         tilt, heading = self._tilt, self._heading
         if self._gradienter is None or tilt is None or now_s - tilt.t_s > OLDEST_S:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, Literal
 
 from companion.links.bytestream import ByteLink, PortSettings
@@ -36,6 +36,8 @@ class SerialSensor:
         self.tap: Callable[[str, bytes | None, float], object] | None = None
         """Called with (name, bytes, time) before they are decoded; without bytes: some are missing."""
         self._take = take
+        self.on_samples: Callable[[Sequence[Sample]], object] | None = None
+        """Called with all samples of a read before anybody else gets them: for what must not wait."""
         self._last_sample_s: float | None = None
         self._counted = (0.0, 0)
         self._rate_hz = 0.0
@@ -58,6 +60,8 @@ class SerialSensor:
         samples = self.decoder.feed(data, t_s)
         if not samples:
             return
+        if self.on_samples is not None:
+            self.on_samples(samples)
         self._last_sample_s = t_s
         since_s, before = self._counted
         if t_s - since_s >= RATE_SPAN_S:

@@ -52,6 +52,8 @@ from companion.storage.changes import ChangeLog
 from companion.storage.records import RecordStore
 
 if TYPE_CHECKING:
+    from companion.daemon.attitude.service import AttitudeService
+    from companion.daemon.autopilot_setup import AutopilotSetup
     from companion.daemon.mqtt.face import MqttFace
     from companion.web.server import Page
 
@@ -157,11 +159,25 @@ class Service:
         self.component = Component(self.link, self.vehicle, self.conductor, self.readiness)
         define_parameters(self.component.parameters, config, self.conductor)
         self.pose = PoseNow(config, self.vehicle, self.collector, offload)
+        self.attitude = self._attitude_service(offload)
+        self.setup_ledger = Ledger(ChangeLog(config.storage.path / "setup"), offload)
+        self._writer = writer
+        self._setup: AutopilotSetup | None = None
+        self.setup_mender = Mender(
+            self.vehicle,
+            self.parameters,
+            writer,
+            self.setup_ledger,
+            self._say,
+            contextlib.nullcontext,
+            command="companion autopilot-setup --undo",
+        )
+        carried = [self.attitude] if self.attitude is not None else []
         self.answers = Answers(
             self.conductor,
             self.vehicle,
             self.collector,
-            [*self.imus.values(), *self.sensors],
+            [*self.imus.values(), *self.sensors, *carried],
             self.store,
             offload,
             mavlink_url=config.mavlink.url,
@@ -176,8 +192,47 @@ class Service:
             link=self.link,
             pose=self.pose,
         )
+        self.answers.carry(self.attitude)
+        self.answers.setup = self._set_up
         self.mqtt = self._mqtt_face(offload)
         self.page = self._page(offload)
+
+    async def _set_up(self, request: Object) -> Object:
+        """`companion autopilot-setup`: rarely asked for, so loaded when it is."""
+        from companion.daemon.autopilot_setup import AutopilotSetup
+
+        if self._setup is None:
+            self.setup_ledger.load()
+            self._setup = AutopilotSetup(
+                self.config,
+                self.vehicle,
+                self.parameters,
+                self._writer,
+                self.setup_ledger,
+                self.setup_mender,
+                self.conductor,
+                self._say,
+            )
+        return await self._setup.answer(request)
+
+    def _attitude_service(self, offload: Offload) -> AttitudeService | None:
+        if self.config.push.attitude == "off":
+            return None
+        from companion.daemon.attitude.service import AttitudeService
+
+        attitude = AttitudeService(
+            self.config,
+            self.link,
+            self.vehicle,
+            self.collector,
+            self.in_force,
+            self.imus,
+            self.sensors,
+            self._say,
+            offload,
+        )
+        self.pose.carried = attitude.pose
+        return attitude
 
     def _mqtt_face(self, offload: Offload) -> MqttFace | None:
         if self.config.mqtt is None:
@@ -295,7 +350,7 @@ class Service:
         Raises:
             CompanionError: it cannot start (another daemon runs, the storage cannot be read).
         """
-        for words in models.not_in_this_version(self.config):
+        for words in models.cannot_work(self.config):
             logger.warning("%s", words)
         control = self.config.control
         async with ControlServer(control.path, self.answers.answer, group=control.group_name):
@@ -311,6 +366,8 @@ class Service:
             ports: open the serial ports (else somebody hands their bytes to `sensors`).
         """
         self.ledger.load()
+        if (self.config.storage.path / "setup").exists():
+            self.setup_ledger.load()
         if self.ledger.fault is not None:
             # Stay and say so: a daemon that is gone is harder to understand from the field.
             logger.error("%s", self.ledger.fault)
@@ -323,12 +380,15 @@ class Service:
                     if mavlink:
                         group.create_task(run_transport(self.link, self.config.mavlink.url), name="mavlink")
                     group.create_task(self.mender.run(), name="mender")
+                    group.create_task(self.setup_mender.run(), name="setup mender")
                     group.create_task(self.reach.run(), name="reach")
                     group.create_task(self.readiness.run(), name="readiness")
                     group.create_task(self.armings.run(), name="armings")
                     group.create_task(self.automatic.run(), name="automatic")
                     group.create_task(self.gate_setup.run(), name="gate setup")
                     group.create_task(self.recorder.run(), name="recorder")
+                    if self.attitude is not None:
+                        group.create_task(self.attitude.run(), name="attitude")
                     if self.page is not None:
                         group.create_task(self.page.run(), name="page")
                     if self.mqtt is not None:
