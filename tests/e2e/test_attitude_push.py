@@ -19,6 +19,7 @@ from companion.calibration.request import What
 from companion.daemon.attitude.service import AttitudeService
 from companion.daemon.job import Job
 from sim.aircraft import Pose
+from sim.flight import BankedCircles
 from sim.motions import Turn
 from sim.scenario import site_at
 from tests.support.rig import Rig
@@ -98,13 +99,11 @@ async def flight(
         assert rig.link.received["handler error"] == 0
 
 
-@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-@pytest.mark.parametrize("own_imu", [True, False])
+@pytest.mark.parametrize(("firmware", "own_imu"), [("ardupilot", True), ("ardupilot", False), ("px4", True)])
 def test_the_heading_follows_the_aircraft_through_a_turn(tmp_path: Path, firmware: Firmware, own_imu: bool) -> None:
     """Within the compass' degree and the delay of the autopilot's own telemetry, on truth."""
 
     async def main() -> None:
-        # PX4's integers tell nothing of small biases unless its offsets may be stepped.
         async with flight(tmp_path, firmware=firmware, own_imu=own_imu, imu_rate_hz=50.0) as flying:
             rig = flying.rig
             rig.autopilot.arm()
@@ -117,8 +116,22 @@ def test_the_heading_follows_the_aircraft_through_a_turn(tmp_path: Path, firmwar
             assert (last.roll, last.pitch) == pytest.approx((roll, pitch), abs=math.radians(1.0))
             assert flying.theirs_deg() < 3.0
 
-    if firmware == "px4" and not own_imu:
-        pytest.skip("its integers hide these biases: test_from_the_integers_of_px4")
+    run_virtual(main())
+
+
+def test_from_the_integers_of_px4(tmp_path: Path) -> None:
+    """Whole milliradians a second carry a turn to a few degrees, and say so in their sigma."""
+
+    async def main() -> None:
+        async with flight(tmp_path, firmware="px4", own_imu=False, part="bmi088") as flying:
+            flying.rig.autopilot.arm()
+            flying.turn(heading_deg=110.0, roll_deg=20.0, pitch_deg=-10.0)
+            await flying.sleep(8.0)
+            last = flying.witness.of(Vision)[-1]
+            wrong = abs(math.remainder(last.yaw - flying.true_yaw_rad, 2.0 * math.pi))
+            assert wrong < 3.0 * math.sqrt(last.covariance[20]) + math.radians(1.0)
+            assert math.degrees(wrong) < 4.0
+
     run_virtual(main())
 
 
@@ -366,6 +379,29 @@ def test_a_tilt_that_differs_for_long_stops_the_push(tmp_path: Path) -> None:
             assert "tilt differs by" in flying.attitude.health.why_not
             rig.double.set_parameter("AHRS_TRIM_Y", 0.0)
             await flying.pushing(20.0)
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("vehicle", ["plane", "copter"])
+def test_circles_without_end_tilt_nothing(tmp_path: Path, vehicle: str) -> None:
+    """35 degrees of bank for a minute; what the field says that a fixed wing has its airspeed in is used there only."""
+
+    async def main() -> None:
+        route = BankedCircles(start_s=70.0)
+        pose = Pose(heading_deg=40.0)
+        async with flight(tmp_path, route=route, pose=pose, vehicle=vehicle, imus=1, imu_rate_hz=25.0) as flying:
+            rig = flying.rig
+            assert rig.aircraft.time_at(rig.now_s) < 65.0
+            rig.double.airspeed_m_s = 15.0
+            rig.autopilot.arm()
+            while rig.aircraft.time_at(rig.now_s) < 140.0:
+                await flying.sleep(5.0)
+                last = flying.witness.of(Vision)[-1]
+                roll, pitch, yaw = rig.aircraft.angles_rad(last.usec * 1e-6 - rig.aircraft.loop_time_of(0.0))
+                assert (last.roll, last.pitch) == pytest.approx((roll, pitch), abs=math.radians(1.0))
+                assert abs(math.remainder(last.yaw - yaw, 2.0 * math.pi)) < math.radians(2.0)
+            assert flying.attitude.carrier.airspeed_m_s == (15.0 if vehicle == "plane" else None)
 
     run_virtual(main())
 

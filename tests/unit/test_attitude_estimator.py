@@ -184,6 +184,15 @@ def test_rest_finds_what_is_left_of_the_gyro_bias() -> None:
     assert estimator.gyro_bias_rad_s == pytest.approx(left, abs=15 * DEG_H)
 
 
+def test_a_movement_that_is_noticed_late_teaches_no_bias() -> None:
+    """Somebody turns it slowly, and for three seconds nobody has said that it does not stand still any more."""
+    estimator = AttitudeEstimator(settings())
+    estimator.align(0.0, np.eye(3), SURE)
+    for k in range(1, 601):
+        estimator.update([ImuSample(k * 0.005, (0.0, 0.0, 0.5 * DEG), (0.0, 0.0, -9.8))], phase="ground", still=True)
+    assert max(abs(value) for value in estimator.gyro_bias_rad_s) < 1.0 * DEG_H
+
+
 def test_in_flight_nothing_is_learned_from_a_moment_that_looks_still() -> None:
     aircraft = VirtualAircraft(Pose(), NORTH)
     estimator = AttitudeEstimator(settings())
