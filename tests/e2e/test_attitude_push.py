@@ -383,6 +383,51 @@ def test_a_tilt_that_differs_for_long_stops_the_push(tmp_path: Path) -> None:
     run_virtual(main())
 
 
+def test_a_heading_that_goes_its_own_way_after_agreeing_stops_the_push(tmp_path: Path) -> None:
+    """Before they have ever agreed the autopilot may have any heading: that is what ours is for."""
+
+    async def main() -> None:
+        async with flight(tmp_path, used=False, calibrated=False) as flying:
+            rig = flying.rig
+            rig.double.estimator.compass = False
+            rig.double.estimator.yaw_error_rad = math.radians(60.0)
+            await flying.calibrate()
+            await flying.pushing()
+            await flying.sleep(15.0)
+            assert flying.attitude.health.pushing
+            rig.double.estimator.yaw_error_rad = 0.0
+            await flying.sleep(15.0)
+            rig.autopilot.arm()
+            rig.double.estimator.yaw_error_rad = math.radians(-60.0)
+            await rig.until(lambda: not flying.attitude.health.pushing, 20.0)
+            assert "heading differs by" in flying.attitude.health.why_not
+            assert "attitude push stopped" in rig.service.status()["headline"]["reason"]
+            rig.double.estimator.yaw_error_rad = 0.0
+            await flying.pushing(20.0)
+
+    run_virtual(main())
+
+
+def test_a_compass_that_disagrees_for_long_stops_the_push(tmp_path: Path) -> None:
+    """A motor's field: the gyros know better for a while, and then nobody does."""
+
+    async def main() -> None:
+        async with flight(tmp_path, used=False) as flying:
+            rig = flying.rig
+            rig.autopilot.arm()
+            compass: Any = rig.devices["compass"]
+            compass.heading_error_deg = 40.0
+            begun_s = rig.now_s
+            await rig.until(lambda: not flying.attitude.health.pushing, 60.0)
+            assert "compass disagrees for" in flying.attitude.health.why_not
+            assert rig.now_s - begun_s > 18.0
+            assert math.degrees(abs(flying.witness.of(Vision)[-1].yaw - flying.true_yaw_rad)) < 3.0
+            compass.heading_error_deg = 0.0
+            await flying.pushing(20.0)
+
+    run_virtual(main())
+
+
 @pytest.mark.parametrize("vehicle", ["plane", "copter"])
 def test_circles_without_end_tilt_nothing(tmp_path: Path, vehicle: str) -> None:
     """35 degrees of bank for a minute; what the field says that a fixed wing has its airspeed in is used there only."""

@@ -6,6 +6,7 @@ import math
 from typing import Final
 
 from companion.attitude.heading import REFUSED_S
+from companion.autopilot.vehicle import Vehicle
 from companion.daemon.attitude.carrier import Carrier
 from companion.daemon.attitude.difference import Difference
 from companion.physics.units import DEG
@@ -33,8 +34,8 @@ class Health:
     autopilot has no heading, or one of its own that is to be replaced by ours.
     """
 
-    def __init__(self, carrier: Carrier, difference: Difference) -> None:
-        self._carrier, self._difference = carrier, difference
+    def __init__(self, carrier: Carrier, difference: Difference, vehicle: Vehicle) -> None:
+        self._carrier, self._difference, self._vehicle = carrier, difference, vehicle
         self.pushing = False
         self.why_not = carrier.waiting_for
         """Why nothing is pushed; empty while it is."""
@@ -73,6 +74,12 @@ class Health:
 
     def _wrong(self, now_s: float) -> str | None:
         carrier = self._carrier
+        if self._vehicle.firmware is None:
+            return "waiting for the autopilot"
+        if self._vehicle.firmware == "other":
+            return "this autopilot is neither ArduPilot nor PX4"
+        if self._vehicle.conflict is not None:
+            return self._vehicle.conflict
         if carrier.estimator is None:
             return carrier.waiting_for
         silent_s = now_s - carrier.heard_s

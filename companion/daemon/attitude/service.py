@@ -16,6 +16,7 @@ from companion.autopilot.vehicle import Vehicle
 from companion.calibration.rolling import RollingCollector
 from companion.component.statustext import Severity, Weight
 from companion.config import Config
+from companion.daemon import models
 from companion.daemon.attitude.carrier import SLOWEST_AIRSPEED_M_S, Carrier
 from companion.daemon.attitude.difference import Difference
 from companion.daemon.attitude.external_estimate import ExternalEstimate
@@ -76,8 +77,8 @@ class AttitudeService:
         self._config, self._vehicle, self._say = config, vehicle, say
         self.carrier = Carrier(config, carrying_imu(config), vehicle, collector, in_force, offload)
         self.difference = Difference(link, vehicle, self.carrier.now)
-        self.health = Health(self.carrier, self.difference)
-        self.sender = Sender(link, config.push.attitude_rate_hz, full=config.push.attitude == "full")
+        self.health = Health(self.carrier, self.difference, vehicle)
+        self.sender = Sender(link, models.attitude_rate_hz(config), full=config.push.attitude == "full")
         self.timesync = TimesyncResponder(link, vehicle)
         self.external = ExternalEstimate(vehicle, self.difference)
         self.external.on_outcome = lambda words: logger.info("attitude: %s", words)
@@ -241,7 +242,9 @@ class AttitudeService:
         """For `companion status` and `check`: one line among the devices."""
         if not self._running:
             return {"name": "attitude", "kind": "attitude", "good": True, "summary": "starts with companion run"}
-        return {"name": "attitude", "kind": "attitude", "good": self.health.pushing, "summary": self._summary()}
+        # That nothing has been calibrated yet is no fault of a device.
+        good = self.health.pushing or self.carrier.alignments == 0
+        return {"name": "attitude", "kind": "attitude", "good": good, "summary": self._summary()}
 
     def _summary(self) -> str:
         if not self.health.pushing:
