@@ -63,9 +63,11 @@ def wanted_for(firmware: Firmware | None) -> tuple[Wanted, ...]:
     """The set of a firmware.
 
     Raises:
-        AutopilotError: a firmware that is not known.
+        AutopilotError: no autopilot yet, or a firmware that is not known.
     """
-    found = WANTED.get(firmware or "other")
+    if firmware is None:
+        raise AutopilotError("no autopilot has been heard yet")
+    found = WANTED.get(firmware)
     if found is None:
         raise AutopilotError("this autopilot is neither ArduPilot nor PX4; what takes a heading there is not known")
     return found

@@ -79,6 +79,17 @@ class Bench:
         )
         await asyncio.sleep(1.0)
 
+    async def prearm_words(self) -> str:
+        """What ArduPilot has against arming, after asking it to look."""
+        since_s = asyncio.get_running_loop().time()
+        self.ground.send(
+            mavlink.MAVLink_command_long_message(
+                self.vehicle.system_id, 1, mavlink.MAV_CMD_RUN_PREARM_CHECKS, 0, *[0.0] * 7
+            )
+        )
+        await self.vehicle.sleep(3.0)
+        return self.ground.texts_since(since_s)
+
     async def theirs_deg(self) -> float:
         """The autopilot's heading less the true one."""
         since_s = asyncio.get_running_loop().time()
@@ -163,6 +174,14 @@ def test_ekf3_takes_the_heading(tmp_path: Path) -> None:
             found = await on.theirs_deg()
             print(f"after a turn by 100 deg: {found:.2f} deg; {await on.attitude()}")
             assert abs(found - LIE_DEG) < FOLLOWS_DEG
+            # Without the stream it does not arm; with it again, after an alignment, nothing objects to it.
+            on.daemon.signal(signal.SIGSTOP)
+            await on.vehicle.sleep(2.0)
+            assert "VisOdom: not healthy" in await on.prearm_words()
+            on.daemon.signal(signal.SIGCONT)
+            await on.pushing()
+            await on.vehicle.sleep(2.0)
+            assert "VisOdom" not in await on.prearm_words()
             undone = await on.ask("autopilot-setup", "--undo")
             assert undone["state"] == "undone", undone
             assert (await on.ground.get("EK3_SRC1_YAW"), await on.ground.get("VISO_TYPE")) == (1.0, 0.0)
