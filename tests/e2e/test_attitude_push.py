@@ -430,7 +430,7 @@ def test_a_compass_that_disagrees_for_long_stops_the_push(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("vehicle", ["plane", "copter"])
 def test_circles_without_end_tilt_nothing(tmp_path: Path, vehicle: str) -> None:
-    """35 degrees of bank for a minute; what the field says that a fixed wing has its airspeed in is used there only."""
+    """35 degrees of bank for half a minute; what the field says that a fixed wing has its airspeed in is used there only."""
 
     async def main() -> None:
         route = BankedCircles(start_s=70.0)
@@ -440,7 +440,7 @@ def test_circles_without_end_tilt_nothing(tmp_path: Path, vehicle: str) -> None:
             assert rig.aircraft.time_at(rig.now_s) < 65.0
             rig.double.airspeed_m_s = 15.0
             rig.autopilot.arm()
-            while rig.aircraft.time_at(rig.now_s) < 140.0:
+            while rig.aircraft.time_at(rig.now_s) < 105.0:
                 await flying.sleep(5.0)
                 last = flying.witness.of(Vision)[-1]
                 roll, pitch, yaw = rig.aircraft.angles_rad(last.usec * 1e-6 - rig.aircraft.loop_time_of(0.0))
