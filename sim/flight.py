@@ -58,14 +58,14 @@ class Route(ABC):
 class BankedCircles(Route):
     """A fixed wing in a level, coordinated turn that never ends: the trap of every leveller.
 
-    It is launched at full speed (a catapult of a second), flies straight for `straight_s`, and rolls into the turn.
+    It gathers speed over `launch_s`, flies straight for `straight_s`, and rolls into the turn.
     """
 
     airspeed_m_s: float = 15.0
     bank_deg: float = 35.0
     straight_s: float = 5.0
     entry_s: float = 3.0
-    launch_s: float = 1.0
+    launch_s: float = 5.0
 
     def _turn(self, t_s: Array) -> tuple[Array, Array]:
         """Turn rate and angle turned."""

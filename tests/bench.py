@@ -30,6 +30,7 @@ from companion.protocols.registry import make_decoder
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
 from companion.samples import ImuSample
+from tests import bench_attitude
 from tests.support.component import FakeVehicle, ScriptedGate
 from tests.support.frames import imu_line, vectornav_imu
 from tests.support.rig import Rig
@@ -204,6 +205,7 @@ def main() -> None:
     print(f"\na calibration with simulator and daemon in one process: {share:.1%} of a core (100 Hz FC, 200 Hz serial)")
     print(f"the same while it is recorded: {recording:.1%}")
     print(f"a recording of it is replayed {speed:.0f} times as fast as it was made")
+    bench_attitude.table()
 
 
 if __name__ == "__main__":

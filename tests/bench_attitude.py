@@ -1,167 +1,120 @@
-"""How long a sample of the serial IMU takes to become a heading on the wire, on an idle machine and on a busy one.
+"""What an attitude costs a sample at 1 kHz, beside the filters of others on the same samples in the same run.
 
-The daemon is a process of its own with a serial IMU at 200 Hz, gradienter, compass and an ArduPilot double, pushing at
-50 Hz. Counted is from just before the write of a frame's last byte to the pseudo-terminal until the kernel has the
-VISION_POSITION_ESTIMATE that carries this very sample; which one that is tells its time stamp.
+Theirs are compiled (vqf: C++, imufusion: C) and called once a sample, as a daemon would have to; none of them carries a
+covariance or the Earth's rotation.
 """
 
 from __future__ import annotations
 
-import argparse
-import asyncio
-import bisect
-import contextlib
-import os
-import socket
-import sys
-import tempfile
-import threading
+import importlib.util
+import math
 import time
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Final
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
+import numpy as np
 
-from sim.pty_device import PtyDevice
-from sim.scenario import demo
-from sim.serve import configuration, serve
-from tests.bench_arming import companion_status, free_port, load, quantile, receive, running
+from companion.attitude.estimator import AttitudeEstimator, AttitudeSettings
+from companion.calibration.allan import noise_profile
+from companion.physics.units import DEG_H
+from companion.samples import ImuSample
 
-READY_S: Final = 120.0
-MORE: Final = """
-[push]
-attitude = "yaw"
-attitude_rate_hz = 50.0
-[calibration]
-min_still_s = 5
-max_s = 8
-at_arm = "off"
-"""
+RATE_HZ: Final = 1000
+SECONDS: Final = 4
+ROUNDS: Final = 5
+LIMIT_US: Final = 6.0
 
 
-class Relay(threading.Thread):
-    """Carries datagrams between the autopilot double and the daemon, and notes those with a heading."""
-
-    def __init__(self, autopilot: tuple[str, int], daemon: tuple[str, int]) -> None:
-        super().__init__(daemon=True)
-        self.headings: list[tuple[int, float]] = []
-        """Stamp in us of the daemon's clock, and when the kernel had it."""
-        self._ends = (self._socket(autopilot), self._socket(None))
-        self._daemon = daemon
-        self._heard = mavlink.MAVLink(None)
-        self._heard.robust_parsing = True
-        self._autopilot: tuple[str, int] | None = None
-
-    @staticmethod
-    def _socket(address: tuple[str, int] | None) -> socket.socket:
-        made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        made.setsockopt(socket.SOL_SOCKET, 35, 1)  # SO_TIMESTAMPNS
-        made.bind(address or ("127.0.0.1", 0))
-        return made
-
-    def run(self) -> None:
-        import select
-
-        autopilot, daemon = self._ends
-        while True:
-            ready, _, _ = select.select([autopilot, daemon], [], [])
-            for one in ready:
-                data, stamp_s, sender = receive(one)
-                if one is autopilot:
-                    self._autopilot = sender
-                    daemon.sendto(data, self._daemon)
-                    continue
-                for message in self._heard.parse_buffer(data) or ():
-                    if isinstance(message, mavlink.MAVLink_vision_position_estimate_message):
-                        self.headings.append((message.usec, stamp_s))
-                if self._autopilot is not None:
-                    autopilot.sendto(data, self._autopilot)
+def _samples() -> list[ImuSample]:
+    random = np.random.default_rng(1)
+    noise = random.standard_normal((RATE_HZ * SECONDS, 6)) * 1e-3
+    times = np.arange(1, len(noise) + 1) / RATE_HZ
+    noise[:, 0] += 0.3 * np.sin(3.0 * times)
+    noise[:, 5] -= 9.81
+    return [
+        ImuSample(t_s, (a, b, c), (d, e, f))
+        for t_s, (a, b, c, d, e, f) in zip(times.tolist(), noise.tolist(), strict=True)
+    ]
 
 
-@contextlib.contextmanager
-def noting_writes(path: Path, writes: list[tuple[float, float]]) -> Iterator[None]:
-    """Note the monotonic and the wall clock just before each write of one device."""
-    write = PtyDevice._write
+def _ours(samples: list[ImuSample], batch: int) -> Callable[[], object]:
+    batches = [samples[at : at + batch] for at in range(0, len(samples), batch)]
+    settings = AttitudeSettings(
+        vehicle_from_sensor=np.eye(3),
+        gravity_m_s2=9.81,
+        latitude_deg=48.0,
+        gyro_noise=noise_profile(None).gyro,
+        gyro_bias_rad_s=(0.001, 0.002, 0.003),
+        gyro_covariance=np.eye(3) * (10.0 * DEG_H) ** 2,
+        accel_bias_m_s2=(0.01, 0.0, 0.0),
+        accel_sigma_m_s2=(0.002,) * 3,
+    )
 
-    def noted(self: PtyDevice, data: bytes) -> None:
-        if self.path == path and data:
-            writes.append((time.monotonic(), time.time()))
-        write(self, data)
+    def work() -> None:
+        estimator = AttitudeEstimator(settings)
+        estimator.align(0.0, np.eye(3), np.eye(3) * 1e-4)
+        for samples in batches:
+            estimator.update(samples, phase="flight")
 
-    PtyDevice._write = noted  # type: ignore[method-assign]
-    try:
-        yield
-    finally:
-        PtyDevice._write = write  # type: ignore[method-assign]
-
-
-def delays(writes: list[tuple[float, float]], headings: list[tuple[int, float]]) -> list[float]:
-    """Of each heading since the write of its sample."""
-    times = [monotonic_s for monotonic_s, _ in writes]
-    found = []
-    for stamp_us, arrived_s in headings:
-        index = bisect.bisect_right(times, stamp_us * 1e-6) - 1
-        if index >= 0:
-            found.append(arrived_s - writes[index][1])
-    return found
+    return work
 
 
-async def measure(relay: Relay, writes: list[tuple[float, float]], words: str, seconds: float) -> None:
-    begun, first = len(relay.headings), len(writes)
-    await asyncio.sleep(seconds)
-    headings = relay.headings[begun:]
-    found = delays(writes[max(first - 50, 0) :], headings)
-    p50, p99, longest = (1e3 * quantile(found, share) for share in (0.5, 0.99, 1.0))
-    print(f"{words:22} {(len(writes) - first) / seconds:5.0f} samples/s, {len(headings) / seconds:4.1f} headings/s: "
-          f"p50 {p50:.2f}, p99 {p99:.2f}, max {longest:.2f} ms; load {os.getloadavg()[0]:.1f}", flush=True)  # fmt: skip
+def _vqf(samples: list[ImuSample]) -> Callable[[], object]:
+    from vqf import VQF
+
+    rows = [(np.array(sample.gyro_rad_s), np.array(sample.accel_m_s2)) for sample in samples]
+
+    def work() -> None:
+        update = VQF(1.0 / RATE_HZ).update
+        for gyro, accel in rows:
+            update(gyro, accel)
+
+    return work
 
 
-async def bench(folder: Path, seconds: float, busy: int, nice: int) -> None:
-    loop = asyncio.get_running_loop()
-    udp, daemon = ("127.0.0.1", free_port()), ("127.0.0.1", free_port())
-    relay = Relay(udp, daemon)
-    relay.start()
-    scenario = demo(unix_s=time.time())
-    writes: list[tuple[float, float]] = []
-    config = folder / "companion.toml"
-    config.write_text(configuration(scenario, directory=folder, udp=daemon) + MORE)
-    with noting_writes(folder / "imu", writes), contextlib.ExitStack() as stack:
-        up = asyncio.Event()
-        serving = asyncio.create_task(serve(scenario, directory=folder, udp=udp, started=up))
-        await up.wait()
-        command = ["nice", "-n", str(nice), sys.executable, "-m", "companion", "-c", str(config)]
-        stack.enter_context(running([*command, "run"], stderr=(folder / "daemon.log").open("w")))
-        asked = None
-        end_s = loop.time() + READY_S
-        while not relay.headings:
-            await asyncio.sleep(1.0)
-            if loop.time() > end_s:
-                raise SystemExit(f"no heading came:\n{(folder / 'daemon.log').read_text()}")
-            status = await asyncio.to_thread(companion_status, config)
-            if status is not None and asked is None:
-                asked = stack.enter_context(running([*command, "calibrate", "--wait"]))
-        await asyncio.sleep(3.0)
-        await measure(relay, writes, "idle, disarmed", seconds)
-        scenario.autopilot.arm()
-        await asyncio.sleep(2.0)
-        await measure(relay, writes, "idle, armed", seconds)
-        with load(busy):
-            await asyncio.sleep(3.0)
-            await measure(relay, writes, f"{busy} busy processes", seconds)
-        serving.cancel()
-        await asyncio.gather(serving, return_exceptions=True)
+def _imufusion(samples: list[ImuSample]) -> Callable[[], object]:
+    import imufusion
+
+    degrees = 180.0 / math.pi
+    rows = [(np.array(s.gyro_rad_s) * degrees, np.array(s.accel_m_s2) / 9.81) for s in samples]
+
+    def work() -> None:
+        ahrs = imufusion.Ahrs()
+        ahrs.set_sample_period(1.0 / RATE_HZ)
+        update = ahrs.update_no_magnetometer
+        for gyro, accel in rows:
+            update(gyro, accel)
+
+    return work
 
 
-def main() -> None:
-    options = argparse.ArgumentParser(prog="python -m tests.bench_attitude", description=__doc__)
-    options.add_argument("--seconds", type=float, default=20.0, help="of each measurement")
-    options.add_argument("--busy", type=int, default=2 * (os.cpu_count() or 1), help="processes that make the load")
-    options.add_argument("--nice", type=int, default=0, help="of the daemon; its service has a negative one")
-    given = options.parse_args()
-    with tempfile.TemporaryDirectory() as text:
-        asyncio.run(bench(Path(text), given.seconds, given.busy, given.nice))
+def _microseconds(work: Callable[[], object], count: int) -> float:
+    best_s = math.inf
+    for _ in range(ROUNDS):
+        start_s = time.process_time()
+        work()
+        best_s = min(best_s, time.process_time() - start_s)
+    return best_s / count * 1e6
+
+
+def table() -> None:
+    """Print it."""
+    samples = _samples()
+    work = {
+        "companion, batches of 4 (250 reads a second)": _ours(samples, 4),
+        "companion, batches of 20": _ours(samples, 20),
+        "companion, one sample a call": _ours(samples, 1),
+    }
+    for name, package, make in (
+        ("vqf, one sample a call", "vqf", _vqf),
+        ("imufusion, likewise", "imufusion", _imufusion),
+    ):
+        if importlib.util.find_spec(package) is not None:
+            work[name] = make(samples)
+    print(f"\nattitude at {RATE_HZ} Hz, us of processor time a sample (at most {LIMIT_US:g} wanted of ours):")
+    for name, one in work.items():
+        print(f"  {name:46} {_microseconds(one, len(samples)):6.2f}")
 
 
 if __name__ == "__main__":
-    main()
+    table()

@@ -430,7 +430,7 @@ def test_a_compass_that_disagrees_for_long_stops_the_push(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("vehicle", ["plane", "copter"])
 def test_circles_without_end_tilt_nothing(tmp_path: Path, vehicle: str) -> None:
-    """35 degrees of bank for half a minute; what the field says that a fixed wing has its airspeed in is used there only."""
+    """35 degrees of bank for half a minute; the field with a fixed wing's airspeed is used on a fixed wing only."""
 
     async def main() -> None:
         route = BankedCircles(start_s=70.0)

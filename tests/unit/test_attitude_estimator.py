@@ -152,7 +152,7 @@ def test_tilt_in_flight_stays_below_what_usual_filters_lose(route: BankedCircles
 
 
 def test_a_known_airspeed_leaves_nothing_of_a_turn() -> None:
-    aircraft = MovingAircraft(BankedCircles(start_s=1.0, bank_deg=15.0), Pose(), NORTH)
+    aircraft = MovingAircraft(BankedCircles(start_s=1.0, bank_deg=15.0, launch_s=1.0), Pose(), NORTH)
     without, with_it = (AttitudeEstimator(settings()) for _ in range(2))
     for estimator in (without, with_it):
         estimator.align(0.0, aircraft.body_from_ned(0.0), SURE)
