@@ -451,6 +451,30 @@ def test_circles_without_end_tilt_nothing(tmp_path: Path, vehicle: str) -> None:
     run_virtual(main())
 
 
+def test_a_fault_of_ours_costs_the_push_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The collector gets every sample; on the ground it begins anew by itself."""
+
+    async def main() -> None:
+        async with flight(tmp_path) as flying:
+            (own,) = [device for device in flying.rig.service.sensors if device.name == "own"]
+            estimator = flying.attitude.carrier.estimator
+            monkeypatch.setattr(estimator, "update", lambda *_, **__: 1 / 0)
+            before = own.decoder.accepted
+            await rig_stops(flying)
+            assert flying.attitude.health.why_not == "internal error; the log has the details"
+            last = len(flying.witness.of(Vision))
+            await flying.pushing(30.0)
+            assert len(flying.witness.of(Vision)) - last <= 2
+            assert flying.attitude.carrier.estimator is not estimator
+            assert own.decoder.accepted > before + 200
+            assert flying.rig.service.collector.glance(flying.rig.now_s).obstacle is None
+
+    async def rig_stops(flying: Flight) -> None:
+        await flying.rig.until(lambda: not flying.attitude.health.pushing, 2.0)
+
+    run_virtual(main())
+
+
 def test_off_is_off() -> None:
     """Neither imported nor listening."""
     code = "import companion.daemon.service, sys; print([m for m in sys.modules if 'attitude' in m])"

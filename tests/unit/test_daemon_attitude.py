@@ -16,7 +16,8 @@ from companion.autopilot.attitude_messages import attitude_messages, vision_posi
 from companion.autopilot.attitude_setup import changes_for
 from companion.calibration.record import ImuRecord, Outcome, WrittenParameter
 from companion.calibration.site import Whereabouts, local_earth
-from companion.config import Imu
+from companion.config import Imu, parse
+from companion.daemon import models
 from companion.daemon.attitude.difference import turn_between
 from companion.daemon.attitude.sender import Sender, is_sane
 from companion.daemon.attitude.source import settings_of, without_truncation
@@ -165,6 +166,16 @@ def test_turns_between_two_attitudes_are_those_of_the_ground(yaw_deg: float) -> 
     assert math.degrees(math.hypot(north, east)) == pytest.approx(1.0, abs=0.05)
     negated = (-theirs[0], -theirs[1], -theirs[2], -theirs[3])
     assert turn_between(ours, negated) == pytest.approx((north, east, down))
+
+
+@pytest.mark.parametrize(
+    ("url", "rate_hz"),
+    [("udpin:127.0.0.1:14550", 30.0), ("serial:/dev/ttyAMA0:921600", 30.0), ("serial:/dev/ttyAMA0:57600", 22.3)],
+)
+def test_a_slow_line_keeps_half_of_itself(url: str, rate_hz: float) -> None:
+    """129 bytes a message, ten bits a byte."""
+    text = f'[mavlink]\nurl = "{url}"\n[[imu]]\nname = "fc"\nsource = "autopilot"\n[push]\nattitude = "yaw"\n'
+    assert models.attitude_rate_hz(parse(text, "test")) == pytest.approx(rate_hz, abs=0.1)
 
 
 def test_other_bits_of_the_mask_stay() -> None:

@@ -157,6 +157,11 @@ class Carrier:
                 sigma_deg = math.hypot(sigma_deg, local.declination_sigma_deg)
             estimator.add_heading(sample.t_s, heading, sigma_deg * DEG)
 
+    def forget(self) -> None:
+        """Begin anew: on the ground, with the calibration in force."""
+        self.estimator = self._record = None
+        self._recent.clear()
+
     def now(self) -> Attitude | None:
         """The attitude at the last sample; None while there is none."""
         return None if self.estimator is None else self.estimator.attitude()

@@ -42,6 +42,7 @@ ATTITUDE_RATE_HZ: Final = 10.0
 """Asked of the autopilot, for comparison."""
 VFR_HUD_RATE_HZ: Final = 5.0
 AIRSPEED_OLD_S: Final = 1.0
+INTERNAL: Final = "internal error; the log has the details"
 SAID_AGAIN_S: Final = 30.0
 """The same stop is not told more often."""
 
@@ -100,14 +101,28 @@ class AttitudeService:
         self._running = False
         self._autopilot_imu = imus.get(self.carrier.imu.name)
         if self._autopilot_imu is not None:
-            self._autopilot_imu.also = self._on_autopilot_sample
+            take = self._guarded(self._on_autopilot_samples)
+            self._autopilot_imu.also = lambda sample: take((sample,))
         for sensor in sensors:
             if sensor.name == self.carrier.imu.name:
-                sensor.on_samples = self._on_imu
+                sensor.on_samples = self._guarded(self._on_imu)
             elif sensor.kind == "compass":
-                sensor.on_samples = self.carrier.take_compass
+                sensor.on_samples = self._guarded(self.carrier.take_compass)
 
     # --- what arrives
+
+    def _guarded(self, take: Callable[[Sequence[Sample]], None]) -> Callable[[Sequence[Sample]], None]:
+        """A fault in here must cost neither the calibration its samples nor the autopilot its truth."""
+
+        def guarded(samples: Sequence[Sample]) -> None:
+            try:
+                take(samples)
+            except Exception:
+                logger.exception("attitude met a fault of the program; it begins anew")
+                self.health.stop(INTERNAL)
+                self.carrier.forget()
+
+        return guarded
 
     def _on_imu(self, samples: Sequence[Sample]) -> None:
         found = [sample for sample in samples if isinstance(sample, ImuSample)]
@@ -116,9 +131,10 @@ class AttitudeService:
         self.carrier.take(found)
         self._push()
 
-    def _on_autopilot_sample(self, sample: ImuSample) -> None:
+    def _on_autopilot_samples(self, samples: Sequence[Sample]) -> None:
         step = self.carrier.gyro_step_rad_s
-        self.carrier.take([without_truncation(sample, step) if step else sample])
+        found = [sample for sample in samples if isinstance(sample, ImuSample)]
+        self.carrier.take([without_truncation(sample, step) for sample in found] if step else found)
         self._push()
 
     def _push(self) -> None:
@@ -168,7 +184,7 @@ class AttitudeService:
                 except Exception:
                     # What is pushed to an EKF in flight must be in order, or not be at all.
                     logger.exception("attitude met a fault of the program")
-                    self.health.stop("internal error; the log has the details")
+                    self.health.stop(INTERNAL)
                     await asyncio.sleep(1.0)
                 await asyncio.sleep(TICK_S)
         finally:
