@@ -30,6 +30,7 @@ from companion.daemon.far_step import FarStepWatch
 from companion.daemon.firmware_calibration import FirmwareCalibration
 from companion.daemon.flight_line import define_parameters
 from companion.daemon.gate_setup import GateSetup
+from companion.daemon.heading_setup import HeadingSetup
 from companion.daemon.in_force import InForce
 from companion.daemon.job import Job
 from companion.daemon.ledger import Ledger, Offload
@@ -53,7 +54,6 @@ from companion.storage.records import RecordStore
 
 if TYPE_CHECKING:
     from companion.daemon.attitude.service import AttitudeService
-    from companion.daemon.autopilot_setup import AutopilotSetup
     from companion.daemon.mqtt.face import MqttFace
     from companion.web.server import Page
 
@@ -160,18 +160,7 @@ class Service:
         define_parameters(self.component.parameters, config, self.conductor)
         self.pose = PoseNow(config, self.vehicle, self.collector, offload)
         self.attitude = self._attitude_service(offload)
-        self.setup_ledger = Ledger(ChangeLog(config.storage.path / "setup"), offload)
-        self._writer = writer
-        self._setup: AutopilotSetup | None = None
-        self.setup_mender = Mender(
-            self.vehicle,
-            self.parameters,
-            writer,
-            self.setup_ledger,
-            self._say,
-            contextlib.nullcontext,
-            command="companion autopilot-setup --undo",
-        )
+        self.setup = HeadingSetup(config, self.vehicle, self.parameters, writer, self.conductor, self._say, offload)
         carried = [self.attitude] if self.attitude is not None else []
         self.answers = Answers(
             self.conductor,
@@ -193,27 +182,9 @@ class Service:
             pose=self.pose,
         )
         self.answers.carry(self.attitude)
-        self.answers.setup = self._set_up
+        self.answers.setup = self.setup.answer
         self.mqtt = self._mqtt_face(offload)
         self.page = self._page(offload)
-
-    async def _set_up(self, request: Object) -> Object:
-        """`companion autopilot-setup`: rarely asked for, so loaded when it is."""
-        from companion.daemon.autopilot_setup import AutopilotSetup
-
-        if self._setup is None:
-            self.setup_ledger.load()
-            self._setup = AutopilotSetup(
-                self.config,
-                self.vehicle,
-                self.parameters,
-                self._writer,
-                self.setup_ledger,
-                self.setup_mender,
-                self.conductor,
-                self._say,
-            )
-        return await self._setup.answer(request)
 
     def _attitude_service(self, offload: Offload) -> AttitudeService | None:
         if self.config.push.attitude == "off":
@@ -366,8 +337,6 @@ class Service:
             ports: open the serial ports (else somebody hands their bytes to `sensors`).
         """
         self.ledger.load()
-        if (self.config.storage.path / "setup").exists():
-            self.setup_ledger.load()
         if self.ledger.fault is not None:
             # Stay and say so: a daemon that is gone is harder to understand from the field.
             logger.error("%s", self.ledger.fault)
@@ -380,7 +349,7 @@ class Service:
                     if mavlink:
                         group.create_task(run_transport(self.link, self.config.mavlink.url), name="mavlink")
                     group.create_task(self.mender.run(), name="mender")
-                    group.create_task(self.setup_mender.run(), name="setup mender")
+                    group.create_task(self.setup.run(), name="setup")
                     group.create_task(self.reach.run(), name="reach")
                     group.create_task(self.readiness.run(), name="readiness")
                     group.create_task(self.armings.run(), name="armings")
