@@ -1,4 +1,4 @@
-"""`python -m sim devices | autopilot | all | demo | ardupilot | px4 | residuals`."""
+"""`python -m sim devices | autopilot | all | demo | ardupilot | px4 | residuals | turntable | drive | flights`."""
 
 from __future__ import annotations
 
@@ -19,6 +19,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             print("python -m sim demo: not part of this copy; try `python -m sim all`", file=sys.stderr)
             return 1
         return int(demo.main(arguments[1:]) or 0)
+    if arguments[:1] == ["turntable"]:
+        from sim.experiments.turntable import main as turntable
+
+        return turntable(arguments[1:])
+    if arguments[:1] in (["drive"], ["flights"]):
+        from sim.experiments.journeys import main as journeys
+
+        return journeys(arguments)
     from sim.serve import FIRMWARE_COMMANDS
     from sim.serve import main as serve
 

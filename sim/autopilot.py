@@ -17,6 +17,7 @@ from sim.ardupilot.calibrations import Calibrations
 from sim.ardupilot.channel import ArduPilotChannel
 from sim.ardupilot.commands import CommandServer
 from sim.ardupilot.estimator import CoarseEstimator
+from sim.ardupilot.external_nav import ExternalNav
 from sim.ardupilot.inertial import InertialPath
 from sim.ardupilot.messages import BUILDERS
 from sim.ardupilot.parameter_server import ParameterServer
@@ -82,6 +83,9 @@ class ArduPilotDouble(AutopilotDouble):
         self._auxiliary = auxiliary
         self.parameters = self._new_store(parameters or {})
         self.estimator = CoarseEstimator()
+        self.external_nav = ExternalNav(self)
+        self.airspeed_m_s = 0.0
+        """What its VFR_HUD says."""
         self._router = Router(system_id, self.channels)
         self._paths = [InertialPath(model, number + 1, self.parameters, seed=seed) for number, model in enumerate(imus)]
         self.calibrations = Calibrations(self._paths, self.parameters, self.random)
@@ -148,6 +152,8 @@ class ArduPilotDouble(AutopilotDouble):
                 failures.append("3D Accel calibration needed")
             if values[f"INS_TCAL{path.instance}_ENABLE"] == 2:
                 failures.append("temperature cal running")
+        if self.external_nav.enabled and not self.external_nav.healthy(loop_s):
+            failures.append("VisOdom: not healthy")
         for output in outputs[1:]:
             if np.linalg.norm(output[3:] - outputs[0][3:]) > values["ARMING_ACCTHRESH"]:
                 failures.append("Accels inconsistent")
@@ -242,6 +248,7 @@ class ArduPilotDouble(AutopilotDouble):
 
     def _started(self, loop_s: float) -> None:
         self.estimator.reset(self.aircraft.time_at(loop_s) - self._up_s)
+        self._choose_yaw_source(loop_s)
         self._start_heartbeats(loop_s)
 
     def _restarted(self, loop_s: float) -> None:
@@ -253,7 +260,16 @@ class ArduPilotDouble(AutopilotDouble):
         for path in self._paths:
             path.reset()
         self.estimator.reset(self.aircraft.time_at(loop_s))
+        self._choose_yaw_source(loop_s)
         self._start_heartbeats(loop_s)
+
+    def _choose_yaw_source(self, loop_s: float) -> None:
+        """A boot: without a compass the heading begins at north, whatever it is."""
+        self.external_nav.restart()
+        self.estimator.compass = not self.external_nav.selected
+        if self.external_nav.selected:
+            _, _, yaw = self.aircraft.angles_rad(self.aircraft.time_at(loop_s))
+            self.estimator.yaw_error_rad = -yaw
 
     def _boot_gyros(self, t_s: float) -> None:
         """INS_GYR_CAL = 1: every boot measures the gyro offsets anew and throws the stored ones away."""
@@ -283,5 +299,7 @@ class ArduPilotDouble(AutopilotDouble):
             self._commands.handle(command_of(channel, message, loop_s))
         elif isinstance(message, mavlink.MAVLink_request_data_stream_message):
             self._commands.data_stream(channel, message, loop_s)
+        elif isinstance(message, mavlink.MAVLink_vision_position_estimate_message | mavlink.MAVLink_odometry_message):
+            self.external_nav.take(message, loop_s)
         elif isinstance(message, mavlink.MAVLink_timesync_message) and message.tc1 == 0:
             self.answer(channel, mavlink.MAVLink_timesync_message(self.boot_us(loop_s) * 1000, message.ts1))

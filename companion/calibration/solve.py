@@ -79,6 +79,7 @@ class Truth:
 
     up: Array
     attitude_covariance_rad2: Matrix
+    """(3, 3) in vehicle FRD."""
     heading_rad: float | None
     heading_sigma_rad: float | None
     from_gradienter: bool
@@ -133,7 +134,7 @@ def solve(
         warnings.append("no gradienter: gyros only, accelerometers not calibrated")
     if compass is None or window.heading is None:
         warnings.append("no compass: the horizontal part of the Earth's rate is unknown, gyro sigma widened")
-    truth = _truth(window, gradienter if tilted is not None else None, compass, local, warnings)
+    truth = truth_of(window, gradienter if tilted is not None else None, compass, local, warnings)
     imus = tuple(_estimate(imu, truth, local, gyros=what.gyros, accelerometers=accelerometers) for imu in window.imus)
     if all(imu.gyro_rad_s is None and imu.accel_m_s2 is None for imu in imus):
         refusals = [
@@ -168,13 +169,18 @@ def solve_at(
     return solve(window, local_earth(where), gradienter, compass, what)
 
 
-def _truth(
+def truth_of(
     window: Window,
     gradienter: GradienterModel | None,
     compass: CompassModel | None,
     local: LocalEarth,
     warnings: list[str],
 ) -> Truth:
+    """How the aircraft stood, from everything but its gyros; what is missing goes into `warnings`.
+
+    Raises:
+        CalibrationRefusedError: the readings cannot be right together.
+    """
     if gradienter is not None and window.tilt is not None:
         up, up_covariance = _up(window.tilt, gradienter)
     else:

@@ -79,7 +79,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _parser() -> Parser:
-    from companion.cli import align, client, ground, install, local, monitor, recordings, report
+    from companion.cli import align, client, ground, install, local, monitor, recordings, report, setup
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -134,6 +134,7 @@ def _parser() -> Parser:
     undo.add_argument(
         "--force", action="store_true", help="leave what somebody else has changed since, and put the rest back"
     )
+    setup.add_command(add)
     history = add("history", client.history, "list past calibrations")
     history.add_argument("-n", "--limit", type=_count, default=20, metavar="N", help="the latest N (default 20)")
     report.add_command(add, _count)

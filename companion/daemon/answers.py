@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from typing import Any, Final, Protocol
 
 import msgspec
@@ -54,6 +54,24 @@ class Device(Protocol):
         ...
 
 
+class Carried(Protocol):
+    """Who carries the attitude."""
+
+    @property
+    def warnings(self) -> list[str]:
+        """For people."""
+        ...
+
+    @property
+    def concern(self) -> str | None:
+        """What the pilot of an armed aircraft should know at once."""
+        ...
+
+    def view(self) -> Object:
+        """Everything, as JSON can hold it."""
+        ...
+
+
 class Answers:
     """Turns requests of the control socket into what the daemon does, and what it does into JSON."""
 
@@ -86,10 +104,19 @@ class Answers:
         self._armings, self._gate_setup, self._automatic = armings, gate_setup, automatic
         self._recorder, self._link, self._pose, self._alignment = recorder, link, pose, alignment
         self._headlines = Headlines(vehicle, collector, conductor, mender, readiness, automatic, mavlink_url, trouble)
+        self._carried: Carried | None = None
         self.page: Callable[[], Object | None] = lambda: None
         """What is to be said of the page; None where none is configured."""
+        self.setup: Callable[[Object], Awaitable[Object]] | None = None
+        """Sets the autopilot up for our heading."""
         self.mqtt: Callable[[], Object] = dict
         """How the broker is reached; empty where none is configured."""
+
+    def carry(self, attitude: Carried | None) -> None:
+        """Tell of the attitude that is carried, too."""
+        self._carried = attitude
+        if attitude is not None:
+            self._headlines.concern = lambda: attitude.concern
 
     async def answer(self, request: Object, face: str = "companion") -> AsyncIterator[Object]:
         """Answer one request of the control socket, or of another face that speaks its words.
@@ -127,6 +154,8 @@ class Answers:
         elif command == "record":
             async for reply in self._recorder.answer(request):
                 yield reply
+        elif command == "autopilot-setup" and self.setup is not None:
+            yield await self.setup(request)
         elif command == "monitor":
             while True:
                 yield {"kind": "progress", "status": await self.look()}
@@ -198,7 +227,8 @@ class Answers:
             "pose": self._pose.now(),
             "readings": self._pose.readings(),
             "alignment": self._alignment.status(),
-            "warnings": self._rivalry.warnings,
+            "warnings": [*self._rivalry.warnings, *(self._carried.warnings if self._carried is not None else ())],
+            "attitude": None if self._carried is None else self._carried.view(),
             "ground_stations": dict(zip(("good", "summary"), self._reach.words(), strict=True)),
             "fault": self._mender.fault,
             "putting_back": self._mender.pending,

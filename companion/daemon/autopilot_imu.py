@@ -67,6 +67,8 @@ class AutopilotImu:
         """How often reading the offsets has failed in a row."""
         self.tap: Callable[[ImuSample], None] | None = None
         """Gets every sample, whatever the offsets behind it."""
+        self.also: Callable[[ImuSample], None] | None = None
+        """Gets every sample that counts, before `take`: for what must not wait."""
         self._vehicle, self._parameters = vehicle, parameters
         self._memory = memory or SlotMemory()
         self._take, self._void = take, void
@@ -147,6 +149,8 @@ class AutopilotImu:
         if self.tap is not None:
             self.tap(sample)
         if self.calibration is not None:
+            if self.also is not None:
+                self.also(sample)
             self._take(sample)
 
     def _invalidate(self, why: str) -> None:

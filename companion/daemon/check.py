@@ -12,7 +12,7 @@ from pathlib import Path
 from companion.config import Config
 from companion.daemon.control import Object, ask, process_behind
 from companion.daemon.doctor import Diagnosis, sensor_findings, system_findings, where_it_may_be
-from companion.daemon.models import doubtful, not_in_this_version
+from companion.daemon.models import cannot_work, doubtful
 from companion.daemon.sensor_health import ABSENT
 from companion.daemon.service import Service
 from companion.errors import DaemonDeniedError, DaemonUnreachableError
@@ -56,7 +56,7 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
         findings.append(Finding("daemon", good=True, words="not running: ports opened by this check"))
         findings.append(_storage(config.storage.path))
         status = await _listen(config, seconds)
-    findings += [Finding("configuration", good=False, words=words) for words in not_in_this_version(config)]
+    findings += [Finding("configuration", good=False, words=words) for words in cannot_work(config)]
     findings += [Finding("warning", good=True, words=words) for words in doubtful(config)]
     vehicle = status["vehicle"]
     findings.append(Finding("autopilot", good=vehicle["system_id"] is not None, words=vehicle["summary"]))

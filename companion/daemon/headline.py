@@ -63,9 +63,16 @@ class Headlines:
         self._readiness, self._automatic, self._mavlink_url = readiness, automatic, mavlink_url
         self._trouble = trouble
         """What is wrong with one of our own sensors, and with which; None while all do well."""
+        self.concern: Callable[[], str | None] = lambda: None
+        """What else the pilot should know of at once, where the rest is well."""
 
     def now(self) -> Headline:
         """The headline of this moment."""
+        headline = self._now()
+        concern = self.concern() if headline.tone == "good" else None
+        return headline if concern is None else Headline(headline.word, f"{concern}; {headline.reason}", "wait")
+
+    def _now(self) -> Headline:
         now_s = asyncio.get_running_loop().time()
         if self._mender.fault is not None:
             return Headline("FAULT", self._mender.fault, "bad")

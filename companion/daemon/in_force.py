@@ -177,6 +177,12 @@ class InForce:
         sigmas = [max(held.sigma_use) for (_, of), held in self._held.items() if of == triad and isinstance(held, Held)]
         return max(sigmas, default=None)
 
+    def record_of(self, name: str) -> ImuRecord | None:
+        """What the last calibration found in one IMU; None when nothing did, or something has replaced it."""
+        if self.calibration is None or any(isinstance(self._held.get((name, t)), Why) for t in ("gyro", "accel")):
+            return None
+        return next((imu for imu in self.calibration.imus if imu.name == name), None)
+
     def temperature_degc(self, name: str) -> float | None:
         """The temperature of an IMU when its output was last looked at; None where it tells none."""
         return self._temperatures.get(name)

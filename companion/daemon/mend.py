@@ -37,9 +37,13 @@ class Mender:
         ledger: Ledger,
         say: Say,
         changing: Callable[[], AbstractContextManager[None]],
+        *,
+        command: str = "companion undo",
     ) -> None:
         self._vehicle, self._parameters, self._writer = vehicle, parameters, writer
         self._ledger, self._say, self._changing = ledger, say, changing
+        self._command = command
+        """By which people ask for an undo."""
 
         self.on_mended: Callable[[str], None] = lambda words: None
 
@@ -124,7 +128,7 @@ class Mender:
         if foreign and not force:
             raise AutopilotError(
                 f"changed by somebody else or by a boot since, so nothing was put back: {'; '.join(foreign)}."
-                " companion undo --force puts the others back"
+                f" {self._command} --force puts the others back"
             )
         if foreign:
             logger.warning("changed by somebody else since, left alone: %s", "; ".join(foreign))

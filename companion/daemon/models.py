@@ -26,6 +26,8 @@ BITS_PER_BYTE: Final = 10.0
 """8N1: a start bit, eight bits of data, a stop bit."""
 HIGHRES_BYTES: Final = 75.0
 """HIGHRES_IMU in MAVLink 2: 63 bytes and 12 around them."""
+VISION_BYTES: Final = 129.0
+"""VISION_POSITION_ESTIMATE likewise: 117 and 12."""
 SCALED_BYTES: Final = 36.0
 """SCALED_IMU2 or 3 likewise: 24 and 12."""
 
@@ -65,10 +67,21 @@ def imu_rate_hz(config: Config) -> float:
     return max(LEAST_IMU_RATE_HZ, min(IMU_RATE_HZ, LINE_SHARE * bytes_per_s / each_time))
 
 
-def not_in_this_version(config: Config) -> list[str]:
-    """What the configuration may ask for that this version does not do: said at start, never silently ignored."""
-    asked = ((config.push.attitude != "off", f'push.attitude = "{config.push.attitude}": attitude is not pushed yet'),)
-    return [words for is_asked, words in asked if is_asked]
+def attitude_rate_hz(config: Config) -> float:
+    """How often the attitude may be sent without filling a serial line (57600 baud: 22 Hz)."""
+    wanted = config.push.attitude_rate_hz
+    kind, _, rest = config.mavlink.url.partition(":")
+    if kind != "serial":
+        return wanted
+    return min(wanted, LINE_SHARE * int(rest.rpartition(":")[2]) / BITS_PER_BYTE / VISION_BYTES)
+
+
+def cannot_work(config: Config) -> list[str]:
+    """What the configuration asks for and cannot come about: said at start, never silently ignored."""
+    found = []
+    if config.push.attitude != "off" and config.compass is None:
+        found.append(f'push.attitude = "{config.push.attitude}" needs [compass]: without one no heading is known')
+    return found
 
 
 def doubtful(config: Config) -> list[str]:

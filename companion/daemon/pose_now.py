@@ -35,6 +35,8 @@ class PoseNow:
         self.gradienter: Callable[[], GradienterModel | None] = lambda: models.gradienter_model(config.gradienter)
         """The gradienter's model as it is in force."""
         self._compass = models.compass_model(config.compass)
+        self.carried: Callable[[], dict[str, Any] | None] = lambda: None
+        """The attitude that is right in flight, too, while one is carried."""
         self._tilt: TiltSample | None = None
         self._heading: CompassSample | None = None
         self._declination_deg: float | None = None
@@ -58,6 +60,8 @@ class PoseNow:
 
         The heading is magnetic as long as the declination has not been looked up.
         """
+        if (carried := self.carried()) is not None:
+            return carried
         now_s = asyncio.get_running_loop().time()
         tilt, heading = self._tilt, self._heading
         gradienter = self.gradienter()

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from companion.daemon.ledger import Offload
@@ -18,7 +18,7 @@ from companion.links.ports import find_holders
 from companion.protocols.registry import Kind
 from companion.protocols.roles import Part
 from companion.protocols.stream_health import SILENT_AFTER_S
-from companion.samples import CompassSample
+from companion.samples import CompassSample, Sample
 
 logger = logging.getLogger(__name__)
 
@@ -125,6 +125,8 @@ class SerialSensor:
         )
         self.tap: Callable[[str, bytes | None, float], object] | None = None
         """Called with (name, bytes, time) before they are decoded; without bytes: some are missing."""
+        self.on_samples: Callable[[Sequence[Sample]], object] | None = None
+        """Called with all samples of a read before anybody else gets them: for what must not wait."""
         self._take, self._offload = take, offload
         self._by_role = dict(zip(device.roles, self.roles, strict=True))
         self.other_north: str | None = None
@@ -171,6 +173,8 @@ class SerialSensor:
         if self.tap is not None:
             self.tap(self.name, data, t_s)
         samples = self.decoder.receive(data, t_s)
+        if samples and self.on_samples is not None:
+            self.on_samples(samples)
         if (breaks := self.decoder.times.clock.breaks) != self._breaks:
             self._breaks = breaks
             logger.warning("%s: the device restarted, or its clock jumped; measuring afresh", self.link.name)

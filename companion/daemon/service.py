@@ -32,6 +32,7 @@ from companion.daemon.far_step import FarStepWatch
 from companion.daemon.firmware_calibration import FirmwareCalibration
 from companion.daemon.flight_line import define_parameters
 from companion.daemon.gate_setup import GateSetup
+from companion.daemon.heading_setup import HeadingSetup
 from companion.daemon.in_force import InForce
 from companion.daemon.job import ALIGNMENT, Job
 from companion.daemon.ledger import Ledger, Offload
@@ -57,6 +58,7 @@ from companion.storage.changes import ChangeLog
 from companion.storage.records import RecordStore
 
 if TYPE_CHECKING:
+    from companion.daemon.attitude.service import AttitudeService
     from companion.daemon.mqtt.face import MqttFace
     from companion.web.server import Page
 
@@ -175,11 +177,14 @@ class Service:
         define_parameters(self.component.parameters, config, self.conductor)
         self.pose = PoseNow(config, self.vehicle, self.collector, offload)
         self.pose.gradienter = self.alignment.model
+        self.attitude = self._attitude_service(offload)
+        self.setup = HeadingSetup(config, self.vehicle, self.parameters, writer, self.conductor, self._say, offload)
+        carried = [self.attitude] if self.attitude is not None else []
         self.answers = Answers(
             self.conductor,
             self.vehicle,
             self.collector,
-            [*self.imus.values(), *(role for sensor in self.sensors for role in sensor.roles)],
+            [*self.imus.values(), *(role for sensor in self.sensors for role in sensor.roles), *carried],
             self.store,
             offload,
             mavlink_url=config.mavlink.url,
@@ -196,8 +201,30 @@ class Service:
             trouble=self.sensor_watch.worst,
             alignment=self.alignment,
         )
+        self.answers.carry(self.attitude)
+        self.answers.setup = self.setup.answer
         self.mqtt = self._mqtt_face(offload)
         self.page = self._page(offload)
+
+    def _attitude_service(self, offload: Offload) -> AttitudeService | None:
+        if self.config.push.attitude == "off":
+            return None
+        from companion.daemon.attitude.service import AttitudeService
+
+        attitude = AttitudeService(
+            self.config,
+            self.link,
+            self.vehicle,
+            self.collector,
+            self.in_force,
+            self.imus,
+            self.sensors,
+            self._say,
+            offload,
+        )
+        attitude.carrier.gradienter = self.alignment.model
+        self.pose.carried = attitude.pose
+        return attitude
 
     def _mqtt_face(self, offload: Offload) -> MqttFace | None:
         if self.config.mqtt is None:
@@ -276,7 +303,7 @@ class Service:
         Raises:
             CompanionError: it cannot start (another daemon runs, the storage cannot be read).
         """
-        for words in (*models.not_in_this_version(self.config), *models.doubtful(self.config)):
+        for words in (*models.cannot_work(self.config), *models.doubtful(self.config)):
             logger.warning("%s", words)
         control = self.config.control
         async with ControlServer(control.path, self.answers.answer, group=control.group_name):
@@ -305,12 +332,15 @@ class Service:
                     if mavlink:
                         group.create_task(run_transport(self.link, self.config.mavlink.url), name="mavlink")
                     group.create_task(self.mender.run(), name="mender")
+                    group.create_task(self.setup.run(), name="setup")
                     group.create_task(self.reach.run(), name="reach")
                     group.create_task(self.readiness.run(), name="readiness")
                     group.create_task(self.armings.run(), name="armings")
                     group.create_task(self.automatic.run(), name="automatic")
                     group.create_task(self.gate_setup.run(), name="gate setup")
                     group.create_task(self.recorder.run(), name="recorder")
+                    if self.attitude is not None:
+                        group.create_task(self.attitude.run(), name="attitude")
                     if self.page is not None:
                         group.create_task(self.page.run(), name="page")
                     if self.mqtt is not None:

@@ -55,6 +55,8 @@ class Supervisor:
         service.link.on_beat = self._expect("MAVLink connection", "mavlink", link_s)
         service.readiness.on_beat = self._expect("estimator", "readiness", ESTIMATOR_S)
         service.automatic.on_beat = self._expect("automatic calibration", "automatic", AUTOMATIC_S)
+        if service.attitude is not None:
+            service.attitude.on_beat = self._expect("attitude", "attitude", ESTIMATOR_S)
         for imu in service.imus.values():
             imu.stream.on_beat = self._expect(f"imu {imu.name}", f"{imu.name} telemetry", imu_stream.BEAT_WITHIN_S)
         for sensor in service.sensors:

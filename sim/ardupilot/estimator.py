@@ -33,6 +33,8 @@ class CoarseEstimator:
         self.tilt_error_rad = np.zeros(2)
         """Roll, pitch."""
         self.yaw_error_rad = 0.0
+        self.compass = True
+        """Whether a compass takes a wrong heading back."""
         self._start_error = np.zeros(3)
         self._tilt_part: Array = np.zeros(3)
         self._tilt_goal: Array = np.zeros(2)
@@ -67,7 +69,9 @@ class CoarseEstimator:
         stays = math.exp(-span / _BIAS_FADES_S)
         # The heading turns by what the estimate does not know; both fade at the same rate.
         unknown = float(gyro_error[2] - self.gyro_bias_rad_s[2])
-        self.yaw_error_rad = (self.yaw_error_rad + unknown * span) * math.exp(-span / _YAW_FADES_S)
+        self.yaw_error_rad += unknown * span
+        if self.compass:
+            self.yaw_error_rad *= math.exp(-span / _YAW_FADES_S)
         self.gyro_bias_rad_s += (1.0 - stays) * (gyro_error - self.gyro_bias_rad_s)
         self._start_error *= stays
         self._tilt_part *= math.exp(-span / _TILT_PART_FADES_S)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.ardupilot.versions import NEWEST
@@ -98,6 +99,25 @@ def ahrs(double: ArduPilotDouble, loop_s: float) -> Message:
     return mavlink.MAVLink_ahrs_message(x, y, z, 0.0, 0.0, 0.001, 0.002)
 
 
+def ekf_status_report(double: ArduPilotDouble, loop_s: float) -> Message:
+    """EKF_STATUS_REPORT: without a heading EKF3 does not use GNSS, and holds its position instead."""
+    flags = mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_VERT | mavlink.EKF_POS_VERT_ABS
+    external = double.external_nav
+    if external.selected and not external.aligned:
+        flags |= mavlink.EKF_CONST_POS_MODE
+    elif double.has_position:
+        flags |= mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_PRED_POS_HORIZ_ABS
+        flags |= mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_PRED_POS_HORIZ_REL
+    return mavlink.MAVLink_ekf_status_report_message(flags, 0.05, 0.05, 0.05, 0.02, 0.0, 0.0)
+
+
+def vfr_hud(double: ArduPilotDouble, loop_s: float) -> Message:
+    """VFR_HUD: on a copter without an airspeed sensor the field has the speed over ground."""
+    _, _, yaw = double.estimated_angles_rad(loop_s)
+    heading = round(np.degrees(yaw)) % 360
+    return mavlink.MAVLink_vfr_hud_message(double.airspeed_m_s, 0.0, heading, 0, double.aircraft.site.height_m, 0.0)
+
+
 def autopilot_version(double: ArduPilotDouble, loop_s: float) -> Message:
     """AUTOPILOT_VERSION: PARAM_FLOAT, and neither C_CAST nor BYTEWISE."""
     capabilities = (
@@ -129,6 +149,8 @@ BUILDERS: dict[int, Builder] = {
     mavlink.MAVLINK_MSG_ID_SCALED_IMU3: scaled_imu3,
     mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version,
     mavlink.MAVLINK_MSG_ID_AHRS: ahrs,
+    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: ekf_status_report,
+    mavlink.MAVLINK_MSG_ID_VFR_HUD: vfr_hud,
 }
 
 # Groups of the legacy REQUEST_DATA_STREAM: no SCALED_IMU and no HIGHRES_IMU in RAW_SENSORS.

@@ -30,6 +30,8 @@ ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = (
 ACK_DELAY_S = (0.003, 0.010)
 REBOOT_DELAY_S = 0.4
 DOWN_S = 3.0
+EXTERNAL_ATTITUDE_ESTIMATE = 620
+"""Of the development dialect; known since 1.17."""
 QUEUE = 8
 """Commands that wait while the commander waits for an authorisation; more are lost."""
 _UNANSWERED = {
@@ -58,6 +60,8 @@ class Commander:
             mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
             mavlink.MAV_CMD_PREFLIGHT_STORAGE: self._storage,
         }
+        if double.version != "1.16":
+            self._handlers[EXTERNAL_ATTITUDE_ESTIMATE] = self._external_attitude
         self.restart()
 
     def restart(self) -> None:
@@ -194,6 +198,13 @@ class Commander:
     def _run_prearm_checks(self, command: Command) -> int:
         for failure in self._double.checks.failures(command.loop_s):
             self._double.say(mavlink.MAV_SEVERITY_CRITICAL, f"Preflight Fail: {failure}")
+        return ACCEPTED
+
+    def _external_attitude(self, command: Command) -> int:
+        yaw_deg = command.params[2]
+        if not math.isfinite(yaw_deg):
+            return UNSUPPORTED
+        self._double.vision.heading_by_command(yaw_deg, command.loop_s)
         return ACCEPTED
 
     def _calibrate(self, command: Command) -> int:

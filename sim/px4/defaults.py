@@ -130,7 +130,14 @@ def _mavlink() -> dict[str, float]:
 
 
 def _estimator() -> dict[str, float]:
-    ints = {"EKF2_IMU_CTRL": 7, "EKF2_MULTI_IMU": 0, "EKF2_EV_CTRL": 0, "EKF2_GPS_CTRL": 7, "EKF2_MAG_TYPE": 0}
+    ints = {
+        "EKF2_IMU_CTRL": 7,
+        "EKF2_MULTI_IMU": 0,
+        "EKF2_EV_CTRL": 0,
+        "EKF2_EV_NOISE_MD": 0,
+        "EKF2_GPS_CTRL": 7,
+        "EKF2_MAG_TYPE": 0,
+    }
     floats = {
         "EKF2_ABL_LIM": 0.4, "EKF2_ABL_TAU": 0.5, "EKF2_ABL_ACCLIM": 25.0, "EKF2_ABL_GYRLIM": 3.0,
         "EKF2_GYR_B_LIM": 0.15, "EKF2_GYR_B_NOISE": 0.001, "EKF2_ACC_B_NOISE": 0.003, "EKF2_GYR_NOISE": 0.015,

@@ -27,6 +27,7 @@ from sim.px4.changes import Consumer
 from sim.px4.checks import Checks
 from sim.px4.commander import Commander, heard_ground_station
 from sim.px4.defaults import EXTERNAL_IDS, SIMULATED_IDS, SLOTS, default_parameters
+from sim.px4.external_vision import ExternalVision
 from sim.px4.messages import BUILDERS, NORMAL_RATES, ONBOARD_RATES
 from sim.px4.parameter_server import ParameterServer
 from sim.px4.parameters import ParameterStore
@@ -133,6 +134,7 @@ class PX4Double(AutopilotDouble):
         self.learned_offsets = LearnedOffsets(self)
         self.calibrations = Calibrations(self)
         self.authorization = ArmAuthorization(self)
+        self.vision = ExternalVision(self)
         self.checks = Checks(self)
         self.commander = Commander(self)
         self._parameter_server = ParameterServer(self)
@@ -232,6 +234,8 @@ class PX4Double(AutopilotDouble):
         self.update_estimators(loop_s)
         roll, pitch, yaw = self.aircraft.angles_rad(self.aircraft.time_at(loop_s))
         roll_error, pitch_error = self.vehicle_imus[0].estimator.tilt_error_rad
+        self.vision.update(loop_s)
+        yaw += self.vision.yaw_error_rad
         return roll + roll_error, pitch + pitch_error, float((yaw + np.pi) % (2.0 * np.pi) - np.pi)
 
     def parameters_changed(self, *, consumers: bool = True) -> None:
@@ -273,7 +277,7 @@ class PX4Double(AutopilotDouble):
         self._frozen.clear()
         for imu in self.vehicle_imus:
             imu.restart()
-        for part in (self._parameter_server, self.calibrations, self.authorization, self.commander):
+        for part in (self._parameter_server, self.calibrations, self.authorization, self.commander, self.vision):
             part.restart()
         for consumer in self._consumers:
             consumer.restart()
@@ -345,6 +349,9 @@ class PX4Double(AutopilotDouble):
                 self.answer(channel, mavlink.MAVLink_timesync_message(now_ns, message.ts1))
             else:
                 self.timesync_answers += 1
+                self.vision.timesync(message.tc1, message.ts1, loop_s)
+        else:
+            self.vision.take(message, loop_s)
 
     def _parameter_message(self, port: PX4Port, message: Message, loop_s: float) -> None:
         server = self._parameter_server

@@ -112,6 +112,16 @@ def extended_sys_state(double: PX4Double, loop_s: float) -> Message:
     )
 
 
+def estimator_status(double: PX4Double, loop_s: float) -> Message:
+    """ESTIMATOR_STATUS: what it uses for its heading is not in it."""
+    flags = mavlink.ESTIMATOR_ATTITUDE | mavlink.ESTIMATOR_VELOCITY_VERT | mavlink.ESTIMATOR_POS_VERT_ABS
+    if double.has_position:
+        flags |= mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_POS_HORIZ_ABS | mavlink.ESTIMATOR_POS_HORIZ_REL
+    return mavlink.MAVLink_estimator_status_message(
+        double.boot_us(loop_s), flags, 0.05, 0.05, 0.05, 0.02, 0.0, 0.0, 0.5, 0.5
+    )
+
+
 def autopilot_version(double: PX4Double, loop_s: float) -> Message:
     """AUTOPILOT_VERSION: PARAM_FLOAT and PARAM_ENCODE_BYTEWISE."""
     capabilities = (
@@ -146,6 +156,7 @@ BUILDERS: dict[int, Builder] = {
     mavlink.MAVLINK_MSG_ID_HOME_POSITION: home_position,
     mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: extended_sys_state,
     mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version,
+    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: estimator_status,
 }
 
 # Streams that run by themselves, in Hz: the modes "onboard" (TELEM2, the companion) and "normal" (TELEM1). GPS_RAW_INT

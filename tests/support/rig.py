@@ -19,6 +19,7 @@ from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.autopilot import ArduPilotDouble
 from sim.devices import HMR3300, Gradienter, Law, SerialDevice, VectorNavBinary
 from sim.firmware.double import AutopilotDouble
+from sim.flight import MovingAircraft, Route
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.px4.double import PX4Double
 from sim.scenario import site_at
@@ -108,11 +109,13 @@ class Rig:
         device_rate_hz: float | None = None,
         feed_s: float = 0.05,
         recordings_mb: int = 0,
+        route: Route | None = None,
+        site: Site | None = None,
         **autopilot: Any,
     ) -> None:
         self.imu_rate_hz, self.feed_s = imu_rate_hz if baud is None else None, feed_s
-        self.site: Site = site_at(40.0, 116.0, 50.0)
-        self.aircraft = VirtualAircraft(pose, self.site)
+        self.site: Site = site or site_at(40.0, 116.0, 50.0)
+        self.aircraft = VirtualAircraft(pose, self.site) if route is None else MovingAircraft(route, pose, self.site)
         self.model = ImuModel(
             self.aircraft,
             part,

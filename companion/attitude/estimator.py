@@ -1,0 +1,334 @@
+"""Attitude of the aircraft from one calibrated IMU, a compass now and then, and what is known of the place.
+
+Method section 3, "Best candidate for the pushed attitude of a micro aircraft without GPS": strapdown on calibrated
+rates with the Earth's rotation taken out, a slow leveller, a scalar heading correction; the gyro biases are refined at
+rest only, because what looks like a bias in flight is a manoeuvre.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import Final, Literal
+
+import msgspec
+import numpy as np
+
+from companion.attitude.heading import STEEP_RAD, HeadingAid, innovation_of_field, innovation_of_heading
+from companion.attitude.leveller import Leveller
+from companion.attitude.quaternion import (
+    Quaternion,
+    Triple,
+    conjugate,
+    from_matrix,
+    from_rotation_vector,
+    multiply,
+    normalised,
+    roll_pitch_yaw,
+    rotate,
+    to_matrix,
+)
+from companion.attitude.strapdown import Strapdown, Stretch
+from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD, Uncertainty
+from companion.calibration.allan import AllanModel
+from companion.physics.earth import earth_rate_ned_rad_s
+from companion.physics.frames import Matrix
+from companion.samples import ImuSample
+
+Phase = Literal["ground", "flight"]
+
+LEVEL_TAU_S: Final[dict[Phase, float]] = {"ground": 3.0, "flight": 30.0}
+STEADY_SHARE: Final = 0.03
+"""A compass that levels itself is read only while the force's length is within so much of g ..."""
+STEADY_RAD_S: Final = math.radians(20.0)
+"""... and nothing turns faster."""
+COVARIANCE_STEP_S: Final = 0.2
+REST_S: Final = 1.0
+REST_SIGMAS: Final = 5.0
+"""A second of rest that tells more than this of bias was none: nobody knows at once that a movement has begun."""
+KEPT_S: Final = 2.0
+"""Orientations are remembered for so long, for compass readings that come late."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class AttitudeSettings:
+    """What the calibration and the site know. Vectors in vehicle FRD.
+
+    `latitude_deg` None: the Earth's rotation is not taken out, and may be an error of 15 deg/h.
+    """
+
+    vehicle_from_sensor: Matrix
+    gravity_m_s2: float
+    latitude_deg: float | None
+    gyro_noise: AllanModel
+    gyro_bias_rad_s: Triple
+    gyro_covariance: Matrix
+    """(3, 3) of the bias, as a prediction of the next minutes."""
+    accel_bias_m_s2: Triple
+    accel_sigma_m_s2: Triple
+
+
+class Attitude(msgspec.Struct, frozen=True, gc=False):
+    """The attitude at one instant, body FRD against NED and true north."""
+
+    t_s: float
+    quaternion: Quaternion
+    """w, x, y, z; body to NED; w >= 0."""
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float
+    """In [-pi, pi], from true north."""
+    rate_rad_s: Triple
+    """Of the body against the Earth in FRD, bias and the Earth's rotation removed."""
+    sigma_rad: Triple
+    """One sigma of roll, pitch and yaw."""
+
+
+class AttitudeEstimator:
+    """One call per batch of samples. Nothing in a sample makes it raise.
+
+    Args:
+        settings: what is known beforehand; `settle` takes newer ones without losing the attitude.
+    """
+
+    def __init__(self, settings: AttitudeSettings) -> None:
+        self._strapdown = Strapdown()
+        self._heading = HeadingAid()
+        self._history: deque[tuple[float, Quaternion]] = deque()
+        self._aligned = False
+        self._still_s = 0.0
+        self._still_angle = np.zeros(3)
+        self._waiting_s = self._missing_s = 0.0
+        self._turned_rad: Triple = (0.0, 0.0, 0.0)
+        self._settle(settings)
+        self._leveller = Leveller(settings.gravity_m_s2)
+
+    def settle(self, settings: AttitudeSettings) -> None:
+        """Take the result of a newer calibration; the attitude goes on, its bias sigma begins anew."""
+        kept = self._uncertainty.attitude
+        self._settle(settings)
+        self._leveller.gravity_m_s2 = settings.gravity_m_s2
+        self._uncertainty.restart(kept)
+
+    def _settle(self, settings: AttitudeSettings) -> None:
+        self._settings = settings
+        turn = settings.vehicle_from_sensor
+        self._sensor_from_vehicle = from_matrix(turn.T)
+        self._strapdown.bias_rad_s = rotate(self._sensor_from_vehicle, settings.gyro_bias_rad_s)
+        self._strapdown.force_bias_m_s2 = rotate(self._sensor_from_vehicle, settings.accel_bias_m_s2)
+        latitude = settings.latitude_deg
+        north, east, down = (0.0, 0.0, 0.0) if latitude is None else earth_rate_ned_rad_s(latitude).tolist()
+        self._earth: Triple = (north, east, down)
+        self._uncertainty = Uncertainty(
+            settings.gyro_noise,
+            turn.T @ settings.gyro_covariance @ turn,
+            settings.accel_sigma_m_s2,
+            settings.gravity_m_s2,
+        )
+
+    # ------------------------------------------------------------------------------------------------- alignment
+
+    def align(self, t_s: float | None, body_from_ned: Matrix, covariance: Matrix) -> None:
+        """Begin from an attitude found otherwise: gradienter and compass (calibration.solve).
+
+        Args:
+            t_s: when it was so; None: at the next sample.
+            body_from_ned: (3, 3); any heading where none is known.
+            covariance: (3, 3) in NED, rad^2; (2, 2) at least `HEADING_UNKNOWN_RAD` squared where none is known.
+        """
+        ned_from_body = from_matrix(np.asarray(body_from_ned).T)
+        self._strapdown.restart(multiply(ned_from_body, conjugate(self._sensor_from_vehicle)), t_s)
+        self._leveller.restart()
+        self._heading.restart()
+        self._uncertainty.restart(np.asarray(covariance))
+        self._history.clear()
+        self._forget_rest()
+        self._waiting_s = self._missing_s = 0.0
+        self._turned_rad = (0.0, 0.0, 0.0)
+        self._aligned = True
+
+    @property
+    def aligned(self) -> bool:
+        """Whether there is an attitude at all."""
+        return self._aligned and not self._strapdown.lost
+
+    @property
+    def heading_known(self) -> bool:
+        """Whether the heading is more than a guess."""
+        return self.aligned and self._uncertainty.heading_sigma_rad < 0.5 * HEADING_UNKNOWN_RAD
+
+    @property
+    def gyro_bias_rad_s(self) -> Triple:
+        """What is subtracted now, vehicle FRD: the calibration's bias with what rest has added to it."""
+        return rotate(conjugate(self._sensor_from_vehicle), self._strapdown.bias_rad_s)
+
+    @property
+    def out_of_order(self) -> int:
+        """Samples left out because they were not later than the one before."""
+        return self._strapdown.out_of_order
+
+    @property
+    def compass(self) -> HeadingAid:
+        """What became of the compass readings."""
+        return self._heading
+
+    # ------------------------------------------------------------------------------------------------- samples
+
+    def update(
+        self,
+        samples: Sequence[ImuSample],
+        *,
+        phase: Phase,
+        still: bool = False,
+        airspeed_m_s: float | None = None,
+    ) -> None:
+        """Take samples in the order of time; without an alignment they are left.
+
+        Args:
+            samples: in the sensor's axes.
+            phase: how much acceleration is to be expected.
+            still: whether the aircraft is known to stand still; then the gyro biases are refined.
+            airspeed_m_s: forward, where known: what turning makes of it is then no tilt (omega x V).
+        """
+        if not self._aligned:
+            return
+        self._strapdown.frame_rate_rad_s = rotate(conjugate(self._leveller.ned_from_e), self._earth)
+        for stretch in self._strapdown.integrate(samples):
+            self._take(stretch, phase, still=still, airspeed_m_s=airspeed_m_s)
+
+    def _take(self, stretch: Stretch, phase: Phase, *, still: bool, airspeed_m_s: float | None) -> None:
+        leveller, span_s, force = self._leveller, stretch.span_s, stretch.force_m_s2
+        if airspeed_m_s is not None:
+            force = self._without_turning(force, stretch, airspeed_m_s)
+        tau_s = LEVEL_TAU_S[phase]
+        believed = leveller.update(force, span_s, tau_s)
+        self._remember(stretch)
+        rx, ry, rz = stretch.rate_rad_s
+        tx, ty, tz = self._turned_rad
+        self._turned_rad = (tx + rx * span_s, ty + ry * span_s, tz + rz * span_s)
+        self._waiting_s += span_s
+        self._missing_s += stretch.missing_s
+        if self._waiting_s >= COVARIANCE_STEP_S:
+            ned_from_sensor = to_matrix(multiply(leveller.ned_from_e, stretch.orientation))
+            self._uncertainty.propagate(self._waiting_s, ned_from_sensor, np.asarray(self._turned_rad), self._missing_s)
+            self._uncertainty.level(self._waiting_s, tau_s, believed, leveller.doubt, phase)
+            self._waiting_s = self._missing_s = 0.0
+            self._turned_rad = (0.0, 0.0, 0.0)
+        if still and phase == "ground" and not stretch.missing_s:
+            self._rest(stretch)
+        else:
+            self._forget_rest()
+
+    def _without_turning(self, force: Triple, stretch: Stretch, airspeed_m_s: float) -> Triple:
+        vx, vy, vz = rotate(self._sensor_from_vehicle, (airspeed_m_s, 0.0, 0.0))
+        wx, wy, wz = stretch.rate_rad_s
+        turning = (wy * vz - wz * vy, wz * vx - wx * vz, wx * vy - wy * vx)
+        tx, ty, tz = rotate(stretch.orientation, turning)
+        return force[0] - tx, force[1] - ty, force[2] - tz
+
+    def _remember(self, stretch: Stretch) -> None:
+        history = self._history
+        history.append((stretch.t_s, stretch.orientation))
+        while history[0][0] < stretch.t_s - KEPT_S:
+            history.popleft()
+
+    # ------------------------------------------------------------------------------------------------- rest
+
+    def _forget_rest(self) -> None:
+        self._still_s = 0.0
+        self._still_angle = np.zeros(3)
+
+    def _rest(self, stretch: Stretch) -> None:
+        self._still_s += stretch.span_s
+        self._still_angle += np.asarray(stretch.rate_rad_s) * stretch.span_s
+        if self._still_s < REST_S:
+            return
+        sensor_from_ned = conjugate(multiply(self._leveller.ned_from_e, stretch.orientation))
+        left = self._still_angle / self._still_s - np.asarray(rotate(sensor_from_ned, self._earth))
+        if np.any(np.abs(left) > REST_SIGMAS * self._uncertainty.rest_sigma(self._still_s)):
+            self._forget_rest()
+            return
+        gain = self._uncertainty.rest(self._still_s)
+        # Both states are truth against estimate: what is found is added to the bias, and turns the attitude.
+        found = gain @ left
+        bx, by, bz = self._strapdown.bias_rad_s
+        self._strapdown.bias_rad_s = (bx + float(found[3]), by + float(found[4]), bz + float(found[5]))
+        turn = from_rotation_vector((float(found[0]), float(found[1]), float(found[2])))
+        self._leveller.ned_from_e = normalised(multiply(turn, self._leveller.ned_from_e))
+        self._forget_rest()
+
+    # ------------------------------------------------------------------------------------------------- compass
+
+    def add_heading(self, t_s: float, heading_true_rad: float, sigma_rad: float) -> bool:
+        """Take the heading that a self-levelling compass had at `t_s`; returns whether it was used."""
+        found = self._sensor_to_ned_at(t_s)
+        if found is None or self._leveller.doubt > STEADY_SHARE:
+            return False
+        rx, ry, rz = self._strapdown.last_rate_rad_s
+        if rx * rx + ry * ry + rz * rz > STEADY_RAD_S**2:
+            return False
+        _, pitch, yaw = roll_pitch_yaw(multiply(found, self._sensor_from_vehicle))
+        if abs(pitch) > STEEP_RAD:
+            return False
+        return self._turn(t_s, innovation_of_heading(heading_true_rad, yaw), sigma_rad)
+
+    def add_field(self, t_s: float, field_frd: Triple, declination_rad: float, sigma_rad: float) -> bool:
+        """Take the magnetic field vector, vehicle FRD and any unit, at `t_s`; returns whether it was used."""
+        found = self._sensor_to_ned_at(t_s)
+        if found is None:
+            return False
+        innovation = innovation_of_field(field_frd, multiply(found, self._sensor_from_vehicle), declination_rad)
+        return innovation is not None and self._turn(t_s, innovation, sigma_rad)
+
+    def _sensor_to_ned_at(self, t_s: float) -> Quaternion | None:
+        """The orientation then, by the leveller's present opinion; None when it is not remembered."""
+        if not self.aligned:
+            return None
+        orientation: Quaternion | None = None
+        for then_s, kept in reversed(self._history):
+            if then_s <= t_s:
+                orientation = kept
+                break
+        return None if orientation is None else multiply(self._leveller.ned_from_e, orientation)
+
+    def _turn(self, t_s: float, innovation_rad: float, sigma_rad: float) -> bool:
+        gain = self._heading.gain(t_s, innovation_rad, self._uncertainty.heading_sigma_rad, sigma_rad)
+        if gain == 0.0:
+            return False
+        self._leveller.turn_heading(gain * innovation_rad)
+        self._uncertainty.head(gain, sigma_rad)
+        return True
+
+    # ------------------------------------------------------------------------------------------------- result
+
+    def attitude(self) -> Attitude | None:
+        """The attitude at the last sample; None while there is none."""
+        t_s = self._strapdown.last_s
+        if not self.aligned or t_s is None:
+            return None
+        q = multiply(multiply(self._leveller.ned_from_e, self._strapdown.orientation), self._sensor_from_vehicle)
+        w, x, y, z = normalised(q)
+        if w < 0.0:
+            w, x, y, z = -w, -x, -y, -z
+        roll, pitch, yaw = roll_pitch_yaw((w, x, y, z))
+        rate = rotate(conjugate(self._sensor_from_vehicle), self._strapdown.last_rate_rad_s)
+        ex, ey, ez = rotate((w, -x, -y, -z), self._earth)
+        rate = (rate[0] - ex, rate[1] - ey, rate[2] - ez)
+        return Attitude(t_s, (w, x, y, z), roll, pitch, yaw, rate, self._sigmas(pitch, yaw))
+
+    def _sigmas(self, pitch_rad: float, yaw_rad: float) -> Triple:
+        covariance = self._uncertainty.attitude
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+        nn, ee, ne = float(covariance[0, 0]), float(covariance[1, 1]), float(covariance[0, 1])
+        about_forward = max(c * c * nn + 2.0 * c * s * ne + s * s * ee, 0.0)
+        about_right = max(s * s * nn - 2.0 * c * s * ne + c * c * ee, 0.0)
+        # Near +-90 degrees of pitch roll and yaw are told apart by nothing; both then may be anything.
+        level = max(math.cos(pitch_rad) ** 2, 1e-4)
+        unknown = HEADING_UNKNOWN_RAD**2
+        return (
+            math.sqrt(min(about_forward / level, unknown)),
+            math.sqrt(min(about_right, unknown)),
+            math.sqrt(min(float(covariance[2, 2]) + about_forward * (1.0 / level - 1.0), unknown)),
+        )

@@ -1,0 +1,135 @@
+"""Quaternions as plain tuples (w, x, y, z), Hamilton's product, unit length; fast enough without an array in sight.
+
+A quaternion `q` takes a vector's components from frame A to frame B: v_B = rotate(q, v_A). Multiplying on the left
+rotates in B, on the right in A.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from companion.physics.frames import Matrix
+
+Quaternion = tuple[float, float, float, float]
+Triple = tuple[float, float, float]
+
+IDENTITY: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+
+def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
+    """The product p q: first q, then p."""
+    pw, px, py, pz = p
+    qw, qx, qy, qz = q
+    return (
+        pw * qw - px * qx - py * qy - pz * qz,
+        pw * qx + px * qw + py * qz - pz * qy,
+        pw * qy - px * qz + py * qw + pz * qx,
+        pw * qz + px * qy - py * qx + pz * qw,
+    )
+
+
+def conjugate(q: Quaternion) -> Quaternion:
+    """The inverse rotation."""
+    return (q[0], -q[1], -q[2], -q[3])
+
+
+def normalised(q: Quaternion) -> Quaternion:
+    """The same rotation with length 1.
+
+    Raises:
+        ValueError: the length is zero or not finite.
+    """
+    w, x, y, z = q
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    if not 0.0 < length < math.inf:
+        raise ValueError("no rotation: length zero or not finite")
+    return (w / length, x / length, y / length, z / length)
+
+
+def rotate(q: Quaternion, v: Triple) -> Triple:
+    """The vector's components in the other frame."""
+    w, x, y, z = q
+    a, b, c = v
+    tx, ty, tz = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    return (a + w * tx + y * tz - z * ty, b + w * ty + z * tx - x * tz, c + w * tz + x * ty - y * tx)
+
+
+def from_rotation_vector(v: Triple) -> Quaternion:
+    """A turn by |v| radians about v."""
+    x, y, z = v
+    angle = math.sqrt(x * x + y * y + z * z)
+    scale = math.sin(0.5 * angle) / angle if angle > 1e-9 else 0.5
+    return (math.cos(0.5 * angle), scale * x, scale * y, scale * z)
+
+
+def about_down(angle_rad: float) -> Quaternion:
+    """A turn about the third axis; in NED, clockwise as a heading counts."""
+    return (math.cos(0.5 * angle_rad), 0.0, 0.0, math.sin(0.5 * angle_rad))
+
+
+def shortest_arc(a: Triple, b: Triple) -> Quaternion:
+    """The smallest turn that takes direction `a` to direction `b`; the identity where either has no length."""
+    size = math.sqrt((a[0] ** 2 + a[1] ** 2 + a[2] ** 2) * (b[0] ** 2 + b[1] ** 2 + b[2] ** 2))
+    if size == 0.0:
+        return IDENTITY
+    w = size + a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    if w < 1e-9 * size:
+        # Opposite: half a turn about anything at right angles to `a`.
+        x, y, z = (0.0, -a[2], a[1]) if abs(a[0]) < max(abs(a[1]), abs(a[2])) else (-a[2], 0.0, a[0])
+        return normalised((0.0, x, y, z))
+    return normalised((w, a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
+
+
+def from_matrix(matrix: Matrix) -> Quaternion:
+    """The quaternion of a 3x3 rotation matrix that takes A to B (Shepperd's choice of the largest element)."""
+    m = matrix
+    trace = float(m[0, 0] + m[1, 1] + m[2, 2])
+    squares = [trace, float(m[0, 0]), float(m[1, 1]), float(m[2, 2])]
+    largest = squares.index(max(squares))
+    if largest == 0:
+        found = (1.0 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])
+    elif largest == 1:
+        found = (m[2, 1] - m[1, 2], 1.0 + 2.0 * m[0, 0] - trace, m[0, 1] + m[1, 0], m[0, 2] + m[2, 0])
+    elif largest == 2:
+        found = (m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1.0 + 2.0 * m[1, 1] - trace, m[1, 2] + m[2, 1])
+    else:
+        found = (m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1.0 + 2.0 * m[2, 2] - trace)
+    w, x, y, z = (float(value) for value in found)
+    return normalised((w, x, y, z))
+
+
+def to_matrix(q: Quaternion) -> Matrix:
+    """The 3x3 matrix of the same rotation."""
+    return np.array([rotate(q, axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))]).T
+
+
+def roll_pitch_yaw(q: Quaternion) -> Triple:
+    """Aerospace angles in radians of a quaternion body FRD to NED; yaw in [-pi, pi].
+
+    At pitch +-90 degrees roll and yaw are not separable; then roll is 0 and yaw carries both.
+    """
+    w, x, y, z = q
+    sine = 2.0 * (w * y - z * x)
+    if abs(sine) > 1.0 - 1e-12:
+        pitch = math.copysign(0.5 * math.pi, sine)
+        return 0.0, pitch, math.remainder(-2.0 * math.copysign(1.0, sine) * math.atan2(x, w), 2.0 * math.pi)
+    return (
+        math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+        math.asin(sine),
+        math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+    )
+
+
+def from_roll_pitch_yaw(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quaternion:
+    """Body FRD to NED from aerospace angles."""
+    sr, cr = math.sin(0.5 * roll_rad), math.cos(0.5 * roll_rad)
+    sp, cp = math.sin(0.5 * pitch_rad), math.cos(0.5 * pitch_rad)
+    sy, cy = math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )

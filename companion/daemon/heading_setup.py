@@ -1,0 +1,58 @@
+"""What `companion autopilot-setup` leaves behind: a ledger of its own, and somebody who puts back what was interrupted.
+
+The rest of it is loaded when it is asked for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING
+
+from companion.autopilot.parameters import ParameterClient
+from companion.autopilot.vehicle import Vehicle
+from companion.autopilot.writer import ParameterWriter
+from companion.config import Config
+from companion.daemon.conductor import Conductor
+from companion.daemon.control import Object
+from companion.daemon.ledger import Ledger, Offload
+from companion.daemon.mend import Mender, Say
+from companion.storage.changes import ChangeLog
+
+if TYPE_CHECKING:
+    from companion.daemon.autopilot_setup import AutopilotSetup
+
+
+class HeadingSetup:
+    """The door to `AutopilotSetup`; `run` it, so that an interrupted write is put back."""
+
+    def __init__(
+        self,
+        config: Config,
+        vehicle: Vehicle,
+        parameters: ParameterClient,
+        writer: ParameterWriter,
+        conductor: Conductor,
+        say: Say,
+        offload: Offload,
+    ) -> None:
+        self._folder = config.storage.path / "setup"
+        self.ledger = Ledger(ChangeLog(self._folder), offload)
+        command = "companion autopilot-setup --undo"
+        self.mender = Mender(vehicle, parameters, writer, self.ledger, say, contextlib.nullcontext, command=command)
+        self._parts = (config, vehicle, parameters, writer, self.ledger, self.mender, conductor, say)
+        self._setup: AutopilotSetup | None = None
+
+    async def run(self) -> None:
+        """Put back what an earlier daemon has left half done, until cancelled."""
+        if self._folder.exists():
+            self.ledger.load()
+        await self.mender.run()
+
+    async def answer(self, request: Object) -> Object:
+        """As `AutopilotSetup.answer`."""
+        from companion.daemon.autopilot_setup import AutopilotSetup
+
+        if self._setup is None:
+            self.ledger.load()
+            self._setup = AutopilotSetup(*self._parts)
+        return await self._setup.answer(request)

@@ -1,0 +1,129 @@
+"""What the double makes of an attitude from outside: VisOdom takes it in, EKF3 uses its yaw where it is told to.
+
+Facts: ArduPilot `GCS_Common.cpp`, `AP_VisualOdom_MAV.cpp`, `AP_NavEKF3_Measurements.cpp` (writeExtNavData),
+`AP_NavEKF3_MagFusion.cpp` (2026-03). VISO_TYPE and EK3_SRC1_YAW count as they were at the boot. Not modelled: position
+and velocity, which nobody here selects; other sets of sources; lanes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.firmware.channel import Message
+
+if TYPE_CHECKING:
+    from sim.autopilot import ArduPilotDouble
+
+EXTNAV = 6
+LEAST_SPACING_MS = 20
+HEALTHY_S = 0.3
+IN_USE_S = 5.0
+YAW_NOISE_RAD = 0.2
+"""VISO_YAW_M_NSE's default: the least sigma that is believed; above 1.5 rad it is cut."""
+GATE_SIGMAS = 3.0
+"""EK3_YAW_I_GATE."""
+FUSED_S = 2.0
+"""How fast the heading follows: of the order of the real one's at 30 Hz and this noise."""
+
+
+class ExternalNav:
+    """The chain from message to heading; `restart` at each boot."""
+
+    def __init__(self, double: ArduPilotDouble) -> None:
+        self._double = double
+        self.rejected: Counter[str] = Counter()
+        """By reason."""
+        self.consumed = 0
+        """Messages that came through to the EKF."""
+        self.sigma_rad = math.nan
+        """Of yaw, as the EKF took it last."""
+        self.restart()
+
+    def restart(self) -> None:
+        """A boot."""
+        values = self._double.parameters.values
+        self.enabled = values["VISO_TYPE"] == 1
+        self.selected = values["EK3_SRC1_YAW"] == EXTNAV
+        self.aligned = False
+        self._stamp_ms = -math.inf
+        self._heard_s = self._fused_s = -math.inf
+
+    def healthy(self, loop_s: float) -> bool:
+        """What the check before arming asks."""
+        return loop_s - self._heard_s < HEALTHY_S
+
+    def in_use(self, loop_s: float) -> bool:
+        """Whether the EKF counts this as its source of yaw at present."""
+        return self.selected and loop_s - self._fused_s < IN_USE_S
+
+    def take(self, message: Message, loop_s: float) -> None:
+        """A message that may be one."""
+        if isinstance(message, mavlink.MAVLink_vision_position_estimate_message):
+            angles = (message.roll, message.pitch, message.yaw)
+            self._take(message.usec, (message.x, message.y, message.z), angles, message.covariance, loop_s)
+        elif isinstance(message, mavlink.MAVLink_odometry_message):
+            frames = (message.frame_id, message.child_frame_id)
+            if frames != (mavlink.MAV_FRAME_LOCAL_FRD, mavlink.MAV_FRAME_BODY_FRD):
+                self.rejected["frame"] += 1
+                return
+            if message.quality < 0:
+                self.rejected["quality"] += 1
+                return
+            w, x, y, z = message.q
+            yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+            position = (message.x, message.y, message.z)
+            self._take(message.time_usec, position, (0.0, 0.0, yaw), message.pose_covariance, loop_s)
+
+    def _take(
+        self,
+        stamp_us: int,
+        position: tuple[float, ...],
+        angles: tuple[float, ...],
+        covariance: Sequence[float],
+        loop_s: float,
+    ) -> None:
+        if not self.enabled:
+            self.rejected["off"] += 1
+            return
+        self._heard_s = loop_s
+        sigma = 0.0
+        if not math.isnan(covariance[0]):
+            total = covariance[15] + covariance[18] + covariance[20]
+            sigma = math.sqrt(total) if total >= 0.0 else math.nan
+        if any(map(math.isnan, position)):
+            self.rejected["position"] += 1
+            return
+        stamp_ms = stamp_us // 1000
+        if stamp_ms - self._stamp_ms < LEAST_SPACING_MS:
+            self.rejected["too soon"] += 1
+            return
+        self._stamp_ms = stamp_ms
+        if any(map(math.isnan, (*angles, sigma))):
+            self.rejected["angle"] += 1
+            return
+        self.consumed += 1
+        self.sigma_rad = max(min(max(sigma, YAW_NOISE_RAD), 1.5), math.radians(5.0))
+        if self.selected:
+            self._fuse(angles[2], loop_s)
+
+    def _fuse(self, yaw_rad: float, loop_s: float) -> None:
+        double = self._double
+        double.update_estimator(loop_s)
+        _, _, truth = double.aircraft.angles_rad(double.aircraft.time_at(loop_s))
+        wrong = math.remainder(yaw_rad - truth, 2.0 * math.pi)
+        estimator = double.estimator
+        if not self.aligned:
+            self.aligned = True
+            estimator.yaw_error_rad = wrong
+            double.say(mavlink.MAV_SEVERITY_INFO, "EKF3 IMU0 yaw aligned")
+        else:
+            innovation = math.remainder(wrong - estimator.yaw_error_rad, 2.0 * math.pi)
+            if abs(innovation) < GATE_SIGMAS * self.sigma_rad:
+                span_s = min(loop_s - self._fused_s, 1.0)
+                estimator.yaw_error_rad += (1.0 - math.exp(-span_s / FUSED_S)) * innovation
+        self._fused_s = loop_s

@@ -1,0 +1,277 @@
+"""An aircraft that moves: attitude and velocity as smooth functions of time, and what perfect sensors read on it.
+
+A route gives Euler angles and velocity in NED; rates and accelerations are their derivatives by central differences of
+the fourth order, exact to 1e-9 for anything an aircraft does. Before its start the aircraft stands as a
+`VirtualAircraft` does, so that it can be calibrated first.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from sim.aircraft import DEFAULT_SITE, Pose, Site, Truth, VirtualAircraft
+from sim.earth import STANDARD_GRAVITY_M_S2, Array
+from sim.motions import Motion
+
+_STEP_S: Final = 2e-3
+_REMEMBERED: Final = 20_000
+"""Answers; those of a second of 200 Hz take 10 kB."""
+
+
+def smooth(u: Array) -> Array:
+    """From 0 to 1 over u in [0, 1], with three continuous derivatives."""
+    u = np.clip(u, 0.0, 1.0)
+    result: Array = u**4 * (35.0 - u * (84.0 - u * (70.0 - 20.0 * u)))
+    return result
+
+
+def smooth_integral(u: Array) -> Array:
+    """The integral of `smooth` from 0; it goes on with slope 1 after u = 1."""
+    v = np.clip(u, 0.0, 1.0)
+    inside = v**5 * (7.0 - v * (14.0 - v * (10.0 - 2.5 * v)))
+    result: Array = inside + np.maximum(u - 1.0, 0.0)
+    return result
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Route(ABC):
+    """A way to move from `start_s` on (aircraft time); before it the angles are those of the start, the speed is 0."""
+
+    start_s: float = 0.0
+
+    @abstractmethod
+    def angles_rad(self, t_s: Array) -> Array:
+        """Roll, pitch, heading (n, 3) of the vehicle; headings are not wrapped."""
+
+    @abstractmethod
+    def velocity_m_s(self, t_s: Array) -> Array:
+        """Velocity (n, 3) in NED."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BankedCircles(Route):
+    """A fixed wing in a level, coordinated turn that never ends: the trap of every leveller.
+
+    It gathers speed over `launch_s`, flies straight for `straight_s`, and rolls into the turn.
+    """
+
+    airspeed_m_s: float = 15.0
+    bank_deg: float = 35.0
+    straight_s: float = 5.0
+    entry_s: float = 3.0
+    launch_s: float = 5.0
+
+    def _turn(self, t_s: Array) -> tuple[Array, Array]:
+        """Turn rate and angle turned."""
+        rate = STANDARD_GRAVITY_M_S2 * math.tan(math.radians(self.bank_deg)) / self.airspeed_m_s
+        u = (t_s - self.start_s - self.launch_s - self.straight_s) / self.entry_s
+        return rate * smooth(u), rate * self.entry_s * smooth_integral(u)
+
+    def angles_rad(self, t_s: Array) -> Array:
+        """The bank that the turn needs; no pitch."""
+        rate, turned = self._turn(t_s)
+        bank = np.arctan(rate * self.airspeed_m_s / STANDARD_GRAVITY_M_S2)
+        return np.column_stack([bank, np.zeros_like(bank), turned])
+
+    def velocity_m_s(self, t_s: Array) -> Array:
+        """Along the heading."""
+        speed = self.airspeed_m_s * smooth((t_s - self.start_s) / self.launch_s)
+        _, turned = self._turn(t_s)
+        return np.column_stack([speed * np.cos(turned), speed * np.sin(turned), np.zeros_like(speed)])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shuttle(Route):
+    """A multirotor that flies to and fro, leaning into each acceleration; its heading swings slowly."""
+
+    lean_deg: float = 12.0
+    period_s: float = 8.0
+    swing_deg: float = 60.0
+    swing_period_s: float = 47.0
+    begin_s: float = 3.0
+
+    def velocity_m_s(self, t_s: Array) -> Array:
+        """Along one line over the ground, its acceleration a sine."""
+        peak = STANDARD_GRAVITY_M_S2 * math.tan(math.radians(self.lean_deg))
+        omega = 2.0 * math.pi / self.period_s
+        since = t_s - self.start_s
+        speed = smooth(since / self.begin_s) * peak / omega * (1.0 - np.cos(omega * since)) * (since > 0.0)
+        return np.column_stack([speed * math.cos(0.4), speed * math.sin(0.4), np.zeros_like(speed)])
+
+    def angles_rad(self, t_s: Array) -> Array:
+        """Leaning such that the thrust, along -z of the body, makes the acceleration."""
+        acceleration = _derivative(self.velocity_m_s, t_s)
+        swing = 2.0 * math.pi / self.swing_period_s
+        heading = math.radians(self.swing_deg) * smooth((t_s - self.start_s) / 5.0)
+        heading = heading * np.sin(swing * (t_s - self.start_s))
+        forward = acceleration[:, 0] * np.cos(heading) + acceleration[:, 1] * np.sin(heading)
+        right = -acceleration[:, 0] * np.sin(heading) + acceleration[:, 1] * np.cos(heading)
+        pitch = np.arctan2(-forward, STANDARD_GRAVITY_M_S2)
+        roll = np.arctan2(right * np.cos(pitch), STANDARD_GRAVITY_M_S2)
+        return np.column_stack([roll, pitch, heading])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drive(Route):
+    """A car on a layout route: starts, bends to both sides, a stop, a slope up and down; it leans a little in bends.
+
+    `legs` are (seconds, speed at their end in m/s, turn in degrees, grade at their end in degrees).
+    """
+
+    legs: tuple[tuple[float, float, float, float], ...] = (
+        (10.0, 8.0, 0.0, 0.0),
+        (15.0, 10.0, 90.0, 0.0),
+        (20.0, 12.0, 0.0, 3.0),
+        (12.0, 7.0, 90.0, 3.0),
+        (20.0, 12.0, -30.0, 0.0),
+        (10.0, 0.0, 0.0, 0.0),
+        (8.0, 0.0, 0.0, 0.0),
+        (12.0, 9.0, 0.0, -2.0),
+        (15.0, 9.0, 120.0, -2.0),
+        (20.0, 12.0, -45.0, 0.0),
+        (18.0, 8.0, 135.0, 1.0),
+        (20.0, 5.0, 0.0, 0.0),
+    )
+    lean_per_g_deg: float = 4.0
+
+    def _profile(self, t_s: Array) -> tuple[Array, Array, Array]:
+        """Speed, heading, grade."""
+        speed, heading, grade = (np.zeros_like(t_s) for _ in range(3))
+        begin, before_speed, before_grade = self.start_s, 0.0, 0.0
+        for seconds, to_speed, turn_deg, to_grade in self.legs:
+            done = smooth((t_s - begin) / seconds)
+            speed += (to_speed - before_speed) * done
+            heading += math.radians(turn_deg) * done
+            grade += math.radians(to_grade - before_grade) * done
+            begin, before_speed, before_grade = begin + seconds, to_speed, to_grade
+        return speed, heading, grade
+
+    def velocity_m_s(self, t_s: Array) -> Array:
+        """Along heading and grade."""
+        speed, heading, grade = self._profile(t_s)
+        level = speed * np.cos(grade)
+        return np.column_stack([level * np.cos(heading), level * np.sin(heading), -speed * np.sin(grade)])
+
+    def angles_rad(self, t_s: Array) -> Array:
+        """Pitch is the grade; it leans outwards in bends."""
+        speed, heading, grade = self._profile(t_s)
+        turning = _derivative(lambda t: self._profile(t)[1][:, None], t_s)[:, 0]
+        lean = -math.radians(self.lean_per_g_deg) * speed * turning / STANDARD_GRAVITY_M_S2
+        return np.column_stack([lean, grade, heading])
+
+
+def _derivative(function: object, t_s: Array) -> Array:
+    assert callable(function)
+    h = _STEP_S
+    result: Array = (
+        8.0 * (function(t_s + h) - function(t_s - h)) - (function(t_s + 2.0 * h) - function(t_s - 2.0 * h))
+    ) / (12.0 * h)
+    return result
+
+
+class MovingAircraft(VirtualAircraft):
+    """A `VirtualAircraft` that stands until its route begins.
+
+    The route's angles are added to the pose's heading; the pose's roll and pitch are how the box of sensors is fixed in
+    the vehicle. "Body" is that box, for the truth and for every sensor on it.
+    """
+
+    def __init__(
+        self,
+        route: Route,
+        pose: Pose = Pose(),  # noqa: B008 - immutable
+        site: Site = DEFAULT_SITE,
+        *,
+        motions: Sequence[Motion] = (),
+    ) -> None:
+        super().__init__(pose, site, motions=motions)
+        self.route = route
+        self._known: dict[bytes, Truth] = {}
+        self._box = _matrices(np.radians([[pose.roll_deg, pose.pitch_deg, 0.0]]))[0]
+        """Vehicle to box."""
+
+    def still_at(self, t_s: float) -> bool:
+        """Before the route, and while no motion acts."""
+        return t_s < self.route.start_s and super().still_at(t_s)
+
+    def matrices(self, t_s: Array) -> Array:
+        """NED to box at times (n): (n, 3, 3)."""
+        angles = self.route.angles_rad(t_s) + np.array([0.0, 0.0, math.radians(self.pose.heading_deg)])
+        vehicle: Array = self._box @ _matrices(angles)
+        return vehicle
+
+    def angles_rad(self, t_s: float) -> tuple[float, float, float]:
+        """True roll, pitch, heading of the box, heading in [-pi, pi]."""
+        c = self.matrices(np.array([t_s]))[0]
+        return (
+            math.atan2(c[1, 2], c[2, 2]),
+            -math.asin(max(-1.0, min(1.0, float(c[0, 2])))),
+            math.atan2(c[0, 1], c[0, 0]),
+        )
+
+    def body_from_ned(self, t_s: float) -> Array:
+        """The attitude matrix (3, 3)."""
+        result: Array = self.matrices(np.array([t_s]))[0]
+        return result
+
+    def truth(self, t_s: Array) -> Truth:
+        """Rates and specific forces of the box at times (n); those asked for again (another seed) are remembered."""
+        key = t_s.tobytes()
+        found = self._known.get(key)
+        if found is None:
+            found = self._moving(t_s)
+            if len(self._known) < _REMEMBERED:
+                self._known[key] = found
+        return found
+
+    def truth_at(self, t_s: float) -> Truth:
+        """The same at one time."""
+        rate, force = self.truth(np.array([t_s]))
+        return Truth(rate[0], force[0])
+
+    def add(self, motion: Motion) -> None:
+        """Let something happen besides; `motion.start_s` is aircraft time."""
+        super().add(motion)
+        self._known.clear()
+
+    def _moving(self, t_s: Array) -> Truth:
+        turn = self.matrices(t_s)
+        # [w x] = -C' C^T for C from NED to body.
+        turning = -_derivative(lambda t: self.matrices(t).reshape(len(t), 9), t_s).reshape(-1, 3, 3)
+        cross = np.einsum("nij,nkj->nik", turning, turn)
+        rate = np.column_stack([cross[:, 2, 1], cross[:, 0, 2], cross[:, 1, 0]])
+        velocity = self._velocity(t_s)
+        acceleration = _derivative(self._velocity, t_s) + 2.0 * np.cross(self._earth_rate_ned, velocity)
+        force = np.einsum("nij,nj->ni", turn, acceleration - self._gravity_ned)
+        rate = rate + np.einsum("nij,j->ni", turn, self._earth_rate_ned)
+        for motion in self._motions:
+            acting = (t_s >= motion.start_s) & (t_s < motion.end_s)
+            if acting.any():
+                force[acting] += motion.acceleration_m_s2(t_s[acting])
+                rate[acting] += motion.euler_rad(t_s[acting])[1]
+        return Truth(rate, force)
+
+    def _velocity(self, t_s: Array) -> Array:
+        heading = math.radians(self.pose.heading_deg)
+        c, s = math.cos(heading), math.sin(heading)
+        result: Array = self.route.velocity_m_s(t_s) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        return result
+
+
+def _matrices(angles_rad: Array) -> Array:
+    """NED to body of Euler angles (n, 3): (n, 3, 3)."""
+    sr, sp, sy = np.sin(angles_rad).T
+    cr, cp, cy = np.cos(angles_rad).T
+    rows = [
+        [cp * cy, cp * sy, -sp],
+        [sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp],
+        [cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp],
+    ]
+    result: Array = np.moveaxis(np.array(rows), 2, 0)
+    return result

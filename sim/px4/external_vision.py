@@ -1,0 +1,164 @@
+"""What the double makes of an attitude from outside: external vision as EKF2 uses its yaw.
+
+Facts: PX4 `mavlink_receiver.cpp`, `EKF2.cpp` (UpdateExtVisionSample), `ev_control.cpp`, `ev_yaw_control.cpp`,
+`Timesync.cpp` (2026). Not modelled: position, velocity, frames other than NED (ODOMETRY counts only with a finite
+position in LOCAL_NED), the estimator's yaw covariance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.firmware.channel import Message
+
+if TYPE_CHECKING:
+    from sim.px4.double import PX4Double
+
+YAW_BIT = 8
+"""Of EKF2_EV_CTRL."""
+LONGEST_GAP_S = 0.2
+STOPS_AFTER_S = 0.4
+RESTARTS_AFTER_S = 1.0
+"""Since the last fusion, before it starts again."""
+NORM_TOLERANCE = 1e-5
+CONVERGED_AFTER = 500
+"""Accepted TIMESYNC exchanges until stamps are used."""
+LONGEST_ROUND_TRIP_S = 0.010
+GATE_SIGMAS = 2.6
+"""EKF2_HDG_GATE."""
+FAILS_AFTER_S = 1.0
+FUSED_S = 2.0
+COMPASS_FADES_S = 10.0
+"""So fast the magnetometer takes a wrong heading back, while no yaw comes from outside."""
+
+
+class ExternalVision:
+    """The chain from message to heading; `restart` at each boot."""
+
+    def __init__(self, double: PX4Double) -> None:
+        self._double = double
+        self.rejected: Counter[str] = Counter()
+        """By reason."""
+        self.consumed = 0
+        """Messages whose orientation came through to EKF2."""
+        self.resets = 0
+        """Of yaw to what came from outside."""
+        self.sigma_rad = math.nan
+        """Of yaw, as EKF2 took it last."""
+        self.late_s = math.nan
+        """How old the last sample was by its stamp."""
+        self.restart()
+
+    def restart(self) -> None:
+        """A boot."""
+        self.active = False
+        """cs_ev_yaw of its status flags."""
+        self.yaw_error_rad = 0.0
+        self.exchanges = 0
+        self._offset_s = 0.0
+        self._counter = 0
+        self._heard_s = self._fused_s = -math.inf
+        self._updated_s = math.nan
+
+    @property
+    def converged(self) -> bool:
+        """Whether stamps are used; before, what arrives is new."""
+        return self.exchanges >= CONVERGED_AFTER
+
+    def timesync(self, their_ns: int, sent_ns: int, loop_s: float) -> None:
+        """An answer to a request of our own."""
+        now_s = self._double.boot_us(loop_s) * 1e-6
+        if now_s - sent_ns * 1e-9 < LONGEST_ROUND_TRIP_S:
+            self.exchanges += 1
+            self._offset_s = 0.5 * (sent_ns * 1e-9 + now_s) - their_ns * 1e-9
+
+    def update(self, loop_s: float) -> None:
+        """Bring the heading to this time."""
+        if self.active and loop_s - self._heard_s > STOPS_AFTER_S:
+            self.active = False
+            self._say("vision data stopped")
+        if not self.active and self._updated_s == self._updated_s:
+            span_s = max(loop_s - self._updated_s, 0.0)
+            if self._double.parameters["EKF2_MAG_TYPE"] != 5:
+                self.yaw_error_rad *= math.exp(-span_s / COMPASS_FADES_S)
+        self._updated_s = loop_s
+
+    def take(self, message: Message, loop_s: float) -> None:
+        """A message that may be one."""
+        if isinstance(message, mavlink.MAVLink_vision_position_estimate_message):
+            angles = (message.roll, message.pitch, message.yaw)
+            if not all(map(math.isfinite, angles)):
+                self.rejected["angle"] += 1
+                return
+            self._sample(message.usec, message.yaw, message.covariance[20], message.reset_counter, loop_s)
+        elif isinstance(message, mavlink.MAVLink_odometry_message):
+            kinds = (0, mavlink.MAV_ESTIMATOR_TYPE_VISION, mavlink.MAV_ESTIMATOR_TYPE_VIO)
+            if message.estimator_type not in (*kinds, mavlink.MAV_ESTIMATOR_TYPE_NAIVE):
+                self.rejected["estimator type"] += 1
+                self._double.say(mavlink.MAV_SEVERITY_CRITICAL, "ODOMETRY: estimator_type unsupported\t")
+                return
+            w, x, y, z = message.q
+            if not abs(1.0 - math.sqrt(w * w + x * x + y * y + z * z)) <= NORM_TOLERANCE:
+                self.rejected["norm"] += 1
+                return
+            placed = all(map(math.isfinite, (message.x, message.y, message.z)))
+            if not placed or message.frame_id != mavlink.MAV_FRAME_LOCAL_NED:
+                self.rejected["frame"] += 1
+                return
+            yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+            self._sample(message.time_usec, yaw, message.pose_covariance[20], message.reset_counter, loop_s)
+
+    def heading_by_command(self, yaw_deg: float, loop_s: float) -> None:
+        """MAV_CMD_EXTERNAL_ATTITUDE_ESTIMATE."""
+        self.update(loop_s)
+        self.yaw_error_rad = self._wrong(math.radians(yaw_deg), loop_s)
+
+    def _sample(self, stamp_us: int, yaw_rad: float, variance: float, counter: int, loop_s: float) -> None:
+        self.update(loop_s)
+        parameters = self._double.parameters
+        self.late_s = (
+            self._double.boot_us(loop_s) * 1e-6 - (stamp_us * 1e-6 + self._offset_s) if self.converged else 0.0
+        )
+        gap_s = loop_s - self._heard_s
+        reset = counter != self._counter
+        self._heard_s, self._counter = loop_s, counter
+        self.consumed += 1
+        floor = parameters["EKF2_EVA_NOISE"]
+        given = parameters["EKF2_EV_NOISE_MD"] == 0 and math.isfinite(variance)
+        self.sigma_rad = max(math.sqrt(max(variance, 0.0)), floor) if given else floor
+        if not int(parameters["EKF2_EV_CTRL"]) & YAW_BIT:
+            if self.active:
+                self.active = False
+                self._say("stopping EV yaw fusion, continuing conditions failing")
+            return
+        wrong = self._wrong(yaw_rad, loop_s)
+        innovation = math.remainder(wrong - self.yaw_error_rad, 2.0 * math.pi)
+        fits = abs(innovation) < GATE_SIGMAS * self.sigma_rad
+        if not self.active:
+            if gap_s < LONGEST_GAP_S and loop_s - self._fused_s > RESTARTS_AFTER_S and fits:
+                self.active = True
+                self._fused_s = loop_s
+            return
+        if reset:
+            self._reset(wrong, loop_s)
+        elif fits:
+            self.yaw_error_rad += (1.0 - math.exp(-min(gap_s, 1.0) / FUSED_S)) * innovation
+            self._fused_s = loop_s
+        elif loop_s - self._fused_s > FAILS_AFTER_S:
+            self._reset(wrong, loop_s)
+
+    def _reset(self, wrong: float, loop_s: float) -> None:
+        self.resets += 1
+        self.yaw_error_rad, self._fused_s = wrong, loop_s
+
+    def _wrong(self, yaw_rad: float, loop_s: float) -> float:
+        _, _, truth = self._double.aircraft.angles_rad(self._double.aircraft.time_at(loop_s))
+        return math.remainder(yaw_rad - truth, 2.0 * math.pi)
+
+    def _say(self, words: str) -> None:
+        """On its console only, as the real one."""
+        self.rejected[words] += 1

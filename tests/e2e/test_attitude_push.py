@@ -1,0 +1,495 @@
+"""Heading into the autopilot: the whole daemon on a virtual aircraft, and what the autopilot makes of what it sends."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import subprocess
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.calibration.request import What
+from companion.daemon.attitude.service import AttitudeService
+from companion.daemon.job import Job
+from sim.aircraft import Pose
+from sim.flight import BankedCircles
+from sim.motions import Turn
+from sim.scenario import site_at
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+from tests.support.witness import Witness
+
+Vision = mavlink.MAVLink_vision_position_estimate_message
+Firmware = Literal["ardupilot", "px4"]
+USES_OURS: dict[str, dict[str, float]] = {
+    "ardupilot": {"VISO_TYPE": 1, "EK3_SRC1_YAW": 6},
+    "px4": {"EKF2_EV_CTRL": 8, "EKF2_EVA_NOISE": 0.05},
+}
+
+
+class Flight:
+    """A rig with its witness."""
+
+    def __init__(self, rig: Rig, witness: Witness) -> None:
+        self.rig, self.witness = rig, witness
+
+    @property
+    def attitude(self) -> AttitudeService:
+        assert self.rig.service.attitude is not None
+        return self.rig.service.attitude
+
+    @property
+    def true_yaw_rad(self) -> float:
+        return self.rig.aircraft.angles_rad(self.rig.aircraft.time_at(self.rig.now_s))[2]
+
+    def theirs_deg(self) -> float:
+        """What the autopilot's heading is off by."""
+        yaw = self.rig.autopilot.estimated_angles_rad(self.rig.now_s)[2]
+        return math.degrees(abs(math.remainder(yaw - self.true_yaw_rad, 2.0 * math.pi)))
+
+    def turn(self, **angles_deg: float) -> None:
+        """Begin a turn now that takes 3 s."""
+        start_s = self.rig.aircraft.time_at(self.rig.now_s) + 0.2
+        self.rig.aircraft.add(Turn(start_s=start_s, duration_s=3.0, **angles_deg))
+
+    async def sleep(self, seconds: float) -> None:
+        end_s = self.rig.now_s + seconds
+        await self.rig.until(lambda: self.rig.now_s >= end_s, seconds + 1.0)
+
+    async def calibrate(self) -> None:
+        job = self.rig.service.conductor.start_calibration(What.BOTH, "test")
+        assert isinstance(job, Job)
+        assert (await job.finished).outcome == "done"
+
+    async def pushing(self, within_s: float = 30.0) -> None:
+        await self.rig.until(lambda: self.attitude.health.pushing, within_s)
+
+
+@asynccontextmanager
+async def flight(
+    folder: Path,
+    *,
+    firmware: Firmware = "ardupilot",
+    mode: str = "yaw",
+    rate_hz: float = 30.0,
+    calibrated: bool = True,
+    used: bool = True,
+    **options: Any,
+) -> AsyncIterator[Flight]:
+    """A rig whose serial IMU carries the attitude, calibrated, pushing."""
+    more = f'[push]\nattitude = "{mode}"\nattitude_rate_hz = {rate_hz}\n'
+    parameters = (USES_OURS[firmware] if used else {}) | options.pop("parameters", {})
+    options = {"own_imu": True, "feed_s": 0.005} | options
+    rig = Rig(folder, firmware=firmware, more=more, parameters=parameters, **options)
+    witness = Witness(rig)
+    async with rig.running():
+        await rig.ready()
+        flying = Flight(rig, witness)
+        if calibrated:
+            await flying.calibrate()
+            await flying.pushing()
+        yield flying
+        assert rig.link.received["handler error"] == 0
+
+
+@pytest.mark.parametrize(("firmware", "own_imu"), [("ardupilot", True), ("ardupilot", False), ("px4", True)])
+def test_the_heading_follows_the_aircraft_through_a_turn(tmp_path: Path, firmware: Firmware, own_imu: bool) -> None:
+    """Within the compass' degree and the delay of the autopilot's own telemetry, on truth."""
+
+    async def main() -> None:
+        async with flight(tmp_path, firmware=firmware, own_imu=own_imu, imu_rate_hz=50.0) as flying:
+            rig = flying.rig
+            rig.autopilot.arm()
+            flying.turn(heading_deg=110.0, roll_deg=20.0, pitch_deg=-10.0)
+            await flying.sleep(8.0)
+            yaw = flying.witness.of(Vision)[-1].yaw
+            assert math.degrees(abs(math.remainder(yaw - flying.true_yaw_rad, 2.0 * math.pi))) < 2.0
+            last = flying.witness.of(Vision)[-1]
+            roll, pitch, _ = rig.aircraft.angles_rad(rig.aircraft.time_at(rig.now_s))
+            assert (last.roll, last.pitch) == pytest.approx((roll, pitch), abs=math.radians(1.0))
+            assert flying.theirs_deg() < 3.0
+
+    run_virtual(main())
+
+
+def test_from_the_integers_of_px4(tmp_path: Path) -> None:
+    """Whole milliradians a second carry a turn to a few degrees, and say so in their sigma."""
+
+    async def main() -> None:
+        async with flight(tmp_path, firmware="px4", own_imu=False, part="bmi088") as flying:
+            flying.rig.autopilot.arm()
+            flying.turn(heading_deg=110.0, roll_deg=20.0, pitch_deg=-10.0)
+            await flying.sleep(8.0)
+            last = flying.witness.of(Vision)[-1]
+            wrong = abs(math.remainder(last.yaw - flying.true_yaw_rad, 2.0 * math.pi))
+            assert wrong < 3.0 * math.sqrt(last.covariance[20]) + math.radians(1.0)
+            assert math.degrees(wrong) < 4.0
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+def test_what_is_sent_is_what_the_firmware_consumes(tmp_path: Path, firmware: Firmware) -> None:
+    async def main() -> None:
+        async with flight(tmp_path, firmware=firmware, used=False) as flying:
+            await flying.sleep(3.0)
+            sent = flying.witness.of(Vision)
+            # The compass' own sigma is 1 deg and the magnetic model's 0.5.
+            assert len(sent) > 80
+            for message in sent:
+                position = (message.x, message.y, message.z)
+                assert all(map(math.isnan, position)) if firmware == "px4" else position == (0.0, 0.0, 0.0)
+                assert all(map(math.isfinite, (message.roll, message.pitch, message.yaw, *message.covariance)))
+                assert math.degrees(math.sqrt(message.covariance[20])) == pytest.approx(1.12, abs=0.1)
+                if firmware == "ardupilot":  # it would add them to yaw's
+                    assert message.covariance[15] == message.covariance[18] == 0.0
+                else:
+                    assert 0.0 < message.covariance[15] < math.radians(1.0) ** 2
+                assert message.get_srcComponent() == 191
+            assert not flying.witness.of(mavlink.MAVLink_odometry_message)
+            assert not flying.witness.of(mavlink.MAVLink_attitude_message)  # only in "full"
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 30.0, 50.0])
+def test_rate_and_stamps(tmp_path: Path, rate_hz: float) -> None:
+    """Never above 50 Hz, never two closer than ArduPilot takes; stamps rise, on the clock that answers TIMESYNC."""
+
+    async def main() -> None:
+        async with flight(tmp_path, firmware="ardupilot", rate_hz=rate_hz) as flying:
+            begin_s = flying.rig.now_s
+            await flying.sleep(4.0)
+            stamps = np.array([message.usec for message in flying.witness.of(Vision, begin_s)])
+            times = np.array(flying.witness.times(Vision, begin_s))
+            assert len(stamps) == pytest.approx(4.0 * rate_hz, rel=0.06, abs=1)
+            assert np.diff(stamps).min() >= 20_000
+            assert np.all(np.abs(times - stamps * 1e-6) < 0.05)
+            assert flying.rig.double.external_nav.rejected.total() == 0
+
+    run_virtual(main())
+
+
+def test_full_shows_ground_stations_too(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with flight(tmp_path, mode="full") as flying:
+            await flying.sleep(4.0)
+            shown = flying.witness.of(mavlink.MAVLink_attitude_message)
+            quaternions = flying.witness.of(mavlink.MAVLink_attitude_quaternion_message)
+            assert 15 <= len(shown) <= 25
+            assert len(quaternions) == len(shown)
+            roll, pitch, yaw = flying.rig.aircraft.angles_rad(0.0)
+            for one, other in zip(shown, quaternions, strict=True):
+                assert one.get_srcComponent() == other.get_srcComponent() == 191
+                q = np.array([other.q1, other.q2, other.q3, other.q4])
+                assert abs(1.0 - float(np.linalg.norm(q))) < 1e-6
+                assert (one.roll, one.pitch, one.yaw) == pytest.approx((roll, pitch, yaw), abs=math.radians(1.5))
+                # The same rotation, reckoned by the other definition.
+                forward = [1 - 2 * (q[2] ** 2 + q[3] ** 2), 2 * (q[1] * q[2] + q[0] * q[3])]
+                assert math.atan2(forward[1], forward[0]) == pytest.approx(one.yaw, abs=1e-5)
+            pose = flying.rig.service.pose.now()
+            assert pose is not None
+            assert pose["source"] == "attitude"
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize(("heading_deg", "latitude_deg", "longitude_deg"), [
+    (0.5, 40.0, 116.0), (359.5, -33.9, 18.4), (180.0, 47.4, 8.5), (90.0, -41.3, 174.8),
+])  # fmt: skip
+def test_headings_at_the_seam_and_declinations_of_both_signs(
+    tmp_path: Path, heading_deg: float, latitude_deg: float, longitude_deg: float
+) -> None:
+    """Beijing -7, Cape Town -27, Zurich +3, Wellington +23 degrees; true north is pushed, to both sides of the seam."""
+
+    async def main() -> None:
+        site = site_at(latitude_deg, longitude_deg, 50.0)
+        pose = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=heading_deg)
+        async with flight(tmp_path, pose=pose, site=site) as flying:
+            flying.rig.autopilot.arm()
+            flying.turn(heading_deg=-3.0)
+            await flying.sleep(5.0)
+            flying.turn(heading_deg=6.0)
+            await flying.sleep(6.0)
+            yaws = [message.yaw for message in flying.witness.of(Vision)]
+            steps = [abs(math.remainder(b - a, 2.0 * math.pi)) for a, b in itertools.pairwise(yaws)]
+            assert max(steps) < math.radians(1.0)
+            assert max(map(abs, yaws)) <= math.pi + 1e-6
+            expected = math.radians(heading_deg + 3.0)
+            assert abs(math.remainder(yaws[-1] - expected, 2.0 * math.pi)) < math.radians(2.0)
+            assert flying.theirs_deg() < 3.0
+
+    run_virtual(main())
+
+
+def test_nothing_is_pushed_before_a_calibration_or_without_a_compass(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with flight(tmp_path, calibrated=False) as flying:
+            await flying.sleep(30.0)
+            assert not flying.witness.of(Vision)
+            assert flying.attitude.view()["why_not"] == "waiting for a calibration"
+            flying.rig.unplugged.add("compass")
+            await flying.sleep(10.0)
+            assert not flying.witness.of(Vision)
+
+    run_virtual(main())
+
+
+def test_a_silent_imu_stops_the_push_at_once_and_says_so(tmp_path: Path) -> None:
+    """In flight a second of silence is the end until the next landing; a short one is bridged."""
+
+    async def main() -> None:
+        async with flight(tmp_path) as flying:
+            rig = flying.rig
+            rig.autopilot.arm()
+            await flying.sleep(1.0)
+            rig.unplugged.add("own")
+            silent_s = rig.now_s
+            await flying.sleep(0.6)
+            last_s = flying.witness.times(Vision)[-1]
+            assert last_s < silent_s + 0.25
+            assert not flying.attitude.health.pushing
+            rig.unplugged.discard("own")
+            await flying.pushing(5.0)
+            assert rig.now_s - silent_s > 3.0  # well for a while first
+            rig.unplugged.add("own")
+            await flying.sleep(2.0)
+            rig.unplugged.discard("own")
+            await flying.sleep(5.0)
+            assert flying.attitude.view()["why_not"] == "attitude lost in flight: it is aligned again on the ground"
+            texts = rig.ground.texts()
+            assert any(text.startswith("Attitude push stopped: IMU own sends nothing") for text in texts)
+            rig.autopilot.disarm()
+            await flying.pushing(30.0)
+
+    run_virtual(main())
+
+
+def test_the_autopilot_loses_its_heading_when_the_stream_stops(tmp_path: Path) -> None:
+    """What EK3_SRC1_YAW = 6 means: no arming without the stream, and GNSS is used only from the first heading on."""
+
+    async def main() -> None:
+        async with flight(tmp_path, calibrated=False) as flying:
+            rig = flying.rig
+            assert "VisOdom: not healthy" in rig.double.prearm_failures(rig.now_s)
+            status: Any = rig.double.build(mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT, rig.now_s)
+            assert status.flags & mavlink.EKF_CONST_POS_MODE
+            assert flying.theirs_deg() > 30.0
+            await flying.calibrate()
+            await flying.pushing()
+            await flying.sleep(1.0)
+            assert "VisOdom: not healthy" not in rig.double.prearm_failures(rig.now_s)
+            status = rig.double.build(mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT, rig.now_s)
+            assert status.flags & mavlink.EKF_POS_HORIZ_ABS
+            assert flying.theirs_deg() < 2.0
+            assert rig.double.external_nav.in_use(rig.now_s)
+            rig.unplugged.add("own")
+            await flying.sleep(6.0)
+            assert not rig.double.external_nav.in_use(rig.now_s)
+            assert "VisOdom: not healthy" in rig.double.prearm_failures(rig.now_s)
+
+    run_virtual(main())
+
+
+def test_a_new_alignment_that_turns_the_heading_is_a_reset(tmp_path: Path) -> None:
+    """The aircraft is carried round while the daemon hears no IMU; PX4 resets its yaw by the counter."""
+
+    async def main() -> None:
+        async with flight(tmp_path, firmware="px4") as flying:
+            await flying.sleep(2.0)
+            assert flying.witness.of(Vision)[-1].reset_counter == 0
+            flying.rig.unplugged.add("own")
+            await flying.sleep(1.5)
+            flying.turn(heading_deg=50.0)
+            await flying.sleep(5.0)
+            flying.rig.unplugged.discard("own")
+            await flying.pushing(40.0)
+            await flying.sleep(3.0)
+            assert flying.witness.of(Vision)[-1].reset_counter == 1
+            assert flying.theirs_deg() < 2.0
+
+    run_virtual(main())
+
+
+def test_px4_is_told_the_heading_once_and_converges_on_our_clock(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with flight(tmp_path, firmware="px4") as flying:
+            commands = mavlink.MAVLink_command_long_message
+            told = [one for one in flying.witness.of(commands) if one.command == 620]
+            await flying.sleep(60.0)
+            told = [one for one in flying.witness.of(commands) if one.command == 620]
+            assert len(told) == 1
+            assert told[0].param3 == pytest.approx(40.0, abs=2.0)
+            assert flying.attitude.external.outcome == "heading given to PX4"
+            vision = flying.rig.px4.vision
+            assert vision.converged
+            assert vision.active
+            assert 0.0 < vision.late_s < 0.02
+
+    run_virtual(main())
+
+
+def test_an_older_px4_does_not_know_the_command(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with flight(tmp_path, firmware="px4", version="1.16") as flying:
+            await flying.sleep(5.0)
+            assert flying.attitude.external.outcome is not None
+            assert "does not take a heading by command" in flying.attitude.external.outcome
+            assert flying.rig.px4.vision.active
+
+    run_virtual(main())
+
+
+def test_a_heading_that_differs_is_told(tmp_path: Path) -> None:
+    """The autopilot goes its own way by 12 degrees: told once, shown as a warning, and gone when it is over."""
+
+    async def main() -> None:
+        async with flight(tmp_path, used=False) as flying:
+            rig = flying.rig
+            await flying.sleep(5.0)
+            assert not flying.attitude.warnings
+            rig.double.estimator.yaw_error_rad = math.radians(16.0)
+            await flying.sleep(8.0)
+            (warning,) = flying.attitude.warnings
+            assert "deg in heading" in warning
+            assert warning in rig.service.status()["warnings"]
+            assert sum("deg in heading" in text for text in rig.ground.texts()) == 1
+            await rig.until(lambda: not flying.attitude.warnings, 120.0)
+            assert flying.attitude.health.pushing
+
+    run_virtual(main())
+
+
+def test_a_tilt_that_differs_for_long_stops_the_push(tmp_path: Path) -> None:
+    """One of the two is wrong and nobody can say which."""
+
+    async def main() -> None:
+        async with flight(tmp_path, used=False) as flying:
+            rig = flying.rig
+            rig.autopilot.arm()
+            rig.double.set_parameter("AHRS_TRIM_Y", math.radians(9.0))
+            await rig.until(lambda: not flying.attitude.health.pushing, 20.0)
+            assert "tilt differs by" in flying.attitude.health.why_not
+            rig.double.set_parameter("AHRS_TRIM_Y", 0.0)
+            await flying.pushing(20.0)
+
+    run_virtual(main())
+
+
+def test_a_heading_that_goes_its_own_way_after_agreeing_stops_the_push(tmp_path: Path) -> None:
+    """Before they have ever agreed the autopilot may have any heading: that is what ours is for."""
+
+    async def main() -> None:
+        async with flight(tmp_path, used=False, calibrated=False) as flying:
+            rig = flying.rig
+            rig.double.estimator.compass = False
+            rig.double.estimator.yaw_error_rad = math.radians(60.0)
+            await flying.calibrate()
+            await flying.pushing()
+            await flying.sleep(15.0)
+            assert flying.attitude.health.pushing
+            rig.double.estimator.yaw_error_rad = 0.0
+            await flying.sleep(15.0)
+            rig.autopilot.arm()
+            rig.double.estimator.yaw_error_rad = math.radians(-60.0)
+            await rig.until(lambda: not flying.attitude.health.pushing, 20.0)
+            assert "heading differs by" in flying.attitude.health.why_not
+            assert "attitude push stopped" in rig.service.status()["headline"]["reason"]
+            rig.double.estimator.yaw_error_rad = 0.0
+            await flying.pushing(20.0)
+
+    run_virtual(main())
+
+
+def test_a_compass_that_disagrees_for_long_stops_the_push(tmp_path: Path) -> None:
+    """A motor's field: the gyros know better for a while, and then nobody does."""
+
+    async def main() -> None:
+        async with flight(tmp_path, used=False) as flying:
+            rig = flying.rig
+            rig.autopilot.arm()
+            compass: Any = rig.devices["compass"]
+            compass.heading_error_deg = 40.0
+            begun_s = rig.now_s
+            await rig.until(lambda: not flying.attitude.health.pushing, 60.0)
+            assert "compass disagrees for" in flying.attitude.health.why_not
+            assert rig.now_s - begun_s > 18.0
+            assert math.degrees(abs(flying.witness.of(Vision)[-1].yaw - flying.true_yaw_rad)) < 3.0
+            compass.heading_error_deg = 0.0
+            await flying.pushing(20.0)
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("vehicle", ["plane", "copter"])
+def test_circles_without_end_tilt_nothing(tmp_path: Path, vehicle: str) -> None:
+    """35 degrees of bank for half a minute; the field with a fixed wing's airspeed is used on a fixed wing only."""
+
+    async def main() -> None:
+        route = BankedCircles(start_s=70.0)
+        pose = Pose(heading_deg=40.0)
+        async with flight(tmp_path, route=route, pose=pose, vehicle=vehicle, imus=1, imu_rate_hz=25.0) as flying:
+            rig = flying.rig
+            assert rig.aircraft.time_at(rig.now_s) < 65.0
+            rig.double.airspeed_m_s = 15.0
+            rig.autopilot.arm()
+            while rig.aircraft.time_at(rig.now_s) < 105.0:
+                await flying.sleep(5.0)
+                last = flying.witness.of(Vision)[-1]
+                roll, pitch, yaw = rig.aircraft.angles_rad(last.usec * 1e-6 - rig.aircraft.loop_time_of(0.0))
+                assert (last.roll, last.pitch) == pytest.approx((roll, pitch), abs=math.radians(1.0))
+                assert abs(math.remainder(last.yaw - yaw, 2.0 * math.pi)) < math.radians(2.0)
+            assert flying.attitude.carrier.airspeed_m_s == (15.0 if vehicle == "plane" else None)
+
+    run_virtual(main())
+
+
+def test_a_fault_of_ours_costs_the_push_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The collector gets every sample; on the ground it begins anew by itself."""
+
+    async def main() -> None:
+        async with flight(tmp_path) as flying:
+            (own,) = [device for device in flying.rig.service.sensors if device.name == "own"]
+            estimator = flying.attitude.carrier.estimator
+            monkeypatch.setattr(estimator, "update", lambda *_, **__: 1 / 0)
+            before = own.decoder.accepted
+            await rig_stops(flying)
+            assert flying.attitude.health.why_not == "internal error; the log has the details"
+            last = len(flying.witness.of(Vision))
+            await flying.pushing(30.0)
+            assert len(flying.witness.of(Vision)) - last <= 2
+            assert flying.attitude.carrier.estimator is not estimator
+            assert own.decoder.accepted > before + 200
+            assert flying.rig.service.collector.glance(flying.rig.now_s).obstacle is None
+
+    async def rig_stops(flying: Flight) -> None:
+        await flying.rig.until(lambda: not flying.attitude.health.pushing, 2.0)
+
+    run_virtual(main())
+
+
+def test_off_is_off() -> None:
+    """Neither imported nor listening."""
+    code = "import companion.daemon.service, sys; print([m for m in sys.modules if 'attitude' in m])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+
+
+def test_off_sends_nothing(tmp_path: Path) -> None:
+    async def main() -> None:
+        rig = Rig(tmp_path, firmware="px4")
+        witness = Witness(rig)
+        async with rig.running():
+            await rig.ready()
+            assert rig.service.attitude is None
+            assert rig.service.status()["attitude"] is None
+            assert not witness.of(mavlink.MAVLink_timesync_message)
+
+    run_virtual(main())
