@@ -81,17 +81,18 @@ text{font:13px system-ui,sans-serif;fill:var(--fg)}.mid{text-anchor:middle}.end{
 """)
 
 
-def page(title: str, now: datetime.datetime, *body: Child) -> str:
+def page(title: str, now: datetime.datetime, *body: Child, source: str = "from the records on this computer") -> str:
     """A whole file.
 
     Args:
         title: of the tab.
         now: when it was made, for the foot.
         body: the parts.
+        source: of its figures, for the foot.
     """
     foot = tag(
         "p",
-        f"Made {now:%Y-%m-%d %H:%M} UTC by companion {__version__} from the records on this computer. All axes:"
+        f"Made {now:%Y-%m-%d %H:%M} UTC by companion {__version__} {source}. All axes:"
         " x forward, y right, z down. Times: UTC by the companion's clock.",
         class_="soft",
     )

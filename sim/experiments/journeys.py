@@ -7,7 +7,7 @@ import datetime
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -44,36 +44,55 @@ def main(argv: Sequence[str]) -> int:
     parts = _drive(arguments) if arguments.command == "drive" else _flights(arguments)
     if arguments.html is not None:
         now = datetime.datetime.now(datetime.UTC)
-        arguments.html.write_text(page(f"Simulated {arguments.command}", now, *parts), encoding="utf-8")
+        arguments.html.write_text(
+            page(f"Simulated {arguments.command}", now, *parts, source="by simulation"), encoding="utf-8"
+        )
         print(f"\nPlots: {arguments.html}")
     return 0
 
 
+class Table(NamedTuple):
+    """Figures with what they are."""
+
+    about: tuple[str, ...]
+    head: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+
+    def text(self) -> str:
+        """For a terminal."""
+        width = max(len(row[0]) for row in self.rows) + 2
+        lines = [*self.about, ""]
+        for first, *others in (self.head, *self.rows):
+            lines.append(f"{first:{width}}" + "".join(f"{other:>9}" for other in others))
+        return "\n".join(lines)
+
+    def html(self) -> Markup:
+        """For a page."""
+        head = tag("tr", *(tag("th", word) for word in self.head))
+        rows = [tag("tr", *(tag("td", word) for word in row)) for row in self.rows]
+        return tag("div", *(tag("p", line) for line in self.about), tag("table", head, *rows))
+
+
 def _drive(arguments: argparse.Namespace) -> list[Markup]:
     trials = many(DRIVE, range(arguments.seeds), jobs=arguments.jobs)
-    lines = [
-        f"{len(trials)} drives of 180 s from roll 9.52 deg, an {DRIVE.part.upper()} calibrated for 60 s before each.",
-        "Errors at 180 s, degrees rms over the drives:",
-        "",
-        f"{'':28}{'pitch':>8}{'roll':>8}{'heading':>9}",
-    ]
+    rows: list[tuple[str, ...]] = []
     for name in ("companion", "companion, no compass", "not calibrated"):
         ends = rms(np.array([trial.errors_deg[name][-1] for trial in trials]))
-        lines.append(f"{name:28}" + "".join(f"{ends[column]:{8 + (column == 2)}.2f}" for _, column in AXES))
-    lines.append(
-        f"{'the paper, one drive':28}{PAPER_DEG['pitch']:8.1f}{PAPER_DEG['roll']:8.1f}{PAPER_DEG['heading']:9.1f}"
-    )
+        rows.append((name, *(f"{ends[column]:.2f}" for _, column in AXES)))
+    rows.append(("the paper, one drive", *(f"{PAPER_DEG[axis]:.1f}" for axis, _ in AXES)))
     whole = [
         rms(np.array([trial.errors_deg["companion"][:, column] for trial in trials]), (0, 1)) for _, column in AXES
     ]
     covered = np.mean([np.abs(trial.errors_deg["companion"]) < 2.0 * trial.sigma_deg for trial in trials], axis=(0, 1))
-    lines += [
-        "",
-        f"over the whole drive        {whole[0]:8.2f}{whole[1]:8.2f}{whole[2]:9.2f}",
-        f"within two of its own sigmas{covered[1]:8.0%}{covered[0]:8.0%}{covered[2]:9.0%}",
-    ]
-    print("\n".join(lines))
-    return [tag("h1", "A drive of 180 s"), _table(lines), *_plots(trials)]
+    rows.append(("companion, all the way", *(f"{value:.2f}" for value in whole)))
+    rows.append(("within 2 of its sigmas", *(f"{covered[column]:.0%}" for _, column in AXES)))
+    about = (
+        f"{len(trials)} drives of 180 s from roll 9.52 deg, an {DRIVE.part.upper()} calibrated for 60 s before each.",
+        "Errors at 180 s, degrees rms over the drives:",
+    )
+    found = Table(about, ("", *(axis for axis, _ in AXES)), rows)
+    print(found.text())
+    return [tag("h1", "A drive of 180 s"), found.html(), *_plots(trials)]
 
 
 def _flights(arguments: argparse.Namespace) -> list[Markup]:
@@ -81,31 +100,28 @@ def _flights(arguments: argparse.Namespace) -> list[Markup]:
     parts: list[Markup] = [tag("h1", "Flights without GPS, airspeed or compass")]
     for setup in (CIRCLES, SHUTTLE):
         trials = many(setup, range(arguments.seeds), others, jobs=arguments.jobs)
-        lines = _compared(setup, trials)
-        print("\n".join(lines), end="\n\n")
-        parts += [tag("h2", setup.name), _table(lines), *_plots(trials)]
+        found = _compared(setup, trials)
+        print(found.text(), end="\n\n")
+        parts += [tag("h2", setup.name), found.html(), *_plots(trials)]
     if missing:
         print(missing, file=sys.stderr)
     return parts
 
 
-def _compared(setup: Setup, trials: Sequence[Trial]) -> list[str]:
-    lines = [
-        f"{setup.name}, {setup.seconds:.0f} s, {setup.part} at {setup.rate_hz:.0f} Hz, {len(trials)} flights:",
-        "all on the same samples; all but one after the same calibration",
-        "",
-        f"{'':28}{'tilt rms':>9}{'worst':>8}  degrees",
-    ]
+def _compared(setup: Setup, trials: Sequence[Trial]) -> Table:
+    about = (
+        (
+            f"{setup.name}, {setup.seconds:.0f} s, {setup.part} at {setup.rate_hz:.0f} Hz, {len(trials)} flights, all on"
+            " the same samples, all but one after the same calibration. Tilt, degrees:"
+        ),
+    )
+    rows: list[tuple[str, ...]] = []
     for name in trials[0].tilt_deg:
         if name == "companion, no compass":
             continue
         tilts = np.array([trial.tilt_deg[name] for trial in trials])
-        lines.append(f"{name:28}{rms(tilts, (0, 1)):9.2f}{tilts.max():8.2f}")
-    return lines
-
-
-def _table(lines: Sequence[str]) -> Markup:
-    return tag("pre", "\n".join(lines), class_="mono")
+        rows.append((name, f"{rms(tilts, (0, 1)):.2f}", f"{tilts.max():.2f}"))
+    return Table(about, ("", "rms", "worst"), rows)
 
 
 def _plots(trials: Sequence[Trial]) -> list[Markup]:
@@ -121,7 +137,7 @@ def _plots(trials: Sequence[Trial]) -> list[Markup]:
             times = drawn[0].times_s[::4].tolist()
             plot = svg.Plot(
                 svg.linear(times),
-                svg.linear(reach, ticks=3),
+                svg.linear(reach, ticks=5),
                 name=f"{name}: error of {axis}",
                 x_label="time, s" if number == 2 else None,
                 y_label=f"{name}: {axis}, deg",

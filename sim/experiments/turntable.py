@@ -100,10 +100,12 @@ def main(argv: Sequence[str]) -> int:
     for part in ("adis16405", "icm42688p"):
         lines = table(part, arguments.seeds, arguments.seconds, arguments.jobs)
         print("\n".join(lines), end="\n\n")
-        parts += [tag("h2", part), tag("pre", "\n".join(lines), class_="mono")]
+        parts += [tag("h2", part), tag("div", tag("pre", "\n".join(lines), class_="mono"), style="overflow-x:auto")]
     if arguments.html is not None:
         now = datetime.datetime.now(datetime.UTC)
-        arguments.html.write_text(page("The turntable of the paper", now, *parts), encoding="utf-8")
+        arguments.html.write_text(
+            page("The turntable of the paper", now, *parts, source="by simulation"), encoding="utf-8"
+        )
         print(f"Page: {arguments.html}")
     return 0
 
