@@ -68,8 +68,8 @@ class Table(NamedTuple):
 
     def html(self) -> Markup:
         """For a page."""
-        head = tag("tr", *(tag("th", word) for word in self.head))
-        rows = [tag("tr", *(tag("td", word) for word in row)) for row in self.rows]
+        head = tag("tr", tag("th", ""), *(tag("th", word, class_="no") for word in self.head[1:]))
+        rows = [tag("tr", tag("td", row[0]), *(tag("td", word, class_="no") for word in row[1:])) for row in self.rows]
         return tag("div", *(tag("p", line) for line in self.about), tag("table", head, *rows))
 
 
@@ -111,8 +111,8 @@ def _flights(arguments: argparse.Namespace) -> list[Markup]:
 def _compared(setup: Setup, trials: Sequence[Trial]) -> Table:
     about = (
         (
-            f"{setup.name}, {setup.seconds:.0f} s, {setup.part} at {setup.rate_hz:.0f} Hz, {len(trials)} flights, all on"
-            " the same samples, all but one after the same calibration. Tilt, degrees:"
+            f"{setup.name}, {setup.seconds:.0f} s, {setup.part} at {setup.rate_hz:.0f} Hz, {len(trials)} flights, all"
+            " on the same samples, all but one after the same calibration. Tilt, degrees:"
         ),
     )
     rows: list[tuple[str, ...]] = []
