@@ -13,7 +13,7 @@ import datetime
 import importlib
 import importlib.util
 import logging
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -156,10 +156,6 @@ class MqttLink:
                 await self._serve()
             except* Exception as group:  # noqa: BLE001 - whatever it is, it costs the connection and nothing else
                 self._lost(group, began_s, reached=self.connections > before)
-            task = asyncio.current_task()
-            if task is not None and task.cancelling():
-                # A task group that has errors to tell forgets that it was cancelled meanwhile (CPython before 3.13).
-                raise asyncio.CancelledError
             if (protocol, self._protocol) == (MQTT_5, MQTT_3_1_1):
                 continue
             if loop.time() - began_s >= WORTH_S:
@@ -197,9 +193,7 @@ class MqttLink:
         try:
             await self._subscribe(client)
             self._up()
-            async with asyncio.TaskGroup() as group:
-                group.create_task(self._send(client), name="mqtt sender")
-                group.create_task(self._receive(client), name="mqtt receiver")
+            await _both(self._send(client), self._receive(client))
         finally:
             self._connected_s = None
             self.outbox.closed()
@@ -303,6 +297,25 @@ class MqttLink:
         self.last_error = reason
         logger.log(logging.DEBUG if self._warned == reason else logging.WARNING, "mqtt: %s", reason)
         self._warned = reason
+
+
+async def _both(sending: Coroutine[Any, Any, None], receiving: Coroutine[Any, Any, None]) -> None:
+    """Run both until one fails; raises what it raised.
+
+    No task group: one that has an error to tell forgets that it was cancelled meanwhile (CPython before 3.13), and
+    whoever is stopped at the moment of a loss would go on for ever.
+    """
+    loop = asyncio.get_running_loop()
+    tasks = [loop.create_task(sending, name="mqtt sender"), loop.create_task(receiving, name="mqtt receiver")]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+    finally:
+        for task in tasks:
+            task.cancel()
+        ended = await asyncio.gather(*tasks, return_exceptions=True)
+    for end in ended:
+        if isinstance(end, Exception):
+            raise end
 
 
 def _load_library() -> str | None:

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from companion.config.sections import Mqtt
+from companion.links import mqtt
 from companion.links.mqtt import MqttLink
 from tests.support.virtual_time import run_virtual
 
@@ -17,32 +18,70 @@ async def at_once(function: Callable[..., Any], *arguments: Any) -> Any:
     return function(*arguments)
 
 
-@pytest.mark.parametrize("order", ["lost first", "stopped first"])
-def test_stopping_at_the_moment_of_a_loss_stops(order: str) -> None:
+class Breaking(MqttLink):
+    """A connection that is up at once and is lost when told so."""
+
+    def __init__(self) -> None:
+        super().__init__(Mqtt(host="broker"), client_id="me", offload=at_once)
+        self.serving, self.loss = asyncio.Event(), asyncio.Event()
+
+    async def _connect(self) -> Any:
+        return None
+
+    async def _subscribe(self, client: Any) -> None:
+        pass
+
+    async def _send(self, client: Any) -> None:
+        await asyncio.get_running_loop().create_future()
+
+    async def _receive(self, client: Any) -> None:
+        self.serving.set()
+        await self.loss.wait()
+        raise OSError("thrown out")
+
+
+async def nothing(client: Any) -> None:
+    pass
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_stopping_at_the_moment_of_a_loss_stops(turns: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two clients of one name throw each other out again and again; whoever is stopped just then must end."""
+    monkeypatch.setattr(mqtt, "_leave", nothing)
 
     async def main() -> None:
-        lost, serving = asyncio.Event(), asyncio.Event()
-
-        class Breaking(MqttLink):
-            async def _serve(self) -> None:
-                async def receive() -> None:
-                    serving.set()
-                    await lost.wait()
-                    raise OSError("thrown out")
-
-                async with asyncio.TaskGroup() as group:
-                    group.create_task(receive())
-
-        link = Breaking(Mqtt(host="broker"), client_id="me", offload=at_once)
+        link = Breaking()
         task = asyncio.create_task(link.run())
-        await serving.wait()
-        lost.set()
-        if order == "lost first":
-            await asyncio.sleep(0)  # the receiver has raised, the group has not heard of it yet
+        await link.serving.wait()
+        link.loss.set()
+        for _ in range(turns):
+            await asyncio.sleep(0)
         task.cancel()
         done, _ = await asyncio.wait([task], timeout=60.0)
         assert done, "it goes on as if nobody had stopped it"
         assert task.cancelled()
+
+    run_virtual(main())
+
+
+def test_after_a_loss_it_connects_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mqtt, "_leave", nothing)
+
+    async def main() -> None:
+        link = Breaking()
+        task = asyncio.create_task(link.run())
+        await link.serving.wait()
+        for connections in (1, 2, 3):
+            async with asyncio.timeout(60.0):
+                await link.serving.wait()
+            assert link.connections == connections
+            link.serving.clear()
+            link.loss.set()
+            await asyncio.sleep(0.01)
+            assert not link.connected
+            assert "next attempt in" in str(link.status()["summary"])
+            link.loss.clear()
+        task.cancel()
+        await asyncio.wait([task])
 
     run_virtual(main())
