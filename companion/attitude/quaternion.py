@@ -16,6 +16,7 @@ Quaternion = tuple[float, float, float, float]
 Triple = tuple[float, float, float]
 
 IDENTITY: Quaternion = (1.0, 0.0, 0.0, 0.0)
+_NO_LENGTH = 1e-150
 
 
 def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
@@ -71,15 +72,17 @@ def about_down(angle_rad: float) -> Quaternion:
 
 def shortest_arc(a: Triple, b: Triple) -> Quaternion:
     """The smallest turn that takes direction `a` to direction `b`; the identity where either has no length."""
-    size = math.sqrt((a[0] ** 2 + a[1] ** 2 + a[2] ** 2) * (b[0] ** 2 + b[1] ** 2 + b[2] ** 2))
-    if size == 0.0:
+    length_a, length_b = math.hypot(*a), math.hypot(*b)
+    if not (length_a > _NO_LENGTH and length_b > _NO_LENGTH):
         return IDENTITY
-    w = size + a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    if w < 1e-9 * size:
+    ax, ay, az = a[0] / length_a, a[1] / length_a, a[2] / length_a
+    bx, by, bz = b[0] / length_b, b[1] / length_b, b[2] / length_b
+    w = 1.0 + ax * bx + ay * by + az * bz
+    if w < 1e-9:
         # Opposite: half a turn about anything at right angles to `a`.
-        x, y, z = (0.0, -a[2], a[1]) if abs(a[0]) < max(abs(a[1]), abs(a[2])) else (-a[2], 0.0, a[0])
+        x, y, z = (0.0, -az, ay) if abs(ax) < max(abs(ay), abs(az)) else (-az, 0.0, ax)
         return normalised((0.0, x, y, z))
-    return normalised((w, a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
+    return normalised((w, ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
 
 
 def from_matrix(matrix: Matrix) -> Quaternion:

@@ -86,6 +86,7 @@ class SensorHealth:
         budget = self.link.budget
         if budget is None or budget.exceeded_s is None or now_s - budget.exceeded_s >= FLOOD_S:
             return None
+        self.stream.excuse()
         rate = f"{self._bytes_per_s / 1e3:.0f} kB/s" if self._bytes_per_s else "too much"
         return Trouble(FLOOD, f"floods us ({rate}); the surplus is thrown away: another device, or a loop-back?")
 

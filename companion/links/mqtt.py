@@ -244,7 +244,7 @@ class MqttLink:
             # Left alone, a connection that came about half way would live on without us.
             await _close(client)
             entering.cancel()
-            await asyncio.wait([entering])
+            await asyncio.wait([entering], timeout=LEAVE_DEADLINE_S)
             raise
         return client
 
@@ -370,8 +370,10 @@ async def _entered(client: aiomqtt.Client, entering: asyncio.Task[aiomqtt.Client
         if not entering.done():
             raise ClosedEarlyError("the broker closes the connection without a word")
     except asyncio.CancelledError:
-        while not entering.done() and _paho(client).socket() is None and not closed.done():
-            await asyncio.sleep(_MOMENT_S)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(CONNECT_DEADLINE_S):
+                while not entering.done() and _paho(client).socket() is None and not closed.done():
+                    await asyncio.sleep(_MOMENT_S)
         raise
     await entering
 

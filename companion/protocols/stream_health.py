@@ -111,6 +111,10 @@ class StreamHealth:
         self._same = self._rail = 0
         self.speaks, self._guess, self._guessed_s = None, "", -math.inf
 
+    def excuse(self) -> None:
+        """What was damaged until now has a cause that is known: nobody shall look for another."""
+        self._marks.clear()
+
     def took(self, data: bytes, samples: Sequence[Sample], t_s: float) -> None:
         """Bytes were read at `t_s` and have completed these samples."""
         self.last_byte_s = t_s
