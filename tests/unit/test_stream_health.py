@@ -128,6 +128,29 @@ def test_what_was_damaged_two_seconds_ago_is_over() -> None:
     assert now_s > 9.9
 
 
+def damaged_for_a_second() -> tuple[ImuLineDecoder, StreamHealth]:
+    """Every third frame of the last second is damaged, up to 2 s on its clock."""
+    decoder = ImuLineDecoder()
+    health = StreamHealth("imu_line", decoder)
+    for tick in range(100):
+        frame = imu_frame(tick)
+        if tick >= 50 and tick % 3 == 0:
+            frame = frame.replace(b"-9.8", b"-9.7")
+        health.took(frame, decoder.feed(frame, 0.02 * tick), 0.02 * tick)
+        health.trouble(0.02 * tick)
+    return decoder, health
+
+
+def test_damage_that_is_explained_is_not_held_against_the_frames_that_follow() -> None:
+    for explained in (False, True):
+        decoder, health = damaged_for_a_second()
+        if explained:
+            health.excuse()
+        frame = imu_frame(100)
+        health.took(frame, decoder.feed(frame, 2.0), 2.0)
+        assert (health.trouble(2.0) is None) == explained
+
+
 def test_silence_beats_everything_that_was_said_before() -> None:
     decoder = ImuLineDecoder()
     health = StreamHealth("imu_line", decoder)
