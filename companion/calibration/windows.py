@@ -25,7 +25,7 @@ from companion.calibration.batches import Batch
 from companion.calibration.integers import integer_columns
 from companion.calibration.pose_windows import FieldWindow, HeadingWindow, TiltWindow
 from companion.calibration.quantised import EDGE_RMS
-from companion.calibration.robust import huber_line, huber_mean
+from companion.calibration.robust import huber_line, robust_mean, slope_limit
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG_H, MG
 
@@ -33,7 +33,8 @@ Floats = NDArray[np.float64]
 Axes = tuple[float, float, float]
 
 RAMP_T: Final = 5.0
-"""|t| of a slope that counts as one. On sensors without a ramp a lower one costs more than it saves (2.4)."""
+"""|t| of a slope that counts as one, more in a short window (`robust.slope_limit`). On sensors without a ramp a lower
+one costs more than it saves (2.4)."""
 RAMP_BATCHES: Final = 8
 WHITE_SHARE: Final = 0.09
 """White variance over floor variance below which more averaging buys nothing: white part 30 % of the floor."""
@@ -183,14 +184,14 @@ def estimates(
     edges = np.repeat([_edges(imu) for imu in imus], 3)
     whole = integer_columns(batches, steps, np.repeat([imu.truncates for imu in imus], 6), edges)
     values = np.where(whole.of, whole.values, values)
-    mean = huber_mean(values, whole.huber_c, whole.least)
+    mean = robust_mean(values, whole.huber_c, whole.least)
     leverage = np.full(values.shape[1], 1.0 / seconds)
     slope = np.zeros(values.shape[1])
     level: Floats = values
     if len(values) >= RAMP_BATCHES:
         times = slots.astype(np.float64) + 0.5
         line = huber_line(times, values, end_s, whole.huber_c, whole.least)
-        ramps = np.abs(line.t_statistic) > RAMP_T
+        ramps = np.abs(line.t_statistic) > slope_limit(len(values), RAMP_T)
         mean = np.where(ramps, line.end, mean)
         leverage = np.where(ramps, line.end_leverage, leverage)
         slope = np.where(ramps, line.slope, 0.0)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from companion.calibration.robust import HUBER_C, huber_line, huber_mean
+from companion.calibration.robust import HUBER_C, huber_line, huber_mean, robust_mean, slope_limit
 
 
 def test_huber_mean_solves_its_own_equation() -> None:
@@ -76,3 +77,42 @@ def test_t_statistic_of_noise_is_students() -> None:
     line = huber_line(np.arange(30.0), rng.normal(size=(30, 4000)), 30.0)
     assert float(line.t_statistic.std()) == pytest.approx(1.0, abs=0.2)
     assert float(np.mean(np.abs(line.t_statistic) > 5.0)) < 1e-3
+
+
+@pytest.mark.parametrize(("count", "within"), [(10, 0.05), (30, 0.03), (60, 0.025)])
+def test_the_robust_mean_is_within_a_few_per_cent_of_the_bound_where_nothing_knocks(count: int, within: float) -> None:
+    """The bound is the plain mean's 1 / sqrt(n), attained by it in Gaussian noise (method section 2.2)."""
+    rng = np.random.default_rng(count)
+    values = rng.normal(size=(count, 20_000))
+    found = float(np.sqrt(np.mean(np.square(robust_mean(values))))) * np.sqrt(count)
+    assert found < 1.0 + within
+    assert found < float(np.sqrt(np.mean(np.square(huber_mean(values))))) * np.sqrt(count)
+
+
+def test_the_robust_mean_forgets_a_knock_that_hubers_feels() -> None:
+    rng = np.random.default_rng(7)
+    values = rng.normal(size=(60, 4000))
+    values[20:23] += 300.0
+    knocked = np.sqrt(np.mean(np.square(robust_mean(values)))) * np.sqrt(60.0)
+    # What is left is a mean of 57.
+    assert knocked == pytest.approx(np.sqrt(60.0 / 57.0), rel=0.05)
+    assert float(np.sqrt(np.mean(np.square(huber_mean(values))))) * np.sqrt(60.0) > 1.2
+
+
+def test_the_robust_mean_of_equal_values_is_their_value_and_moves_with_them() -> None:
+    assert robust_mean(np.full((5, 2), 7.0)) == pytest.approx([7.0, 7.0])
+    values = np.random.default_rng(8).standard_t(2.0, (21, 5))
+    assert robust_mean(3.0 * values + 2.0) == pytest.approx(3.0 * robust_mean(values) + 2.0)
+    assert robust_mean(np.array([[0.0], [0.0], [0.0], [0.0], [1.0]])) == pytest.approx([0.0], abs=0.3)
+
+
+@pytest.mark.parametrize("count", [8, 10, 15])
+def test_the_limit_of_a_slope_in_a_short_window_is_students(count: int) -> None:
+    assert slope_limit(count, 5.0) == pytest.approx(stats.t.isf(0.5e-4, count - 2), rel=0.03)
+    assert slope_limit(60, 5.0) == 5.0
+
+
+def test_chance_seldom_makes_a_slope_of_ten_seconds() -> None:
+    line = huber_line(np.arange(10.0), np.random.default_rng(9).normal(size=(10, 20_000)), 10.0)
+    assert float(np.mean(np.abs(line.t_statistic) > slope_limit(10, 5.0))) < 1e-3
+    assert float(np.mean(np.abs(line.t_statistic) > 5.0)) > 2e-3
