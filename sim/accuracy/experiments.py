@@ -1,0 +1,274 @@
+"""The experiments: many stands each, in several processes; what comes back are errors and sigmas, truth known.
+
+Each is one function of a seed, so that a run is the same however many processes share the work.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Final, TypeVar
+
+import numpy as np
+
+from companion.calibration.allan import noise_profile
+from companion.calibration.rolling import Window
+from companion.calibration.windows import ImuInput
+from companion.errors import CalibrationRefusedError
+from sim.accuracy import paper, peers
+from sim.accuracy.stand import (
+    GRAVITY_ANOMALY_M_S2,
+    NEXT_S,
+    POSTURES,
+    RATE_HZ,
+    References,
+    Stand,
+    biases,
+    collected,
+    samples,
+    sigmas_stat,
+    sigmas_use,
+    sites,
+    solved,
+    stand,
+)
+from sim.earth import Array
+from sim.imu_model import MG, AxisNoise, ImuSpec
+
+SPANS_S: Final = (10, 30, 60)
+FLOORED: Final = ("icm42688p", "bmi088", "adis16470", "adis16405")
+TILTS: Final = (
+    ("at most 10 arcsec", 10.0 / 3600.0 / math.sqrt(3.0)),
+    ("10 arcsec", 10.0 / 3600.0),
+    ("0.01 deg", 0.01),
+    ("0.05 deg", 0.05),
+    ("0.1 deg", 0.1),
+)
+"""References of the tilt and their sigma in degrees; of the first, every error up to its limit is as likely."""
+TILT_DRAWS: Final = 8
+"""Of a reference's error, for one stand."""
+FIELD_TILT_DEG: Final = 0.01
+FIELD_HEADING_DEG: Final = 1.0
+METHODS: Final = ("plain mean", "ArduPilot", "PX4, mean", "PX4, in force", "as printed")
+STEP_RAD_S: Final = 1e-3
+NOISE_LSB: Final = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0)
+
+_Found = TypeVar("_Found")
+
+
+def many(one: Callable[..., _Found], arguments: Sequence[tuple[object, ...]], jobs: int) -> list[_Found]:
+    """`one(*arguments)` of all, in order."""
+    if jobs == 1:
+        return [one(*each) for each in arguments]
+    with ProcessPoolExecutor(jobs) as pool:
+        return list(pool.map(one, *zip(*arguments, strict=True), chunksize=max(1, len(arguments) // (8 * jobs))))
+
+
+def whole_seconds(times: Array, rows: Array, window: Window) -> Array:
+    """The readings that are of this window."""
+    return np.asarray(rows[(times >= window.start_s) & (times < window.end_s)])
+
+
+# ------------------------------------------------------------------------------------------------------------ white
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WhiteRun:
+    """One stand with white noise only and perfect references; arrays (spans, 6), over the bound."""
+
+    error: Array
+    sigma: Array
+    plain: Array
+    """Error of the plain mean of the same readings, which attains the bound."""
+    plain_sigma: Array
+
+
+def white(seed: int, number: int) -> WhiteRun:
+    """Errors and sigma_stat in units of the Cramer-Rao bound N / sqrt(T)."""
+    posture = POSTURES[number % len(POSTURES)]
+    site = sites()[number // len(POSTURES) % len(sites())]
+    standing = stand("white_only", posture, site, (seed, 1, number))
+    taken = ImuInput(name="imu", rotation=standing.imu.mounting, profile=noise_profile("icm42688p"))
+    times, rows = samples(standing, SPANS_S[-1])
+    found: list[tuple[Array, Array, Array, Array]] = []
+    for window in collected(standing, taken, times, rows, SPANS_S):
+        truth = standing.bias(window.start_s, window.end_s)
+        bound = standing.imu.white / np.sqrt(window.end_s - window.start_s)
+        imu = solved(standing, window).imus[0]
+        inside = standing.in_vehicle(whole_seconds(times, rows, window))
+        still = inside.mean(axis=0) - standing.in_vehicle(standing.imu.expected(window.start_s))
+        each = (biases(imu) - truth, sigmas_stat(imu), still, peers.plain_mean(inside)[1])
+        found.append((each[0] / bound, each[1] / bound, each[2] / bound, each[3] / bound))
+    error, sigma, plain, plain_sigma = np.array(found).transpose(1, 0, 2)
+    return WhiteRun(error, sigma, plain, plain_sigma)
+
+
+# ------------------------------------------------------------------------------------------------------------ floors
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FloorRun:
+    """One stand with a part's flicker and walk, judged by its bias over the next three minutes; (spans, 6), SI."""
+
+    posture: str
+    ideal: Array
+    """Error with perfect references: what the IMU alone leaves."""
+    error: Array
+    """Error with a gradienter of 0.01 deg and a compass of 1 deg."""
+    sigma: Array
+    """sigma_use of the latter."""
+    plain: Array
+    plain_sigma: Array
+    methods: Array
+    """Errors of `METHODS` (5, 6), from the end of the longest span on; NaN where one has none."""
+    tilted: Array
+    """Errors of the two horizontal accelerometers in the longest span (references, draws, 2)."""
+
+
+def floors(part: str, seed: int, number: int) -> FloorRun:
+    """One stand of this part."""
+    posture = POSTURES[number % len(POSTURES)]
+    site = sites()[number // len(POSTURES) % len(sites())]
+    standing = stand(
+        part, posture, site, (seed, 2, FLOORED.index(part), number), anomaly_m_s2=GRAVITY_ANOMALY_M_S2
+    )  # fmt: skip
+    taken = ImuInput(name="imu", rotation=standing.imu.mounting, profile=noise_profile(part))
+    times, rows = samples(standing, SPANS_S[-1])
+    windows = collected(standing, taken, times, rows, SPANS_S)
+    references = References.drawn(FIELD_TILT_DEG, FIELD_HEADING_DEG, standing.random)
+    ideal, error, sigma, plain, plain_sigma = [], [], [], [], []
+    inside, truth = rows, np.zeros(6)
+    for window in windows:
+        truth = standing.bias(window.end_s, window.end_s + NEXT_S)
+        inside = standing.in_vehicle(whole_seconds(times, rows, window))
+        ideal.append(biases(solved(standing, window).imus[0]) - truth)
+        imu = solved(standing, window, references).imus[0]
+        error.append(biases(imu) - truth)
+        sigma.append(sigmas_use(imu))
+        naive, naive_sigma = peers.plain_mean(inside)
+        plain.append(naive - truth)
+        plain_sigma.append(naive_sigma)
+    return FloorRun(
+        posture=posture.name,
+        ideal=np.array(ideal),
+        error=np.array(error),
+        sigma=np.array(sigma),
+        plain=np.array(plain),
+        plain_sigma=np.array(plain_sigma),
+        methods=_methods(standing, windows[-1].end_s, inside.mean(axis=0)) - truth,
+        tilted=_tilted(standing, windows[-1], truth),
+    )
+
+
+def _methods(standing: Stand, end_s: float, mean: Array) -> Array:
+    """The biases that others find at the end of the longest window, or of the same readings."""
+    level, none = np.concatenate([np.zeros(3), peers.LEVEL]), np.full(3, np.nan)
+    still = paper.Still(standing.imu.aircraft.pose, standing.site)
+    return np.array(
+        [
+            mean - level,
+            peers.ardupilot(standing, end_s - 0.5),
+            np.concatenate([peers.px4_mean(standing, end_s - 1.0), none]),
+            peers.px4(standing, end_s - 1.0),
+            paper.biases(still, mean, paper.ALL),
+        ]
+    )
+
+
+def _tilted(standing: Stand, window: Window, truth: Array) -> Array:
+    rows = []
+    for name, sigma in TILTS:
+        if name.startswith("at most"):
+            drawn = standing.random.uniform(-1.0, 1.0, (TILT_DRAWS, 2)) * (sigma * math.sqrt(3.0))
+        else:
+            drawn = standing.random.normal(size=(TILT_DRAWS, 2)) * sigma
+        for x, y in drawn.tolist():
+            references = References(tilt_sigma_deg=sigma, tilt_error_deg=(x, y))
+            rows.append((biases(solved(standing, window, references).imus[0]) - truth)[3:5])
+    return np.array(rows).reshape(len(TILTS), TILT_DRAWS, 2)
+
+
+# ---------------------------------------------------------------------------------------------------------- integers
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IntegerRun:
+    """One stand whose readings are cut to whole mrad/s and mg; arrays (6), in steps."""
+
+    error: Array
+    """NaN: refused."""
+    sigma: Array
+    """sigma_stat; 0.5 and more where the readings do not tell."""
+    plain: Array
+    """Error of the plain mean with the Earth and the pose taken off."""
+    half: Array
+    """Likewise, of the mean half a step away from zero."""
+
+
+def integers(noise_lsb: float, seed: int, number: int) -> IntegerRun:
+    """One stand of noise of so many steps a reading, biases uniform over two and a half steps to either side."""
+    steps = np.repeat([STEP_RAD_S, MG], 3)
+    density = noise_lsb / np.sqrt(float(RATE_HZ))
+    spec = ImuSpec(name="cut", gyro=AxisNoise(white=density * STEP_RAD_S), accel=AxisNoise(white=density * MG))
+    random = np.random.default_rng([seed, 22, number])
+    bias = random.uniform(-2.5, 2.5, 6) * steps
+    posture = replace(POSTURES[2], pitch_deg=float(random.uniform(-8, 8)), roll_deg=float(random.uniform(-8, 8)))
+    standing = stand(
+        spec,
+        posture,
+        sites()[number % len(sites())],
+        (seed, 3, round(1000 * noise_lsb), number),
+        gyro_bias_rad_s=bias[:3],
+        accel_bias_m_s2=bias[3:],
+    )
+    taken = ImuInput(
+        name="imu",
+        rotation=np.eye(3),
+        profile=noise_profile("icm42688p"),
+        gyro_step_rad_s=STEP_RAD_S,
+        accel_step_m_s2=MG,
+        truncates=True,
+    )
+    times, exact = samples(standing, SPANS_S[-1])
+    rows = np.trunc(exact / steps) * steps
+    window = collected(standing, taken, times, rows, (SPANS_S[0], SPANS_S[-1]))[-1]
+    inside = whole_seconds(times, rows, window)
+    plain = inside.mean(axis=0) - standing.imu.expected(window.start_s)
+    half = plain + np.sign(inside.mean(axis=0)) * steps / 2.0
+    try:
+        imu = solved(standing, window).imus[0]
+    except CalibrationRefusedError:  # gyros and accelerometers
+        return IntegerRun(np.full(6, np.nan), np.full(6, np.nan), plain / steps, half / steps)
+    return IntegerRun((biases(imu) - bias) / steps, sigmas_stat(imu) / steps, plain / steps, half / steps)
+
+
+# ------------------------------------------------------------------------------------------------------------- paper
+
+
+def errata(seed: int, count: int) -> dict[paper.Erratum, Array]:
+    """What each error in print alone makes, (count, 6) FRD, of noise-free readings with usual biases.
+
+    Poses within 20 degrees, headings and sites as they come; a sensor of specific force, as all are.
+    """
+    random = np.random.default_rng([seed, 23])
+    found: dict[paper.Erratum, list[Array]] = {name: [] for name in paper.ERRATA}
+    for number in range(count):
+        posture = replace(
+            POSTURES[0], pitch_deg=float(random.uniform(-20, 20)), roll_deg=float(random.uniform(-20, 20))
+        )
+        standing = stand("perfect", posture, sites()[number % len(sites())], (seed, 4, number))
+        still = paper.Still(standing.imu.aircraft.pose, standing.site)
+        mean, truth = standing.imu.expected(0.0), standing.bias(0.0, 0.0)
+        for name, values in found.items():
+            values.append(paper.biases(still, mean, frozenset((name,))) - truth)
+    return {name: np.array(values) for name, values in found.items()}
+
+
+def predicted(noise: AxisNoise, mean_s: float, horizon_s: float) -> float:
+    """sqrt(V(T, H)) of method section 2.2, from the simulator's own figures."""
+    r = horizon_s / mean_s
+    phi = ((1.0 + r) ** 2 * np.log(1.0 + r) - r**2 * np.log(r)) / r - np.log(r)
+    variance = noise.white**2 / mean_s + noise.flicker**2 / np.pi * phi + noise.walk**2 * (mean_s + horizon_s) / 3.0
+    return float(np.sqrt(variance))

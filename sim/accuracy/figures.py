@@ -1,0 +1,56 @@
+"""Figures with their own uncertainty, out of many stands."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from sim.earth import Array
+
+
+class Figure(NamedTuple):
+    """A figure and its standard error."""
+
+    value: float
+    error: float
+
+    def times(self, factor: float) -> Figure:
+        """In another unit."""
+        return Figure(self.value * factor, self.error * abs(factor))
+
+
+def rms(errors: Array) -> Figure:
+    """Root mean square of errors (stands, …), the standard error by the scatter between stands; NaN are left out."""
+    each = np.square(errors).reshape(len(errors), -1)
+    square = float(np.nanmean(each))
+    counted = np.isfinite(each).sum(axis=1)
+    # A ratio of sums over stands, for stands may count differently.
+    apart = np.nansum(each - square, axis=1)
+    error = math.sqrt(float(np.square(apart).sum())) / float(counted.sum())
+    return Figure(math.sqrt(square), error / (2.0 * math.sqrt(square)) if square > 0.0 else 0.0)
+
+
+def covered(errors: Array, sigmas: Array, times: float) -> Figure:
+    """Share of errors (stands, …) within so many sigmas, likewise."""
+    inside = (np.abs(errors) <= times * sigmas).astype(np.float64).reshape(len(errors), -1)
+    known = np.isfinite(errors).reshape(len(errors), -1)
+    count = float(known.sum())
+    if count == 0.0:
+        return Figure(math.nan, math.nan)
+    share = float((inside * known).sum()) / count
+    apart = ((inside - share) * known).sum(axis=1)
+    # At 0 or 100 % the scatter says nothing: then as of one more that is on the other side.
+    return Figure(share, max(math.sqrt(float(np.square(apart).sum())), 1.0 if share in {0.0, 1.0} else 0.0) / count)
+
+
+def beside(errors: Array, efficient: Array) -> Figure:
+    """Rms of errors over that of an efficient estimator on the same readings, in units of the bound (stands, …).
+
+    What is added to an efficient estimator is uncorrelated with it (Rao), so this is sqrt(1 + rms(difference)^2): the
+    luck of the readings, which both share, falls out, and few stands tell a per cent.
+    """
+    added = rms(errors - efficient)
+    value = math.sqrt(1.0 + added.value**2)
+    return Figure(value, added.value * added.error / value)

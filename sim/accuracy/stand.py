@@ -1,0 +1,270 @@
+"""One aircraft standing still: a simulated IMU read sample by sample into the collector that flies, and its solution.
+
+Nothing of the estimator is copied or shortened: samples go into `RollingCollector` (seconds, stillness, stretch, robust
+means, ramps, sigmas), its windows into `solve` (pose, Earth, biases, covariance). The truth, its noise, its Earth and
+its gradienter are the simulator's own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from companion.calibration.pose_models import CompassModel, GradienterModel
+from companion.calibration.request import What
+from companion.calibration.rolling import RollingCollector, Settings, Window
+from companion.calibration.site import LocalEarth, local_earth
+from companion.calibration.solve import ImuSolution, Solution, solve
+from companion.calibration.windows import ImuInput
+from companion.physics.gradienter import Law
+from companion.samples import CompassSample, ImuSample, TiltSample
+from sim.aircraft import Pose, Site, VirtualAircraft
+from sim.devices import Gradienter
+from sim.earth import Array
+from sim.experiments.still import whereabouts
+from sim.imu_model import DEG_H, MG, ImuModel, ImuSpec
+from sim.scenario import site_at
+
+BEGIN_S: Final = 0.5
+"""The stream begins in the middle of a second, which is not counted; the windows begin at 1 s."""
+NEXT_S: Final = 180.0
+RATE_HZ: Final = 100
+GYRO_BIAS_RAD_S: Final = 100.0 * DEG_H
+"""One sigma of the bias of a power-up, as the paper's tables scatter (method section 1.3)."""
+ACCEL_BIAS_M_S2: Final = 2.0 * MG
+GRAVITY_ANOMALY_M_S2: Final = 3.0e-4
+"""30 mGal, one sigma: what the formula of normal gravity leaves (method section 2.1)."""
+_CLOSE_S: Final = 0.3
+_TILT_HZ: Final = 10.0
+_TILT_NOISE_DEG: Final = 1e-4
+_HEADING_HZ: Final = 8.0
+_HEADING_NOISE_DEG: Final = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Posture:
+    """How it stands, and with what: degrees; the law of the gradienter; the IMU's mounting."""
+
+    name: str
+    pitch_deg: float
+    roll_deg: float
+    law: Law = "axis"
+    mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    by_eye_deg: float = 0.0
+    """One sigma of what is added to pitch and roll, by somebody who levels it by eye."""
+
+
+POSTURES: Final = (
+    Posture("level", 0.0, 0.0),
+    Posture("by eye", 0.0, 0.0, "slope", by_eye_deg=0.5),
+    Posture("5/-3", 5.0, -3.0),
+    Posture("20/15", 20.0, 15.0, "slope", (180.0, 0.0, 90.0)),
+    Posture("inverted", 10.0, 170.0, "euler"),
+)
+"""The last hangs on its back, which gradienters of law "euler" can tell; the one before carries its IMU upside down."""
+
+
+@functools.cache
+def sites() -> tuple[Site, ...]:
+    """The equator, 45 N, 60 N and the south, each with its magnetic field."""
+    places = ((0.0, -78.0, 2800.0), (45.0, 10.0, 100.0), (60.0, 25.0, 20.0), (-35.0, 149.0, 580.0))
+    return tuple(site_at(*place) for place in places)
+
+
+@functools.cache
+def _local(site: Site) -> LocalEarth:
+    return local_earth(whereabouts(site))
+
+
+@dataclass(frozen=True, slots=True)
+class AnomalousSite(Site):
+    """A place where gravity is not that of the formula."""
+
+    anomaly_m_s2: float = 0.0
+
+    @property
+    def gravity_m_s2(self) -> float:
+        """What a pendulum measures there."""
+        return super(AnomalousSite, self).gravity_m_s2 + self.anomaly_m_s2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stand:
+    """An aircraft at rest with one IMU."""
+
+    posture: Posture
+    site: Site
+    """As its formula has it; the aircraft's own may have an anomaly."""
+    imu: ImuModel
+    random: np.random.Generator
+
+    @property
+    def heading_deg(self) -> float:
+        """True."""
+        return self.imu.aircraft.pose.heading_deg
+
+    def read(self, start_s: float, period_s: float, count: int) -> Array:
+        """`count` readings (count, 6) in vehicle FRD, each the mean over `period_s`, from `start_s` on."""
+        times = start_s + (np.arange(count, dtype=np.float64) + 0.5) * period_s
+        return self.in_vehicle(self.imu.read(times, period_s))
+
+    def in_vehicle(self, rows: Array) -> Array:
+        """Readings (…, 6) of sensor axes in the vehicle's."""
+        turn = self.imu.mounting.T
+        return np.concatenate([rows[..., :3] @ turn, rows[..., 3:] @ turn], axis=-1)
+
+    def bias(self, start_s: float, end_s: float) -> Array:
+        """The true mean bias (6) over a time, vehicle FRD."""
+        return self.in_vehicle(np.concatenate(self.imu.mean_bias(start_s, end_s)))
+
+
+def stand(
+    spec: ImuSpec | str,
+    posture: Posture,
+    site: Site,
+    seed: Sequence[int],
+    *,
+    anomaly_m_s2: float = 0.0,
+    gyro_bias_rad_s: Array | None = None,
+    accel_bias_m_s2: Array | None = None,
+) -> Stand:
+    """Put one up: its heading, its biases (unless given, in sensor axes) and its noise come from the seed."""
+    random = np.random.default_rng([*seed, 21])
+    tilt = random.normal(size=2) * posture.by_eye_deg
+    heading_deg = float(random.uniform(0.0, 360.0))
+    pose = Pose(posture.pitch_deg + float(tilt[0]), posture.roll_deg + float(tilt[1]), heading_deg)
+    here = AnomalousSite(**dataclasses.asdict(site), anomaly_m_s2=float(random.normal() * anomaly_m_s2))
+    gyro, accel = random.normal(size=3) * GYRO_BIAS_RAD_S, random.normal(size=3) * ACCEL_BIAS_M_S2
+    imu = ImuModel(
+        VirtualAircraft(pose, here),
+        spec,
+        seed=int(random.integers(2**62)),
+        gyro_bias_rad_s=(gyro if gyro_bias_rad_s is None else gyro_bias_rad_s).tolist(),
+        accel_bias_m_s2=(accel if accel_bias_m_s2 is None else accel_bias_m_s2).tolist(),
+        mounting_deg=posture.mounting_deg,
+    )
+    return Stand(posture, site, imu, random)
+
+
+def samples(standing: Stand, seconds: float, rate_hz: int = RATE_HZ) -> tuple[Array, Array]:
+    """What the IMU says from `BEGIN_S` until `seconds` good ones are over: times (n) and readings (n, 6), its axes."""
+    times = BEGIN_S + (np.arange(round((1.0 - BEGIN_S + seconds) * rate_hz)) + 0.5) / rate_hz
+    return times, standing.imu.read(times, 1.0 / rate_hz)
+
+
+def collected(
+    standing: Stand, taken: ImuInput, times: Array, rows: Array, spans_s: Sequence[int], *, horizon_s: float = NEXT_S
+) -> list[Window]:
+    """The windows after so many seconds each (ascending), fed sample by sample in the order of time.
+
+    Gradienter and compass are read without an error of their own; what a reference is wrong by comes in `solved`.
+
+    Raises:
+        CalibrationRefusedError: as `RollingCollector.window`.
+    """
+    wanted = Settings(
+        min_still_s=float(spans_s[0]),
+        max_s=float(spans_s[-1]),
+        target_gyro_sigma_rad_s=0.0,
+        target_accel_sigma_m_s2=0.0,
+        horizon_s=horizon_s,
+    )
+    collector = RollingCollector(wanted, [taken], gradienter=True, compass=True)
+    tilts, headings = _tilts(standing, float(times[-1])), _headings(standing, float(times[-1]))
+    found: list[Window] = []
+    spans = list(spans_s)
+    for t_s, (p, q, r, x, y, z) in zip(times.tolist(), rows.tolist(), strict=True):
+        if spans and t_s >= 1.0 + spans[0]:
+            found.append(collector.window(1.0 + spans.pop(0) + _CLOSE_S))
+        while tilts and tilts[-1].t_s <= t_s:
+            collector.add_tilt(tilts.pop())
+        while headings and headings[-1].t_s <= t_s:
+            collector.add_compass(headings.pop())
+        collector.add_imu(taken.name, ImuSample(t_s, (p, q, r), (x, y, z)))
+    return found + [collector.window(1.0 + span + _CLOSE_S) for span in spans]
+
+
+def _tilts(standing: Stand, until_s: float) -> list[TiltSample]:
+    """Latest first."""
+    times = np.arange(BEGIN_S, until_s, 1.0 / _TILT_HZ)
+    device = Gradienter(standing.imu.aircraft, law=standing.posture.law, range_deg=360.0)
+    readings = device.tilt_deg(times) + standing.random.normal(size=(len(times), 2)) * _TILT_NOISE_DEG
+    return [TiltSample(t_s, x, y) for t_s, (x, y) in zip(times.tolist(), readings.tolist(), strict=True)][::-1]
+
+
+def _headings(standing: Stand, until_s: float) -> list[CompassSample]:
+    """Latest first."""
+    times = np.arange(BEGIN_S, until_s, 1.0 / _HEADING_HZ)
+    noise = standing.random.normal(size=len(times)) * _HEADING_NOISE_DEG
+    readings = np.mod(standing.heading_deg - standing.site.declination_deg + noise, 360.0)
+    return [CompassSample(t_s, heading) for t_s, heading in zip(times.tolist(), readings.tolist(), strict=True)][::-1]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class References:
+    """What tilt and heading are believed to be good to, and what they are wrong by; degrees."""
+
+    tilt_sigma_deg: float = 0.0
+    tilt_error_deg: tuple[float, float] = (0.0, 0.0)
+    heading_sigma_deg: float = 0.0
+    heading_error_deg: float = 0.0
+
+    @classmethod
+    def drawn(cls, tilt_sigma_deg: float, heading_sigma_deg: float, random: np.random.Generator) -> References:
+        """Wrong by what their sigmas say."""
+        x, y, heading = (random.normal(size=3) * [tilt_sigma_deg, tilt_sigma_deg, heading_sigma_deg]).tolist()
+        return cls(
+            tilt_sigma_deg=tilt_sigma_deg,
+            tilt_error_deg=(x, y),
+            heading_sigma_deg=heading_sigma_deg,
+            heading_error_deg=heading,
+        )
+
+
+EXACT: Final = References()
+
+
+def solved(standing: Stand, window: Window, references: References = EXACT) -> Solution:
+    """The solution of one window.
+
+    A reading that is wrong by e and taken as it is does what a right one does from which -e is taken off.
+
+    Raises:
+        CalibrationRefusedError: as `solve`.
+    """
+    x, y = references.tilt_error_deg
+    tilt = GradienterModel(standing.posture.law, np.eye(3), (-x, -y), references.tilt_sigma_deg)
+    heading = CompassModel(
+        magnetic=True,
+        vehicle_from_sensor=np.eye(3),
+        offset_deg=references.heading_error_deg,
+        sigma_deg=references.heading_sigma_deg,
+    )
+    return solve(window, _local(standing.site), tilt, heading, What.BOTH)
+
+
+def biases(found: ImuSolution) -> Array:
+    """(6,) as found, vehicle FRD; NaN where a triad is refused."""
+    refused = np.full(3, math.nan)
+    return np.concatenate(
+        [
+            refused if found.gyro_rad_s is None else found.gyro_rad_s,
+            refused if found.accel_m_s2 is None else found.accel_m_s2,
+        ]
+    )
+
+
+def sigmas_stat(found: ImuSolution) -> Array:
+    """(6,) sigma_stat."""
+    return np.concatenate([found.gyro_sigma_stat_rad_s, found.accel_sigma_stat_m_s2])
+
+
+def sigmas_use(found: ImuSolution) -> Array:
+    """(6,) sigma_use."""
+    return np.sqrt(np.diag(found.covariance))

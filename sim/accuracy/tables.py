@@ -1,0 +1,387 @@
+"""The experiments as tables for people, as figures for machines, and as claims that hold or do not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from sim.accuracy import paper
+from sim.accuracy.experiments import (
+    FIELD_HEADING_DEG,
+    FIELD_TILT_DEG,
+    FLOORED,
+    METHODS,
+    NOISE_LSB,
+    SPANS_S,
+    STEP_RAD_S,
+    TILTS,
+    FloorRun,
+    IntegerRun,
+    WhiteRun,
+    errata,
+    floors,
+    integers,
+    many,
+    predicted,
+    white,
+)
+from sim.accuracy.figures import Figure, beside, covered, rms
+from sim.accuracy.stand import NEXT_S, POSTURES
+from sim.earth import STANDARD_GRAVITY_M_S2, Array
+from sim.imu_model import DEG_H, MG, PARTS, UG
+
+UPRIGHT: Final = ("level", "by eye", "5/-3")
+"""Where the horizontal accelerometers are the body's x and y."""
+PAPER_LEFT_UG: Final = (56.80, 36.24)
+"""Mean absolute E and N of the paper's table 1, worked out again (method section 1.3)."""
+SECTIONS: Final = ("white", "floors", "methods", "tilt", "integers", "paper")
+_TRIADS: Final = (("gyro", "deg/h", DEG_H, slice(0, 3)), ("accel", "ug", UG, slice(3, 6)))
+_LSB_DEG_H: Final = STEP_RAD_S / DEG_H
+_REFERENCES: Final = f"gradienter {FIELD_TILT_DEG:g} deg, compass {FIELD_HEADING_DEG:g} deg"
+_HALF_A_STEP: Final = 0.45
+"""A sigma_stat of so many steps is no measurement."""
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """What must hold, and whether it does: beyond what chance does with this number of stands (three sigmas)."""
+
+    words: str
+    unit: str
+    found: Figure
+    at_most: float
+    at_least: float = 0.0
+
+    @property
+    def holds(self) -> bool:
+        """Whether it does."""
+        slack = 3.0 * self.found.error
+        return self.at_least - slack <= self.found.value <= self.at_most + slack
+
+    def __str__(self) -> str:
+        allowed = f"<= {self.at_most:g}" if not self.at_least else f"{self.at_least:g} to {self.at_most:g}"
+        return (
+            f"{'yes' if self.holds else 'NO':4}{self.words:55}{self.found.value:9.3f} +- {self.found.error:.3f}"
+            f" {self.unit:6}{allowed:>11}"
+        )
+
+
+@dataclass(slots=True)
+class Section:
+    """One table."""
+
+    title: str
+    lines: list[str]
+    figures: dict[str, Any]
+    claims: list[Claim] = field(default_factory=list)
+
+
+def report(
+    runs: int, seed: int, only: tuple[str, ...], jobs: int, progress: Callable[[str], None]
+) -> dict[str, Section]:
+    """All sections asked for, by name.
+
+    Args:
+        runs: stands with white noise; a fifth of it of every part, a twentieth for every step of noise under integers.
+        seed: of everything.
+        only: of `SECTIONS`.
+        jobs: processes.
+        progress: is told what begins.
+    """
+    found: dict[str, Section] = {}
+    if "white" in only:
+        progress(f"white noise: {runs} stands")
+        found["white"] = _white(many(white, [(seed, number) for number in range(runs)], jobs))
+    if {"floors", "methods", "tilt"} & set(only):
+        each = max(runs // 5, len(POSTURES))
+        progress(f"flicker and walk: {each} stands of each of {len(FLOORED)} parts")
+        work = [(part, seed, number) for part in FLOORED for number in range(each)]
+        flat = many(floors, work, jobs)
+        parts = {part: flat[each * index : each * (index + 1)] for index, part in enumerate(FLOORED)}
+        for name, make in (("floors", _floors), ("methods", _methods), ("tilt", _tilt)):
+            if name in only:
+                found[name] = make(parts)
+    if "integers" in only:
+        each = max(runs // 20, 4)
+        progress(f"integers: {each} stands of each of {len(NOISE_LSB)} noises")
+        cut = many(integers, [(noise, seed, number) for noise in NOISE_LSB for number in range(each)], jobs)
+        found["integers"] = _integers(
+            {noise: cut[each * index : each * (index + 1)] for index, noise in enumerate(NOISE_LSB)}
+        )
+    if "paper" in only:
+        found["paper"] = _paper(errata(seed, 400))
+    return found
+
+
+def _percent(figure: Figure) -> str:
+    return f"{100.0 * figure.value:6.1f} %"
+
+
+def _white(runs: list[WhiteRun]) -> Section:
+    error, sigma = np.array([run.error for run in runs]), np.array([run.sigma for run in runs])
+    plain, plain_sigma = np.array([run.plain for run in runs]), np.array([run.plain_sigma for run in runs])
+    lines = [
+        "rms error over the Cramer-Rao bound N / sqrt(T); beside: over the plain mean of the same readings",
+        "",
+        "        gyro                 accelerometer             beside   sigma_stat covers    plain mean",
+        "         x     y     z         x     y     z     all  the mean  1 sigma  2 sigma     all  2 sigma",
+    ]
+    figures: dict[str, Any] = {}
+    claims = []
+    for index, span in enumerate(SPANS_S):
+        axes = [rms(error[:, index, axis]) for axis in range(6)]
+        whole, efficient = rms(error[:, index]), beside(error[:, index], plain[:, index])
+        by_axis = [beside(error[:, index, axis], plain[:, index, axis]) for axis in range(6)]
+        once, twice = (covered(error[:, index], sigma[:, index], times) for times in (1.0, 2.0))
+        simple = rms(plain[:, index])
+        simple_twice = covered(plain[:, index], plain_sigma[:, index], 2.0)
+        lines.append(
+            f"{span:3d} s"
+            + "".join(f"{axis.value:{10 if at == 3 else 6}.3f}" for at, axis in enumerate(axes))
+            + f"{whole.value:8.3f}{efficient.value:10.3f} {_percent(once)} {_percent(twice)}"
+            + f"{simple.value:8.3f} {_percent(simple_twice)}"
+        )
+        figures[f"{span} s"] = {
+            "axes": axes,
+            "axes_beside_the_mean": by_axis,
+            "all": whole,
+            "beside_the_mean": efficient,
+            "covered_1_sigma": once,
+            "covered_2_sigma": twice,
+            "plain_mean": simple,
+            "plain_mean_covered_2_sigma": simple_twice,
+        }
+        worst = max(by_axis)
+        claims.append(Claim(f"white noise, {span} s: worst axis over the bound", "", worst, 1.05))
+        claims.append(Claim(f"white noise, {span} s: 2 sigma of sigma_stat cover", "%", twice.times(100.0), 97.0, 94.0))
+    last = figures[f"{SPANS_S[-1]} s"]
+    lines += [
+        "",
+        f"Standard errors: one axis {last['axes'][0].error:.3f}, all {last['all'].error:.3f},",
+        f"beside the mean {last['beside_the_mean'].error:.4f}, coverage {100.0 * last['covered_2_sigma'].error:.2f} %.",
+        "The plain mean attains the bound; beside it the luck of the readings falls out.",
+    ]
+    return Section(f"White noise only, perfect references ({len(runs)} stands)", lines, figures, claims)
+
+
+def _stack(runs: list[FloorRun], name: str) -> Array:
+    return np.array([getattr(run, name) for run in runs])
+
+
+def _upright(runs: list[FloorRun]) -> list[FloorRun]:
+    return [run for run in runs if run.posture in UPRIGHT]
+
+
+def _floors(parts: dict[str, list[FloorRun]]) -> Section:
+    lines = [
+        f"rms error against the mean bias of the next {NEXT_S:.0f} s; bound: N / sqrt(T); V: V(T, {NEXT_S:.0f} s)",
+        "",
+        f"{'':65}sigma_use covers      plain mean",
+        f"{'':27}bound sqrt V    rms   +-  worst    /V  1 sigma  2 sigma     rms  2 sigma",
+    ]
+    figures: dict[str, Any] = {}
+    claims = []
+    for part, runs in parts.items():
+        level = _upright(runs)
+        for triad, unit, scale, columns in _TRIADS:
+            gyro = triad == "gyro"
+            noise = PARTS[part].gyro if gyro else PARTS[part].accel
+            for index, span in enumerate(SPANS_S):
+                ideal = _stack(runs, "ideal")[:, index, :3] if gyro else _stack(level, "ideal")[:, index, 3:5]
+                found = rms(ideal).times(1.0 / scale)
+                worst = max(rms(ideal[:, axis]).value / scale for axis in range(ideal.shape[1]))
+                bound, use = noise.white / np.sqrt(span) / scale, predicted(noise, span, NEXT_S) / scale
+                error, sigma = _stack(runs, "error")[:, index, columns], _stack(runs, "sigma")[:, index, columns]
+                once, twice = (covered(error, sigma, times) for times in (1.0, 2.0))
+                words = f"{part if gyro and not index else '':10}{f'{triad}, {unit}' if not index else '':11}"
+                line = (
+                    f"{words}{span:3d} s{bound:7.1f}{use:7.1f}{found.value:7.1f}{found.error:5.1f}{worst:7.1f}"
+                    f"{found.value / use:6.2f} {_percent(once)} {_percent(twice)}"
+                )
+                each = figures.setdefault(part, {}).setdefault(triad, {})[f"{span} s"] = {
+                    "unit": unit,
+                    "bound": bound,
+                    "sqrt_v": use,
+                    "rms": found,
+                    "worst_axis": worst,
+                    "covered_1_sigma": once,
+                    "covered_2_sigma": twice,
+                }
+                if gyro:
+                    plain, plain_sigma = _stack(runs, "plain")[:, index, :3], _stack(runs, "plain_sigma")[:, index, :3]
+                    simple, simple_twice = rms(plain).times(1.0 / scale), covered(plain, plain_sigma, 2.0)
+                    line += f"{simple.value:8.1f} {_percent(simple_twice)}"
+                    each |= {"plain_mean": simple, "plain_mean_covered_2_sigma": simple_twice}
+                lines.append(line)
+                if part == "icm42688p" and gyro and span == SPANS_S[-1]:
+                    claims.append(Claim("ICM-42688-P gyro, 60 s, next 180 s: rms", "deg/h", found, 5.5))
+    lines += [
+        "",
+        "rms and worst axis: perfect references; of accelerometers the two horizontal ones, upright stands.",
+        f"Coverage: all axes, {_REFERENCES}, gravity 30 mGal off.",
+        "The plain mean takes the Earth for at rest and its sigma for s / sqrt(n).",
+    ]
+    count = len(next(iter(parts.values())))
+    return Section(f"Parts with flicker and walk ({count} stands each)", lines, figures, claims)
+
+
+def _methods(parts: dict[str, list[FloorRun]]) -> Section:
+    names = ("companion", *METHODS)
+    lines = ["gyro, rms deg/h against the bias of the next 180 s; biases of a power-up are 100 deg/h, 1 sigma", ""]
+    lines.append(f"{'':12}" + "".join(f"{name:>14}" for name in names))
+    figures: dict[str, Any] = {"gyro_deg_h": {}, "accel_mg": {}}
+    for part, runs in parts.items():
+        errors = np.concatenate([_stack(runs, "error")[:, -1:], _stack(runs, "methods")], axis=1)
+        found = [rms(errors[:, row, :3]).times(1.0 / DEG_H) for row in range(len(names))]
+        figures["gyro_deg_h"][part] = dict(zip(names, found, strict=True))
+        lines.append(f"{part:12}" + "".join(f"{one.value:14.1f}" for one in found))
+    runs = parts["icm42688p"]
+    lines += ["", "accelerometers of an ICM-42688-P, rms mg horizontal / vertical; biases 2 mg, 1 sigma", ""]
+    lines.append(f"{'':10}" + "".join(f"{name:>17}" for name in names if name != METHODS[2]))
+    for posture in UPRIGHT:
+        here = [run for run in runs if run.posture == posture]
+        errors = np.concatenate([_stack(here, "error")[:, -1:], _stack(here, "methods")], axis=1)
+        line, row_of = f"{posture:10}", figures["accel_mg"].setdefault(posture, {})
+        for row, name in enumerate(names):
+            if name == METHODS[2]:
+                continue
+            flat, down = (rms(errors[:, row, part]).times(1.0 / MG) for part in (slice(3, 5), slice(5, 6)))
+            row_of[name] = {"horizontal": flat, "vertical": down}
+            line += f"{_short(flat.value)} / {_short(down.value):>6}".rjust(17)
+        lines.append(line)
+    lines += [
+        "",
+        f"Companion ({_REFERENCES}), plain mean, paper (exact angles): 60 s.",
+        "ArduPilot: half a second; PX4, mean: one. By eye: level to 0.5 deg, 1 sigma. PX4, in force: a vector",
+        "below 0.01 (rad/s, m/s^2) is not taken, and the accelerometers are levelled by themselves.",
+    ]
+    return Section("Beside what else is done", lines, figures)
+
+
+def _short(value: float) -> str:
+    return f"{value:.3f}" if value < 1.0 else f"{value:.1f}"
+
+
+def _tilt(parts: dict[str, list[FloorRun]]) -> Section:
+    runs = _upright(parts["icm42688p"])
+    lines = [
+        "horizontal accelerometers of an ICM-42688-P after 60 s, against the bias of the next 180 s; ug",
+        "",
+        "tilt reference       its own error     rms    +-   over it   mean of |error|",
+    ]
+    figures: dict[str, Any] = {}
+    claims = []
+    tilted = _stack(runs, "tilted")
+    for index, (name, sigma) in enumerate(TILTS):
+        own = float(np.radians(sigma)) * STANDARD_GRAVITY_M_S2 / UG
+        found = rms(tilted[:, index]).times(1.0 / UG)
+        apart = np.abs(tilted[:, index]).mean(axis=(1, 2)) / UG
+        size = Figure(float(apart.mean()), float(apart.std(ddof=1)) / float(np.sqrt(len(apart))))
+        over = found.times(1.0 / own)
+        figures[name] = {"own_ug": own, "rms_ug": found, "over_its_own": over, "mean_absolute_ug": size}
+        lines.append(
+            f"{name:20}{own:14.1f}{found.value:8.1f}{found.error:6.1f}{over.value:10.3f}{size.value:18.1f}"
+        )  # fmt: skip
+        if name.startswith("at most"):
+            claims.append(Claim("tilt at most 10 arcsec off: mean of |error|", "ug", size, min(PAPER_LEFT_UG)))
+        else:
+            claims.append(Claim(f"tilt of {name}: rms over the reference's own", "", over, 1.10))
+    east, north = PAPER_LEFT_UG
+    lines += [
+        "",
+        f"The paper, five stands, turntable of 10 arcsec: mean of |error| {east:.1f} ug east, {north:.1f} ug north.",
+    ]
+    return Section(f"The tilt reference rules ({len(runs)} upright stands)", lines, figures, claims)
+
+
+def _integers(noises: dict[float, list[IntegerRun]]) -> Section:
+    lines = [
+        "steps of 1 mrad/s = 206 deg/h and 1 mg; noise in steps a reading; 60 s at 100 Hz; sigma_stat covers",
+        "",
+        "              by share                gyro, deg/h      accel, mg         covers    plain mean, deg/h",
+        "noise refused  1/2 step measured     rms    max     rms    max  1 sigma  2 sigma    rms   max +1/2",
+    ]
+    figures: dict[str, Any] = {}
+    claims = []
+    for noise, runs in noises.items():
+        error, sigma = np.array([run.error for run in runs]), np.array([run.sigma for run in runs])
+        plain, half = np.array([run.plain for run in runs]), np.array([run.half for run in runs])
+        refused = np.isnan(error)
+        coarse = ~refused & (sigma >= _HALF_A_STEP)
+        measured = np.where(refused | coarse, np.nan, error)
+        shares = [float(one.mean()) for one in (refused, coarse, ~refused & ~coarse)]
+        words = f"{noise:5.1f}" + "".join(f"{100.0 * share:7.1f} %" for share in shares)
+        each: dict[str, Any] = {
+            "refused": shares[0],
+            "half_a_step": shares[1],
+            "measured": shares[2],
+            "plain_rms_deg_h": rms(plain).times(_LSB_DEG_H),
+            "plain_max_deg_h": float(np.abs(plain).max()) * _LSB_DEG_H,
+            "plain_and_half_a_step_rms_deg_h": rms(half).times(_LSB_DEG_H),
+        }
+        figures[f"{noise:g}"] = each
+        simple = (
+            f"{each['plain_rms_deg_h'].value:7.0f}{each['plain_max_deg_h']:6.0f}"
+            f"{each['plain_and_half_a_step_rms_deg_h'].value:5.0f}"
+        )
+        if shares[2] > 0.0:
+            gyro, accel = measured[:, :3], measured[:, 3:]
+            once, twice = (covered(measured, sigma, times) for times in (1.0, 2.0))
+            largest = (float(np.nanmax(np.abs(gyro))) * _LSB_DEG_H, float(np.nanmax(np.abs(accel))))
+            each |= {
+                "rms_deg_h": rms(gyro).times(_LSB_DEG_H),
+                "max_deg_h": largest[0],
+                "rms_mg": rms(accel),
+                "max_mg": largest[1],
+                "covered_1_sigma": once,
+                "covered_2_sigma": twice,
+            }
+            words += (
+                f"{each['rms_deg_h'].value:8.1f}{largest[0]:7.1f}{each['rms_mg'].value:8.3f}{largest[1]:7.3f}"
+                f" {_percent(once)} {_percent(twice)}"
+            )
+            if 0.3 <= noise <= 1.0:
+                claims.append(
+                    Claim(f"integers, noise {noise:g}: largest gyro error", "deg/h", Figure(largest[0], 0.0), 15.0)
+                )
+                claims.append(
+                    Claim(f"integers, noise {noise:g}: largest accel error", "mg", Figure(largest[1], 0.0), 0.15)
+                )
+        else:
+            words += f"{'-':>8}{'-':>7}{'-':>8}{'-':>7}{'-':>9}{'-':>9}"
+        if coarse.any():
+            kept = covered(np.where(coarse, error, np.nan), sigma, 1.0)
+            each["half_a_step_covered_1_sigma"] = kept
+            claims.append(
+                Claim(f"integers, noise {noise:g}: half a step covers", "%", kept.times(100.0), 100.0, 99.9)
+            )  # fmt: skip
+        lines.append(words + simple)
+    lines += [
+        "",
+        "Refused: around zero, where nothing is known but that the bias is small. Half a step: sigma says so,",
+        "and every error lies within one sigma. The plain means, and those half a step further from zero",
+        "(+1/2, rms), have the Earth and the pose taken off.",
+    ]
+    count = len(next(iter(noises.values())))
+    return Section(f"Integers cut toward zero ({count} stands of six axes each)", lines, figures, claims)
+
+
+def _paper(found: dict[paper.Erratum, Array]) -> Section:
+    lines = [
+        "what each error in print makes by itself, rms; accelerometers of specific force, poses within 20 deg",
+        "",
+        f"{'':62}right  forward       up",
+    ]
+    figures: dict[str, Any] = {}
+    for name, errors in found.items():
+        accel = name.startswith("4")
+        scale, unit = (MG, "mg") if accel else (DEG_H, "deg/h")
+        triad = errors[:, 3:] if accel else errors[:, :3]
+        # Body axes of the paper: right, forward, up.
+        axes = [rms(triad[:, axis]).times(1.0 / scale) for axis in (1, 0, 2)]
+        figures[name] = {"words": paper.ERRATA[name], "unit": unit, "right_forward_up": axes}
+        lines.append(f"{paper.ERRATA[name]:58}" + "".join(f"{axis.value:9.1f}" for axis in axes) + f"  {unit}")
+    return Section("The paper's equations as printed", lines, figures)
