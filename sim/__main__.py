@@ -1,4 +1,4 @@
-"""`python -m sim devices | autopilot | all | demo | ardupilot | px4 | residuals | turntable | drive | flights`."""
+"""`python -m sim COMMAND`: devices, autopilot, all, demo, ardupilot, px4, residuals, turntable, drive, flights, rest."""
 
 from __future__ import annotations
 
@@ -23,6 +23,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         from sim.experiments.turntable import main as turntable
 
         return turntable(arguments[1:])
+    if arguments[:1] == ["rest"]:
+        from sim.experiments.rest import main as rest
+
+        return rest(arguments[1:])
     if arguments[:1] in (["drive"], ["flights"]):
         from sim.experiments.journeys import main as journeys
 

@@ -164,11 +164,20 @@ def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s
 def _notes(
     finding: Finding, against: NoiseProfile, found: Sequence[Rests], kept: Sequence[Kept], obstacle: str
 ) -> list[str]:
+    import numpy as np
+
     notes = []
+    unseen = not any(np.isfinite(rest.temperature_degc).any() for each in found for rest in each.stretches)
     if finding.kept:
-        notes.append(f"too short to tell {', '.join(finding.kept)}: those are of profile {against.name!r} or below")
+        notes.append(
+            f"too short to tell {', '.join(finding.kept)}: as in {against.name!r}, as far as the recordings allow"
+        )
     if finding.still_s < SHORT_S:
         notes.append("less than 20 min at rest: an hour tells N and B, a night K too")
+    if not any(axis.per_kelvin or axis.drift_per_s for axis in finding.axes) and unseen:
+        walking = [name for name, axis, *_ in _named(finding) if axis.fit.known[2]]
+        if walking:
+            notes.append(f"K of {', '.join(walking)}: may be warm-up, or the room's temperature, which is not recorded")
     moved_s = sum(each.seconds - each.still_s for each in found)
     if moved_s:
         notes.append(f"{moved_s} s were not at rest and are left out{f' ({obstacle})' if obstacle else ''}")
@@ -208,7 +217,7 @@ def _lines(result: Result) -> list[str]:
     span = _temperatures(result.logs)
     degc = "" if span is None else f", {span[0]:.1f} to {span[1]:.1f} degC"
     lines = [f"imu {result.imu}: {finding.still_s / 3600.0:.2f} h at rest in {recordings}{degc}"]
-    lines.append(f"{'':24} {'N, per s':>16} {'floor A':>16} {'K, over sqrt(s)':>16}")
+    lines.append(f"{'':24} {'N, x sqrt(s)':>16} {'floor A':>16} {'K, / sqrt(s)':>16}")
     for name, axis, unit, unit_name, digits in _named(finding):
         cells = [_cell(axis, which, unit, digits) for which in range(3)]
         lines.append(f"{name + ', ' + unit_name:24} {cells[0]:>16} {cells[1]:>16} {cells[2]:>16}")
