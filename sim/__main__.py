@@ -1,4 +1,4 @@
-"""`python -m sim COMMAND`: devices, autopilot, all, demo, ardupilot, px4, residuals, turntable, drive, flights, rest."""
+"""`python -m sim WHAT`: devices, autopilot, all, demo, ardupilot, px4, residuals, turntable, drive, flights, rest."""
 
 from __future__ import annotations
 

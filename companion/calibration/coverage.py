@@ -41,10 +41,14 @@ class Kept(msgspec.Struct, frozen=True, kw_only=True):
     """Of the misses, rad/s or m/s^2."""
     sigma_use: float
     """Median of sqrt(V(T, H))."""
+    sigma_other: float
+    """Likewise, were the noise that of the profile it is compared with."""
     share: float
     """Within 2 sigma of the bias; that the minute's own white noise is in what is seen of it is allowed for."""
     share_strict: float
     """Within 2 sigma_use as it stands."""
+    share_other: float
+    """As `share`, by the profile it is compared with."""
     share_naive: float
     """Within 2 s / sqrt(n), of all samples of the window."""
 
@@ -54,6 +58,7 @@ class _Misses(msgspec.Struct):
 
     miss: list[Floats]
     use: list[Floats]
+    other: list[Floats]
     seen: list[Floats]
     """Variance of what is seen of the next minute, about its bias."""
     naive: list[Floats]
@@ -65,7 +70,7 @@ def coverage(recordings: Sequence[Sequence[Rest]], fallback: NoiseProfile) -> li
 
     Args:
         recordings: the stretches of each.
-        fallback: as for `fit_profile`.
+        fallback: as for `fit_profile`; and the one to compare with.
 
     Returns:
         A line for each triad and length of window; none where no recording has room for a window and its minute.
@@ -73,14 +78,32 @@ def coverage(recordings: Sequence[Sequence[Rest]], fallback: NoiseProfile) -> li
     parts = [list(each) for each in recordings if each]
     if len(parts) == 1:
         parts = list(_halves(parts[0]))
-    found = {mean_s: _Misses([], [], [], []) for mean_s in MEANS_S}
+    tests = []
     for number, part in enumerate(parts):
         others = [rest for index, each in enumerate(parts) if index != number for rest in each]
-        if sum(len(rest.slots) for rest in others) < LEAST_STILL_S:
-            continue
-        profile = fit_profile("test", others, fallback).profile
+        if sum(len(rest.slots) for rest in others) >= LEAST_STILL_S:
+            tests.append((part, fit_profile("test", others, fallback).profile))
+    return keeps(tests, fallback)
+
+
+def keeps(
+    tests: Sequence[tuple[Sequence[Rest], NoiseProfile]],
+    other: NoiseProfile,
+    means_s: Sequence[int] = MEANS_S,
+    next_s: int = NEXT_S,
+) -> list[Kept]:
+    """How often the seconds after a window came out as profiles say.
+
+    Args:
+        tests: stretches, and the profile that is to hold in them.
+        other: a profile to compare with.
+        means_s: lengths of windows.
+        next_s: how much is predicted.
+    """
+    found = {mean_s: _Misses([], [], [], [], []) for mean_s in means_s}
+    for rests, profile in tests:
         for mean_s, misses in found.items():
-            _predict(part, profile, mean_s, misses)
+            _predict(rests, profile, other, (mean_s, next_s), misses)
     return [
         _summary(triad, columns, mean_s, misses)
         for triad, columns in TRIADS
@@ -103,11 +126,11 @@ def _halves(rests: Sequence[Rest]) -> tuple[list[Rest], list[Rest]]:
     return first, second
 
 
-def _starts(rests: Sequence[Rest], mean_s: int) -> tuple[list[tuple[Rest, int]], float]:
-    """Places without a hole where a window and its minute begin, and for how many there is room side by side."""
-    length = mean_s + NEXT_S
+def _starts(rests: Sequence[Rest], mean_s: int, next_s: int) -> tuple[list[tuple[Rest, int]], float]:
+    """Places without a hole where a window and what it predicts begin, and for how many there is room side by side."""
+    length = mean_s + next_s
     room = sum(max(len(rest.slots) - length, 0) for rest in rests)
-    stride = max(mean_s, room // MOST_WINDOWS, 1)
+    stride = max(min(mean_s, next_s), room // MOST_WINDOWS)
     places = [
         (rest, at)
         for rest in rests
@@ -117,23 +140,33 @@ def _starts(rests: Sequence[Rest], mean_s: int) -> tuple[list[tuple[Rest, int]],
     return places, sum(len(rest.slots) // length for rest in rests) if places else 0.0
 
 
-def _predict(rests: Sequence[Rest], profile: NoiseProfile, mean_s: int, misses: _Misses) -> None:
-    places, minutes = _starts(rests, mean_s)
+def _predict(
+    rests: Sequence[Rest], profile: NoiseProfile, other: NoiseProfile, lengths_s: tuple[int, int], misses: _Misses
+) -> None:
+    mean_s, next_s = lengths_s
+    places, minutes = _starts(rests, mean_s, next_s)
     misses.minutes += minutes
-    imu = ImuInput(name="", rotation=np.eye(3), profile=profile)
     for at in range(0, len(places), _AT_ONCE):
         some = places[at : at + _AT_ONCE]
         past = [rest.batches[start : start + mean_s] for rest, start in some]
-        end_s = past[0][-1].slot + 1.0
-        found = estimates([imu] * len(some), past, end_s=end_s, horizon_s=float(NEXT_S))
-        mean = np.array([np.concatenate([gyro.mean, accel.mean]) for gyro, accel in found])
-        use = np.array([np.concatenate([gyro.use_variance, accel.use_variance]) for gyro, accel in found])
-        coming = np.stack([rest.means[start + mean_s : start + mean_s + NEXT_S] for rest, start in some], axis=1)
-        white = allan_variance(np.arange(NEXT_S), coming.reshape(NEXT_S, -1), 1)[0].reshape(-1, CHANNELS)
+        mean, use = _estimated(past, profile, next_s)
+        coming = np.stack([rest.means[start + mean_s : start + mean_s + next_s] for rest, start in some], axis=1)
+        white = allan_variance(np.arange(next_s), coming.reshape(next_s, -1), 1)[0].reshape(-1, CHANNELS)
         misses.miss.append(mean - coming.mean(axis=0))
         misses.use.append(use)
-        misses.seen.append(white / NEXT_S)
+        misses.other.append(_estimated(past, other, next_s)[1])
+        misses.seen.append(white / next_s)
         misses.naive.append(np.array([_naive(window) for window in past]))
+
+
+def _estimated(windows: Sequence[Sequence[Batch]], profile: NoiseProfile, next_s: int) -> tuple[Floats, Floats]:
+    """(w, 6) means and their use variances; every window goes in as if it were an IMU of its own."""
+    imu = ImuInput(name="", rotation=np.eye(3), profile=profile)
+    end_s = windows[0][-1].slot + 1.0
+    found = estimates([imu] * len(windows), windows, end_s=end_s, horizon_s=float(next_s))
+    mean = [np.concatenate([gyro.mean, accel.mean]) for gyro, accel in found]
+    use = [np.concatenate([gyro.use_variance, accel.use_variance]) for gyro, accel in found]
+    return np.array(mean), np.array(use)
 
 
 def _naive(window: Sequence[Batch]) -> Floats:
@@ -149,7 +182,9 @@ def _naive(window: Sequence[Batch]) -> Floats:
 
 def _summary(triad: Triad, columns: slice, mean_s: int, misses: _Misses) -> Kept:
     miss = np.square(np.concatenate(misses.miss)[:, columns])
-    use, seen, naive = (np.concatenate(each)[:, columns] for each in (misses.use, misses.seen, misses.naive))
+    use, other, seen, naive = (
+        np.concatenate(each)[:, columns] for each in (misses.use, misses.other, misses.seen, misses.naive)
+    )
 
     def share(variance: Floats) -> float:
         return float((miss <= SIGMAS**2 * variance).mean())
@@ -161,7 +196,9 @@ def _summary(triad: Triad, columns: slice, mean_s: int, misses: _Misses) -> Kept
         minutes=misses.minutes,
         rms=float(np.sqrt(miss.mean())),
         sigma_use=float(np.sqrt(np.median(use))),
+        sigma_other=float(np.sqrt(np.median(other))),
         share=share(use + seen),
         share_strict=share(use),
+        share_other=share(other + seen),
         share_naive=share(naive),
     )

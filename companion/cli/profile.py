@@ -232,21 +232,24 @@ def _lines(result: Result) -> list[str]:
             ]
             lines.append(f"{f'{triad}: {name}':24} {cells[0]:>16} {cells[1]:>16} {cells[2]:>16}")
     if result.kept:
+        against = f"by {result.compared.name}"
+        heads = ("T, s", "sigma_use", against, "rms error", "2 sigma", "strictly", "naive")
+        widths = (5, 11, max(11, len(against)), 11, 8, 9, 7)
         lines.append(
-            "the next minute after a window of T s: how much of it was within 2 sigma (sessions of others, or halves)"
+            "the minute after windows of T s, learned from other recordings or the other half; within 2 sigma:"
         )
-        lines.append(
-            f"{'':8} {'T, s':>5} {'sigma_use':>12} {'rms error':>12} {'2 sigma':>9} {'strictly':>9} {'naive':>7}"
-        )
+        lines.append(_row("", heads, widths))
         for each in result.kept:
             unit, unit_name, digits = _UNITS[each.triad]
-            use, rms = (f"{value / unit:.{digits}f} {unit_name}" for value in (each.sigma_use, each.rms))
-            lines.append(
-                f"{each.triad:8} {each.mean_s:>5} {use:>12} {rms:>12} {each.share:>9.1%} {each.share_strict:>9.1%}"
-                f" {each.share_naive:>7.1%}"
-            )
+            sizes = [f"{value / unit:.{digits}f} {unit_name}" for value in (each.sigma_use, each.sigma_other, each.rms)]
+            shares = (each.share, each.share_strict, each.share_naive)
+            lines.append(_row(each.triad, (f"{each.mean_s}", *sizes, *(f"{share:.1%}" for share in shares)), widths))
     lines += [f"note: {note}" for note in result.notes]
     return lines + [f"DO NOT USE: {words}" for words in result.broken]
+
+
+def _row(first: str, cells: Sequence[str], widths: Sequence[int]) -> str:
+    return f"{first:6}" + " ".join(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
 
 
 def _figures(model: AllanModel) -> tuple[float, float, float]:
