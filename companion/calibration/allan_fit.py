@@ -143,7 +143,9 @@ class _Part:
         spans = np.array(found.spans, dtype=np.float64)
         self.spans = found.spans
         self.variance = variance
-        self.design = np.stack([1.0 / spans, np.full(len(spans), FLOOR_OF_FLICKER**2), spans / 3.0], axis=1)
+        # Of an average with holes only what is there averages white noise away; one second has none.
+        counts = np.where(spans > 1.0, found.filled * spans, 1.0)
+        self.design = np.stack([1.0 / counts, np.full(len(spans), FLOOR_OF_FLICKER**2), spans / 3.0], axis=1)
         self._scatter = _scatter(found.length, found.spans) / found.filled
 
     def covariance(self, theta: Floats) -> Floats:
@@ -213,7 +215,10 @@ def _excess(parts: Sequence[_Part], theta: Floats) -> tuple[int, float] | None:
             total[2] += weight * model[row]
     worst: tuple[int, float] | None = None
     for span, (weight, measured, expected) in found.items():
-        above = (measured - expected) / math.sqrt(weight)
+        # sum(w v) has the variance sum(w); a sum of squares is chi-square, which Wilson and Hilferty make normal.
+        freedom = 2.0 * expected**2 / weight
+        spread = 2.0 / (9.0 * freedom)
+        above = ((measured / expected) ** (1.0 / 3.0) - 1.0 + spread) / math.sqrt(spread)
         if above > EXCESS_SIGMAS and measured > EXCESS_RATIO * expected:
             ratio = math.sqrt(measured / expected)
             if worst is None or ratio > worst[1]:
