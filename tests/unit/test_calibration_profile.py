@@ -22,7 +22,7 @@ UNKNOWN = noise_profile(None)
 def at_rest(seconds: int, rate_hz: int = 50, seed: int = 1) -> tuple[Floats, Floats]:
     rng = np.random.default_rng(seed)
     readings = rng.normal(0.0, [0.05 * DEG] * 3 + [3.0 * MG] * 3, (seconds * rate_hz, 6))
-    return np.arange(seconds * rate_hz) / rate_hz + 0.004, readings + [0.01, 0.0, 0.0, 0.0, 0.0, -9.8]
+    return np.arange(seconds * rate_hz) / rate_hz + 0.004, readings + np.array([0.01, 0.0, 0.0, 0.0, 0.0, -9.8])
 
 
 # --- seconds
@@ -171,8 +171,8 @@ def by(kept: list[Kept]) -> dict[tuple[str, int], Kept]:
 
 @pytest.fixture(scope="module")
 def night() -> Rests:
-    """2.8 h, as the recordings of the ADIS16405 were, at a fifth of their rate: noise does not care."""
-    t_s, readings = adis16405(10080, 20, seed=12)
+    """2.8 h, as the recordings of the ADIS16405 were, at a tenth of their rate: noise does not care."""
+    t_s, readings = adis16405(10080, 10, seed=12)
     return rests(t_s, readings, None, "adis", UNKNOWN)
 
 
