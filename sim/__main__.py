@@ -1,4 +1,4 @@
-"""`python -m sim`: devices, autopilot, all, demo, ardupilot, px4, residuals, turntable, drive, flights, accuracy."""
+"""`python -m sim`: devices, autopilot, all, demo, ardupilot, px4, residuals, turntable, flights, accuracy, rest, ..."""
 
 from __future__ import annotations
 
@@ -27,6 +27,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         from sim.accuracy.cli import main as accuracy
 
         return accuracy(arguments[1:])
+    if arguments[:1] == ["rest"]:
+        from sim.experiments.rest import main as rest
+
+        return rest(arguments[1:])
     if arguments[:1] in (["drive"], ["flights"]):
         from sim.experiments.journeys import main as journeys
 

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.config.sections import Noise
 from companion.errors import ConfigError
 from companion.physics.units import DEG_H, MG
 
@@ -78,14 +79,16 @@ PROFILES: Final[dict[str, NoiseProfile]] = {
 }
 
 
-def noise_profile(name: str | None) -> NoiseProfile:
-    """The profile of that name; None gives the conservative one for an unknown part.
+def noise_profile(name: str | Noise | None) -> NoiseProfile:
+    """The profile of that name, or of these figures; None gives the conservative one for an unknown part.
 
     Raises:
         ConfigError: no such profile; the message names the nearest and all known.
     """
     if name is None:
         return PROFILES["unknown"]
+    if isinstance(name, Noise):
+        return NoiseProfile(name.name, AllanModel(*name.gyro), AllanModel(*name.accel))
     key = name.strip().lower().replace("-", "").replace("_", "").replace(" ", "")
     if key in PROFILES:
         return PROFILES[key]

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from companion import __version__, config
+from companion.config.profiles import SavedProfiles
 from companion.errors import CompanionError, ConfigError, DaemonUnreachableError, NobodyHeardError
 
 DONE: Final = 0
@@ -59,9 +60,21 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
         print(json.dumps({"state": state, "reason": reason}))
 
 
-def load_config(options: argparse.Namespace) -> config.Config:
-    """The configuration that -c names, or the default one."""
-    return config.load(config_path(options))
+def load_config(options: argparse.Namespace, *, profiles: bool = False) -> config.Config:
+    """The configuration that -c names, or the default one.
+
+    Args:
+        options: of the command line.
+        profiles: read the saved noise profiles that it names too; who only asks the daemon may not be allowed to, and
+            leaves them be.
+    """
+
+    def saved(directory: Path) -> SavedProfiles | None:
+        from companion.storage.profiles import ProfileStore
+
+        return ProfileStore(directory) if profiles else None
+
+    return config.load(config_path(options), saved)
 
 
 def config_path(options: argparse.Namespace) -> Path:
@@ -79,7 +92,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _parser() -> Parser:
-    from companion.cli import align, client, ground, install, local, monitor, recordings, report, setup
+    from companion.cli import align, client, ground, install, local, monitor, profile, recordings, report, setup
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -141,6 +154,7 @@ def _parser() -> Parser:
     add("monitor", monitor.monitor, "watch the daemon until Ctrl-C")
     add("web-token", local.web_token, "where the page is, and the token that its buttons need")
     recordings.add_commands(add)
+    profile.add_command(add)
     ground.add_commands(commands, common)
     return parser
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 async def run(options: argparse.Namespace) -> int:
     """`companion run`."""
-    config = load_config(options)
+    config = load_config(options, profiles=True)
     # Where the whole process stands still the watchdog's SIGABRT is the only witness: let it say where that was.
     faulthandler.enable()
     logs.set_up("debug" if options.verbose else config.log.level)
@@ -120,7 +120,7 @@ async def check(options: argparse.Namespace) -> int:
     """`companion check`."""
     from companion.daemon.check import run_check
 
-    config = load_config(options)
+    config = load_config(options, profiles=True)
     findings = await run_check(config, options.seconds)
     good = all(finding.good for finding in findings)
     reason = "; ".join(f"{finding.name}: {finding.words}" for finding in findings if not finding.good)

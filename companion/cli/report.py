@@ -67,7 +67,7 @@ def _where(options: argparse.Namespace) -> tuple[Path, dict[str, NoiseProfile]]:
     from companion.calibration.allan import noise_profile
 
     try:
-        config = load_config(options)
+        config = load_config(options, profiles=True)
     except ConfigError as error:
         if options.storage is not None:
             # A folder copied to another computer needs no configuration there.

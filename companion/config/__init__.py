@@ -11,6 +11,7 @@ from pathlib import Path
 
 import msgspec
 
+from companion.config.profiles import Saved, none_saved, with_saved_profiles
 from companion.config.rules import check_together
 from companion.config.sections import (
     AtArm,
@@ -27,6 +28,7 @@ from companion.config.sections import (
     Mavlink,
     Mounting,
     Mqtt,
+    Noise,
     Parity,
     Push,
     Storage,
@@ -51,6 +53,7 @@ __all__ = [
     "Mavlink",
     "Mounting",
     "Mqtt",
+    "Noise",
     "Parity",
     "Push",
     "Storage",
@@ -62,8 +65,8 @@ __all__ = [
 DEFAULT_PATH = Path("/etc/companion/companion.toml")
 
 
-def load(path: Path) -> Config:
-    """Read and check a configuration file.
+def load(path: Path, saved: Saved = none_saved) -> Config:
+    """Read and check a configuration file; `saved` says where saved noise profiles are.
 
     Raises:
         ConfigError: one line that names the file, the key, what was found and what is allowed.
@@ -74,11 +77,11 @@ def load(path: Path) -> Config:
         raise ConfigError(f"{path}: no such file; give another with -c FILE") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
-    return parse(text, str(path))
+    return parse(text, str(path), saved)
 
 
-def parse(text: str, name: str) -> Config:
-    """Check the text of a configuration file; `name` stands for the file in messages.
+def parse(text: str, name: str, saved: Saved = none_saved) -> Config:
+    """Check the text of a configuration file; `name` stands for the file in messages, `saved` as for `load`.
 
     Raises:
         ConfigError: one line that names the file, the key, what was found and what is allowed.
@@ -93,4 +96,4 @@ def parse(text: str, name: str) -> Config:
     except msgspec.ValidationError as error:
         raise ConfigError(f"{name}: {explain(str(error), raw)}") from None
     check_together(config, name)
-    return config
+    return with_saved_profiles(config, name, saved)

@@ -11,6 +11,7 @@ from msgspec import Meta
 
 ImuProtocol = Literal["vectornav", "imu_line", "witmotion", "mip", "xsens", "stim300"]
 Profile = Literal["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
+"""Those of the catalogue; others are learned and saved (`companion profile --save`)."""
 GradienterProtocol = Literal[
     "inclinometer_xy", "jewell", "hmr3300", "nmea", "os5000", "rion", "pni", "witmotion", "stim300"
 ]
@@ -51,6 +52,17 @@ class Mavlink(Section, frozen=True):
     component_id: Annotated[int, Meta(ge=1, le=255)] = 191
 
 
+class Noise(Section, frozen=True):
+    """A saved profile, in the place of its name as soon as the file has been read: a recording takes it along."""
+
+    name: NonEmpty
+    gyro: tuple[float, float, float]
+    """White noise N, flicker B and random walk K in rad/s (times sqrt(s), 1, over sqrt(s))."""
+    accel: tuple[float, float, float]
+    """Likewise in m/s^2."""
+    origin: str = ""
+
+
 class Imu(Section, frozen=True):
     """One IMU to be calibrated: the autopilot's, read over MAVLink, or our own on a serial port."""
 
@@ -65,7 +77,8 @@ class Imu(Section, frozen=True):
     autopilot_instance: Annotated[int, Meta(ge=1, le=3)] | None = None
     read_only: bool = False
     """Whether nothing may ever be sent to the device on that port."""
-    profile: Profile | None = None
+    profile: str | Noise | None = None
+    """One of the catalogue (`Profile`), or a saved one."""
 
 
 class Gradienter(Section, frozen=True):

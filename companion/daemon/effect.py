@@ -20,6 +20,7 @@ from companion.autopilot.verify import Observation, Verdict, judge
 from companion.autopilot.writer import Change
 from companion.calibration.allan import AllanModel, floor_variance, noise_profile
 from companion.calibration.rolling import ImuWindow
+from companion.config import Noise
 from companion.daemon.far_step import FarMean
 from companion.physics.frames import Array
 from companion.physics.units import DEG_H, MG
@@ -72,7 +73,7 @@ def judge_vectors(
     calibration: ImuCalibration,
     changes: list[Change],
     kind: StreamKind | None,
-    profile: str | None,
+    profile: str | Noise | None,
     on_the_way: OnTheWay | None = None,
 ) -> list[Verdict]:
     """Judge the vectors that were written: accelerometers, gyros, or both.

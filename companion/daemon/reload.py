@@ -21,6 +21,7 @@ from companion.daemon.ledger import Offload
 from companion.daemon.service import Service
 from companion.errors import ConfigError
 from companion.physics.units import DEG_H, MG
+from companion.storage.profiles import ProfileStore
 
 logger = logging.getLogger(__name__)
 
@@ -89,7 +90,7 @@ class Reloader:
     async def reload(self) -> str:
         """Apply what the file says now; what came of it in one line, empty when all of it is in force."""
         try:
-            new = flat(await self._offload(load, self._path))
+            new = flat(await self._offload(load, self._path, ProfileStore))
         except ConfigError as error:
             logger.error("reload refused, the old configuration stays in force: %s", error)  # noqa: TRY400 - one line
             return f"reload refused: {error}"

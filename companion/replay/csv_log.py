@@ -7,6 +7,7 @@ turns them into the vehicle's (x forward, y right, z down).
 from __future__ import annotations
 
 import datetime
+import io
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -15,6 +16,7 @@ from typing import Final
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from companion.calibration.allan import noise_profile
 from companion.calibration.pose_windows import HeadingWindow, TiltWindow
@@ -31,6 +33,8 @@ from companion.errors import CalibrationRefusedError, StorageError
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import ImuSample
+
+Floats = NDArray[np.float64]
 
 _TIMES: Final = {"t_s": 1.0, "t_ms": 1e-3, "t_us": 1e-6, "t_ns": 1e-9}
 _RATES: Final = {"rad_s": 1.0, "deg_s": DEG, "deg_h": DEG_H}
@@ -73,12 +77,12 @@ class _Columns:
 
     def __init__(self, names: Sequence[str], where: str) -> None:
         self.names = [name.strip().strip('"').lower() for name in names]
-        self.time, self._time_factor = self._find("t", _TIMES, "", where)
+        self.time, self.time_factor = self._find("t", _TIMES, "", where)
         axes = [self._find(f"{kind}{axis}", units, "_", where) for kind, units in (("g", _RATES), ("a", _FORCES))
                 for axis in "xyz"]  # fmt: skip
-        self._axes = [column for column, _ in axes]
-        self._factors = [factor for _, factor in axes]
-        self._temperature = self.names.index(_TEMPERATURE) if _TEMPERATURE in self.names else None
+        self.axes = [column for column, _ in axes]
+        self.factors = [factor for _, factor in axes]
+        self.temperature = self.names.index(_TEMPERATURE) if _TEMPERATURE in self.names else None
 
     def _find(self, what: str, units: dict[str, float], joint: str, where: str) -> tuple[int, float]:
         names = {f"{what}{joint}{unit}" if joint else unit: factor for unit, factor in units.items()}
@@ -96,14 +100,13 @@ class _Columns:
         """
         if len(fields) != len(self.names):
             raise StorageError(f"{where}: found {len(fields)} fields; allowed: {len(self.names)}, as many as columns")
-        t_s = self._number(fields, self.time, where) * self._time_factor
+        t_s = self._number(fields, self.time, where) * self.time_factor
         gx, gy, gz, ax, ay, az = (
-            self._number(fields, column, where) * factor
-            for column, factor in zip(self._axes, self._factors, strict=True)
+            self._number(fields, column, where) * factor for column, factor in zip(self.axes, self.factors, strict=True)
         )
         temperature = None
-        if self._temperature is not None and fields[self._temperature].strip():
-            temperature = self._number(fields, self._temperature, where)
+        if self.temperature is not None and fields[self.temperature].strip():
+            temperature = self._number(fields, self.temperature, where)
         return ImuSample(t_s, (gx, gy, gz), (ax, ay, az), temperature)
 
     def _number(self, fields: Sequence[str], column: int, where: str) -> float:
@@ -131,6 +134,65 @@ def read(path: Path, columns: str | None = None) -> Iterator[ImuSample]:
             yield from _read(file, path, columns)
     except (OSError, UnicodeDecodeError) as error:
         raise StorageError(f"{path}: cannot be read as text: {getattr(error, 'strerror', None) or error}") from None
+
+
+def read_arrays(path: Path, columns: str | None = None) -> tuple[Floats, Floats, Floats]:
+    """All samples of a CSV file at once: as `read`, by numpy's own reader, ten times as fast.
+
+    Returns:
+        (n,) times in s; (n, 6) gyro in rad/s and accelerometer in m/s^2; (n,) degC, NaN where unknown.
+
+    Raises:
+        StorageError: as `read`, which has the last word on whatever is not a plain table of numbers.
+    """
+    found = _table(path, columns)
+    if found is None:
+        samples = list(read(path, columns))
+        nan = math.nan
+        return (
+            np.array([sample.t_s for sample in samples]),
+            np.array([(*sample.gyro_rad_s, *sample.accel_m_s2) for sample in samples]).reshape(-1, 6),
+            np.array([nan if sample.temperature_degc is None else sample.temperature_degc for sample in samples]),
+        )
+    return found
+
+
+def _table(path: Path, names: str | None) -> tuple[Floats, Floats, Floats] | None:
+    """The file as a table; None where `read` has to look at it line by line."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            skip = 0
+            for line in file:
+                text = line.strip()
+                if text and not text.startswith("#"):
+                    break
+                skip += 1
+            else:
+                return None
+            separator = max(",;\t", key=text.count)
+            named = names is None or re.search("[A-DF-Za-df-z_]{2}", text) is not None
+            columns = _Columns(text.split(separator) if names is None else names.split(","), str(path))
+        source: Path | io.BytesIO = path
+        with path.open("rb") as raw:
+            raw.seek(-1, io.SEEK_END)
+            if raw.read(1) != b"\n":
+                # Perhaps cut in the middle of a number, which then still looks like one: without its last line.
+                raw.seek(0)
+                data = raw.read()
+                source = io.BytesIO(data[: data.rfind(b"\n") + 1])
+        temperature = columns.temperature
+        wanted = [columns.time, *columns.axes, *([] if temperature is None else [temperature])]
+        rows = np.loadtxt(
+            source, delimiter=separator, comments="#", quotechar='"', encoding="utf-8-sig", ndmin=2,
+            skiprows=skip + named, usecols=wanted,
+        )  # fmt: skip
+    except (OSError, ValueError, StorageError):
+        return None
+    t_s = rows[:, 0] * columns.time_factor
+    if not np.isfinite(rows).all() or not (np.diff(t_s) > 0.0).all():
+        return None
+    degc = rows[:, 7] if temperature is not None else np.full(len(rows), math.nan)
+    return t_s, rows[:, 1:7] * columns.factors, degc
 
 
 def _read(file: Iterator[str], path: Path, names: str | None) -> Iterator[ImuSample]:

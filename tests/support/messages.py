@@ -40,6 +40,7 @@ ELSEWHERE = {
     "companion/daemon/mqtt/discovery.py": "names for Home Assistant",
     "companion/installation": "printed by commands that are run at home, with what to do",
     "companion/cli/install.py": "printed by commands that are run at home, with what to do",
+    "companion/cli/profile.py": "the table and its notes: docs/profiles.md",
     "companion/calibration/machine.py": "labels of the diagram in docs/calibration.md",
     "companion/recording/topics.py": "names of fields in a recording",
     "companion/daemon/headline.py": "the big word of page and monitor: docs/page.md has each",

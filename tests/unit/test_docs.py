@@ -128,8 +128,13 @@ def understood(command: str) -> str:
 def sim_parser(words: list[str]) -> argparse.ArgumentParser:
     """Of `python -m sim`, as sim/__main__.py chooses it."""
     from sim import serve
+    from sim.experiments import rest
     from sim.sitl import cli as firmware
 
+    if words[:1] == ["rest"]:
+        made = argparse.ArgumentParser()
+        made.add_subparsers().add_parser("rest", parents=[rest.parser()], add_help=False)
+        return made
     return firmware.parser() if words[:1] and words[0] in serve.FIRMWARE_COMMANDS else serve.parser()
 
 

@@ -1,0 +1,331 @@
+"""`companion profile`: what noise an IMU has, out of recordings of it at rest."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import msgspec
+
+from companion.cli import DONE, FAILED, Command, load_config, print_json, seconds
+from companion.errors import CalibrationRefusedError, ConfigError, StorageError
+from companion.physics.units import DEG_H, MG
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from companion.calibration.allan import AllanModel, NoiseProfile
+    from companion.calibration.coverage import Kept
+    from companion.calibration.profile_fit import AxisFinding, Finding
+    from companion.calibration.rest import Rests
+    from companion.replay.still_log import StillLog
+
+LEAST_SHARE: Final = 0.90
+"""Of the minutes within 2 sigma below which a profile is not saved."""
+LEAST_MINUTES: Final = 20.0
+"""Side by side: fewer say nothing about a share of 90 %."""
+SHORT_S: Final = 1200
+_UNITS: Final = {"gyro": (DEG_H, "deg/h", 1), "accel": (1e-3 * MG, "ug", 0)}
+_AXES: Final = "xyz"
+
+
+class Result(NamedTuple):
+    """What was found of one IMU."""
+
+    imu: str
+    logs: list[StillLog]
+    rests: list[Rests]
+    finding: Finding
+    compared: NoiseProfile
+    kept: list[Kept]
+    notes: list[str]
+
+    @property
+    def broken(self) -> list[str]:
+        """Where the profile did not keep its word, in words."""
+        return [
+            f"{each.triad}: only {each.share:.0%} of the minutes after {each.mean_s} s were within 2 sigma"
+            for each in self.kept
+            if each.share < LEAST_SHARE and each.minutes >= LEAST_MINUTES
+        ]
+
+
+def add_command(add: Callable[[str, Command, str], argparse.ArgumentParser]) -> None:
+    """Add `profile`; `add` makes a parser of name, command and help."""
+    sub = add("profile", profile, "learn an IMU's noise from recordings of it at rest (docs/profiles.md)")
+    sub.add_argument("files", nargs="+", type=Path, metavar="FILE", help="recordings (.mcap) or CSV logs")
+    sub.add_argument("--imu", metavar="NAME", help="only this one; of CSV files: what theirs is called (default imu)")
+    sub.add_argument("--columns", metavar="NAMES", help="of CSV files without names, such as t_s,gx_deg_s,... ")
+    sub.add_argument(
+        "--profile", metavar="PART", help="to compare with, and for what the recordings do not tell (default: as used)"
+    )
+    sub.add_argument("--skip", type=seconds, default=0.0, metavar="S", help="leave out so much at each beginning")
+    sub.add_argument("--save", metavar="NAME", help='keep it: profile = "NAME" in [[imu]] then takes it')
+    sub.add_argument("--storage", type=Path, metavar="DIR", help="where to (default: as in the configuration)")
+
+
+async def profile(options: argparse.Namespace) -> int:
+    """`companion profile`."""
+    from companion.replay.csv_log import NAME
+    from companion.replay.still_log import read_logs
+    from companion.storage.profiles import ProfileStore, check_name
+
+    store = None
+    if options.save is not None:
+        check_name(options.save)
+        store = ProfileStore(options.storage or load_config(options).storage.path)
+    compared = _compared(options)
+    logs = read_logs(options.files, options.columns, options.imu or NAME)
+    results, refused = [], []
+    for imu, own in _by_imu(logs, options.imu).items():
+        try:
+            results.append(_learn(imu, own, compared, options.skip))
+        except CalibrationRefusedError as error:
+            refused.append(f"imu {imu}: {error}")
+    for words in refused:
+        print(f"companion: {words}", file=sys.stderr)
+    saved = None
+    reason = "; ".join(refused)
+    state = "done" if results and not refused else "failed"
+    if store is not None and state == "done":
+        if len(results) > 1:
+            names = ", ".join(result.imu for result in results)
+            raise ConfigError(f"--save: found IMUs {names}; allowed: one; say which with --imu")
+        if results[0].broken:
+            state, reason = "refused", f"not saved: {'; '.join(results[0].broken)}"
+        else:
+            saved = store.write(_to_save(results[0], options.save))
+    if getattr(options, "json", False):
+        answer = {"state": state, "reason": reason, "file": None if saved is None else str(saved)}
+        print_json({**answer, "imus": [_object(result) for result in results]})
+    else:
+        for result in results:
+            print("\n".join(_lines(result)))
+        if saved is not None:
+            print(f'saved: {saved}; profile = "{options.save}" in [[imu]] takes it, after a restart')
+    if state == "refused":
+        print(f"companion: {reason}", file=sys.stderr)
+    return DONE if state == "done" else FAILED
+
+
+def _compared(options: argparse.Namespace) -> NoiseProfile | None:
+    from companion.calibration.allan import noise_profile
+
+    return None if options.profile is None else noise_profile(options.profile)
+
+
+def _by_imu(logs: Sequence[StillLog], wanted: str | None) -> dict[str, list[StillLog]]:
+    found: dict[str, list[StillLog]] = {}
+    for log in logs:
+        found.setdefault(log.imu, []).append(log)
+    if wanted is None:
+        return found
+    if wanted not in found:
+        raise StorageError(f"no IMU {wanted!r} in these files; there are: {', '.join(found)}")
+    return {wanted: found[wanted]}
+
+
+def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float) -> Result:
+    """All of one IMU.
+
+    Raises:
+        CalibrationRefusedError: the recordings tell nothing of it.
+    """
+    from companion.calibration.allan import noise_profile
+    from companion.calibration.coverage import coverage
+    from companion.calibration.profile_fit import fit_profile
+    from companion.calibration.rest import rests
+
+    whole = [log for log in logs if not log.truncated]
+    if not whole:
+        raise CalibrationRefusedError(
+            "it was recorded in whole mrad/s and mg, cut toward zero: their steps hide the sensor's noise"
+        )
+    against = compared or noise_profile(whole[-1].profile)
+    found = []
+    for log in whole:
+        part = slice(0) if not len(log.t_s) else log.t_s >= log.t_s[0] + skip_s
+        found.append(rests(log.t_s[part], log.readings[part], log.temperature_degc[part], imu, against))
+    obstacle = next((each.obstacle for each in found if each.obstacle), "")
+    stretches = [stretch for each in found for stretch in each.stretches]
+    try:
+        finding = fit_profile(imu, stretches, against)
+    except CalibrationRefusedError as error:
+        raise CalibrationRefusedError(f"{error}{f' (in the way: {obstacle})' if obstacle else ''}") from None
+    kept = coverage([each.stretches for each in found], against)
+    return Result(imu, whole, found, finding, against, kept, _notes(finding, against, found, kept, obstacle))
+
+
+def _notes(
+    finding: Finding, against: NoiseProfile, found: Sequence[Rests], kept: Sequence[Kept], obstacle: str
+) -> list[str]:
+    import numpy as np
+
+    notes = []
+    unseen = not any(np.isfinite(rest.temperature_degc).any() for each in found for rest in each.stretches)
+    if finding.kept:
+        notes.append(
+            f"too short to tell {', '.join(finding.kept)}: as in {against.name!r}, as far as the recordings allow"
+        )
+    if finding.still_s < SHORT_S:
+        notes.append("less than 20 min at rest: an hour tells N and B, a night K too")
+    if not any(axis.per_kelvin or axis.drift_per_s for axis in finding.axes) and unseen:
+        walking = [name for name, axis, *_ in _named(finding) if axis.fit.known[2]]
+        if walking:
+            notes.append(f"K of {', '.join(walking)}: may be warm-up, or the room's temperature, which is not recorded")
+    moved_s = sum(each.seconds - each.still_s for each in found)
+    if moved_s:
+        notes.append(f"{moved_s} s were not at rest and are left out{f' ({obstacle})' if obstacle else ''}")
+    for name, axis, unit, unit_name, _ in _named(finding):
+        if axis.drift_per_s:
+            drift = axis.drift_per_s * 3600.0 / unit
+            notes.append(
+                f"{name} drifts by {drift:.3g} {unit_name} in an hour: K allows for it; --skip leaves warm-up out"
+            )
+        if axis.per_kelvin is not None:
+            notes.append(
+                f"{name} follows the temperature, {axis.per_kelvin / unit:.3g} {unit_name} per K: this is in B and K"
+            )
+        if axis.fit.excess is not None:
+            span, ratio = axis.fit.excess
+            notes.append(
+                f"{name}: {ratio:.1f} times the noise that N, B and K make of {span} s: something periodic, or steps;"
+                " B allows for it"
+            )
+    if not kept:
+        notes.append("too short to test: no room for a window and the minute after it in both halves")
+    elif all(each.minutes < LEAST_MINUTES for each in kept):
+        notes.append("too short a test: the shares say little")
+    return notes
+
+
+def _named(finding: Finding) -> Iterator[tuple[str, AxisFinding, float, str, int]]:
+    for column, axis in enumerate(finding.axes):
+        triad = "gyro" if column < 3 else "accel"
+        yield (f"{triad} {_AXES[column % 3]}", axis, *_UNITS[triad])
+
+
+def _lines(result: Result) -> list[str]:
+    """For people."""
+    finding = result.finding
+    recordings = f"{len(result.logs)} recording{'s' if len(result.logs) > 1 else ''}"
+    span = _temperatures(result.logs)
+    degc = "" if span is None else f", {span[0]:.1f} to {span[1]:.1f} degC"
+    lines = [f"imu {result.imu}: {finding.still_s / 3600.0:.2f} h at rest in {recordings}{degc}"]
+    lines.append(f"{'':24} {'N, x sqrt(s)':>16} {'floor A':>16} {'K, / sqrt(s)':>16}")
+    for name, axis, unit, unit_name, digits in _named(finding):
+        cells = [_cell(axis, which, unit, digits) for which in range(3)]
+        lines.append(f"{name + ', ' + unit_name:24} {cells[0]:>16} {cells[1]:>16} {cells[2]:>16}")
+    for triad, ours, theirs in (
+        ("gyro", finding.profile.gyro, result.compared.gyro),
+        ("accel", finding.profile.accel, result.compared.accel),
+    ):
+        unit, _, digits = _UNITS[triad]
+        for name, model in (("this profile", ours), (result.compared.name, theirs)):
+            cells = [
+                f"{value / unit:.{digits + more}f}" for value, more in zip(_figures(model), (0, 0, 2), strict=True)
+            ]
+            lines.append(f"{f'{triad}: {name}':24} {cells[0]:>16} {cells[1]:>16} {cells[2]:>16}")
+    if result.kept:
+        against = f"by {result.compared.name}"
+        heads = ("T, s", "sigma_use", against, "rms error", "2 sigma", "strictly", "naive")
+        widths = (5, 11, max(11, len(against)), 11, 8, 9, 7)
+        lines.append(
+            "the minute after windows of T s, learned from other recordings or the other half; within 2 sigma:"
+        )
+        lines.append(_row("", heads, widths))
+        for each in result.kept:
+            unit, unit_name, digits = _UNITS[each.triad]
+            sizes = [f"{value / unit:.{digits}f} {unit_name}" for value in (each.sigma_use, each.sigma_other, each.rms)]
+            shares = (each.share, each.share_strict, each.share_naive)
+            lines.append(_row(each.triad, (f"{each.mean_s}", *sizes, *(f"{share:.1%}" for share in shares)), widths))
+    lines += [f"note: {note}" for note in result.notes]
+    return lines + [f"DO NOT USE: {words}" for words in result.broken]
+
+
+def _row(first: str, cells: Sequence[str], widths: Sequence[int]) -> str:
+    return f"{first:6}" + " ".join(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True))
+
+
+def _figures(model: AllanModel) -> tuple[float, float, float]:
+    return model.white, model.floor, model.walk
+
+
+def _cell(axis: AxisFinding, which: int, unit: float, digits: int) -> str:
+    """A figure with its standard error, or its upper limit where it is not told."""
+    from companion.calibration.allan import FLOOR_OF_FLICKER
+
+    factor = (1.0, FLOOR_OF_FLICKER, 1.0)[which] / unit
+    digits += 2 * (which == 2)
+    value, square = axis.fit.figures[which], axis.fit.sigmas[which]
+    if axis.fit.known[which]:
+        return f"{value * factor:.{digits}f} +-{square / (2.0 * value) * factor:.{digits}f}"
+    upper = axis.fit.upper[which] * factor
+    return f"< {upper:.{digits}f}" if math.isfinite(upper) else "not told"
+
+
+def _temperatures(logs: Sequence[StillLog]) -> tuple[float, float] | None:
+    import numpy as np
+
+    known = [log.temperature_degc[np.isfinite(log.temperature_degc)] for log in logs]
+    known = [each for each in known if len(each)]
+    return (min(float(each.min()) for each in known), max(float(each.max()) for each in known)) if known else None
+
+
+def _to_save(result: Result, name: str) -> Any:
+    from companion.storage.profiles import FORMAT_VERSION, SavedProfile, Source
+
+    finding = result.finding
+    now = datetime.datetime.now(tz=datetime.UTC)
+    return SavedProfile(
+        format_version=FORMAT_VERSION,
+        name=name,
+        saved_at=now.isoformat(timespec="seconds"),
+        imu=result.imu,
+        gyro=finding.profile.gyro,
+        accel=finding.profile.accel,
+        kept_from=result.compared.name,
+        kept=finding.kept,
+        sources=tuple(
+            Source(
+                file=", ".join(log.files),
+                began_at=log.began_at,
+                still_s=float(rests.still_s),
+                temperature_degc=_temperatures([log]),
+            )
+            for log, rests in zip(result.logs, result.rests, strict=True)
+        ),
+        notes=tuple(result.notes),
+    )
+
+
+def _object(result: Result) -> dict[str, Any]:
+    finding = result.finding
+    return {
+        "name": result.imu,
+        "still_s": finding.still_s,
+        "seconds": sum(each.seconds for each in result.rests),
+        "recordings": [", ".join(log.files) for log in result.logs],
+        "temperature_degc": _temperatures(result.logs),
+        "profile": msgspec.to_builtins(finding.profile),
+        "compared": msgspec.to_builtins(result.compared),
+        "kept": list(finding.kept),
+        "axes": [_finite(msgspec.to_builtins(axis)) for axis in finding.axes],
+        "coverage": [msgspec.to_builtins(each) for each in result.kept],
+        "notes": result.notes,
+        "broken": result.broken,
+    }
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no infinity: an upper limit that nobody knows is null."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

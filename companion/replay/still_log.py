@@ -1,0 +1,192 @@
+"""Long recordings of IMUs at rest as columns of numbers: our own recordings, and CSV logs of others."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.autopilot import imu_messages
+from companion.config import Config, Noise
+from companion.errors import StorageError
+from companion.recording import topics
+from companion.recording.walk import MAGIC, Attachment, Message, Metadata, Recording
+from companion.replay import csv_log
+
+Floats = NDArray[np.float64]
+
+TRUNCATED: Final = frozenset(
+    message.kind.message
+    for every in (imu_messages.ARDUPILOT, imu_messages.PX4)
+    for messages in every.values()
+    for message in messages
+    if message.kind.truncates
+)
+"""Messages of whole mrad/s and mg: their steps hide what a profile is about."""
+CONTINUED_S: Final = 60.0
+"""A recording that begins within so much of another's end, on the same clock, goes on with it."""
+
+
+class StillLog(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU in one session: a file, or several of which each goes on where the one before ends."""
+
+    imu: str
+    files: tuple[str, ...]
+    began_unix_s: float | None
+    t_s: Floats
+    """(n,) ascending."""
+    readings: Floats
+    """(n, 6): gyro in rad/s, accelerometer in m/s^2; axes as recorded."""
+    temperature_degc: Floats
+    """(n,); NaN where unknown."""
+    profile: str | Noise | None = None
+    """That of the configuration in force then."""
+    truncated: bool = False
+    """It came as integers only, which are left out."""
+    clock_offset_s: float | None = None
+    """UTC minus the recording's clock."""
+
+    @property
+    def began_at(self) -> str | None:
+        """UTC."""
+        if self.began_unix_s is None:
+            return None
+        return datetime.datetime.fromtimestamp(self.began_unix_s, tz=datetime.UTC).isoformat(timespec="seconds")
+
+
+def read_logs(paths: Sequence[Path], columns: str | None = None, csv_name: str = csv_log.NAME) -> list[StillLog]:
+    """All IMUs in all files, one entry for each IMU and session.
+
+    Args:
+        paths: recordings (.mcap) and CSV logs.
+        columns: of CSV files that do not name theirs.
+        csv_name: what the IMU of a CSV file is called.
+
+    Raises:
+        StorageError: a file cannot be read, in one line.
+    """
+    found: list[StillLog] = []
+    for path in paths:
+        try:
+            with path.open("rb") as file:
+                head = file.read(len(MAGIC))
+        except OSError as error:
+            raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
+        if head and not MAGIC.startswith(head) and b"\0" not in head:
+            t_s, readings, temperature = csv_log.read_arrays(path, columns)
+            found.append(
+                StillLog(
+                    imu=csv_name, files=(path.name,), began_unix_s=None,
+                    t_s=t_s, readings=readings, temperature_degc=temperature,
+                )
+            )  # fmt: skip
+        else:
+            found += _read_recording(path)
+    return _joined(found)
+
+
+def _read_recording(path: Path) -> list[StillLog]:
+    decoder = msgspec.json.Decoder(topics.ImuEntry)
+    entries: dict[str, list[topics.ImuEntry]] = {}
+    truncated: set[str] = set()
+    profiles: dict[str, str | Noise | None] = {}
+    offset_s: float | None = None
+    for item in Recording(path):
+        if isinstance(item, Message):
+            if not item.topic.startswith(topics.IMU):
+                continue
+            try:
+                entry = decoder.decode(item.data)
+            except msgspec.MsgspecError as error:
+                raise StorageError(
+                    f"{path}: a message on {item.topic} cannot be used by this version ({error})"
+                ) from None
+            name = item.topic.removeprefix(topics.IMU)
+            own = entries.setdefault(name, [])
+            if entry.message in TRUNCATED:
+                truncated.add(name)
+            elif not own or entry.t_s > own[-1].t_s:
+                own.append(entry)
+        elif isinstance(item, Metadata) and item.name == topics.METADATA:
+            offset_s = _offset(item.table)
+        elif isinstance(item, Attachment) and item.name == topics.CONFIG:
+            profiles = _profiles(item.data)
+    if not entries:
+        raise StorageError(f"{path}: no samples of an IMU in it")
+    return [
+        _log(path, name, own, offset_s, profiles.get(name), truncated=name in truncated)
+        for name, own in entries.items()
+    ]
+
+
+def _log(
+    path: Path,
+    name: str,
+    entries: list[topics.ImuEntry],
+    offset_s: float | None,
+    profile: str | Noise | None,
+    *,
+    truncated: bool,
+) -> StillLog:
+    nan = float("nan")
+    rows = np.array([(*entry.gyro_rad_s, *entry.accel_m_s2) for entry in entries], dtype=np.float64).reshape(-1, 6)
+    temperatures = (nan if entry.temperature_degc is None else entry.temperature_degc for entry in entries)
+    t_s = np.array([entry.t_s for entry in entries], dtype=np.float64)
+    return StillLog(
+        imu=name,
+        files=(path.name,),
+        began_unix_s=None if offset_s is None or not len(t_s) else float(t_s[0]) + offset_s,
+        t_s=t_s,
+        readings=rows,
+        temperature_degc=np.fromiter(temperatures, dtype=np.float64, count=len(entries)),
+        profile=profile,
+        truncated=truncated and not entries,
+        clock_offset_s=offset_s,
+    )
+
+
+def _offset(table: dict[str, str]) -> float | None:
+    try:
+        return float(table["unix_s"]) - float(table["t_s"])
+    except (KeyError, ValueError):
+        return None
+
+
+def _profiles(data: bytes) -> dict[str, str | Noise | None]:
+    """By IMU; a configuration of another version only costs the comparison."""
+    try:
+        config = msgspec.json.decode(data, type=Config)
+    except msgspec.MsgspecError:
+        return {}
+    return {imu.name: imu.profile for imu in config.imu}
+
+
+def _joined(logs: Iterable[StillLog]) -> list[StillLog]:
+    """Recordings of one run of the daemon, cut into files, as one session."""
+    result: list[StillLog] = []
+    for log in sorted(logs, key=lambda each: (each.imu, each.began_unix_s or 0.0)):
+        before = result[-1] if result else None
+        if before is not None and _goes_on(before, log):
+            result[-1] = msgspec.structs.replace(
+                before,
+                files=(*before.files, *log.files),
+                t_s=np.concatenate([before.t_s, log.t_s]),
+                readings=np.concatenate([before.readings, log.readings]),
+                temperature_degc=np.concatenate([before.temperature_degc, log.temperature_degc]),
+            )
+        else:
+            result.append(log)
+    return result
+
+
+def _goes_on(before: StillLog, log: StillLog) -> bool:
+    if before.imu != log.imu or before.clock_offset_s is None or log.clock_offset_s is None:
+        return False
+    if not len(before.t_s) or not len(log.t_s) or abs(before.clock_offset_s - log.clock_offset_s) > 1.0:
+        return False
+    return 0.0 < float(log.t_s[0] - before.t_s[-1]) < CONTINUED_S

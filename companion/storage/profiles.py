@@ -1,0 +1,170 @@
+"""Noise profiles learned from recordings: `profiles/NAME.json` in the storage directory."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from companion.calibration.allan import AllanModel, NoiseProfile
+from companion.config import Noise
+from companion.config.profiles import CATALOGUE
+from companion.errors import StorageError
+from companion.storage.atomic import write_atomically
+
+FORMAT_VERSION: Final = 1
+MOST_BYTES: Final = 1_000_000
+_NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]{0,39}")
+
+
+class Source(msgspec.Struct, frozen=True, kw_only=True):
+    """One recording that a profile was learned from."""
+
+    file: str
+    began_at: str | None
+    """UTC, where the recording tells it."""
+    still_s: float
+    temperature_degc: tuple[float, float] | None
+    """Lowest and highest."""
+
+
+class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
+    """The file."""
+
+    format_version: int
+    name: str
+    saved_at: str
+    """UTC."""
+    imu: str
+    gyro: AllanModel
+    """rad/s (times sqrt(s), 1, over sqrt(s))."""
+    accel: AllanModel
+    """m/s^2 likewise."""
+    kept_from: str
+    """The profile whose figures stand for those in `kept`."""
+    kept: tuple[str, ...]
+    """Figures that the recordings were too short to tell."""
+    sources: tuple[Source, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def origin(self) -> str:
+        """In words."""
+        seconds, many = sum(source.still_s for source in self.sources), len(self.sources)
+        recordings = f"{many} recording{'s' if many != 1 else ''}"
+        return f"learned from {seconds / 3600.0:.1f} h at rest in {recordings}, saved {self.saved_at[:10]}"
+
+    @property
+    def noise(self) -> Noise:
+        """As the configuration carries it."""
+        gyro, accel = self.gyro, self.accel
+        return Noise(
+            name=self.name,
+            gyro=(gyro.white, gyro.flicker, gyro.walk),
+            accel=(accel.white, accel.flicker, accel.walk),
+            origin=self.origin,
+        )
+
+    @property
+    def profile(self) -> NoiseProfile:
+        """As the estimator takes it."""
+        return NoiseProfile(self.name, self.gyro, self.accel)
+
+
+def check_name(name: str) -> None:
+    """Whether a profile may be saved under this name.
+
+    Raises:
+        StorageError: it is the catalogue's, or no name for a file; says what is allowed.
+    """
+    plain = re.sub(r"[-_ ]", "", name.lower())
+    if plain in CATALOGUE:
+        raise StorageError(f"profile {name!r}: that name is the catalogue's; allowed: another one")
+    if not _NAME.fullmatch(name):
+        raise StorageError(
+            f"profile {name!r}: allowed: up to 40 small letters, digits, dots, dashes and underscores,"
+            " a letter or digit first"
+        )
+
+
+class ProfileStore:
+    """The folder `profiles` of a storage directory."""
+
+    def __init__(self, directory: Path) -> None:
+        self._folder = directory / "profiles"
+
+    def path(self, name: str) -> Path:
+        """The file of a profile."""
+        return self._folder / f"{name}.json"
+
+    def names(self) -> list[str]:
+        """All that are there, whether they can be read or not.
+
+        Raises:
+            StorageError: the folder cannot be listed.
+        """
+        try:
+            files = [entry.stem for entry in self._folder.iterdir() if entry.suffix == ".json"]
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise StorageError(f"{self._folder}: cannot be listed: {error.strerror or error}") from error
+        return sorted(name for name in files if _NAME.fullmatch(name))
+
+    def read(self, name: str) -> SavedProfile:
+        """One profile.
+
+        Raises:
+            StorageError: one line: it cannot be read, is damaged, or of a newer version.
+        """
+        path = self.path(name)
+        try:
+            with path.open("rb") as file:
+                data = file.read(MOST_BYTES + 1)
+        except OSError as error:
+            raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from error
+        try:
+            found = _from_json(data)
+        except (ValueError, msgspec.MsgspecError) as error:
+            raise StorageError(f"{path}: not a readable profile: {error}") from error
+        if found.name != name:
+            raise StorageError(f"{path}: not a readable profile: it is of {found.name!r}")
+        return found
+
+    def noise(self, name: str) -> Noise:
+        """One profile as the configuration carries it.
+
+        Raises:
+            StorageError: as `read`.
+        """
+        return self.read(name).noise
+
+    def write(self, profile: SavedProfile) -> Path:
+        """Keep a profile, in the place of one of that name; returns its file.
+
+        Raises:
+            StorageError: the name is not allowed, or the file could not be written.
+        """
+        check_name(profile.name)
+        path = self.path(profile.name)
+        # Nothing in it is secret, and whoever may enter the folder may run `check` on what it says.
+        write_atomically(path, msgspec.json.format(msgspec.json.encode(profile), indent=2) + b"\n", mode=0o644)
+        return path
+
+
+def _from_json(data: bytes) -> SavedProfile:
+    if len(data) > MOST_BYTES:
+        raise ValueError(f"more than {MOST_BYTES} bytes")
+    raw: Any = msgspec.json.decode(data)
+    version = raw.get("format_version") if isinstance(raw, dict) else None
+    if isinstance(version, int) and version > FORMAT_VERSION:
+        raise ValueError(f"found format {version}; allowed: up to {FORMAT_VERSION} (a newer companion has saved it)")
+    found = msgspec.convert(raw, SavedProfile)
+    for model in (found.gyro, found.accel):
+        figures = (model.white, model.flicker, model.walk)
+        if not all(map(math.isfinite, figures)) or min(figures) < 0.0 or model.white == 0.0:
+            raise ValueError(f"found N, B, K of {figures}; allowed: N above 0, none negative")
+    return found
