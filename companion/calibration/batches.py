@@ -15,7 +15,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.protocols.bulk import ImuBlock
+
 Floats = NDArray[np.float64]
+_Piece = tuple[Floats, Floats, Floats | None]
+"""Times, rows and stamps."""
 
 MAX_SAMPLES: Final = 4096
 """Kept of one slot; what comes beyond is dropped and counted. Ten times the fastest stream."""
@@ -76,6 +80,11 @@ class BatchSource:
         circle: the single channel is an angle in degrees on [0, 360); means are taken on the circle.
     """
 
+    _pieces: tuple[_Piece, ...] = ()
+    """Of the second under way, what came in blocks; what came later one by one is in the lists."""
+    _in_pieces = 0
+    """Samples of the second under way that are in `_pieces`."""
+
     steps: NDArray[np.float64] | None = None
     """(c,) of a stream of integers, of which every second keeps how often each one came; None for floats."""
 
@@ -107,6 +116,8 @@ class BatchSource:
         self._times: list[float] = []
         self._rows: list[tuple[float, ...]] = []
         self._stamps: list[float | None] = []
+        self._pieces = ()
+        self._in_pieces = 0
         self._temperature_sum = 0.0
         self._temperature_count = 0
 
@@ -132,7 +143,7 @@ class BatchSource:
         self._newest = t_s
         self.last_s = t_s
         self._backward = 0
-        if len(self._rows) >= MAX_SAMPLES:
+        if len(self._rows) + self._in_pieces >= MAX_SAMPLES:
             self.dropped["too many a second"] += 1
             return ended
         self._times.append(t_s)
@@ -142,6 +153,60 @@ class BatchSource:
             self._temperature_sum += temperature_degc
             self._temperature_count += 1
         return ended
+
+    def take(self, block: ImuBlock, start: int, stop: int) -> tuple[int, bool]:
+        """Take samples of a block up to `stop`, or to the end of a second: `add` of each, at once.
+
+        Returns:
+            Where to go on, and whether a second has ended with the first of them, as `add` says it.
+        """
+        times = block.t_s
+        first_s = float(times[start])
+        if not self._newest <= first_s < self._slot_end:
+            stamp = None if block.stamps is None else float(block.stamps[start])
+            temperature_degc = None if block.temperature_degc is None else float(block.temperature_degc[start])
+            return start + 1, self.add(first_s, tuple(block.rows[start].tolist()), temperature_degc, stamp)
+        stop = start + int(np.searchsorted(times[start:stop], self._slot_end))
+        self._newest = self.last_s = float(times[stop - 1])
+        self._backward = 0
+        room = MAX_SAMPLES - len(self._rows) - self._in_pieces
+        kept = slice(start, min(stop, start + max(room, 0)))
+        if stop > kept.stop:
+            self.dropped["too many a second"] += stop - kept.stop
+        self._collect_piece()
+        stamps = None if block.stamps is None else block.stamps[kept]
+        self._pieces = (*self._pieces, (times[kept], block.rows[kept], stamps))
+        self._in_pieces += kept.stop - start
+        if block.temperature_degc is not None and kept.stop > start:
+            # One after the other, as `add` does.
+            readings = np.concatenate(([self._temperature_sum], block.temperature_degc[kept]))
+            self._temperature_sum = float(np.add.accumulate(readings)[-1])
+            self._temperature_count += kept.stop - start
+        return stop, False
+
+    def _collect_piece(self) -> None:
+        """Put what came one by one behind the pieces."""
+        if not self._rows:
+            return
+        stamps = None if None in self._stamps else np.array(self._stamps, dtype=np.float64)
+        piece = np.array(self._times), np.array(self._rows, dtype=np.float64), stamps
+        self._pieces = (*self._pieces, piece)
+        self._in_pieces += len(self._rows)
+        self._times, self._rows, self._stamps = [], [], []
+
+    def _whole(self) -> _Piece:
+        """All samples of the second under way, at least one."""
+        if not self._in_pieces:
+            stamps = None if None in self._stamps else np.array(self._stamps, dtype=np.float64)
+            return np.array(self._times), np.array(self._rows, dtype=np.float64), stamps
+        self._collect_piece()
+        pieces = self._pieces
+        stamped = [stamps for _, _, stamps in pieces if stamps is not None]
+        return (
+            np.concatenate([times for times, _, _ in pieces]),
+            np.concatenate([rows for _, rows, _ in pieces]),
+            np.concatenate(stamped) if len(stamped) == len(pieces) else None,
+        )
 
     def _from_the_past(self, t_s: float) -> bool:
         if not math.isfinite(t_s) or abs(t_s) >= _MAX_TIME_S:
@@ -181,7 +246,7 @@ class BatchSource:
         return True
 
     def _close(self) -> None:
-        if self._slot is not None and self._rows and not self._partial:
+        if self._slot is not None and (self._rows or self._in_pieces) and not self._partial:
             batch = self._summarise(self._slot)
             if batch is not None:
                 self.batches[batch.slot] = batch
@@ -190,9 +255,7 @@ class BatchSource:
         self._clear()
 
     def _summarise(self, slot: int) -> Batch | None:
-        rows = np.array(self._rows, dtype=np.float64)
-        times = np.array(self._times)
-        stamps = None if None in self._stamps else np.array(self._stamps, dtype=np.float64)
+        times, rows, stamps = self._whole()
         if self._circle:
             rows = _unrolled(rows)
         # NaN compares false, so this drops it too.
