@@ -16,7 +16,10 @@ from companion.protocols.clock import SampleTimes
 from companion.samples import Sample
 
 if TYPE_CHECKING:  # numpy is for those who have many readings at once
-    from companion.protocols.bulk import ImuBlock
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from companion.protocols.bulk import Floats, ImuBlock
 
 AHEAD_S = 0.5
 """So far ahead of its line no stream gets: a baud rate then means nothing on that port (USB without a UART)."""
@@ -107,17 +110,24 @@ class Decoder(ABC):
         del reads, read_s
         return None
 
-    def _line_after(self, lengths: Sequence[int], read_s: Sequence[float]) -> float | None:
-        """How far ahead of its line the stream is after so many reads; None where it is too far."""
-        before_s, ahead_s = self._read_s, self._ahead_s
-        for received, t_s in zip(lengths, read_s, strict=True):
-            if before_s is not None:
-                ahead_s += received * self.seconds_per_byte - (t_s - before_s)
-                if ahead_s < -_STALL_S:
-                    ahead_s = -_STALL_S
-                elif ahead_s > AHEAD_S:
-                    return None
-            before_s = t_s
+    def _line_after(self, lengths: NDArray[np.int64], read_s: Floats) -> float | None:
+        """How far ahead of its line the stream is after so many reads; None where it is too far, or nobody knows."""
+        import numpy as np
+
+        if self._read_s is None:
+            return None
+        ahead_s = self._ahead_s
+        steps_s = lengths * self.seconds_per_byte - np.diff(read_s, prepend=self._read_s)
+        # One after the other, like the sums of `_check_line`.
+        sums_s = np.add.accumulate(np.concatenate(([ahead_s], steps_s)))
+        if sums_s.min() >= -_STALL_S and sums_s.max() <= AHEAD_S:
+            return float(sums_s[-1])
+        for step_s in steps_s.tolist():
+            ahead_s += step_s
+            if ahead_s < -_STALL_S:
+                ahead_s = -_STALL_S
+            elif ahead_s > AHEAD_S:
+                return None
         return ahead_s
 
     def _check_line(self, received: int, t_s: float) -> None:

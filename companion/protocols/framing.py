@@ -70,16 +70,17 @@ class FrameDecoder(Decoder):
 
         from companion.protocols.bulk import ImuBlock
 
-        lengths = list(map(len, reads))
-        ahead_s = self._line_after(lengths, read_s) if self.seconds_per_byte else self._ahead_s
+        lengths = np.fromiter(map(len, reads), np.int64, len(reads))
+        read_at_s = np.array(read_s)
+        ahead_s = self._line_after(lengths, read_at_s) if self.seconds_per_byte else self._ahead_s
         if ahead_s is None:
             return None
         # Where in the stream every frame and every read ends.
         first = self._received - len(self._buffer)
         ends = first + frames.frame_bytes * np.arange(1, len(frames.rows) + 1)
-        chunks = [*self._chunks, *zip((self._received + np.cumsum(lengths)).tolist(), read_s, strict=True)]
-        chunk_ends = np.array([end for end, _ in chunks])
-        chunk_s = np.array([t_s for _, t_s in chunks])
+        before = len(self._chunks)
+        chunk_ends = np.concatenate(([end for end, _ in self._chunks], self._received + np.cumsum(lengths))).astype(int)
+        chunk_s = np.concatenate(([t_s for _, t_s in self._chunks], read_at_s))
         chunk = np.searchsorted(chunk_ends, ends)
         came_s = chunk_s[chunk] - self.seconds_per_byte * (chunk_ends[chunk] - ends)
         arrival_s = came_s - frames.frame_bytes * self.seconds_per_byte
@@ -89,7 +90,8 @@ class FrameDecoder(Decoder):
         consumed = int(ends[-1])
         self._received = int(chunk_ends[-1])
         self._buffer = buffer[consumed - first :]
-        self._chunks = deque(each for each in chunks if each[0] > consumed)
+        left = int(np.searchsorted(chunk_ends, consumed, side="right"))
+        self._chunks = deque(zip(chunk_ends[left:].tolist(), chunk_s[left:].tolist(), strict=True))
         if self.seconds_per_byte:
             self._ahead_s, self._read_s = ahead_s, read_s[-1]
         self.accepted += len(ends)
@@ -101,7 +103,7 @@ class FrameDecoder(Decoder):
             temperature_degc=frames.temperature_degc,
             stamps=times.device_s,
             breaks=self.times.clock.breaks,
-            reads=np.maximum(chunk - (len(chunks) - len(reads)), 0),
+            reads=np.maximum(chunk - before, 0),
         )
 
     def _frames(self, buffer: bytes) -> Frames | None:

@@ -25,16 +25,8 @@ _HEAD: Final = struct.Struct("<BQ")
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 _CHUNK_HEAD: Final = struct.Struct("<QQQI")
 _WHOLE_HEAD: Final = _HEAD.size + _MESSAGE_HEAD.size
-_MESSAGE_TYPE: Final = np.dtype(
-    [
-        ("kind", "u1"),
-        ("length", "<u8"),
-        ("channel", "<u2"),
-        ("sequence", "<u4"),
-        ("log_time_ns", "<u8"),
-        ("publish_time_ns", "<u8"),
-    ]
-)
+_LOG_TIME: Final = _HEAD.size + 6
+"""Where in a message it stands: behind the numbers of its channel and its own."""
 _LENGTH: Final = struct.Struct("<I")
 _LONG: Final = struct.Struct("<Q")
 MOST_CHUNK_BYTES: Final = 64 * 1024 * 1024
@@ -52,9 +44,10 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Messages:
-    """Messages that follow each other, as far as somebody wants them; the lists are equally long."""
+    """Messages that follow each other, as far as somebody wants them; (n,) of each."""
 
-    topics: list[str]
+    numbers: NDArray[np.int64]
+    """Of the topic of each: its place in `Recording.topics`."""
     log_times_ns: NDArray[np.uint64]
     data: list[bytes]
 
@@ -93,9 +86,10 @@ class Recording:
         self.path = path
         self.cut_short: str | None = None
         """After reading: why it ended before its end, in words; None when it is whole."""
-        self._topics: dict[int, str] = {}
-        self._chosen = np.zeros(1 << 16, dtype=np.bool_)
-        """By number of channel, whether its topic is known and wanted."""
+        self.topics: list[str] = []
+        """That were met so far."""
+        self._number_of = np.full(1 << 16, -1)
+        """The number of a channel's topic; negative where it is not known or not wanted."""
         try:
             with path.open("rb") as file:
                 head = file.read(len(MAGIC))
@@ -111,7 +105,8 @@ class Recording:
         """Everything in the order of writing, until the end or a cut."""
         for item in self.runs():
             if isinstance(item, Messages):
-                yield from map(Message, item.topics, item.log_times_ns.tolist(), item.data)
+                topics = [self.topics[number] for number in item.numbers.tolist()]
+                yield from map(Message, topics, item.log_times_ns.tolist(), item.data)
             else:
                 yield item
 
@@ -151,8 +146,10 @@ class Recording:
                 yield from self._records(_chunk(data[at:end], at), 0, outermost=False)
             elif kind == _CHANNEL:
                 number = int.from_bytes(data[at : at + 2], "little")
-                self._topics[number] = topic = _text(data, at + 4)[0]
-                self._chosen[number] = self._wanted(topic)
+                topic = _text(data, at + 4)[0]
+                if topic not in self.topics:
+                    self.topics.append(topic)
+                self._number_of[number] = self.topics.index(topic) if self._wanted(topic) else -1
             elif kind == _METADATA:
                 yield _metadata(data, at)
             elif kind == _ATTACHMENT:
@@ -165,17 +162,22 @@ class Recording:
 
     def _messages(self, data: Any, starts: NDArray[np.int64]) -> Messages:
         """Those of the messages that begin there whose topics are known and wanted."""
-        heads = np.frombuffer(data, np.uint8)[starts[:, None] + np.arange(_WHOLE_HEAD)].view(_MESSAGE_TYPE)[:, 0]
-        chosen = self._chosen[heads["channel"]]
-        starts, heads = starts[chosen], heads[chosen]
+        numbers = self._number_of[_anywhere(data, "<u2")[starts + _HEAD.size]]
+        chosen = numbers >= 0
+        starts = starts[chosen]
         begins = (starts + _WHOLE_HEAD).tolist()
-        ends = (starts + _HEAD.size + heads["length"].astype(np.int64)).tolist()
-        topics = self._topics
+        ends = (starts + _HEAD.size + _anywhere(data, "<u8")[starts + 1].astype(np.int64)).tolist()
         return Messages(
-            [topics[number] for number in heads["channel"].tolist()],
-            heads["log_time_ns"],
+            numbers[chosen],
+            _anywhere(data, "<u8")[starts + _LOG_TIME],
             [bytes(data[begin:end]) for begin, end in zip(begins, ends, strict=True)],
         )
+
+
+def _anywhere(data: Any, kind: str) -> NDArray[Any]:
+    """The numbers that begin at each byte."""
+    size = np.dtype(kind).itemsize
+    return np.ndarray((max(len(data) - size + 1, 0),), kind, data, strides=(1,))
 
 
 def _chain(data: bytes, at: int) -> NDArray[np.int64]:
@@ -186,8 +188,7 @@ def _chain(data: bytes, at: int) -> NDArray[np.int64]:
     """
     octets = np.frombuffer(data, np.uint8)
     found: NDArray[np.int64] = at + np.flatnonzero(octets[at : len(data) - _WHOLE_HEAD + 1] == _MESSAGE)
-    # Lengths of eight bytes; no message of ours has as many as take five.
-    heads = octets[found[:, None] + np.arange(1, _HEAD.size)].view("<u8")[:, 0]
+    heads = _anywhere(data, "<u8")[found + 1]
     likely = (heads >= _MESSAGE_HEAD.size) & (heads < MOST_CHUNK_BYTES)
     found, ends = found[likely], found[likely] + _HEAD.size + heads[likely].astype(np.int64)
     if bool((ends[:-1] == found[1:]).all()) and ends[-1] <= len(data):
