@@ -31,6 +31,8 @@ _MAX_TIME_S: Final = 1e12
 _BACKWARD_SAMPLES: Final = 20
 """So many samples in a row from the past mean that the clock went back, not that some were late."""
 _BACKWARD_S: Final = 2.0
+_EVEN: Final = 1.4999
+"""Steps of a counter that are all within so much of each other are one step each, whatever the usual one is."""
 _PINNED_SAMPLES: Final = 5
 _PINNED_DISTINCT: Final = 8
 _PINNED_SIGMAS: Final = 4.0
@@ -259,39 +261,43 @@ class BatchSource:
         if self._circle:
             rows = _unrolled(rows)
         # NaN compares false, so this drops it too.
-        sound = (np.abs(rows) <= self._limits).all(axis=1)
-        if not sound.all():
+        believable = np.abs(rows) <= self._limits
+        if not believable.all():
+            sound = believable.all(axis=1)
             self.dropped["not a believable number"] += int((~sound).sum())
             rows, times = rows[sound], times[sound]
             stamps = None if stamps is None else stamps[sound]
         if stamps is not None:
             fresh = _first_of_each(stamps, rows)
-            if not fresh.all():
+            if fresh is not None:
                 self.dropped["repeated"] += int((~fresh).sum())
                 rows, times, stamps = rows[fresh], times[fresh], stamps[fresh]
         n = len(rows)
         if n == 0:
             return None
         if stamps is not None:
-            self.lost += _missing(np.append(self._last_stamp, stamps))
+            self.lost += _missing(np.concatenate(((self._last_stamp,), stamps)))
             self._last_stamp = stamps[-1]
         ordered = np.sort(rows, axis=0)
         distinct = 1 + (ordered[1:] != ordered[:-1]).sum(axis=0)
-        centre = rows.mean(axis=0)
-        gaps = np.diff(times, prepend=float(slot), append=slot + 1.0)
+        # The very sums of `mean` and `var`, each once.
+        centre = np.add.reduce(rows, axis=0) / n
+        off, steps = rows - centre, rows[1:] - rows[:-1]
+        gaps = times[1:] - times[:-1]
+        edges = float(times[0]) - float(slot), slot + 1.0 - float(times[-1])
         return Batch(
             slot=slot,
             n=n,
             first_s=float(times[0]),
             last_s=float(times[-1]),
             mean=np.mod(centre, 360.0) if self._circle else centre,
-            variance=rows.var(axis=0, ddof=1) if n > 1 else np.zeros(rows.shape[1]),
-            white=np.square(np.diff(rows, axis=0)).mean(axis=0) / 2.0 if n > 1 else np.zeros(rows.shape[1]),
+            variance=np.add.reduce(off * off, axis=0) / (n - 1) if n > 1 else np.zeros(rows.shape[1]),
+            white=np.add.reduce(steps * steps, axis=0) / (n - 1) / 2.0 if n > 1 else np.zeros(rows.shape[1]),
             low=ordered[0],
             high=ordered[-1],
             distinct=np.asarray(distinct, dtype=np.int64),
             clipped=_clipped(ordered, distinct),
-            largest_gap_s=float(gaps.max()),
+            largest_gap_s=max(*edges, float(gaps.max()) if n > 1 else 0.0),
             missing=None if stamps is None else _missing(stamps),
             temperature_degc=self._temperature_sum / self._temperature_count if self._temperature_count else None,
             counts=None if self.steps is None else _counts(rows, self.steps),
@@ -319,16 +325,19 @@ def _unrolled(rows: Floats) -> Floats:
         return np.asarray(finite[0] + np.mod(rows - finite[0] + 180.0, 360.0) - 180.0)
 
 
-def _first_of_each(stamps: Floats, rows: Floats) -> NDArray[np.bool_]:
-    """False for a row whose stamp and values were already seen: the same packet over a second route.
+def _first_of_each(stamps: Floats, rows: Floats) -> NDArray[np.bool_] | None:
+    """False for a row whose stamp and values were already seen: the same packet over a second route; None: none was.
 
     A stamp alone is not enough: counters wrap, and some devices' clocks stand still.
     """
+    if (stamps[1:] > stamps[:-1]).all():
+        return None
     _, first, inverse = np.unique(stamps, return_index=True, return_inverse=True)
     if len(first) == len(stamps):
-        return np.ones(len(stamps), dtype=np.bool_)
+        return None
     original = first[inverse]
-    return np.asarray((original == np.arange(len(stamps))) | (rows != rows[original]).any(axis=1))
+    fresh = np.asarray((original == np.arange(len(stamps))) | (rows != rows[original]).any(axis=1))
+    return None if fresh.all() else fresh
 
 
 def _missing(stamps: Floats) -> int:
@@ -336,9 +345,9 @@ def _missing(stamps: Floats) -> int:
 
     The step is learned (some devices count at an internal rate), and going down, as after a restart, is nobody's loss.
     """
-    steps = np.diff(stamps)
+    steps = stamps[1:] - stamps[:-1]
     steps = steps[steps > 0]
-    if len(steps) == 0:
+    if len(steps) == 0 or steps.max() < _EVEN * steps.min():
         return 0
     usual = float(np.median(steps))
     return int(np.maximum(np.rint(steps / usual) - 1.0, 0.0).sum())
