@@ -15,7 +15,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.protocols.bulk import ImuBlock
+
 Floats = NDArray[np.float64]
+_Piece = tuple[Floats, Floats, Floats | None]
+"""Times, rows and stamps."""
 
 MAX_SAMPLES: Final = 4096
 """Kept of one slot; what comes beyond is dropped and counted. Ten times the fastest stream."""
@@ -27,6 +31,8 @@ _MAX_TIME_S: Final = 1e12
 _BACKWARD_SAMPLES: Final = 20
 """So many samples in a row from the past mean that the clock went back, not that some were late."""
 _BACKWARD_S: Final = 2.0
+_EVEN: Final = 1.4999
+"""Steps of a counter that are all within so much of each other are one step each, whatever the usual one is."""
 _PINNED_SAMPLES: Final = 5
 _PINNED_DISTINCT: Final = 8
 _PINNED_SIGMAS: Final = 4.0
@@ -76,6 +82,11 @@ class BatchSource:
         circle: the single channel is an angle in degrees on [0, 360); means are taken on the circle.
     """
 
+    _pieces: tuple[_Piece, ...] = ()
+    """Of the second under way, what came in blocks; what came later one by one is in the lists."""
+    _in_pieces = 0
+    """Samples of the second under way that are in `_pieces`."""
+
     steps: NDArray[np.float64] | None = None
     """(c,) of a stream of integers, of which every second keeps how often each one came; None for floats."""
 
@@ -107,6 +118,8 @@ class BatchSource:
         self._times: list[float] = []
         self._rows: list[tuple[float, ...]] = []
         self._stamps: list[float | None] = []
+        self._pieces = ()
+        self._in_pieces = 0
         self._temperature_sum = 0.0
         self._temperature_count = 0
 
@@ -132,7 +145,7 @@ class BatchSource:
         self._newest = t_s
         self.last_s = t_s
         self._backward = 0
-        if len(self._rows) >= MAX_SAMPLES:
+        if len(self._rows) + self._in_pieces >= MAX_SAMPLES:
             self.dropped["too many a second"] += 1
             return ended
         self._times.append(t_s)
@@ -142,6 +155,60 @@ class BatchSource:
             self._temperature_sum += temperature_degc
             self._temperature_count += 1
         return ended
+
+    def take(self, block: ImuBlock, start: int, stop: int) -> tuple[int, bool]:
+        """Take samples of a block up to `stop`, or to the end of a second: `add` of each, at once.
+
+        Returns:
+            Where to go on, and whether a second has ended with the first of them, as `add` says it.
+        """
+        times = block.t_s
+        first_s = float(times[start])
+        if not self._newest <= first_s < self._slot_end:
+            stamp = None if block.stamps is None else float(block.stamps[start])
+            temperature_degc = None if block.temperature_degc is None else float(block.temperature_degc[start])
+            return start + 1, self.add(first_s, tuple(block.rows[start].tolist()), temperature_degc, stamp)
+        stop = start + int(np.searchsorted(times[start:stop], self._slot_end))
+        self._newest = self.last_s = float(times[stop - 1])
+        self._backward = 0
+        room = MAX_SAMPLES - len(self._rows) - self._in_pieces
+        kept = slice(start, min(stop, start + max(room, 0)))
+        if stop > kept.stop:
+            self.dropped["too many a second"] += stop - kept.stop
+        self._collect_piece()
+        stamps = None if block.stamps is None else block.stamps[kept]
+        self._pieces = (*self._pieces, (times[kept], block.rows[kept], stamps))
+        self._in_pieces += kept.stop - start
+        if block.temperature_degc is not None and kept.stop > start:
+            # One after the other, as `add` does.
+            readings = np.concatenate(([self._temperature_sum], block.temperature_degc[kept]))
+            self._temperature_sum = float(np.add.accumulate(readings)[-1])
+            self._temperature_count += kept.stop - start
+        return stop, False
+
+    def _collect_piece(self) -> None:
+        """Put what came one by one behind the pieces."""
+        if not self._rows:
+            return
+        stamps = None if None in self._stamps else np.array(self._stamps, dtype=np.float64)
+        piece = np.array(self._times), np.array(self._rows, dtype=np.float64), stamps
+        self._pieces = (*self._pieces, piece)
+        self._in_pieces += len(self._rows)
+        self._times, self._rows, self._stamps = [], [], []
+
+    def _whole(self) -> _Piece:
+        """All samples of the second under way, at least one."""
+        if not self._in_pieces:
+            stamps = None if None in self._stamps else np.array(self._stamps, dtype=np.float64)
+            return np.array(self._times), np.array(self._rows, dtype=np.float64), stamps
+        self._collect_piece()
+        pieces = self._pieces
+        stamped = [stamps for _, _, stamps in pieces if stamps is not None]
+        return (
+            np.concatenate([times for times, _, _ in pieces]),
+            np.concatenate([rows for _, rows, _ in pieces]),
+            np.concatenate(stamped) if len(stamped) == len(pieces) else None,
+        )
 
     def _from_the_past(self, t_s: float) -> bool:
         if not math.isfinite(t_s) or abs(t_s) >= _MAX_TIME_S:
@@ -181,7 +248,7 @@ class BatchSource:
         return True
 
     def _close(self) -> None:
-        if self._slot is not None and self._rows and not self._partial:
+        if self._slot is not None and (self._rows or self._in_pieces) and not self._partial:
             batch = self._summarise(self._slot)
             if batch is not None:
                 self.batches[batch.slot] = batch
@@ -190,45 +257,47 @@ class BatchSource:
         self._clear()
 
     def _summarise(self, slot: int) -> Batch | None:
-        rows = np.array(self._rows, dtype=np.float64)
-        times = np.array(self._times)
-        stamps = None if None in self._stamps else np.array(self._stamps, dtype=np.float64)
+        times, rows, stamps = self._whole()
         if self._circle:
             rows = _unrolled(rows)
         # NaN compares false, so this drops it too.
-        sound = (np.abs(rows) <= self._limits).all(axis=1)
-        if not sound.all():
+        believable = np.abs(rows) <= self._limits
+        if not believable.all():
+            sound = believable.all(axis=1)
             self.dropped["not a believable number"] += int((~sound).sum())
             rows, times = rows[sound], times[sound]
             stamps = None if stamps is None else stamps[sound]
         if stamps is not None:
             fresh = _first_of_each(stamps, rows)
-            if not fresh.all():
+            if fresh is not None:
                 self.dropped["repeated"] += int((~fresh).sum())
                 rows, times, stamps = rows[fresh], times[fresh], stamps[fresh]
         n = len(rows)
         if n == 0:
             return None
         if stamps is not None:
-            self.lost += _missing(np.append(self._last_stamp, stamps))
+            self.lost += _missing(np.concatenate(((self._last_stamp,), stamps)))
             self._last_stamp = stamps[-1]
         ordered = np.sort(rows, axis=0)
         distinct = 1 + (ordered[1:] != ordered[:-1]).sum(axis=0)
-        centre = rows.mean(axis=0)
-        gaps = np.diff(times, prepend=float(slot), append=slot + 1.0)
+        # The very sums of `mean` and `var`, each once.
+        centre = np.add.reduce(rows, axis=0) / n
+        off, steps = rows - centre, rows[1:] - rows[:-1]
+        gaps = times[1:] - times[:-1]
+        edges = float(times[0]) - float(slot), slot + 1.0 - float(times[-1])
         return Batch(
             slot=slot,
             n=n,
             first_s=float(times[0]),
             last_s=float(times[-1]),
             mean=np.mod(centre, 360.0) if self._circle else centre,
-            variance=rows.var(axis=0, ddof=1) if n > 1 else np.zeros(rows.shape[1]),
-            white=np.square(np.diff(rows, axis=0)).mean(axis=0) / 2.0 if n > 1 else np.zeros(rows.shape[1]),
+            variance=np.add.reduce(off * off, axis=0) / (n - 1) if n > 1 else np.zeros(rows.shape[1]),
+            white=np.add.reduce(steps * steps, axis=0) / (n - 1) / 2.0 if n > 1 else np.zeros(rows.shape[1]),
             low=ordered[0],
             high=ordered[-1],
             distinct=np.asarray(distinct, dtype=np.int64),
             clipped=_clipped(ordered, distinct),
-            largest_gap_s=float(gaps.max()),
+            largest_gap_s=max(*edges, float(gaps.max()) if n > 1 else 0.0),
             missing=None if stamps is None else _missing(stamps),
             temperature_degc=self._temperature_sum / self._temperature_count if self._temperature_count else None,
             counts=None if self.steps is None else _counts(rows, self.steps),
@@ -256,16 +325,19 @@ def _unrolled(rows: Floats) -> Floats:
         return np.asarray(finite[0] + np.mod(rows - finite[0] + 180.0, 360.0) - 180.0)
 
 
-def _first_of_each(stamps: Floats, rows: Floats) -> NDArray[np.bool_]:
-    """False for a row whose stamp and values were already seen: the same packet over a second route.
+def _first_of_each(stamps: Floats, rows: Floats) -> NDArray[np.bool_] | None:
+    """False for a row whose stamp and values were already seen: the same packet over a second route; None: none was.
 
     A stamp alone is not enough: counters wrap, and some devices' clocks stand still.
     """
+    if (stamps[1:] > stamps[:-1]).all():
+        return None
     _, first, inverse = np.unique(stamps, return_index=True, return_inverse=True)
     if len(first) == len(stamps):
-        return np.ones(len(stamps), dtype=np.bool_)
+        return None
     original = first[inverse]
-    return np.asarray((original == np.arange(len(stamps))) | (rows != rows[original]).any(axis=1))
+    fresh = np.asarray((original == np.arange(len(stamps))) | (rows != rows[original]).any(axis=1))
+    return None if fresh.all() else fresh
 
 
 def _missing(stamps: Floats) -> int:
@@ -273,9 +345,9 @@ def _missing(stamps: Floats) -> int:
 
     The step is learned (some devices count at an internal rate), and going down, as after a restart, is nobody's loss.
     """
-    steps = np.diff(stamps)
+    steps = stamps[1:] - stamps[:-1]
     steps = steps[steps > 0]
-    if len(steps) == 0:
+    if len(steps) == 0 or steps.max() < _EVEN * steps.min():
         return 0
     usual = float(np.median(steps))
     return int(np.maximum(np.rint(steps / usual) - 1.0, 0.0).sum())

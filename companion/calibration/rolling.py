@@ -7,28 +7,28 @@ when every source was still in it. Method section 3, items 2, 3 and 7.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import msgspec
-import numpy as np
 
 from companion.calibration.batches import Batch
 from companion.calibration.estimates import Estimates, Found, Work
-from companion.calibration.field_heading import FieldHeading
 from companion.calibration.heading_watch import HeadingWatch
+from companion.calibration.intake import Intake
+from companion.calibration.measurement import Measurement, PoseSeconds
+from companion.calibration.obstacles import is_moving, obstacle, settling
 from companion.calibration.outlook import Glance, Status
 from companion.calibration.pose_models import CompassModel, GradienterModel
-from companion.calibration.pose_windows import HeadingWindow, TiltWindow, heading_window, tilt_window
+from companion.calibration.pose_windows import HeadingWindow, TiltWindow
 from companion.calibration.settling import AT_ONCE, Lag
-from companion.calibration.sources import Source, SourceStatus, compass_source, gradienter_source, imu_source
-from companion.calibration.stillness import ImuGate, Verdict
+from companion.calibration.sources import Source, SourceStatus
+from companion.calibration.stillness import ImuGate
 from companion.calibration.stop import Settings, expected_s, is_enough
 from companion.calibration.stretch import Stretch
 from companion.calibration.trace import Snapshot, TraceLog
-from companion.calibration.windows import ImuInput, ImuWindow, Window, integer_steps
+from companion.calibration.windows import ImuInput, ImuWindow, Window
 from companion.errors import CalibrationRefusedError
-from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 
 __all__ = [
     "Glance",
@@ -52,7 +52,7 @@ _CLOSE_S: Final = 0.25
 _MARGIN: Final = 8
 
 
-class RollingCollector:
+class RollingCollector(Intake):
     """Collects batches of all sources, judges stillness, and gives means of the still stretch.
 
     Pure: no clock and no I/O. Nothing that a sample holds makes it raise; what is dropped is counted by reason.
@@ -71,7 +71,6 @@ class RollingCollector:
         ValueError: two IMUs of one name.
     """
 
-    _field: FieldHeading | None = None
     _watch: HeadingWatch | None = None
 
     def __init__(
@@ -90,14 +89,13 @@ class RollingCollector:
         self._settings = settings
         self._min_good = settings.min_slots
         self._max_slots = settings.max_slots
-        self._keep = self._max_slots + _MARGIN
-        self._inputs: dict[str, ImuInput] = {}
-        self._imus: dict[str, Source] = {}
-        self._lags = (gradienter_lag, compass_lag)
-        self._tilt = gradienter_source(self._keep, gradienter_lag) if gradienter else None
-        self._heading = compass_source(self._keep, compass_lag) if compass else None
-        self._breaks: dict[str, int] = {}
-        self._field = None if field_by is None else FieldHeading(*field_by, self._keep)
+        super().__init__(
+            self._max_slots + _MARGIN,
+            gradienter=gradienter,
+            compass=compass,
+            lags=(gradienter_lag, compass_lag),
+            field_by=field_by,
+        )
         self._watch = HeadingWatch()
         self._stretch = Stretch(self._min_good, self._max_slots)
         self._next: int | None = None
@@ -108,76 +106,10 @@ class RollingCollector:
         self._trace = TraceLog()
         self._restarted_because = ""
         self._restarts = 0
-        self.unknown_samples = 0
         for imu in imus:
             self.set_imu(imu)
 
-    # ------------------------------------------------------------------------------------------------- samples in
-
-    def add_imu(self, name: str, sample: ImuSample) -> None:
-        """Take one sample of the IMU of that name; of an unknown name it is counted and dropped."""
-        source = self._imus.get(name)
-        if source is None:
-            self.unknown_samples += 1
-            return
-        if sample.breaks != self._breaks.get(name, 0):
-            self._breaks[name] = sample.breaks
-            self._forget(f"imu {name} restarted", name)
-        stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
-        row = sample.gyro_rad_s + sample.accel_m_s2
-        if source.batches.add(sample.t_s, row, sample.temperature_degc, stamp):
-            self._evaluate()
-
-    def add_tilt(self, sample: TiltSample) -> None:
-        """Take one reading of the gradienter; dropped when none is expected."""
-        if self._field is not None:
-            self._field.take_tilt(sample)
-        if self._tilt is None:
-            self.unknown_samples += 1
-        elif self._tilt.batches.add(sample.t_s, (sample.x_deg, sample.y_deg), sample.temperature_degc):
-            self._evaluate()
-
-    def add_compass(self, sample: CompassSample) -> bool:
-        """Take one heading of the device's own; whether it is the one that counts (else that from its field does)."""
-        counts = self._field is None or self._field.takes_own(sample)
-        if counts:
-            self._take_heading(sample)
-        return counts
-
-    def add_field(self, sample: MagSample) -> CompassSample | None:
-        """Take the compass' field; the heading that came of it, where that is the one that counts."""
-        if self._heading is None or self._field is None:
-            self.unknown_samples += 1
-            return None
-        heading = self._field.take(sample)
-        self._heading.hint = self._field.hint
-        if heading is not None:
-            self._take_heading(heading)
-        return heading
-
-    def _take_heading(self, sample: CompassSample) -> None:
-        if self._heading is None:
-            self.unknown_samples += 1
-        elif self._heading.batches.add(sample.t_s, (sample.heading_deg,)):
-            self._evaluate()
-
     # ------------------------------------------------------------------------------------------------- what changes
-
-    def set_imu(self, imu: ImuInput) -> None:
-        """Add an IMU, or say that its stream is another kind now: all that was learned of it is forgotten."""
-        self._inputs[imu.name] = imu
-        prior = None if imu.gyro_prior_rad_s is None else np.asarray(imu.gyro_prior_rad_s)
-        gate = ImuGate(imu.name, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2), prior)
-        known = self._imus.get(imu.name)
-        if known is None:
-            known = self._imus[imu.name] = imu_source(imu.name, gate, self._keep)
-            known.batches.steps = integer_steps(imu)
-            # It has no share in the seconds so far.
-            self._break()
-        else:
-            known.gate = gate
-            known.batches.steps = integer_steps(imu)
-            self.reset("another stream", imu.name)
 
     def retarget(self, settings: Settings) -> None:
         """Other targets from the next look on; the lengths (`min_still_s`, `max_s`) stay as they were."""
@@ -187,32 +119,12 @@ class RollingCollector:
             target_accel_sigma_m_s2=settings.target_accel_sigma_m_s2,
         )
 
-    def expect(self, *, gradienter: bool, compass: bool) -> None:
-        """Change which pose sensors are waited for, for example when one is found dead; the IMUs' history stays."""
-        added = (gradienter and self._tilt is None) or (compass and self._heading is None)
-        if gradienter != (self._tilt is not None):
-            self._tilt = gradienter_source(self._keep, self._lags[0]) if gradienter else None
-        if compass != (self._heading is not None):
-            self._heading = compass_source(self._keep, self._lags[1]) if compass else None
-        if added:
-            self._break()
-
     def reset(self, why: str, imu: str | None = None) -> None:
         """Forget what was measured, of one IMU or of everything: armed, offsets written, restarted.
 
         The second under way is forgotten too. The stretch begins again; learned noise stays.
         """
         self._forget(why, imu)
-
-    def _forget(self, why: str, imu: str | None) -> None:
-        self._restarted_because = why
-        for source in self._sources():
-            if imu is None or (source.kind == "imu" and source.name == imu):
-                source.batches.forget()
-                source.verdict = Verdict(still=False)
-                if isinstance(source.gate, ImuGate):
-                    source.gate.forget_level()
-        self._break()
 
     # ------------------------------------------------------------------------------------------------- what is known
 
@@ -221,7 +133,7 @@ class RollingCollector:
         self._advance(now_s)
         return Glance(
             obstacle=self._obstacle(now_s),
-            moving=self._moving(now_s),
+            moving=is_moving(self._sources(), now_s, good_now=self._stretch.good_now),
             still_s=float(self._stretch.good),
             steady_s=float(self._stretch.steady),
         )
@@ -287,6 +199,14 @@ class RollingCollector:
         Raises:
             CalibrationRefusedError: not still, not still for long enough, or a source fails its checks.
         """
+        return self.measurement(now_s, since_s=since_s).window()
+
+    def measurement(self, now_s: float, *, since_s: float | None = None) -> Measurement:
+        """What `window` would give, not worked out yet; costs a small part of it.
+
+        Raises:
+            CalibrationRefusedError: not still, or not still for long enough.
+        """
         self._advance(now_s)
         if (reason := self._obstacle(now_s)) is not None:
             raise CalibrationRefusedError(reason)
@@ -294,23 +214,17 @@ class RollingCollector:
         if not self._are_enough(slots, since_s):
             needed = self._min_good if since_s is None else min(MIN_BATCHES, self._min_good)
             raise CalibrationRefusedError(f"still for {len(slots)} s only, needs {needed} s")
-        estimates = self._estimate(slots, since_s)
-        if isinstance(estimates, CalibrationRefusedError):
-            raise estimates
-        if (settling := self._settles(slots, 0)) is not None:
-            raise CalibrationRefusedError(settling)
-        return Window(
-            start_s=float(slots[0]),
-            end_s=slots[-1] + 1.0,
-            imus=tuple(item.window for item in estimates),
-            tilt=tilt_window(self._pose_batches(self._tilt, slots)) if self._tilt else None,
-            heading=heading_window(
-                self._pose_batches(self._heading, slots),
+        return Measurement(
+            slots=slots,
+            estimate=self._estimate_later(slots, since_s),
+            settling=self._settles(slots, 0),
+            tilt=_pose_seconds(self._tilt, slots),
+            heading=_pose_seconds(
+                self._heading,
+                slots,
                 from_field=self._field is not None and self._field.from_field,
                 wander_deg=None if self._watch is None else self._watch.wander_deg,
-            )
-            if self._heading
-            else None,
+            ),
             field=self._field.window(slots) if self._field and self._heading else None,
         )
 
@@ -324,9 +238,6 @@ class RollingCollector:
         return self._trace.snapshot(self._inputs, started_s, measured_s)
 
     # ------------------------------------------------------------------------------------------------- inside
-
-    def _sources(self) -> list[Source]:
-        return [*self._imus.values(), *(source for source in (self._tilt, self._heading) if source is not None)]
 
     def _break(self) -> None:
         self._stretch.clear()
@@ -404,39 +315,20 @@ class RollingCollector:
                 source.gate.accept(batch)
 
     def _obstacle(self, now_s: float) -> str | None:
-        """What is in the way right now: a silent source, or the latest second was not still."""
-        for source in self._sources():
-            if (silence := source.silence(now_s)) is not None:
-                return silence
-        if self._stretch.good_now:
-            return None
-        for source in self._sources():
-            if words := source.verdict.words:
-                return words if source.verdict.fault else f"waiting for still: {words}"
-        return f"hold still {self._min_good} s"
-
-    def _moving(self, now_s: float) -> bool:
-        """Whether nothing but a movement is in the way right now."""
-        sources = self._sources()
-        faulty = any(
-            source.silence(now_s) is not None or (source.verdict.fault and source.verdict.words) for source in sources
-        )
-        return not faulty and not self._stretch.good_now
+        return obstacle(self._sources(), now_s, good_now=self._stretch.good_now, min_good=self._min_good)
 
     def _waiting_for(self, now_s: float) -> str | None:
         obstacle = self._obstacle(now_s)
         if obstacle is not None:
             return obstacle
         left_s = 0 if self._stretch.begun else self._min_good - self._stretch.good
-        settling = self._settles(self._slots(None), left_s)
-        if settling is not None or not left_s:
-            return settling
+        settles = self._settles(self._slots(None), left_s)
+        if settles is not None or not left_s:
+            return settles
         return f"hold still {left_s} s more"
 
     def _settles(self, slots: list[int], left_s: int) -> str | None:
-        needed = min(MIN_BATCHES, self._min_good)
-        lacks = (source.lacks(slots, needed, left_s) for source in (self._tilt, self._heading) if source is not None)
-        return next(filter(None, lacks), None)
+        return settling((self._tilt, self._heading), slots, min(MIN_BATCHES, self._min_good), left_s)
 
     def _slots(self, since_s: float | None) -> list[int]:
         start = self._stretch.start
@@ -471,8 +363,24 @@ class RollingCollector:
             since_s=since_s,
         )
 
-    def _pose_batches(self, source: Source, slots: list[int]) -> list[Batch]:
-        found = source.settled(slots)
-        if not found:
-            raise CalibrationRefusedError(f"no reading from {source.label} in {len(slots)} s")
-        return found
+    def _estimate_later(self, slots: list[int], since_s: float | None) -> Callable[[], Found]:
+        """`_estimate`, worked out when it is asked for, of what is known now."""
+        found = self._estimates.known(slots[-1], since_s)
+        if found is not None:
+            return lambda: found
+        work = self._work(slots, since_s)
+
+        def estimate() -> Found:
+            found = work.run()
+            self._estimates.keep(work, found)
+            return found
+
+        return estimate
+
+
+def _pose_seconds(
+    source: Source | None, slots: list[int], *, from_field: bool = False, wander_deg: float | None = None
+) -> PoseSeconds | None:
+    if source is None:
+        return None
+    return PoseSeconds(source.label, source.settled(slots), len(slots), from_field, wander_deg)

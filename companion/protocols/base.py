@@ -9,10 +9,17 @@ from __future__ import annotations
 import binascii
 from abc import ABC, abstractmethod
 from collections import Counter
-from typing import ClassVar, Final
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, ClassVar, Final
 
 from companion.protocols.clock import SampleTimes
 from companion.samples import Sample
+
+if TYPE_CHECKING:  # numpy is for those who have many readings at once
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from companion.protocols.bulk import Floats, ImuBlock
 
 AHEAD_S = 0.5
 """So far ahead of its line no stream gets: a baud rate then means nothing on that port (USB without a UART)."""
@@ -93,6 +100,35 @@ class Decoder(ABC):
         if self.seconds_per_byte:
             self._check_line(len(data), t_s)
         return self.times.place(samples, t_s, self.frame_bytes * self.seconds_per_byte) if samples else samples
+
+    def receive_many(self, reads: Sequence[bytes], read_s: Sequence[float]) -> ImuBlock | None:
+        """The same as `receive` for one read after the other, at once and much quicker, where the stream is regular.
+
+        None: it is not, or this decoder knows no quicker way; then nothing was taken. Samples other than those of an
+        IMU are left out.
+        """
+        del reads, read_s
+        return None
+
+    def _line_after(self, lengths: NDArray[np.int64], read_s: Floats) -> float | None:
+        """How far ahead of its line the stream is after so many reads; None where it is too far, or nobody knows."""
+        import numpy as np
+
+        if self._read_s is None:
+            return None
+        ahead_s = self._ahead_s
+        steps_s = lengths * self.seconds_per_byte - np.diff(read_s, prepend=self._read_s)
+        # One after the other, like the sums of `_check_line`.
+        sums_s = np.add.accumulate(np.concatenate(([ahead_s], steps_s)))
+        if sums_s.min() >= -_STALL_S and sums_s.max() <= AHEAD_S:
+            return float(sums_s[-1])
+        for step_s in steps_s.tolist():
+            ahead_s += step_s
+            if ahead_s < -_STALL_S:
+                ahead_s = -_STALL_S
+            elif ahead_s > AHEAD_S:
+                return None
+        return ahead_s
 
     def _check_line(self, received: int, t_s: float) -> None:
         """Find out whether bytes come faster than the line could carry them: then its line time means nothing."""

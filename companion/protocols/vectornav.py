@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import binascii
 import re
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from companion.protocols.base import (
     CHECKSUM,
@@ -27,6 +27,9 @@ from companion.protocols.checks import check_attitude, check_imu, numbers
 from companion.protocols.framing import WAIT, FrameDecoder
 from companion.protocols.vectornav_binary import Layout, header_bytes, layout_of
 from companion.samples import AttitudeSample, ImuSample, MagSample, Sample
+
+if TYPE_CHECKING:
+    from companion.protocols.bulk import Frames
 
 SENTENCE_LIMIT = 250
 """Bytes of a sentence after its "$"; the longest asynchronous one has some 200."""
@@ -97,6 +100,19 @@ class VectorNavDecoder(FrameDecoder):
         except RejectedError as error:
             self.rejected[error.reason] += 1
         return end
+
+    def _frames(self, buffer: bytes) -> Frames | None:
+        header = self._header
+        if not header or not buffer.startswith(header):
+            return None
+        layout = self._layouts.get(header) or layout_of(header)
+        whole = len(buffer) // layout.frame_bytes * layout.frame_bytes
+        if not buffer.startswith(header[: len(buffer) - whole], whole):
+            return None
+        return layout.frames(header, buffer, whole)
+
+    def _took(self, frames: Frames) -> None:
+        self._layouts[frames.header] = layout_of(frames.header)
 
     def _sentence(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         """Where to go on after what begins with a "$", or `WAIT` for more bytes."""

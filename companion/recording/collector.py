@@ -12,6 +12,7 @@ from companion.calibration.outlook import Glance, Status
 from companion.calibration.pose_models import CompassModel, GradienterModel
 from companion.calibration.rolling import ImuInput, RollingCollector, Settings, Window
 from companion.calibration.settling import AT_ONCE, Lag
+from companion.protocols.bulk import ImuBlock
 from companion.recording.journal import Journal
 from companion.samples import CompassSample, ImuSample, TiltSample
 
@@ -70,6 +71,13 @@ class RecordedCollector(RollingCollector):
         if self.journal.queues:
             self.journal.imu(name, sample, self._message_of(name), sample.t_s)
         super().add_imu(name, sample)
+
+    def add_block(self, name: str, block: ImuBlock, start: int = 0, stop: int | None = None) -> None:  # noqa: D102
+        if self.journal.queues:
+            message = self._message_of(name)
+            for sample in block.samples(start, stop):
+                self.journal.imu(name, sample, message, sample.t_s)
+        super().add_block(name, block, start, stop)
 
     def add_tilt(self, sample: TiltSample) -> None:  # noqa: D102
         self.journal.tilt(sample)

@@ -9,10 +9,13 @@ from __future__ import annotations
 import mmap
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from companion.errors import StorageError
 
@@ -21,6 +24,9 @@ _CHANNEL, _MESSAGE, _CHUNK, _ATTACHMENT, _METADATA, _DATA_END = 0x04, 0x05, 0x06
 _HEAD: Final = struct.Struct("<BQ")
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 _CHUNK_HEAD: Final = struct.Struct("<QQQI")
+_WHOLE_HEAD: Final = _HEAD.size + _MESSAGE_HEAD.size
+_LOG_TIME: Final = _HEAD.size + 6
+"""Where in a message it stands: behind the numbers of its channel and its own."""
 _LENGTH: Final = struct.Struct("<I")
 _LONG: Final = struct.Struct("<Q")
 MOST_CHUNK_BYTES: Final = 64 * 1024 * 1024
@@ -34,6 +40,16 @@ class Message:
     topic: str
     log_time_ns: int
     data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Messages:
+    """Messages that follow each other, as far as somebody wants them; (n,) of each."""
+
+    numbers: NDArray[np.int64]
+    """Of the topic of each: its place in `Recording.topics`."""
+    log_times_ns: NDArray[np.uint64]
+    data: list[bytes]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +86,10 @@ class Recording:
         self.path = path
         self.cut_short: str | None = None
         """After reading: why it ended before its end, in words; None when it is whole."""
-        self._topics: dict[int, str] = {}
+        self.topics: list[str] = []
+        """That were met so far."""
+        self._number_of = np.full(1 << 16, -1)
+        """The number of a channel's topic; negative where it is not known or not wanted."""
         try:
             with path.open("rb") as file:
                 head = file.read(len(MAGIC))
@@ -84,12 +103,26 @@ class Recording:
 
     def __iter__(self) -> Iterator[Message | Metadata | Attachment]:
         """Everything in the order of writing, until the end or a cut."""
+        for item in self.runs():
+            if isinstance(item, Messages):
+                topics = [self.topics[number] for number in item.numbers.tolist()]
+                yield from map(Message, topics, item.log_times_ns.tolist(), item.data)
+            else:
+                yield item
+
+    def runs(self, wanted: Callable[[str], bool] | None = None) -> Iterator[Messages | Metadata | Attachment]:
+        """The same, many messages at once.
+
+        Args:
+            wanted: says of a topic, once, whether its messages are; None: all are.
+        """
+        self._wanted = wanted or (lambda topic: True)
         try:
             yield from self._records(memoryview(self._data), len(MAGIC), outermost=True)
         except (_DamagedError, struct.error, UnicodeDecodeError) as error:
             self.cut_short = str(error)
 
-    def _records(self, data: Any, at: int, *, outermost: bool) -> Iterator[Message | Metadata | Attachment]:
+    def _records(self, data: Any, at: int, *, outermost: bool) -> Iterator[Messages | Metadata | Attachment]:
         size = len(data)
         if size < at:
             raise _DamagedError(f"cut in its first {at} bytes")
@@ -97,20 +130,26 @@ class Recording:
             if size - at < _HEAD.size:
                 raise _DamagedError(f"cut at byte {size}")
             kind, length = _HEAD.unpack_from(data, at)
-            at += _HEAD.size
-            end = at + length
+            end = at + _HEAD.size + length
             if kind == 0 or end > size:
+                at += _HEAD.size
                 raise _DamagedError(f"cut at byte {size}" if kind else f"nothing but zeros from byte {at} on")
             if kind == _MESSAGE:
-                topic, _, log_time_ns, _ = _MESSAGE_HEAD.unpack_from(data, at)
-                known = self._topics.get(topic)
-                if known is not None:
-                    yield Message(known, log_time_ns, bytes(data[at + _MESSAGE_HEAD.size : end]))
-            elif kind == _CHUNK and outermost:
+                if length < _MESSAGE_HEAD.size:
+                    raise _DamagedError("damaged: a message is shorter than its head")
+                starts = np.array([at]) if outermost else _chain(data, at)
+                yield self._messages(data, starts)
+                at = int(starts[-1])
+                end = at + _HEAD.size + _HEAD.unpack_from(data, at)[1]
+            at += _HEAD.size
+            if kind == _CHUNK and outermost:
                 yield from self._records(_chunk(data[at:end], at), 0, outermost=False)
             elif kind == _CHANNEL:
                 number = int.from_bytes(data[at : at + 2], "little")
-                self._topics[number] = _text(data, at + 4)[0]
+                topic = _text(data, at + 4)[0]
+                if topic not in self.topics:
+                    self.topics.append(topic)
+                self._number_of[number] = self.topics.index(topic) if self._wanted(topic) else -1
             elif kind == _METADATA:
                 yield _metadata(data, at)
             elif kind == _ATTACHMENT:
@@ -120,6 +159,45 @@ class Recording:
             at = end
         if outermost:
             raise _DamagedError(f"cut at byte {size}")
+
+    def _messages(self, data: Any, starts: NDArray[np.int64]) -> Messages:
+        """Those of the messages that begin there whose topics are known and wanted."""
+        numbers = self._number_of[_anywhere(data, "<u2")[starts + _HEAD.size]]
+        chosen = numbers >= 0
+        starts = starts[chosen]
+        begins = (starts + _WHOLE_HEAD).tolist()
+        ends = (starts + _HEAD.size + _anywhere(data, "<u8")[starts + 1].astype(np.int64)).tolist()
+        return Messages(
+            numbers[chosen],
+            _anywhere(data, "<u8")[starts + _LOG_TIME],
+            [bytes(data[begin:end]) for begin, end in zip(begins, ends, strict=True)],
+        )
+
+
+def _anywhere(data: Any, kind: str) -> NDArray[Any]:
+    """The numbers that begin at each byte."""
+    size = np.dtype(kind).itemsize
+    return np.ndarray((max(len(data) - size + 1, 0),), kind, data, strides=(1,))
+
+
+def _chain(data: bytes, at: int) -> NDArray[np.int64]:
+    """Where the messages begin that follow each other in a chunk, from a whole one on at `at`.
+
+    Each says where the next one is; but what looks like the beginning of one nearly always is, and can be looked for
+    everywhere at once.
+    """
+    octets = np.frombuffer(data, np.uint8)
+    found: NDArray[np.int64] = at + np.flatnonzero(octets[at : len(data) - _WHOLE_HEAD + 1] == _MESSAGE)
+    heads = _anywhere(data, "<u8")[found + 1]
+    likely = (heads >= _MESSAGE_HEAD.size) & (heads < MOST_CHUNK_BYTES)
+    found, ends = found[likely], found[likely] + _HEAD.size + heads[likely].astype(np.int64)
+    if bool((ends[:-1] == found[1:]).all()) and ends[-1] <= len(data):
+        return found
+    following = dict(zip(found.tolist(), ends.tolist(), strict=True))
+    starts = [at]
+    while following.get(end := following[starts[-1]], len(data) + 1) <= len(data):
+        starts.append(end)
+    return np.array(starts, dtype=np.int64)
 
 
 def _chunk(data: Any, at: int) -> bytes:

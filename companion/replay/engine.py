@@ -8,16 +8,21 @@ that only the autopilot can tell: what was written and read back, and with which
 
 from __future__ import annotations
 
+import contextlib
 import datetime
+import itertools
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from companion.autopilot import imu_messages
 from companion.autopilot.imu_calibration import ImuCalibration
 from companion.autopilot.imu_messages import ImuMessage, Reading
+from companion.calibration.measurement import Measurement
 from companion.calibration.record import AlignmentUsed, ImuRecord, Record, from_json
 from companion.calibration.request import What
 from companion.calibration.rolling import RollingCollector, Window
@@ -35,10 +40,15 @@ from companion.links.mavlink import MavlinkLink
 from companion.protocols.base import Decoder
 from companion.recording import state, topics
 from companion.recording.files import versions
-from companion.recording.walk import Attachment, Message, Metadata, Recording
+from companion.recording.walk import Attachment, Messages, Metadata, Recording
+from companion.replay.blocks import SerialImu
 from companion.replay.compare import Difference, differences
-from companion.samples import ImuSample
+from companion.samples import ImuSample, Sample
 
+AT_ONCE: Final = 16384
+"""Messages that are gathered before they are replayed; half of them samples, they are some seconds of a 1 kHz IMU."""
+FEWEST: Final = 64
+"""Reads of one IMU among them for which it is worth while to look at all of them at once."""
 PENDING: Final = 4000
 """Telemetry that nobody has counted yet is remembered so long."""
 
@@ -82,10 +92,13 @@ class Replay:
 
     Args:
         recording: the file.
+        in_blocks: what is regular is decoded and collected many samples at once; else one by one, which gives the same.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: Recording, *, in_blocks: bool = True) -> None:
         self._recording = recording
+        self._in_blocks = in_blocks
+        self._gathered: list[Messages] = []
         self._config: Config | None = None
         self._versions: dict[str, str] = {}
         self._collector: RollingCollector | None = None
@@ -94,7 +107,7 @@ class Replay:
         """Of each device, by the name that its bytes have."""
         self._link = MavlinkLink()
         self._pending: dict[str, deque[tuple[float, Reading]]] = {}
-        self._windows: dict[int, Window | CalibrationRefusedError] = {}
+        self._windows: dict[int, Window | Measurement | CalibrationRefusedError] = {}
         self._where = Whereabouts()
         self._offsets: dict[str, ImuCalibration | None] = {}
         self._solution: Solution | None = None
@@ -115,10 +128,11 @@ class Replay:
         Raises:
             StorageError: one line: it is not one of ours, or it was made by a version whose state is not known here.
         """
-        for item in self._recording:
-            if isinstance(item, Message):
-                self._message(item)
+        for item in self._recording.runs(self._is_wanted):
+            if isinstance(item, Messages):
+                self._gather(item)
             elif isinstance(item, Metadata) and item.name == topics.METADATA:
+                self._flush()
                 self._versions = item.table
                 if (found := item.table.get("format")) != topics.FORMAT_VERSION:
                     raise StorageError(
@@ -126,7 +140,9 @@ class Replay:
                         f" companion {item.table.get('companion')})"
                     )
             elif isinstance(item, Attachment) and item.name == topics.CONFIG:
+                self._flush()
                 self._configure(item.data)
+        self._flush()
         if self._collector is None:
             cut = self._recording.cut_short
             whose = f"{cut}, before anything was recorded" if cut else "an MCAP file, but not a recording of companion"
@@ -158,20 +174,96 @@ class Replay:
 
     # --- what comes, in its order
 
-    def _message(self, message: Message) -> None:
-        topic = message.topic
+    def _is_wanted(self, topic: str) -> bool:
+        return self._config is None or self._handler_of(topic) is not None
+
+    def _gather(self, messages: Messages) -> None:
+        self._gathered.append(messages)
+        if sum(len(each.data) for each in self._gathered) >= AT_ONCE:
+            self._flush()
+
+    def _flush(self) -> None:
+        """Replay what has been gathered."""
+        gathered, self._gathered = self._gathered, []
+        if not gathered:
+            return
+        numbers = np.concatenate([each.numbers for each in gathered])
+        data = list(itertools.chain.from_iterable(each.data for each in gathered))
+        start = 0
+        # A state brings other decoders.
+        for state_at in np.flatnonzero(self._is_of(numbers, topics.STATE)).tolist():
+            self._row(numbers[start:state_at], data[start:state_at])
+            self._message(topics.STATE, data[state_at])
+            start = state_at + 1
+        self._row(numbers[start:], data[start:])
+
+    def _is_of(self, numbers: NDArray[np.int64], *begins: str) -> NDArray[np.bool_]:
+        """Which of the messages are on a topic that begins so."""
+        found = [number for number, topic in enumerate(self._recording.topics) if topic.startswith(begins)]
+        return np.isin(numbers, found)
+
+    def _row(self, numbers: NDArray[np.int64], data: list[bytes]) -> None:
+        """Replay messages among which no state is."""
+        if self._collector is None or not data:
+            return
+        imus: list[SerialImu] = []
+        others = np.ones(len(data), dtype=np.bool_)
+        for name, decoder in self._decoders.items() if self._in_blocks else ():
+            topic = topics.SERIAL + name
+            if topic not in self._recording.topics or [role.kind for role in self._roles[name]] != ["imu"]:
+                continue
+            its = numbers == self._recording.topics.index(topic)
+            if np.count_nonzero(its) >= FEWEST:
+                with self._usable(topic):
+                    imus.append(SerialImu(name, decoder, np.flatnonzero(its), itertools.compress(data, its.tolist())))
+                others &= ~its
+        # Others' readings may pass samples of an IMU that lie between two ends of seconds, whoever looks may not.
+        looks = others & ~self._is_of(numbers, topics.SERIAL, topics.IMU, topics.MAVLINK_IN)
+        ends = {place: imu for imu in imus for place in (*imu.ends, *imu.one_by_one)}
+        for place in sorted({*np.flatnonzero(others).tolist(), *ends}):
+            if looks[place]:
+                self._take_samples(imus, place)
+            if (imu := ends.get(place)) is not None:
+                self._take_samples([imu], place)
+            else:
+                self._message(self._recording.topics[numbers[place]], data[place])
+        self._take_samples(imus, len(data))
+        timed = np.flatnonzero(others & ~self._is_of(numbers, topics.IMU))
+        last = max(imus, key=lambda imu: imu.last_place, default=None)
+        if last is not None and (len(timed) == 0 or last.last_place > timed[-1]):
+            self._at(last.last_s)
+
+    def _take_samples(self, imus: Sequence[SerialImu], place: int) -> None:
+        """Give the collector what has come of these IMUs up to the message at that place."""
+        for imu in imus:
+            with self._usable(topics.SERIAL + imu.name):
+                if self._collector is not None:
+                    imu.collect(self._collector, place)
+                self._collect(imu.name, imu.one_by_one.get(place, ()))
+
+    @contextlib.contextmanager
+    def _usable(self, topic: str) -> Iterator[None]:
+        """What cannot be made of a message is one line.
+
+        Raises:
+            StorageError: it is.
+        """
+        try:
+            yield
+        except (msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            raise StorageError(
+                f"{self._recording.path}: a message on {topic} cannot be used by this version ({error})"
+            ) from None
+
+    def _message(self, topic: str, data: bytes) -> None:
         try:
             handler = self._handlers[topic]
         except KeyError:
             handler = self._handlers[topic] = self._handler_of(topic)
         if handler is None or (self._collector is None and topic != topics.STATE):
             return
-        try:
-            handler(message.data)
-        except (msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-            raise StorageError(
-                f"{self._recording.path}: a message on {topic} cannot be used by this version ({error})"
-            ) from None
+        with self._usable(topic):
+            handler(data)
 
     def _handler_of(self, topic: str) -> Callable[[bytes], None] | None:
         known: dict[str, Callable[[bytes], None]] = {
@@ -235,7 +327,10 @@ class Replay:
         if raw.data is None:
             decoder.interrupted()
             return
-        for sample in decoder.receive(raw.data, raw.t_s):
+        self._collect(name, decoder.receive(raw.data, raw.t_s))
+
+    def _collect(self, name: str, samples: Iterable[Sample]) -> None:
+        for sample in samples:
             for role, part in parts_of(sample, self._roles[name]):
                 if self._collector is not None:
                     collect(self._collector, role, part)
@@ -243,6 +338,8 @@ class Replay:
     def _take_mavlink(self, data: bytes) -> None:
         raw = msgspec.json.decode(data, type=topics.RawBytes)
         self._at(raw.t_s)
+        if self._config is None or not any(imu.source == "autopilot" for imu in self._config.imu):
+            return  # nobody takes a sample from it
         if raw.data is None:
             self._link.attach(None)
         else:
@@ -284,7 +381,8 @@ class Replay:
         match entry.event:
             case "window":
                 try:
-                    self._windows[detail] = collector.window(entry.t_s)
+                    # Most are never asked for.
+                    self._windows[detail] = collector.measurement(entry.t_s)
                 except CalibrationRefusedError as error:
                     self._windows[detail] = error
                 while len(self._windows) > PENDING:
@@ -320,6 +418,8 @@ class Replay:
         try:
             if isinstance(window, CalibrationRefusedError):
                 raise window
+            if isinstance(window, Measurement):
+                window = window.window()
             self._solution = self._solved(_refined(window, detail["refined"]), What[detail["what"]])
         except CalibrationRefusedError as error:
             self._no_solution = f"refused here: {error}"

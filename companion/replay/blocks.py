@@ -1,0 +1,103 @@
+"""Serial IMUs of a recording, thousands of reads at once; what comes of it is the same as read by read.
+
+First every IMU's bytes are decoded, on which nothing but its own decoder has a say. Then the samples go into the
+collector, and there the order matters in two places only: whoever looks at it must find what had come until then, and
+seconds must end in their order. In between, samples of one source do not touch another's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from collections.abc import Iterable
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.rolling import RollingCollector
+from companion.protocols.base import Decoder
+from companion.protocols.bulk import ImuBlock
+from companion.recording import topics
+from companion.samples import Sample
+
+FEW_READS: Final = 16
+"""So many are read one by one where something about them is not regular; around them is what is."""
+
+_read: Final = msgspec.json.Decoder(topics.RawBytes)
+
+
+@dataclasses.dataclass(slots=True)
+class _Waiting:
+    """A block that has not gone into the collector yet, or in part."""
+
+    block: ImuBlock
+    places: NDArray[np.int64]
+    """(n,) of the message that completed each of its samples."""
+    taken: int = 0
+
+
+class SerialImu:
+    """One IMU's share of a row of messages.
+
+    Args:
+        name: the device's.
+        decoder: its own.
+        places: (n,) of its messages in the row, at least one.
+        data: these messages.
+
+    Raises:
+        msgspec.MsgspecError: one is none of raw bytes; nothing has been decoded.
+    """
+
+    def __init__(self, name: str, decoder: Decoder, places: NDArray[np.int64], data: Iterable[bytes]) -> None:
+        self.name = name
+        self.last_place = int(places[-1])
+        self.one_by_one: dict[int, list[Sample]] = {}
+        """Samples that came of reads that were not regular, by the place of their message."""
+        self.ends: list[int] = []
+        """Places of messages with which a second may end."""
+        self._decoder = decoder
+        self._places = places
+        self._waiting: deque[_Waiting] = deque()
+        raws = list(map(_read.decode, data))
+        self.last_s = raws[-1].t_s
+        reads, times = [raw.data for raw in raws], [raw.t_s for raw in raws]
+        start = 0
+        for gap in [*(index for index, data in enumerate(reads) if data is None), len(reads)]:
+            self._decode(reads[start:gap], times[start:gap], start)  # type: ignore[arg-type] # None only at a gap
+            if gap < len(reads):
+                decoder.interrupted()
+            start = gap + 1
+
+    def _decode(self, reads: list[bytes], times: list[float], first: int) -> None:
+        """Decode reads, of which the first is the device's read `first`: as many at once as are regular."""
+        if not reads:
+            return
+        block = self._decoder.receive_many(reads, times)
+        if block is not None:
+            places = self._places[first + block.reads]
+            seconds = np.floor(block.t_s)
+            self.ends += places[np.flatnonzero(np.diff(seconds, prepend=seconds[0] - 1.0))].tolist()
+            self._waiting.append(_Waiting(block, places))
+        elif len(reads) <= FEW_READS:
+            for index, (data, t_s) in enumerate(zip(reads, times, strict=True), first):
+                self.one_by_one[int(self._places[index])] = self._decoder.receive(data, t_s)
+        else:
+            half = len(reads) // 2
+            self._decode(reads[:half], times[:half], first)
+            self._decode(reads[half:], times[half:], first + half)
+
+    def collect(self, collector: RollingCollector, place: int) -> None:
+        """Give the collector what has come up to and with the message at that place."""
+        waiting = self._waiting
+        while waiting:
+            item = waiting[0]
+            stop = int(np.searchsorted(item.places, place, side="right"))
+            if stop > item.taken:
+                collector.add_block(self.name, item.block, item.taken, stop)
+                item.taken = stop
+            if stop < len(item.block):
+                return
+            waiting.popleft()

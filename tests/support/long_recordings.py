@@ -1,0 +1,189 @@
+"""Long recordings and logs of a still aircraft, written as a daemon would have, but in seconds instead of hours.
+
+Plain numpy and a few lines a device: nothing of the simulator, no decoder, no collector that is fed.
+"""
+
+from __future__ import annotations
+
+import binascii
+import heapq
+import itertools
+import struct
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.rolling import RollingCollector
+from companion.calibration.site import Whereabouts
+from companion.config import Config, parse
+from companion.daemon import models
+from companion.daemon.serial_devices import serial_devices
+from companion.recording import journal, topics
+from companion.recording.files import RecordingFile, versions
+from companion.recording.journal import Beginning, Entry
+from companion.recording.state import freeze
+from companion.samples import CompassSample, ImuSample, TiltSample
+
+Floats = NDArray[np.float64]
+
+START_S: Final = 5000.25
+UNIX_S: Final = 1.8e9
+GYRO_BIAS: Final = (0.0008, -0.0005, 0.0003)
+"""rad/s, of every IMU."""
+ACCEL: Final = (0.85, 0.47, -9.74)
+"""m/s^2, what level-headed gravity and the biases of every IMU come to."""
+NOISE: Final = (1.5e-3,) * 3 + (0.02,) * 3
+TEXT: Final = """
+[mavlink]
+url = "udpout:127.0.0.1:9"
+{imus}
+[gradienter]
+port = "/nowhere/gradienter"
+protocol = "inclinometer_xy"
+law = "slope"
+sigma_deg = 0.005
+[compass]
+port = "/nowhere/compass"
+protocol = "hmr3300"
+sigma_deg = 1.0
+[calibration]
+min_still_s = 10.0
+max_s = 60.0
+"""
+IMU: Final = """
+[[imu]]
+name = "{name}"
+source = "serial"
+port = "/nowhere/{name}"
+protocol = "vectornav"
+profile = "adis16470"
+baud = 921600
+"""
+_FRAME: Final = struct.Struct("<BHHQ7f")
+_LINE_S: Final = 10.0 / 921600.0
+"""Of one byte."""
+
+
+def config(names: Sequence[str]) -> Config:
+    """The configuration that the recording carries."""
+    return parse(TEXT.format(imus="".join(IMU.format(name=name) for name in names)), "long recording")
+
+
+def readings(seconds: float, rate_hz: float, seed: int) -> tuple[Floats, Floats]:
+    """(n,) seconds since `START_S` on the sensor's own clock, (n, 6) rad/s and m/s^2, white noise at rest."""
+    rng = np.random.default_rng(seed)
+    count = round(seconds * rate_hz)
+    rows = rng.normal((*GYRO_BIAS, *ACCEL), NOISE, (count, 6))
+    return np.arange(count) / rate_hz, rows
+
+
+def vectornav_frames(device_s: Floats, rows: Floats, temperature_degc: float = 25.0) -> list[bytes]:
+    """One binary frame a row, groups 05, masks 0121 and 0010 (VectorNav UM001)."""
+    frames = []
+    for time_ns, row in zip(np.rint(device_s * 1e9).astype(np.int64).tolist(), rows.tolist(), strict=True):
+        body = _FRAME.pack(0x05, 0x0121, 0x0010, time_ns, *row, temperature_degc)
+        frames.append(b"\xfa" + body + struct.pack(">H", binascii.crc_hqx(body, 0)))
+    return frames
+
+
+def _imu(name: str, seconds: float, rate_hz: float, read_s: float, seed: int) -> Iterator[Entry]:
+    """A serial IMU: what each read brought, and the samples that came of it."""
+    rng = np.random.default_rng(seed + 100)
+    device_s, rows = readings(seconds, rate_hz, seed)
+    device_s = device_s + 12.0
+    frames = vectornav_frames(device_s, rows)
+    came_s = START_S + (device_s - 12.0) * (1.0 + 20e-6) + len(frames[0]) * _LINE_S
+    if read_s:
+        # An adapter that hands over every so often.
+        came_s = np.ceil(came_s / read_s) * read_s
+    came_s = came_s + rng.exponential(1e-4, len(came_s)) * (read_s == 0.0)
+    came_s = np.maximum.accumulate(came_s)
+    start, count = 0, len(frames)
+    times, devices, values = came_s.tolist(), device_s.tolist(), rows.tolist()
+    while start < count:
+        t_s, end = times[start], start + 1
+        while end < count and times[end] == t_s:
+            end += 1
+        yield topics.SERIAL + name, t_s, journal._raw, (t_s, b"".join(frames[start:end]))
+        for k in range(start, end):
+            gx, gy, gz, ax, ay, az = values[k]
+            sample = ImuSample(t_s, (gx, gy, gz), (ax, ay, az), 25.0, None, devices[k])
+            yield topics.IMU + name, t_s, topics.imu_json, (sample, None)
+        start = end
+
+
+def _gradienter(seconds: float) -> Iterator[Entry]:
+    rng = np.random.default_rng(7)
+    for k in range(round(seconds * 10.0)):
+        t_s = START_S + 0.05 + 0.1 * k
+        x, y = -3.0 + rng.normal(0.0, 0.002), 5.0 + rng.normal(0.0, 0.002)
+        yield topics.SERIAL + "gradienter", t_s, journal._raw, (t_s, f"X={x:+07.3f}\r\nY={y:+07.3f}\r\n".encode())
+        yield topics.GRADIENTER, t_s, topics.tilt_json, (TiltSample(t_s, x, y),)
+
+
+def _compass(seconds: float) -> Iterator[Entry]:
+    rng = np.random.default_rng(8)
+    for k in range(round(seconds * 8.0)):
+        t_s = START_S + 0.07 + 0.125 * k
+        heading = 40.0 + rng.normal(0.0, 0.2)
+        yield topics.SERIAL + "compass", t_s, journal._raw, (t_s, f"{heading:.1f}, 5.0, -3.0\r\n".encode())
+        yield topics.COMPASS, t_s, topics.compass_json, (CompassSample(t_s, heading, 5.0, -3.0),)
+
+
+def _looks(seconds: float) -> Iterator[Entry]:
+    """Once a second somebody looks, and means are taken."""
+    for k in range(1, int(seconds)):
+        t_s = START_S + k + 0.4
+        yield topics.JOURNAL, t_s, journal._event, (t_s, "look", None)
+        yield topics.JOURNAL, t_s, journal._event, (t_s, "window", k)
+
+
+def write_recording(path: Path, *, seconds: float, rate_hz: float = 1000.0, imus: int = 1, read_s: float = 0.0) -> int:
+    """A recording of serial IMUs, a gradienter and a compass; how many IMU samples it has.
+
+    Args:
+        path: where.
+        seconds: how long.
+        rate_hz: of each IMU.
+        imus: how many.
+        read_s: the reads of the IMUs' ports come so far apart; 0: one a frame.
+    """
+    names = [f"imu{k}" for k in range(imus)]
+    settings = config(names)
+    collector = RollingCollector(
+        models.settings(settings),
+        [models.imu_input(imu, None) for imu in settings.imu],
+        gradienter=True,
+        compass=True,
+        gradienter_lag=models.lag("gradienter", settings.gradienter),
+        compass_lag=models.lag("compass", settings.compass),
+        field_by=models.field_by(settings),
+    )
+    decoders = {device.name: freeze(device.info.decoder(10.0 / device.baud)) for device in serial_devices(settings)}
+    state = {
+        "collector": freeze(collector),
+        "decoders": decoders,
+        "mavlink": b"",
+        "windows": [],
+        "where": Whereabouts(40.0, 116.0, 50.0, "config", None),
+        "offsets": {},
+        "solved": None,
+    }
+    file = RecordingFile(path)
+    begin_s = START_S - 0.01
+    streams = [
+        *(_imu(name, seconds, rate_hz, read_s, seed) for seed, name in enumerate(names)),
+        _gradienter(seconds),
+        _compass(seconds),
+        _looks(seconds),
+    ]
+    file.write([Beginning(begin_s, UNIX_S, versions(), msgspec.json.encode(settings), state)])
+    entries = heapq.merge(*streams, key=lambda entry: entry[1])
+    for _, second in itertools.groupby(entries, key=lambda entry: int(entry[1])):
+        file.write(list(second))
+    file.close()
+    return imus * round(seconds * rate_hz)
