@@ -101,6 +101,66 @@ class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):
     outcome: Outcome
 
 
+class GyroPrior(msgspec.Struct, frozen=True, kw_only=True):
+    """What earlier power-ups said of one gyro, and what became of it."""
+
+    used: bool
+    """Whether it took part in the estimate; a guard it was in any case."""
+    power_ups: int
+    """Behind it, not counting this one."""
+    temperature_model: bool
+    """A line over temperature; else a mean."""
+    expected_rad_s: Axes
+    sigma_rad_s: Axes
+    """Of today's bias about it."""
+    measured_rad_s: Axes
+    """Today's whole bias by the readings alone."""
+    shift_sigma: Axes
+    """Measured less expected, in sigmas of that difference."""
+
+
+class AccelPrior(msgspec.Struct, frozen=True, kw_only=True):
+    """Likewise of one accelerometer."""
+
+    used: bool
+    power_ups: int
+    temperature_model: bool
+    expected_m_s2: Axes
+    sigma_m_s2: Axes
+    measured_m_s2: Axes
+    shift_sigma: Axes
+
+
+class Prior(msgspec.Struct, frozen=True, kw_only=True):
+    """What was known of one IMU from before; None where that is less than three power-ups."""
+
+    gyro: GyroPrior | None
+    accel: AccelPrior | None
+
+
+class Effective(msgspec.Struct, frozen=True, kw_only=True):
+    """What the accelerometers' bias is worth at another attitude: scale errors times 1 g are in it."""
+
+    scale_from: Literal["assumed", "alignment"]
+    """An alignment with tilts has told the scale; else 0.5 % is assumed."""
+    scale_sigma_m_s2: Axes
+    """Scale error times 1 g, one sigma an axis: an axis' bias moves by it times the change of its share of gravity;
+    the vertical one's of a level aircraft that is tilted, times 1 - cos(tilt)."""
+    level_sigma_m_s2: Axes
+    """Sigma of the bias as that of the level aircraft."""
+    sensor_sigma_m_s2: Axes
+    """Sigma of the bias as the sensor's own, in its own axes, whatever its attitude."""
+
+
+class CrossCovariance(msgspec.Struct, frozen=True, kw_only=True):
+    """What two IMUs' errors have in common: tilt, heading, gravity, the Earth's rate."""
+
+    imus: tuple[str, str]
+    covariance: tuple[tuple[float | None, ...], ...]
+    """6x6 as an IMU's own `covariance`; rows of the first, columns of the second. That of the difference of their
+    biases is the sum of both IMUs' own less this and its transpose."""
+
+
 class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     """One IMU: whole biases (measured without any offset, minus truth), sigmas, and what was written."""
 
@@ -119,6 +179,10 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     residual_accel_m_s2: Axes | None
     warnings: tuple[str, ...] = ()
     written: dict[str, WrittenParameter] = {}
+    prior: Prior | None = None
+    """None: nothing was known from before, or nothing is to be made of it."""
+    effective: Effective | None = None
+    """None where the accelerometers were not determined."""
 
 
 class Arming(msgspec.Struct, frozen=True, kw_only=True):
@@ -174,6 +238,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     """UTC, ISO 8601: when what this calibration has written was put back on request."""
     magnetic: Magnetic | None = None
     """How good the heading can be; None without a compass."""
+    cross_covariance: tuple[CrossCovariance, ...] = ()
+    """Of every two IMUs."""
     armings: tuple[Arming, ...] = ()
     """Armings while this calibration was in force; empty in the file, filled in by the history."""
 

@@ -9,7 +9,9 @@ autopilot's offset has to carry here; it is not part of sigma.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -17,7 +19,7 @@ import numpy as np
 from companion.calibration import magnetic
 from companion.calibration.bias import accelerometer_bias, attitude_error_jacobian, bias_covariance, gyro_bias
 from companion.calibration.pose_models import CompassModel, GradienterModel, up_in_vehicle, vehicle_heading_rad
-from companion.calibration.record import Magnetic, Pose, PoseSigma, Site
+from companion.calibration.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site
 from companion.calibration.request import What
 from companion.calibration.rolling import ImuWindow, TiltWindow, Window
 from companion.calibration.site import LocalEarth, Whereabouts, local_earth
@@ -61,6 +63,10 @@ class ImuSolution:
     warnings: tuple[str, ...]
     dithered: bool = False
     """The telemetry was seen to follow this IMU's offsets step by step."""
+    prior: Prior | None = None
+    """What was known from before, and what became of it."""
+    effective: Effective | None = None
+    """What the accelerometers' bias is worth at another attitude."""
 
     @property
     def gyro_sigma_use_rad_s(self) -> Array:
@@ -87,12 +93,31 @@ class Truth:
     """Of theta and gamma."""
     magnetic: Magnetic | None = None
     """What the compass' field and steadiness say of the heading; None without a compass."""
+    up_by_reading: Matrix | None = None
+    """d up / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
+    reading_sigma_rad: tuple[float, float] = (0.0, 0.0)
+    """Of the gradienter's two means, without its zero."""
 
     @property
     def body_from_ned(self) -> Matrix:
         """The attitude; with an unknown heading, that of heading north."""
         gamma, theta = roll_pitch_from_up(self.up)
         return body_from_ned(gamma, theta, self.heading_rad or 0.0)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Shared:
+    """The errors that all IMUs of one stretch have in common: one attitude, one gravity, one Earth's rate."""
+
+    up: Array
+    gravity_m_s2: float
+    covariance: Matrix
+    """6x6 (gyro rad/s, accelerometer m/s^2), part of every IMU's own and the cross-covariance of any two."""
+    by_reading: Matrix | None
+    """d (accelerometer bias) / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
+    reading_sigma_rad: tuple[float, float]
+    zero_sigma_rad: float
+    """Of the gradienter's zero, the same in every calibration."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -107,6 +132,10 @@ class Solution:
     """What was asked for and its readings do not tell, such as "gyro fc"; the IMU's warnings say why."""
     magnetic: Magnetic | None = None
     """How good the heading can be; None without a compass."""
+    shared: Shared | None = None
+    """None only where somebody has made a solution by hand."""
+    cross: Mapping[tuple[str, str], Matrix] = dataclasses.field(default_factory=dict)
+    """Cross-covariance (6x6) of every two IMUs, in their order."""
 
 
 def solve(
@@ -144,6 +173,7 @@ def solve(
             raise CalibrationRefusedError("; ".join(refusals))
     unknown = [f"gyro {imu.name}" for imu in window.imus if what.gyros and imu.refused("gyro")]
     unknown += [f"accel {imu.name}" for imu in window.imus if accelerometers and imu.refused("accel")]
+    shared = _shared(truth, local, gradienter.sigma_deg * DEG if gradienter is not None and tilted is not None else 0.0)
     return Solution(
         pose=_pose(truth),
         site=local.site,
@@ -151,6 +181,8 @@ def solve(
         warnings=tuple(warnings),
         unknown=tuple(unknown),
         magnetic=truth.magnetic,
+        shared=shared,
+        cross=dict.fromkeys(itertools.combinations((imu.name for imu in imus), 2), shared.covariance),
     )
 
 
@@ -181,8 +213,11 @@ def truth_of(
     Raises:
         CalibrationRefusedError: the readings cannot be right together.
     """
+    by_reading: Matrix | None = None
+    reading_sigma = (0.0, 0.0)
     if gradienter is not None and window.tilt is not None:
-        up, up_covariance = _up(window.tilt, gradienter)
+        up, by_reading, up_covariance = _up(window.tilt, gradienter)
+        reading_sigma = (window.tilt.x_sigma_deg * DEG, window.tilt.y_sigma_deg * DEG)
     else:
         mean = np.mean([imu.accel_m_s2 for imu in window.imus], axis=0)
         up = mean / np.linalg.norm(mean)
@@ -197,8 +232,18 @@ def truth_of(
         math.sqrt(up_covariance[0, 0] / (1.0 - up[0] ** 2)),
         math.sqrt(gamma_variance @ up_covariance @ gamma_variance),
     )
+    without = Truth(
+        up,
+        covariance,
+        None,
+        None,
+        gradienter is not None,
+        tilt_sigma,
+        up_by_reading=by_reading,
+        reading_sigma_rad=reading_sigma,
+    )
     if compass is None or window.heading is None:
-        return Truth(up, covariance, None, None, gradienter is not None, tilt_sigma)
+        return without
     found = magnetic.assess(
         window.heading,
         window.field,
@@ -209,18 +254,24 @@ def truth_of(
     )
     warnings += found.warnings
     if not found.is_usable:
-        return Truth(up, covariance, None, None, gradienter is not None, tilt_sigma, found.magnetic)
+        return dataclasses.replace(without, magnetic=found.magnetic)
     if compass.magnetic and local.site.declination_deg is None:
         warnings.append("declination unknown (no position or date): magnetic heading used, sigma widened")
     # A heading from the field takes part in the tilt's errors: one wrong tilt turns all three angles.
     turned = jacobian - np.outer(up, found.heading_by_up)
     covariance = turned @ up_covariance @ turned.T + np.outer(up, up) * found.sigma_rad**2
     sigma = math.sqrt(found.sigma_rad**2 + found.heading_by_up @ up_covariance @ found.heading_by_up)
-    return Truth(up, covariance, found.heading_rad, sigma, gradienter is not None, tilt_sigma, found.magnetic)
+    return dataclasses.replace(
+        without,
+        attitude_covariance_rad2=covariance,
+        heading_rad=found.heading_rad,
+        heading_sigma_rad=sigma,
+        magnetic=found.magnetic,
+    )
 
 
-def _up(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix]:
-    """Up in the vehicle's axes and its covariance (3x3, radian squared)."""
+def _up(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix, Matrix]:
+    """Up in the vehicle's axes, its derivatives by the readings (3x2), and its covariance (3x3, radian squared)."""
     x_deg, y_deg = tilt.x_deg - model.offset_deg[0], tilt.y_deg - model.offset_deg[1]
     try:
         up = up_in_vehicle(model, tilt.x_deg, tilt.y_deg)
@@ -228,7 +279,7 @@ def _up(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix]:
     except ValueError as error:
         raise CalibrationRefusedError(str(error)) from None
     variance = [(math.hypot(model.sigma_deg, sigma) * DEG) ** 2 for sigma in (tilt.x_sigma_deg, tilt.y_sigma_deg)]
-    return up, jacobian @ np.diag(variance) @ jacobian.T
+    return up, jacobian, jacobian @ np.diag(variance) @ jacobian.T
 
 
 def _pose(truth: Truth) -> Pose:
@@ -243,6 +294,26 @@ def _pose(truth: Truth) -> Pose:
             gamma=truth.tilt_sigma_rad[1] / DEG if known else None,
             psi=truth.heading_sigma_rad / DEG if truth.heading_sigma_rad is not None else None,
         ),
+    )
+
+
+def _shared(truth: Truth, local: LocalEarth, zero_sigma_rad: float) -> Shared:
+    by_up = truth.up_by_reading
+    return Shared(
+        up=truth.up,
+        gravity_m_s2=local.gravity_m_s2,
+        covariance=bias_covariance(
+            attitude_covariance_rad2=truth.attitude_covariance_rad2,
+            up=truth.up,
+            gravity_m_s2=local.gravity_m_s2,
+            gravity_sigma_m_s2=local.gravity_sigma_m_s2,
+            earth_rate_body=local.rate_in_body(truth.body_from_ned, heading_known=truth.heading_rad is not None),
+            gyro_variance=np.zeros(3),
+            accel_variance=np.zeros(3),
+        ),
+        by_reading=None if by_up is None else -local.gravity_m_s2 * by_up,
+        reading_sigma_rad=truth.reading_sigma_rad,
+        zero_sigma_rad=zero_sigma_rad,
     )
 
 

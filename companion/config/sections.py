@@ -131,6 +131,8 @@ class Calibration(Section, frozen=True):
     """So long after it was last seen to be right a calibration counts as fresh (method section 3, item 8)."""
     max_temperature_change_degc: PositiveFloat = 3.0
     """So far from the temperature at which it was seen to be right (the same)."""
+    prior: bool = True
+    """Whether earlier calibrations guard new ones, and weigh in where that betters them (docs/calibration.md)."""
 
 
 class Push(Section, frozen=True):

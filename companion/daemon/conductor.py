@@ -26,6 +26,7 @@ from companion.component.statustext import Severity, Weight
 from companion.config import Config
 from companion.daemon.align_steps import Plan
 from companion.daemon.aligner import Aligner
+from companion.daemon.bias_memory import BiasMemory
 from companion.daemon.course import Course, Say, Stage, in_words
 from companion.daemon.job import ALIGNMENT, Job, JobCancelledError
 from companion.daemon.ledger import Offload
@@ -53,7 +54,9 @@ class Conductor:
         say: Say,
         offload: Offload,
         aligner: Aligner,
+        memory: BiasMemory,
     ) -> None:
+        self._memory = memory
         self._aligner = aligner
         self._config, self._vehicle, self._collector, self._course = config, vehicle, collector, course
         self._pusher, self._mender, self._store = pusher, mender, store
@@ -353,6 +356,7 @@ class Conductor:
                 last = self.last
                 if last is not None and last.state == "done" and last.system_id == self._vehicle.system_id:
                     self.last = msgspec.structs.replace(last, undone_at=now) if _has_written(last) else last
+                    await self._memory.forget(last.started_at)
                 try:
                     await self._offload(self._store.mark_undone, self._vehicle.system_id, now)
                 except StorageError as error:

@@ -17,7 +17,9 @@ import numpy as np
 
 from companion.autopilot.change import WriteFailedError
 from companion.autopilot.vehicle import ArmState, Vehicle
+from companion.calibration.joint import weigh
 from companion.calibration.machine import Event, Machine, State
+from companion.calibration.prior import Expectation
 from companion.calibration.request import What
 from companion.calibration.rolling import RollingCollector, Settings, Window
 from companion.calibration.site import Whereabouts
@@ -28,6 +30,7 @@ from companion.config import Config
 from companion.daemon import estimating, models
 from companion.daemon.alignment import AlignmentInForce
 from companion.daemon.autopilot_imu import AutopilotImu, not_ready
+from companion.daemon.bias_memory import BiasMemory
 from companion.daemon.dither import Ditherer
 from companion.daemon.job import Job, JobCancelledError
 from companion.daemon.ledger import Offload
@@ -67,7 +70,9 @@ class Course:
         reboot: Reboot,
         ditherer: Ditherer,
         alignment: AlignmentInForce,
+        memory: BiasMemory,
     ) -> None:
+        self._memory = memory
         self._config, self._vehicle, self._collector, self._imus = config, vehicle, collector, imus
         self._pusher, self._ditherer, self._reboot = pusher, ditherer, reboot
         self._say, self._offload, self._alignment = say, offload, alignment
@@ -75,8 +80,9 @@ class Course:
         """Where it stands."""
         self.settings = models.settings(config)
         """How good is good enough."""
-        self.on_solved: Callable[[Window, Window, Whereabouts, What], None] = lambda *of_what: None
-        """Told of every solution: the window measured, the one used, the place, and what was asked for."""
+        self.on_solved: Callable[[Window, Window, Whereabouts, What, Expectation], None] = lambda *of_what: None
+        """Told of every solution: the window measured, the one used, the place, what was asked for, and what was known
+        from before."""
         self._late: Stage = "checking"
         """Of State.VERIFYING."""
         self._settled_by_s = 0.0
@@ -125,8 +131,10 @@ class Course:
                 draft.begin_again(f"{error.reason}; put back, and written where it belongs")
                 job.check_cancelled()
             else:
+                await self._memory.keep(draft.points)
                 return
         await self._measure_and_push(job, draft)
+        await self._memory.keep(draft.points)
 
     async def _measure_and_push(self, job: Job, draft: Draft) -> None:
         self._collector.retarget(self._wanted(job.what))
@@ -148,8 +156,10 @@ class Course:
             job.what,
         )
         draft.alignment = self._alignment.used
-        draft.solution, draft.measured_s = solution, (measured.start_s, measured.end_s)
-        self.on_solved(measured, window, where, job.what)
+        draft.measured_s = (measured.start_s, measured.end_s)
+        solution = self._weighed(
+            solution, draft, lambda expectation: self.on_solved(measured, window, where, job.what, expectation)
+        )
         plan = await self._pusher.plan(solution, draft)
         job.check_cancelled()
         if not plan.changes:
@@ -188,6 +198,27 @@ class Course:
             if self._vehicle.boots != boots:
                 await self._reboot.survived(plan, draft)
         self.machine.on(Event.VERIFIED)
+
+    def _weighed(self, solution: Solution, draft: Draft, tell: Callable[[Expectation], None]) -> Solution:
+        """The solution with what is known from before; fills the draft, and says what contradicts.
+
+        Raises:
+            AutopilotError: the offsets in force are not known at the moment.
+        """
+        draft.solution = solution
+        unix_s = draft.started_at.timestamp()
+        for name, words in self._memory.forgotten().items():
+            draft.warn(name, words)
+        expectation = self._memory.expectation(solution, unix_s)
+        tell(expectation)
+        whole = self._memory.whole(solution)
+        weighed = weigh(solution, whole, expectation)
+        started_at = draft.started_at.isoformat(timespec="milliseconds")
+        draft.points = self._memory.measured(solution, whole, weighed.doubts, started_at, unix_s)
+        draft.solution = weighed.solution
+        for doubt in weighed.doubts:
+            self._say(Severity.WARNING, doubt.words, Weight.NEWS)
+        return weighed.solution
 
     async def _settle(self, job: Job, plan: Plan, draft: Draft) -> None:
         """The write is done and stays; a cancel ends only the waiting for the autopilot's EKF."""

@@ -17,6 +17,7 @@ from typing import Final
 import msgspec
 
 from companion.autopilot.vehicle import Vehicle
+from companion.calibration.prior import Expectation
 from companion.calibration.record import AlignmentUsed, Record
 from companion.calibration.request import What
 from companion.calibration.rolling import RollingCollector, Window
@@ -112,7 +113,9 @@ class Recorder:
     def _on_serial(self, name: str, data: bytes | None, t_s: float) -> None:
         self._journal.raw(topics.SERIAL + name, t_s, data)
 
-    def on_solved(self, measured: Window, refined: Window, where: Whereabouts, what: What) -> None:
+    def on_solved(
+        self, measured: Window, refined: Window, where: Whereabouts, what: What, expectation: Expectation
+    ) -> None:
         """A calibration's biases have been worked out; what from, besides the readings."""
         self._solved = freeze(
             {
@@ -123,6 +126,8 @@ class Recorder:
                 "what": what.name,
                 "offsets": self._around.read_offsets(),
                 "alignment": None if (used := self.alignment()) is None else (*used.offset_deg, used.sigma_deg),
+                # What is known from before lies on disk and changes with every calibration.
+                "expectation": expectation,
             }
         )
         self._journal.event(asyncio.get_running_loop().time(), "solved", self._solved)

@@ -6,9 +6,8 @@ import dataclasses
 import datetime
 from typing import Literal
 
-import numpy as np
-
-from companion.calibration.record import AlignmentUsed, Axes, ImuRecord, Record, WrittenParameter
+from companion.calibration.history import Point
+from companion.calibration.record import AlignmentUsed, Axes, CrossCovariance, ImuRecord, Record, WrittenParameter
 from companion.calibration.solve import ImuSolution, Solution
 from companion.physics.frames import Array, Matrix
 
@@ -32,6 +31,8 @@ class Draft:
     alignment: AlignmentUsed | None = None
     """What was in force of the gradienter's alignment."""
     imu_warnings: dict[str, list[str]] = dataclasses.field(default_factory=dict)
+    points: dict[str, Point] = dataclasses.field(default_factory=dict)
+    """By IMU: what later calibrations may know of this one, once it has come to a good end."""
 
     def warn(self, imu: str, words: str) -> None:
         """Add a warning to one IMU, once."""
@@ -45,6 +46,7 @@ class Draft:
         self.whole.clear()
         self.written.clear()
         self.imu_warnings.clear()
+        self.points.clear()
         self.warnings.append(why)
 
     def record(self, state: Literal["done", "failed", "cancelled"], reason: str, duration_s: float) -> Record:
@@ -62,6 +64,7 @@ class Draft:
             magnetic=solution.magnetic if solution else None,
             alignment=self.alignment,
             imus=tuple(self._imu(estimate) for estimate in solution.imus) if solution else (),
+            cross_covariance=_cross(solution) if solution else (),
         )
 
     def _imu(self, estimate: ImuSolution) -> ImuRecord:
@@ -83,6 +86,8 @@ class Draft:
             residual_accel_m_s2=_axes(estimate.accel_m_s2 if owner_corrects else None),
             warnings=(*estimate.warnings, *self.imu_warnings.get(estimate.name, ())),
             written=self.written.get(estimate.name, {}),
+            prior=estimate.prior,
+            effective=estimate.effective,
         )
 
 
@@ -96,5 +101,18 @@ def _axes(vector: Array | None) -> Axes | None:
 def _covariance(matrix: Matrix, *, gyro: bool, accel: bool) -> tuple[tuple[float | None, ...], ...] | None:
     if not gyro and not accel:
         return None
-    known = np.array([gyro] * 3 + [accel] * 3)
-    return tuple(tuple(float(matrix[i, j]) if known[i] and known[j] else None for j in range(6)) for i in range(6))
+    known = [gyro] * 3 + [accel] * 3
+    return _where_known(matrix, known, known)
+
+
+def _cross(solution: Solution) -> tuple[CrossCovariance, ...]:
+    known = {imu.name: [imu.gyro_rad_s is not None] * 3 + [imu.accel_m_s2 is not None] * 3 for imu in solution.imus}
+    return tuple(
+        CrossCovariance(imus=(one, other), covariance=_where_known(matrix, known[one], known[other]))
+        for (one, other), matrix in solution.cross.items()
+        if any(known[one]) and any(known[other])
+    )
+
+
+def _where_known(matrix: Matrix, rows: list[bool], columns: list[bool]) -> tuple[tuple[float | None, ...], ...]:
+    return tuple(tuple(float(matrix[i, j]) if rows[i] and columns[j] else None for j in range(6)) for i in range(6))

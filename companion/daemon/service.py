@@ -24,6 +24,7 @@ from companion.daemon.answers import Answers
 from companion.daemon.armings import Armings
 from companion.daemon.automatic import Automatic
 from companion.daemon.autopilot_imu import AutopilotImu
+from companion.daemon.bias_memory import BiasMemory
 from companion.daemon.conductor import Conductor
 from companion.daemon.control import ControlServer, Object
 from companion.daemon.course import Course
@@ -111,6 +112,7 @@ class Service:
         )
         self.store = RecordStore(config.storage.path)
         self.alignment = AlignmentInForce(config, offload)
+        self.memory = BiasMemory(config, self.vehicle, self.imus, self.sensors, self.alignment, offload)
         self.ledger = Ledger(ChangeLog(config.storage.path), offload)
         writer = ParameterWriter(self.parameters, self.vehicle)
         far = FarStepWatch(self.link, self.vehicle, self.slots)
@@ -143,12 +145,23 @@ class Service:
             reboot,
             Ditherer(config, self.vehicle, self.parameters, self.imus, self.collector, writer, self.ledger),
             self.alignment,
+            self.memory,
         )
         aligner = Aligner(
             config, self.vehicle, self.collector, self.imus, course.machine, self.alignment, self._say, offload
         )
         self.conductor = Conductor(
-            config, self.vehicle, self.collector, course, pusher, self.mender, self.store, self._say, offload, aligner
+            config,
+            self.vehicle,
+            self.collector,
+            course,
+            pusher,
+            self.mender,
+            self.store,
+            self._say,
+            offload,
+            aligner,
+            self.memory,
         )
         course.on_solved = self.recorder.on_solved
         self.recorder.alignment = lambda: self.alignment.used
@@ -320,6 +333,7 @@ class Service:
         """
         self.ledger.load()
         self.alignment.load()
+        self.memory.load()
         if self.ledger.fault is not None:
             # Stay and say so: a daemon that is gone is harder to understand from the field.
             logger.error("%s", self.ledger.fault)

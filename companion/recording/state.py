@@ -25,8 +25,10 @@ from companion.calibration.batches import Batch, BatchSource, Counts
 from companion.calibration.estimates import Estimates
 from companion.calibration.field_heading import FieldHeading
 from companion.calibration.heading_watch import HeadingWatch
+from companion.calibration.pose_effect import PoseEffect
 from companion.calibration.pose_models import CompassModel, GradienterModel
 from companion.calibration.pose_windows import FieldWindow, HeadingWindow, TiltWindow
+from companion.calibration.prior import Expectation, Expected, ExpectedImu
 from companion.calibration.rolling import RollingCollector
 from companion.calibration.settling import Lag, Settling
 from companion.calibration.site import Whereabouts
@@ -66,6 +68,9 @@ _VALUES: Final[dict[str, type]] = {
         Batch,
         CompassModel,
         Counts,
+        Expectation,
+        Expected,
+        ExpectedImu,
         FarStep,
         FieldWindow,
         GradienterModel,
@@ -77,6 +82,7 @@ _VALUES: Final[dict[str, type]] = {
         ImuWindow,
         Lag,
         NoiseProfile,
+        PoseEffect,
         Rival,
         Settings,
         TiltWindow,

@@ -22,12 +22,14 @@ from numpy.typing import NDArray
 from companion.autopilot import imu_messages
 from companion.autopilot.imu_calibration import ImuCalibration
 from companion.autopilot.imu_messages import ImuMessage, Reading
+from companion.calibration.joint import weigh
+from companion.calibration.prior import Expectation
 from companion.calibration.measurement import Measurement
 from companion.calibration.record import AlignmentUsed, ImuRecord, Record, from_json
 from companion.calibration.request import What
 from companion.calibration.rolling import RollingCollector, Window
 from companion.calibration.site import Whereabouts
-from companion.calibration.solve import Solution, solve_at
+from companion.calibration.solve import ImuSolution, Solution, solve_at
 from companion.config import Config
 from companion.daemon import models
 from companion.daemon.alignment import aligned
@@ -37,6 +39,7 @@ from companion.daemon.report import Draft
 from companion.daemon.serial_devices import Role, collect, parts_of, serial_devices
 from companion.errors import CalibrationRefusedError, StorageError
 from companion.links.mavlink import MavlinkLink
+from companion.physics.frames import Array
 from companion.protocols.base import Decoder
 from companion.recording import state, topics
 from companion.recording.files import versions
@@ -420,7 +423,9 @@ class Replay:
                 raise window
             if isinstance(window, Measurement):
                 window = window.window()
-            self._solution = self._solved(_refined(window, detail["refined"]), What[detail["what"]])
+            solution = self._solved(_refined(window, detail["refined"]), What[detail["what"]])
+            whole = {found.name: self._whole(found) for found in solution.imus}
+            self._solution = weigh(solution, whole, detail.get("expectation") or Expectation()).solution
         except CalibrationRefusedError as error:
             self._no_solution = f"refused here: {error}"
 
@@ -430,6 +435,10 @@ class Replay:
         gradienter = aligned(models.gradienter_model(config.gradienter), self._alignment)
         compass = models.compass_model(config.compass)
         return solve_at(window, self._where, gradienter, compass, what)
+
+    def _whole(self, found: ImuSolution) -> tuple[Array | None, Array | None]:
+        calibration = self._solved_with.get(found.name)
+        return (found.gyro_rad_s, found.accel_m_s2) if calibration is None else whole_of(calibration, found)
 
     def _take_record(self, data: bytes) -> None:
         entry = msgspec.json.decode(data, type=topics.RecordEntry)

@@ -708,6 +708,7 @@ def test_the_command_says_the_same_and_ends_with_0(
         "warnings": list(usual[1].warnings),
         "armings": [],
         "imus": json.loads(msgspec.json.encode(usual[1].imus)),
+        "cross_covariance": json.loads(msgspec.json.encode(usual[1].cross_covariance)),
     }
     assert companion(["replay", str(usual[0])]) == 0
     assert "1 of 1 calibrations recomputed, the same to the last bit" in capsys.readouterr().out

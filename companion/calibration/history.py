@@ -1,0 +1,114 @@
+"""What earlier calibrations found of one IMU, and which of it is worth a prior.
+
+Kept are whole biases as they were *measured*, never what a prior has made of them: a prior that learns from itself
+believes itself more with every calibration. One power-up is one point, however often was calibrated in it: the bias
+that the sensor has started with is in all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, Literal
+
+import msgspec
+
+Axes = tuple[float, float, float]
+Triad = Literal["gyro", "accel"]
+
+NEW_AFTER: Final = 3
+"""So many power-ups in a row that contradict what was before are no outliers: the sensor is another one now."""
+SAME_START_S: Final = 60.0
+"""Two power-ups whose beginnings differ by less are one: the wall clock is set in between, by a little."""
+
+
+class PowerUp(msgspec.Struct, frozen=True, kw_only=True):
+    """Since when the sensor has been powered, as well as that can be told.
+
+    Two are taken for one where either says so: too few points make a prior cautious, one counted twice makes it bold.
+    """
+
+    host: str
+    """One and the same as long as the companion computer runs."""
+    since_unix_s: float | None
+    """When the sensor's own device started, by the wall clock; None where it does not tell."""
+
+    def is_same(self, other: PowerUp) -> bool:
+        """Whether nothing says that the power was off in between."""
+        if self.host == other.host:
+            return True
+        mine, theirs = self.since_unix_s, other.since_unix_s
+        return mine is not None and theirs is not None and abs(mine - theirs) < SAME_START_S
+
+
+class Measured(msgspec.Struct, frozen=True, kw_only=True):
+    """One triad's whole bias, vehicle FRD, rad/s or m/s^2, as the readings alone gave it."""
+
+    bias: Axes
+    sigma_stat: Axes
+    sigma_use: Axes
+    """Of the sensor alone, without what the pose adds."""
+    sigma_shared: Axes
+    """What the place and the heading add; of an accelerometer without the gradienter's zero."""
+    suspect: bool = False
+    """It contradicted what was known."""
+
+
+class Point(msgspec.Struct, frozen=True, kw_only=True):
+    """One calibration of one IMU."""
+
+    started_at: str
+    """Of its record."""
+    unix_s: float
+    power_up: PowerUp
+    temperature_degc: float | None
+    up: Axes
+    """Unit vector in the vehicle's axes: the attitude at which the accelerometers' bias was measured."""
+    zero: str | None = None
+    """Which zero of the gradienter the accelerometers were measured with; None without them."""
+    zero_sigma_rad: float = 0.0
+    gyro: Measured | None = None
+    accel: Measured | None = None
+
+    def of(self, triad: Triad) -> Measured | None:
+        """One half of it."""
+        return self.gyro if triad == "gyro" else self.accel
+
+
+def by_power_up(points: Sequence[Point]) -> list[list[Point]]:
+    """The points of each power-up, in the order in which they were measured."""
+    groups: list[list[Point]] = []
+    for point in points:
+        for group in reversed(groups):
+            if any(point.power_up.is_same(other.power_up) for other in group):
+                group.append(point)
+                break
+        else:
+            groups.append([point])
+    return groups
+
+
+def believed(points: Sequence[Point], triad: Triad) -> list[list[Point]]:
+    """By power-up, what of these points is worth a prior for one triad.
+
+    Outliers are left out. `NEW_AFTER` of them in a row are none: then it is what was before them that is left out.
+    """
+    groups = by_power_up([point for point in points if point.of(triad) is not None])
+    outliers = [all(_is_suspect(point, triad) for point in group) for group in groups]
+    first = row = 0
+    accepted: set[int] = set()
+    for k, outlier in enumerate(outliers):
+        row = row + 1 if outlier else 0
+        if row >= NEW_AFTER:
+            first = k + 1 - row
+            accepted = set(range(first, k + 1))
+    found: list[list[Point]] = []
+    for k in range(first, len(groups)):
+        kept = groups[k] if k in accepted else [p for p in groups[k] if not _is_suspect(p, triad)]
+        if kept:
+            found.append(kept)
+    return found
+
+
+def _is_suspect(point: Point, triad: Triad) -> bool:
+    found = point.of(triad)
+    return found is not None and found.suspect
