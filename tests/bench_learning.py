@@ -1,6 +1,6 @@
 """A noise profile out of a night's recording: 2.8 h at 100 Hz, a million samples of six axes, against reading them.
 
-`python -m tests.bench_profile`; a part of `make bench`.
+`python -m tests.bench_learning`; a part of `make bench`.
 """
 
 from __future__ import annotations
