@@ -28,10 +28,11 @@ READ_BYTES = 4096
 QUICK_READS = 20
 QUICK_S = 0.0015
 """So many reads, that far apart in the mean or less, are a stream whose every byte would wake the loop."""
-PAUSE_S = 0.008
+COLLECT_S = 0.01
 """So long such a stream is collected before the next read: a wake-up costs far more than the bytes that it brings.
 
-What it brings is stamped that much late at worst, half of what a USB adapter adds that is left as it came.
+What it brings is stamped that much late at worst, less than what a USB adapter adds that is left as it came. Two of
+them are the 20 ms within which an autopilot takes one heading (autopilots section 6).
 """
 FULLEST_LINE = 0.9
 """Of a line's time, where its stream may be collected."""
@@ -45,6 +46,7 @@ BEAT_S = 1.0
 BEAT_WITHIN_S = 8.0
 """An open that takes all the time it may, and the longest pause after it."""
 PAUSE_S = 0.05
+"""So long a port that brings more than its budget is left alone."""
 DISCARD_BYTES = 65536
 DISCARD_READS = 16
 """After a pause so much is thrown away at the most, a millisecond's work; the rest waits in the kernel, not here."""
@@ -226,7 +228,7 @@ class ByteLink:
         if self._reads == QUICK_READS:
             if now_s - self._reads_since[0] < QUICK_READS * QUICK_S and self._fits_the_line(*self._reads_since, now_s):
                 loop.remove_reader(self._descriptor)
-                self._collecting = loop.call_later(PAUSE_S, self._collected)
+                self._collecting = loop.call_later(COLLECT_S, self._collected)
             self._reads, self._reads_since = 0, (now_s, self.bytes_received)
 
     def _collected(self) -> None:
@@ -237,7 +239,7 @@ class ByteLink:
         if self._descriptor is None:
             return
         if came and self._fits_the_line(*before, now_s):
-            self._collecting = loop.call_later(PAUSE_S, self._collected)
+            self._collecting = loop.call_later(COLLECT_S, self._collected)
         else:
             self._collecting, self._reads_since = None, (now_s, self.bytes_received)
             loop.add_reader(self._descriptor, self._readable)
