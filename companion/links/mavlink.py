@@ -14,6 +14,8 @@ from typing import Literal, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.links.mavlink_signing import Signing
+
 logger = logging.getLogger(__name__)
 
 Message = mavlink.MAVLink_message
@@ -44,6 +46,8 @@ class MavlinkLink:
         self.last_received_s: float | None = None
         self.tap: Callable[[Direction, bytes | None, float | None], object] | None = None
         """Called with (direction, bytes, time of arrival); without bytes: some are missing here."""
+        self.signing: Signing | None = None
+        """Signs what is sent and judges what comes; None: nobody does."""
         self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._codec.robust_parsing = True
         self._transmit: Callable[[bytes], object] | None = None
@@ -84,6 +88,8 @@ class MavlinkLink:
             self.dropped += 1
             return False
         data = message.pack(self._codec)
+        if self.signing is not None:
+            data = self.signing.sign(data, message.crc_extra)
         self._codec.seq = (self._codec.seq + 1) % 256
         if self.tap is not None:
             self.tap("out", data, None)
@@ -138,6 +144,8 @@ class MavlinkLink:
         if isinstance(message, mavlink.MAVLink_unknown):
             # One counter for all: noise can look like any of 16 million message ids.
             self.received["unknown"] += 1
+            return
+        if self.signing is not None and not self.signing.admits(message.get_msgbuf()):
             return
         self.received[name] += 1
         self.last_received_s = t_s
