@@ -34,4 +34,4 @@ class Permission:
             self.refused[sender] = 0
         if sender in self.refused:
             self.refused[sender] += 1
-        return f"{system}/{component} is not in mavlink.allow"
+        return f"{system}/{component} not in mavlink.allow"

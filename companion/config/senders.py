@@ -8,7 +8,7 @@ from typing import Final
 
 EVERYBODY: Final = ("*",)
 ALLOWED: Final = '"SYSTEM" or "SYSTEM:COMPONENT", each a number from 0 to 255, a range such as 250-255, or *'
-_IDS: Final = re.compile(r"(?:\*|(\d{1,3})(?:-(\d{1,3}))?)")
+_IDS: Final = re.compile(r"(?:\*|([0-9]{1,3})(?:-([0-9]{1,3}))?)")
 
 
 class Senders:

@@ -187,5 +187,5 @@ def _go_on_from(kept: SigningTime | None, now_s: float, boot_id: str) -> int:
     if kept is None:
         return 0
     if boot_id and boot_id == kept.boot_id and now_s >= kept.uptime_s:
-        return kept.ticks + int((now_s - kept.uptime_s) * TICKS_PER_S)
-    return kept.reserved
+        return kept.ticks + int((now_s - kept.uptime_s) * TICKS_PER_S) + 1
+    return kept.reserved + 1
