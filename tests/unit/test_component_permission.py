@@ -139,7 +139,7 @@ def test_a_parameter_is_answered_with_the_value_that_stays() -> None:
             b.ground.send_raw(set_push(b.ground, 0.0))
             await asyncio.sleep(1)
             assert push(b) == 1.0
-            values = [m.param_value for _, m in b.ground.received if m.get_type() == "PARAM_VALUE"]
+            values = [m.param_value for _, m in b.ground.received if isinstance(m, mavlink.MAVLink_param_value_message)]
             assert values == [1.0]
             assert b.ground.texts() == ["CMP_PUSH not set: 255/190 not in mavlink.allow"]
 
