@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 # Tests run in two processes: the boards and machines this is made for have at least two cores.
 JOBS ?= 2
 
-.PHONY: help demo test check format bench deb deb-test clean
+.PHONY: help demo test check format bench deb deb-test lock sbom audit clean
 
 help:
 	@echo 'make demo    watch a virtual aircraft being calibrated (about a minute)'
@@ -16,6 +16,9 @@ help:
 	@echo 'make bench   speed, as ratios within one run'
 	@echo 'make deb     a Debian package for machines like this one, in dist/'
 	@echo 'make deb-test  try that package in a clean root (as root; a minute or two)'
+	@echo 'make lock    requirements/*.txt anew: every dependency with its hashes (UPGRADE=1: the newest; needs the network)'
+	@echo 'make sbom    what the package has of others, as CycloneDX, in dist/ (needs the network)'
+	@echo 'make audit   known vulnerabilities of what is in requirements/ (needs the network)'
 	@echo 'make clean   remove what the other targets made'
 
 $(VENV)/.run: pyproject.toml
@@ -62,5 +65,40 @@ deb:
 deb-test: deb
 	@packaging/deb/try_in_clean_root.sh dist/companion_*.deb
 
+# What supply chain tools need is theirs alone: nothing of it is in the environment that runs or tests the companion.
+TOOLS := $(VENV)-tools
+LOCKED := runtime mqtt recording ground dev
+UPGRADE ?=
+COMPILE = $(TOOLS)/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+	--no-header $(if $(UPGRADE),--upgrade)
+
+$(TOOLS)/.made: requirements/tools.txt
+	@$(PYTHON) -m venv $(TOOLS)
+	@$(TOOLS)/bin/pip install --quiet --disable-pip-version-check --require-hashes -r requirements/tools.txt
+	@touch $@
+
+# The extras after dev, which has them all, and with its versions: what is tested is what is installed.
+lock: $(TOOLS)/.made
+	@$(COMPILE) pyproject.toml --extra dev -o requirements/dev.txt
+	@$(COMPILE) pyproject.toml -c requirements/dev.txt --no-annotate -o requirements/runtime.txt
+	@for extra in mqtt recording ground; do \
+		$(COMPILE) pyproject.toml --extra $$extra -c requirements/dev.txt --no-annotate -o requirements/$$extra.txt || exit 1; \
+	done
+	@$(COMPILE) requirements/build.in -o requirements/build.txt
+	@$(COMPILE) requirements/tools.in -o requirements/tools.txt
+	@git --no-pager diff --stat -- requirements
+
+sbom: $(TOOLS)/.made
+	@$(TOOLS)/bin/python packaging/sbom.py --extras "$(EXTRAS)"
+
+# --strict: what could not be looked up is no clean bill of health, but a failure.
+audit: $(TOOLS)/.made
+	@for name in $(LOCKED) build tools; do \
+		echo "== requirements/$$name.txt"; \
+		$(TOOLS)/bin/pip-audit --strict --disable-pip --require-hashes --progress-spinner off \
+			-r requirements/$$name.txt || { echo "make audit: requirements/$$name.txt is NOT known to be clean:" \
+			"it has known vulnerabilities, or the service that knows of them was not reached (see above)" >&2; exit 1; }; \
+	done
+
 clean:
-	rm -rf build dist $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf build dist $(VENV) $(TOOLS) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

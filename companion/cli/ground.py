@@ -9,10 +9,11 @@ import re
 import signal
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from companion.cli import DONE, FAILED, Parser, print_json, seconds
-from companion.errors import LinkError
+from companion.errors import ConfigError, LinkError, NobodyHeardError
 
 if TYPE_CHECKING:
     from companion.ground.station import Outcome, Station
@@ -35,6 +36,12 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
     link.add_argument("--component", type=_number, metavar="N", help="the companion's component id (default 191)")
     link.add_argument(
         "--within", type=seconds, metavar="S", help="how long to look for the companion on the link (default 5)"
+    )
+    link.add_argument(
+        "--signing-key-file",
+        type=Path,
+        metavar="FILE",
+        help="sign with this key and believe nobody else (docs/security.md)",
     )
     subcommands = ground.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
@@ -88,13 +95,17 @@ async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Aw
     from companion.ground.link import open_link
     from companion.ground.station import Station
 
-    url = getattr(options, "url", DEFAULT_URL)
+    url, key_file = getattr(options, "url", DEFAULT_URL), getattr(options, "signing_key_file", None)
+    key = None if key_file is None else _key(key_file)
     heard = Heard(getattr(options, "component", 191))
     # MAVSDK prints some of its own troubles on stdout, which is for the answer alone.
     with contextlib.redirect_stdout(sys.stderr), Display() as display:
-        async with open_link(url, heard) as link:
+        async with open_link(url, heard, key) as link:
             station = Station(link, url, display)
-            await station.find(getattr(options, "system", None), getattr(options, "within", 5.0))
+            try:
+                await station.find(getattr(options, "system", None), getattr(options, "within", 5.0))
+            except NobodyHeardError as error:
+                raise NobodyHeardError("; ".join(filter(None, (str(error), link.unbelieved())))) from None
             async with _interruptible(station):
                 outcome = await work(station)
     if getattr(options, "json", False):
@@ -119,6 +130,15 @@ async def _interruptible(station: Station) -> AsyncIterator[None]:
         for number in numbers:
             loop.remove_signal_handler(number)
             signal.signal(number, before[number])
+
+
+def _key(path: Path) -> bytes:
+    from companion.links.mavlink_keys import read_key
+
+    try:
+        return read_key(path)
+    except LinkError as error:
+        raise ConfigError(str(error)) from None
 
 
 def _url(text: str) -> str:

@@ -98,6 +98,9 @@ def status_lines(status: Object) -> list[str]:
         lines.append(f"recording to {file['path']}: {file['seconds']:.0f} s, {file['bytes'] / 1e6:.1f} MB")
     vehicle = status["vehicle"]
     lines.append(f"autopilot: {vehicle['summary']}")
+    if vehicle["signing"] is not None:
+        lines.append(f"signing ({vehicle['signing']['mode']}): {vehicle['signing']['summary']}")
+    lines += [f"not allowed to ask: {sender} ({count} times)" for sender, count in vehicle["refused"].items()]
     lines += [f"{device['name']}: {device['summary']}{_counts(device)}" for device in status["devices"]]
     lines += _reading_lines(status)
     lines += [f"warning: {warning}" for warning in status["warnings"]]

@@ -25,6 +25,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.calibration.request import What
 from companion.component import requests
 from companion.component.identity import autopilot_version
+from companion.component.permission import Permission
 from companion.component.service import CalibrationService, Job, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.links.mavlink import MavlinkLink
@@ -59,6 +60,8 @@ _WORDS = {
     What.GYROS: "gyros",
     What.ACCELEROMETERS: "accelerometers",
 }
+_NAMES: dict[type, str] = {requests.Calibrate: "Calibration", requests.Undo: "Undo", requests.Cancel: "Cancel"}
+"""What not everybody may ask for."""
 # Arm authorisation is a verdict, not a job, and silence is one of its answers.
 _LEFT_TO_OTHERS = frozenset({mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST})
 
@@ -88,8 +91,10 @@ class CommandServer:
         service: CalibrationService,
         say: Callable[[Severity, str, Weight], object],
         wake: Callable[[], None],
+        permission: Permission | None = None,
     ) -> None:
         self._link, self._service, self._say, self._wake = link, service, say, wake
+        self._permission = permission or Permission()
         self._running: _Running | None = None
         self._next_ack_s = 0.0
         self._finals: OrderedDict[requests.Key, _Final] = OrderedDict()
@@ -133,7 +138,7 @@ class CommandServer:
         if message.command in _LEFT_TO_OTHERS:
             return
         command = requests.from_message(message)
-        request = requests.judge(command)
+        request = self._permit(command, requests.judge(command))
         copy = self._is_copy(command, now_s)
         running = self._running
         if running is not None and running.key == command.key and not isinstance(request, requests.Refused):
@@ -150,6 +155,16 @@ class CommandServer:
             self._finally(command.key, final.result, now_s)
             return
         self._obey(command.key, request, now_s)
+
+    def _permit(
+        self, command: requests.Command, request: requests.Request | requests.Refused
+    ) -> requests.Request | requests.Refused:
+        """The request, or its refusal when its sender may not ask for that."""
+        name = _NAMES.get(type(request))
+        if name is None:
+            return request
+        reason = self._permission.refuses((command.key.system_id, command.key.component_id), name.lower())
+        return requests.Refused(mavlink.MAV_RESULT_DENIED, f"{name} refused: {reason}") if reason else request
 
     def _is_copy(self, command: requests.Command, now_s: float) -> bool:
         """Whether the network delivered this very packet before."""

@@ -13,6 +13,7 @@ from companion.component.arming_script import ArmingScript
 from companion.component.commands import CommandServer
 from companion.component.identity import heartbeat
 from companion.component.own_parameters import OwnParameters
+from companion.component.permission import Permission
 from companion.component.service import ArmGate, CalibrationService, VehicleView
 from companion.component.statustext import Severity, StatusText, Weight
 from companion.links.mavlink import MavlinkLink
@@ -39,8 +40,9 @@ class Component:
         self.on_beat: Callable[[], None] = lambda: None
         """Called at every turn of the working loop."""
         self.texts = StatusText(link, self._woken.set)
-        self.parameters = OwnParameters(link, self.texts.say, self._woken.set)
-        self._commands = CommandServer(link, service, self.texts.say, self._woken.set)
+        self.permission = Permission()
+        self.parameters = OwnParameters(link, self.texts.say, self._woken.set, self.permission)
+        self._commands = CommandServer(link, service, self.texts.say, self._woken.set, self.permission)
         self._authoriser = ArmAuthoriser(link, vehicle, gate, self.texts.say) if gate is not None else None
         self._script = ArmingScript(link, vehicle, gate) if gate is not None else None
         self._unsubscribe = link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)

@@ -19,6 +19,7 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.component.permission import Permission
 from companion.component.statustext import Severity, Weight
 from companion.errors import CompanionError
 from companion.links.mavlink import MavlinkLink
@@ -68,8 +69,10 @@ class OwnParameters:
         link: MavlinkLink,
         say: Callable[[Severity, str, Weight], object] = lambda severity, text, weight: None,
         wake: Callable[[], None] = lambda: None,
+        permission: Permission | None = None,
     ) -> None:
         self._link, self._say, self._wake = link, say, wake
+        self._permission = permission or Permission()
         self._all: list[_Parameter] = []
         self._by_name: dict[str, _Parameter] = {}
         self._pending: dict[int, None] = {}
@@ -194,7 +197,10 @@ class OwnParameters:
             if message.target_component == self._link.component_id:
                 self._send_unknown(message, message.param_id, -1)
             return
-        refusal = self._apply(parameter, message)
+        sender = (message.get_srcSystem(), message.get_srcComponent())
+        if sender == (self._link.system_id, self._link.component_id):
+            return  # an echo, or somebody who pretends to be us
+        refusal = self._permission.refuses(sender, f"setting {parameter.name}") or self._apply(parameter, message)
         if refusal:
             self._say(Severity.WARNING, f"{parameter.name} not set: {refusal}", Weight.REFUSAL)
         if self._send(parameter):

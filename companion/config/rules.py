@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Iterator
 
+from companion.config.mavlink_rules import check_access
 from companion.config.mqtt_rules import check_mqtt
 from companion.config.sections import Compass, Config, Gradienter, Imu, Mounting
 from companion.config.words import allowed
@@ -55,6 +56,7 @@ def check_together(config: Config, name: str) -> None:
     _check_field_heading(config, name)
     _check_ports_differ(config, name)
     _check_mavlink_url(config.mavlink.url, name)
+    check_access(config.mavlink, name)
     if config.web is not None:
         _check_bind(config.web.bind, name)
     if config.mqtt is not None:

@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from companion.config.senders import EVERYBODY
+
 ImuProtocol = Literal["vectornav", "imu_line", "witmotion", "mip", "xsens", "stim300"]
 Profile = Literal["icm42688p", "bmi088", "adis16470", "adis16405", "unknown"]
 """Those of the catalogue; others are learned and saved (`companion profile --save`)."""
@@ -20,6 +22,7 @@ Law = Literal["axis", "slope", "euler"]
 Parity = Literal["none", "even", "odd"]
 AtArm = Literal["gate", "warn", "off"]
 LogLevel = Literal["debug", "info", "warning", "error"]
+Signing = Literal["off", "sign", "require"]
 
 Latitude = Annotated[float, Meta(ge=-90, le=90)]
 Longitude = Annotated[float, Meta(ge=-180, le=180)]
@@ -30,6 +33,11 @@ NonEmpty = Annotated[str, Meta(min_length=1)]
 # Plain str on purpose: msgspec (0.19 to 0.22) confuses a length limit inside a union with a tuple and corrupts memory.
 Mounting = str | tuple[float, float, float]
 """A MAVLink rotation name, or [roll, pitch, yaw] in degrees, sensor to vehicle FRD."""
+
+
+def secret_path(name: str) -> Path:
+    """Where a secret lies: at its path, or, without a folder, among systemd's credentials."""
+    return Path(os.environ.get("CREDENTIALS_DIRECTORY", "/")) / name
 
 
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -50,6 +58,21 @@ class Mavlink(Section, frozen=True):
 
     url: NonEmpty
     component_id: Annotated[int, Meta(ge=1, le=255)] = 191
+    allow: tuple[str, ...] = EVERYBODY
+    """Who may calibrate, cancel, undo and set our parameters: as `config.senders` reads it."""
+    signing: Signing | None = None
+    """"require" where a key file is named, else "off"."""
+    signing_key_file: NonEmpty | None = None
+
+    @property
+    def signing_mode(self) -> Signing:
+        """As configured, else by whether there is a key."""
+        return self.signing or ("off" if self.signing_key_file is None else "require")
+
+    @property
+    def signing_key_path(self) -> Path | None:
+        """The key's file; one without a folder is looked for among systemd's credentials."""
+        return None if self.signing_key_file is None else secret_path(self.signing_key_file)
 
 
 class Noise(Section, frozen=True):
@@ -176,9 +199,7 @@ class Mqtt(Section, frozen=True):
     @property
     def password_path(self) -> Path | None:
         """The password's file; one without a folder is looked for among systemd's credentials."""
-        if self.password_file is None:
-            return None
-        return Path(os.environ.get("CREDENTIALS_DIRECTORY", "/")) / self.password_file
+        return None if self.password_file is None else secret_path(self.password_file)
 
 
 class Control(Section, frozen=True):

@@ -116,6 +116,8 @@ def _describe(annotation: object) -> str:
         return ", ".join(f'"{value}"' for value in arguments)
     if origin in (Union, types.UnionType):
         return " or ".join(words for words in map(_describe, arguments) if words)
+    if origin is tuple and Ellipsis in arguments:
+        return f"a list, each {_describe(arguments[0])}"
     if origin is tuple:
         return f"[{', '.join('number' for _ in arguments)}]"
     if origin is list or (isinstance(annotation, type) and issubclass(annotation, msgspec.Struct)):

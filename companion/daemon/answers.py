@@ -12,6 +12,7 @@ from companion.autopilot.vehicle import Vehicle
 from companion.calibration.record import Record
 from companion.calibration.request import What
 from companion.calibration.rolling import RollingCollector
+from companion.component.permission import Permission
 from companion.component.service import Refusal
 from companion.daemon.align_answers import answer_align
 from companion.daemon.alignment import AlignmentInForce
@@ -30,6 +31,7 @@ from companion.daemon.readiness import Readiness
 from companion.daemon.recorder import Recorder
 from companion.daemon.rivalry import Rivalry
 from companion.daemon.shown_calibration import shown_calibration
+from companion.daemon.signing import LinkSigning
 from companion.errors import CalibrationRefusedError
 from companion.links.mavlink import MavlinkLink
 from companion.storage.records import RecordStore
@@ -105,12 +107,19 @@ class Answers:
         self._recorder, self._link, self._pose, self._alignment = recorder, link, pose, alignment
         self._headlines = Headlines(vehicle, collector, conductor, mender, readiness, automatic, mavlink_url, trouble)
         self._carried: Carried | None = None
+        self._signing: LinkSigning | None = None
+        self._permission = Permission()
         self.page: Callable[[], Object | None] = lambda: None
         """What is to be said of the page; None where none is configured."""
         self.setup: Callable[[Object], Awaitable[Object]] | None = None
         """Sets the autopilot up for our heading."""
         self.mqtt: Callable[[], Object] = dict
         """How the broker is reached; empty where none is configured."""
+
+    def watch_access(self, signing: LinkSigning, permission: Permission) -> None:
+        """Tell of who is not believed and who was refused, too."""
+        self._signing, self._permission = signing, permission
+        self._headlines.deaf = lambda: signing.deaf
 
     def carry(self, attitude: Carried | None) -> None:
         """Tell of the attitude that is carried, too."""
@@ -218,11 +227,13 @@ class Answers:
                 "armed": self._vehicle.arm_state.value,
                 "summary": f"{self._vehicle.name}, {self._vehicle.arm_state.value}"
                 if self._vehicle.system_id is not None
-                else f"not heard yet on {self._mavlink_url}",
+                else self._headlines.not_heard(),
                 "heartbeat_age_s": None if age_s is None else round(age_s, 1),
                 "messages": received.total() - received["bad"],
                 "bad": received["bad"],
                 "not_sent": self._link.dropped,
+                "signing": None if self._signing is None else self._signing.status(),
+                "refused": {f"{system}/{one}": count for (system, one), count in self._permission.refused.items()},
             },
             "pose": self._pose.now(),
             "readings": self._pose.readings(),

@@ -60,6 +60,8 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
     findings += [Finding("warning", good=True, words=words) for words in doubtful(config)]
     vehicle = status["vehicle"]
     findings.append(Finding("autopilot", good=vehicle["system_id"] is not None, words=vehicle["summary"]))
+    if (signing := vehicle["signing"]) is not None:
+        findings.append(Finding("signing", good=signing["good"], words=signing["summary"]))
     elsewhere = where_it_may_be(config)
     findings += [_device(device, elsewhere) for device in status["devices"]]
     diagnoses = system_findings(config, list(ours))

@@ -63,8 +63,14 @@ class Headlines:
         self._readiness, self._automatic, self._mavlink_url = readiness, automatic, mavlink_url
         self._trouble = trouble
         """What is wrong with one of our own sensors, and with which; None while all do well."""
+        self.deaf: Callable[[], str | None] = lambda: None
+        """Why what comes from the autopilot is not believed; None when it is."""
         self.concern: Callable[[], str | None] = lambda: None
         """What else the pilot should know of at once, where the rest is well."""
+
+    def not_heard(self) -> str:
+        """That no autopilot has been heard so far, and why where that is known."""
+        return f"not heard yet on {self._mavlink_url}{f': {why}' if (why := self.deaf()) else ''}"
 
     def now(self) -> Headline:
         """The headline of this moment."""
@@ -99,8 +105,9 @@ class Headlines:
     def _no_autopilot(self) -> Headline:
         age_s = self._vehicle.heartbeat_age_s
         if age_s is None:
-            return Headline("NO AUTOPILOT", f"not heard yet on {self._mavlink_url}", "bad")
-        return Headline("NO AUTOPILOT", f"no heartbeat for {age_s:.0f} s: power? cable?", "bad")
+            return Headline("NO AUTOPILOT", self.not_heard(), "bad")
+        why = self.deaf() or "power? cable?"
+        return Headline("NO AUTOPILOT", f"no heartbeat for {age_s:.0f} s: {why}", "bad")
 
     def _working(self, job: Job, now_s: float) -> Headline:
         words, percent = job.words or self._conductor.state.value, job.progress_percent

@@ -86,6 +86,16 @@ def cannot_work(config: Config) -> list[str]:
 
 def doubtful(config: Config) -> list[str]:
     """What in the configuration is taken as it stands, and is probably not meant."""
+    return [*_unused_key(config), *_other_law(config)]
+
+
+def _unused_key(config: Config) -> list[str]:
+    if config.mavlink.signing_mode != "off" or config.mavlink.signing_key_file is None:
+        return []
+    return ['mavlink.signing_key_file is named, but signing = "off": nothing is signed or checked']
+
+
+def _other_law(config: Config) -> list[str]:
     gradienter = config.gradienter
     if gradienter is None:
         return []

@@ -15,6 +15,7 @@ import msgspec
 
 from companion.component.own_parameters import OwnParameters
 from companion.config import Config, load
+from companion.config.senders import Senders
 from companion.config.words import shown
 from companion.daemon.flight_line import AT_ARM
 from companion.daemon.ledger import Offload
@@ -52,6 +53,10 @@ def _stop_rivals(service: Service, value: bool) -> None:  # noqa: FBT001 - as al
     service.rivalry.stop_rivals = value
 
 
+def _allow(service: Service, value: tuple[str, ...]) -> None:
+    service.component.permission.senders = Senders(value)
+
+
 def _log_level(_service: Service, value: str) -> None:
     logging.getLogger().setLevel(value.upper())
 
@@ -62,6 +67,7 @@ RELOADABLE: Final[Mapping[str, Apply]] = {
     "calibration.at_arm": _at_arm,
     "push.parameters": _push,
     "push.stop_rivals": _stop_rivals,
+    "mavlink.allow": _allow,
     "log.level": _log_level,
 }
 """What can change without a restart, and how."""

@@ -17,6 +17,7 @@ from companion.autopilot.writer import ParameterWriter
 from companion.component.component import Component
 from companion.component.service import JobResult
 from companion.config import Config, Imu
+from companion.config.senders import Senders
 from companion.daemon import models
 from companion.daemon.aligner import Aligner
 from companion.daemon.alignment import AlignmentInForce
@@ -50,6 +51,7 @@ from companion.daemon.rivalry import Rivalry
 from companion.daemon.sensor_watch import SensorWatch
 from companion.daemon.sensors import SerialSensor
 from companion.daemon.serial_devices import Role, collect, serial_devices
+from companion.daemon.signing import LinkSigning
 from companion.links.mavlink import MavlinkLink
 from companion.links.mavlink_transport import run_transport
 from companion.protocols.roles import Part
@@ -187,6 +189,8 @@ class Service:
         self.armings = Armings(self.vehicle, self.readiness, config.storage.path, self._say, offload)
         self.gate_setup = GateSetup(self.vehicle, self.parameters, self.readiness, self._say)
         self.component = Component(self.link, self.vehicle, self.conductor, self.readiness)
+        self.component.permission.senders = Senders(config.mavlink.allow)
+        self.signing = LinkSigning(config, self.link, self.vehicle, self._say, offload)
         define_parameters(self.component.parameters, config, self.conductor)
         self.pose = PoseNow(config, self.vehicle, self.collector, offload)
         self.pose.gradienter = self.alignment.model
@@ -216,6 +220,7 @@ class Service:
         )
         self.answers.carry(self.attitude)
         self.answers.setup = self.setup.answer
+        self.answers.watch_access(self.signing, self.component.permission)
         self.mqtt = self._mqtt_face(offload)
         self.page = self._page(offload)
 
@@ -334,6 +339,7 @@ class Service:
         self.ledger.load()
         self.alignment.load()
         self.memory.load()
+        self.signing.load()
         if self.ledger.fault is not None:
             # Stay and say so: a daemon that is gone is harder to understand from the field.
             logger.error("%s", self.ledger.fault)
@@ -343,6 +349,7 @@ class Service:
             async with asyncio.TaskGroup() as group:
                 try:
                     group.create_task(self.component.run(), name="component")
+                    group.create_task(self.signing.run(), name="signing")
                     if mavlink:
                         group.create_task(run_transport(self.link, self.config.mavlink.url), name="mavlink")
                     group.create_task(self.mender.run(), name="mender")
@@ -376,8 +383,14 @@ class Service:
     async def listen(self, seconds: float) -> Object:
         """Open everything, listen, and tell what `status` would; for `companion check`, writes nothing."""
         self.conductor.only_listening = "only a check is running: start companion run"
+        self.signing.load()
         running = [self.component.run(), run_transport(self.link, self.config.mavlink.url)]
-        running += [self.reach.run(), self.gate_setup.run(), *(imu.run() for imu in self.imus.values())]
+        running += [
+            self.signing.run(),
+            self.reach.run(),
+            self.gate_setup.run(),
+            *(imu.run() for imu in self.imus.values()),
+        ]
         running += [*(sensor.run() for sensor in self.sensors), self.sensor_watch.run()]
         if self.mqtt is not None:
             self.mqtt.only_listening = True

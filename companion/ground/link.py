@@ -36,6 +36,8 @@ class GroundLink:
         self.own, self.heard = own, heard
         self._sdk, self._direct = sdk, direct
         self._ack_handlers: list[Callable[[Ack], None]] = []
+        self.unbelieved: Callable[[], str] = lambda: ""
+        """What was dropped because of its signature, in words; empty: nothing."""
         self._loop = asyncio.get_running_loop()
         for name in _HEARD:
             direct.subscribe_message(name, self._in_a_thread)
@@ -154,8 +156,8 @@ class _Log:
 
 
 @asynccontextmanager
-async def open_link(url: str, heard: Heard) -> AsyncIterator[GroundLink]:
-    """Be a ground station on a link; `heard` learns what comes.
+async def open_link(url: str, heard: Heard, key: bytes | None = None) -> AsyncIterator[GroundLink]:
+    """Be a ground station on a link; `heard` learns what comes; with a key, only what is signed with it.
 
     Raises:
         ConfigError: MAVSDK is not installed, or the url is none.
@@ -173,6 +175,13 @@ async def open_link(url: str, heard: Heard) -> AsyncIterator[GroundLink]:
     with mavsdk.Mavsdk(configuration) as sdk:
         direct = MavlinkDirectServer(sdk.server_component_by_id(own.component_id))
         link = GroundLink(sdk, direct, own, heard)
+        if key is not None:
+            from companion.ground.signed_link import open_signed
+
+            async with open_signed(sdk, own, url, key) as signed:
+                link.unbelieved = signed.words
+                yield link
+            return
         try:
             await asyncio.to_thread(sdk.add_any_connection_with_handle, f"{_SCHEMES[kind]}://{where}:{number}")
         except mavsdk.MavsdkError as error:

@@ -15,6 +15,7 @@ from typing import Literal, TypeVar
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.links.mavlink_frames import Codec, kind_at, read
+from companion.links.mavlink_signing import Signing
 
 logger = logging.getLogger(__name__)
 
@@ -46,6 +47,8 @@ class MavlinkLink:
         self.last_received_s: float | None = None
         self.tap: Callable[[Direction, bytes | None, float | None], object] | None = None
         """Called with (direction, bytes, time of arrival); without bytes: some are missing here."""
+        self.signing: Signing | None = None
+        """Signs what is sent and judges what comes; None: nobody does."""
         self._codec: Codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._codec.robust_parsing = True
         self._transmit: Callable[[bytes], object] | None = None
@@ -86,6 +89,8 @@ class MavlinkLink:
             self.dropped += 1
             return False
         data = message.pack(self._codec)
+        if self.signing is not None:
+            data = self.signing.sign(data, message.crc_extra)
         self._codec.seq = (self._codec.seq + 1) % 256
         if self.tap is not None:
             self.tap("out", data, None)
@@ -132,7 +137,7 @@ class MavlinkLink:
         The codec, which knows everything and takes several times as long, gets the rest from the first frame on that is
         anything special: signed, of version 1, with text or arrays in it for somebody, damaged, cut off.
         """
-        if self._codec.signing.secret_key is not None:
+        if self.signing is not None:
             return data
         at = 0
         while (found := kind_at(data, at)) is not None:
@@ -169,6 +174,8 @@ class MavlinkLink:
         if isinstance(message, mavlink.MAVLink_unknown):
             # One counter for all: noise can look like any of 16 million message ids.
             self.received["unknown"] += 1
+            return
+        if self.signing is not None and not self.signing.admits(message.get_msgbuf()):
             return
         self.received[name] += 1
         self.last_received_s = t_s

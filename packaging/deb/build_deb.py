@@ -138,12 +138,32 @@ def debian_python(python: str) -> Path:
 
 
 def collect_wheels(interpreter: Path, extras: str, work: Path) -> Path:
-    """What pip resolves for this machine, the companion among it."""
-    tools = work / "tools"
+    """What the lock files name, hash for hash, and the companion, built with what they name too.
+
+    Raises:
+        BuildError: there is no lock for an extra, or a step failed.
+    """
+    locks = [lock_file(name) for name in ("runtime", *filter(None, extras.split(",")))]
+    tools, wheels = work / "tools", work / "wheels"
     run(interpreter, "-m", "venv", tools)
-    what = f"{PROJECT}[{extras}]" if extras else str(PROJECT)
-    run(tools / "bin/pip", "wheel", "--quiet", "--disable-pip-version-check", "--wheel-dir", work / "wheels", what)
-    return work / "wheels"
+    pip, quiet = tools / "bin/pip", ("--quiet", "--disable-pip-version-check")
+    run(pip, "install", *quiet, "--require-hashes", "-r", lock_file("build"))
+    listed: list[str | Path] = [word for path in locks for word in ("-r", path)]
+    run(pip, "download", *quiet, "--require-hashes", "--only-binary", ":all:", "--no-deps", "--dest", wheels, *listed)
+    run(pip, "wheel", *quiet, "--no-deps", "--no-build-isolation", "--wheel-dir", wheels, PROJECT)
+    return wheels
+
+
+def lock_file(name: str) -> Path:
+    """The lock of an extra.
+
+    Raises:
+        BuildError: there is none.
+    """
+    path = PROJECT / f"requirements/{name}.txt"
+    if not path.is_file():
+        raise BuildError(f"{path} is not there: the extras are those in pyproject.toml, locked by make lock")
+    return path
 
 
 def install(interpreter: Path, extras: str, work: Path, wheels: Path, stage: Path) -> Path:

@@ -23,6 +23,9 @@ class Stream:
 class Channel(abc.ABC):
     """An `End` as tests/support/wire.py means it: attach how to send, receive what came."""
 
+    UNSIGNED: tuple[int, ...] = (mavlink.MAVLINK_MSG_ID_RADIO, mavlink.MAVLINK_MSG_ID_RADIO_STATUS)
+    """Messages that need no signature where one is required."""
+
     def __init__(self, system_id: int, handle: Callable[[Channel, Message, float], None]) -> None:
         self.received: Counter[str] = Counter()
         """Messages by name, and "bad" for bytes that are none."""
@@ -72,6 +75,21 @@ class Channel(abc.ABC):
         self._codec.seq = (self._codec.seq + 1) % 256
         self.sent[message.get_type()] += 1
         self._transmit(data)
+
+    def require_signatures(self, key: bytes, ticks: int, link_id: int) -> None:
+        """Sign, and take what is not signed with the key only of the kinds in `UNSIGNED`: as on every port but USB.
+
+        By pymavlink's own signing, which is not the companion's.
+
+        Args:
+            key: 32 bytes.
+            ticks: how far its clock is, in 10 us since 2015; an autopilot without GNSS may be far behind.
+            link_id: of this port.
+        """
+        signing = self._codec.signing
+        signing.secret_key, signing.timestamp, signing.link_id = key, ticks, link_id
+        signing.sign_outgoing = True
+        signing.allow_unsigned_callback = lambda _codec, message_id: message_id in self.UNSIGNED
 
     def forward(self, data: bytes) -> None:
         """Send somebody else's packet unchanged."""

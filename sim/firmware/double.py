@@ -79,6 +79,11 @@ class AutopilotDouble(abc.ABC):
         """Bytes from the companion's wire; never raises."""
         self._port.receive(data, t_s)
 
+    def require_signatures(self, key: bytes, ticks: int = 0) -> None:
+        """Sign on both ports and take only what is signed with the key, as after SETUP_SIGNING."""
+        for number, channel in enumerate(self.channels, start=1):
+            channel.require_signatures(key, ticks, number)
+
     async def run(self) -> None:
         """Send heartbeats and streams until cancelled."""
         loop = asyncio.get_running_loop()

@@ -39,6 +39,14 @@ class PX4Port(Channel):
         data_rate: bytes per second (MAV_n_RATE) to which the streams are scaled down together; None: enough for all.
     """
 
+    # PX4's documents, MAVLink Message Signing (main, 2026): its "unsigned message allowlist".
+    UNSIGNED = (
+        HEARTBEAT,
+        mavlink.MAVLINK_MSG_ID_RADIO_STATUS,
+        mavlink.MAVLINK_MSG_ID_ADSB_VEHICLE,
+        mavlink.MAVLINK_MSG_ID_COLLISION,
+    )
+
     def __init__(
         self,
         system_id: int,

@@ -284,3 +284,46 @@ def test_texts_that_are_no_utf_8_spoil_nothing() -> None:
         assert set(said.err.splitlines()) == {"?? ???? ?[31m"}, "what the companion says, and nothing of MAVSDK's"
 
     asyncio.run(main())
+
+
+def test_over_a_signed_link_with_the_key_and_without(tmp_path: Path) -> None:
+    """MAVSDK has no signing: what it says and hears goes through ours, which the autopilot judges by pymavlink's."""
+    right, wrong = tmp_path / "right.key", tmp_path / "wrong.key"
+    for path, words in ((right, "a passphrase for the field"), (wrong, "another one altogether")):
+        path.write_text(f"{words}\n")
+        path.chmod(0o600)
+
+    async def main() -> None:
+        async with ground_line(tmp_path, "ardupilot", signing_key=right) as line:
+            key = ("--signing-key-file", str(right))
+            # The double answers whoever spoke last: one after the other.
+            strange = await line.ground("cancel", "--within", "2", "--signing-key-file", str(wrong), chosen=False)
+            assert strange.code == NOBODY, strange
+            assert "messages dropped because of their signature:" in strange.err
+            assert "other key" in strange.err
+            without = await line.ground("cancel", "--within", "2")
+            assert without.code == NOBODY, without
+            assert "beats, but does not answer" in without.err
+            cancelled = await line.ground("cancel", "--json", *key)
+            assert (cancelled.code, cancelled.json["state"]) == (DONE, "idle"), cancelled
+            status = await line.daemon.status()
+            assert status is not None
+            assert status["vehicle"]["signing"]["good"]
+            assert status["vehicle"]["signing"]["mode"] == "require"
+            for said in (cancelled, strange, without):
+                assert "passphrase for" not in said.err + said.out
+
+    asyncio.run(main())
+
+
+def test_a_key_that_cannot_be_used_is_said_before_anything_is_opened(tmp_path: Path) -> None:
+    path = tmp_path / "signing.key"
+    path.write_text("short")
+    path.chmod(0o600)
+
+    async def main() -> None:
+        said = await finish(await ground("status", "--url", "udpin:127.0.0.1:0", "--signing-key-file", str(path)))
+        assert said.code == USAGE, said
+        assert "found 5 bytes; wanted: 32 bytes, 64 hexadecimal digits" in said.err
+
+    asyncio.run(main())

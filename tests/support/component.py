@@ -32,6 +32,12 @@ class Ground:
     def attach(self, transmit: Callable[[bytes], None] | None) -> None:
         self._transmit = transmit
 
+    def sign(self, key: bytes, ticks: int, link_id: int = 7) -> None:
+        """Sign what is sent, by pymavlink's own signing, beginning at a time; whatever comes is listened to."""
+        signing = self._codec.signing
+        signing.secret_key, signing.timestamp, signing.link_id, signing.sign_outgoing = key, ticks, link_id, True
+        signing.allow_unsigned_callback = lambda _codec, _id: True
+
     def receive(self, data: bytes, t_s: float) -> None:
         self.raw.append(data)
         for message in self._codec.parse_buffer(data) or ():

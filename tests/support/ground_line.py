@@ -6,10 +6,13 @@ import asyncio
 import contextlib
 import json
 import sys
+import time
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from companion.links.mavlink_keys import read_key
+from companion.links.mavlink_signing import ticks_of
 from sim.companion_process import CompanionProcess
 from sim.motions import Motion
 from sim.pty_device import PtyDevice
@@ -66,9 +69,17 @@ async def finish(process: asyncio.subprocess.Process, within_s: float = 60.0) ->
 
 @contextlib.asynccontextmanager
 async def ground_line(
-    folder: Path, firmware: Firmware, *, motions: Sequence[Motion] = (), daemon: bool = True
+    folder: Path,
+    firmware: Firmware,
+    *,
+    motions: Sequence[Motion] = (),
+    daemon: bool = True,
+    signing_key: Path | None = None,
 ) -> AsyncIterator[GroundLine]:
-    """Devices on ptys, the autopilot double with two UDP ports, and the daemon as a process; calibrates on request."""
+    """Devices on ptys, the autopilot double with two UDP ports, and the daemon as a process; calibrates on request.
+
+    With a key file autopilot and daemon sign, and take nothing else.
+    """
     scenario = demo(seed=25, firmware=firmware, motions=motions)
     async with contextlib.AsyncExitStack() as stack:
         scenario.aircraft.begin(asyncio.get_running_loop().time())
@@ -81,6 +92,9 @@ async def ground_line(
         autopilot = asyncio.create_task(scenario.autopilot.run())
         stack.callback(autopilot.cancel)
         text = configuration(scenario, directory=folder, udp=link.local).replace("udpin:", "udpout:")
+        if signing_key is not None:
+            text = text.replace("[mavlink]\n", f'[mavlink]\nsigning_key_file = "{signing_key}"\n', 1)
+            scenario.autopilot.require_signatures(read_key(signing_key), ticks_of(time.time()))
         text += '[calibration]\nmin_still_s = 3\nmax_s = 4\nat_arm = "off"\n'
         (folder / "companion.toml").write_text(text)
         process = CompanionProcess(folder)

@@ -102,6 +102,7 @@ class Rig:
         mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
         at_arm: str = "off",
         more: str = "",
+        mavlink: str = "",
         loss: float = 0.0,
         duplicate: float = 0.0,
         baud: int | None = None,
@@ -145,6 +146,7 @@ class Rig:
             recordings_mb=recordings_mb,
             more=more,
         )
+        text = text.replace("[[imu]]", f"{mavlink}\n[[imu]]", 1)
         if baud is not None:
             text = text.replace("udpout:127.0.0.1:9", f"serial:/nowhere/autopilot:{baud}")
         self.text = text

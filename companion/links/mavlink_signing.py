@@ -1,0 +1,184 @@
+"""MAVLink 2 signing: who holds the key has sent this, and it is not an old message once more.
+
+After the specification (mavlink.io, Message Signing): 13 bytes behind the checksum, link id, 48 bit of time in units of
+10 us since 2015, and the first 48 bit of SHA-256 over key, packet, link id and time. Own code and not pymavlink's for
+what comes in: pymavlink 2.4.50 takes over the time of a packet before it has looked at the signature (one forged packet
+far in the future would shut the true sender out), keeps a place for every stranger that claims to be somebody, and logs
+each.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Final, Literal
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+EPOCH_S: Final = 1420070400
+"""2015-01-01 UTC."""
+TICKS_PER_S: Final = 100_000
+LAST: Final = 2**48 - 1
+LATE_TICKS: Final = 60 * TICKS_PER_S
+"""So far behind our own time may a sender be that is heard for the first time (the specification's minute)."""
+MAX_STREAMS: Final = 64
+"""Senders with the key that are remembered, by system, component and link; newcomers beyond are not believed."""
+MAX_STRANGERS: Final = 16
+NEVER_SIGNED: Final = frozenset({mavlink.MAVLINK_MSG_ID_RADIO_STATUS, mavlink.MAVLINK_MSG_ID_RADIO})
+"""A telemetry radio adds these by itself and has no key."""
+EARLIEST_S: Final = 1577836800.0
+"""2020: a clock before that has not been set."""
+
+_SIGNED: Final = mavlink.MAVLINK_IFLAG_SIGNED
+_MARKER_1: Final = mavlink.PROTOCOL_MARKER_V1
+_TAIL: Final = mavlink.MAVLINK_SIGNATURE_BLOCK_LEN
+_HASH: Final = 6
+
+Reason = Literal["unsigned", "other key", "old", "no key"]
+"""Why a message is not believed. "old": it, or a later one of the same sender, has been heard before."""
+
+
+def uptime_s() -> float:
+    """Seconds since the board was started, asleep or not; never goes back."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+def ticks_of(unix_s: float) -> int:
+    """A time as signatures carry it; 0 for a clock that has not been set."""
+    return int((unix_s - EPOCH_S) * TICKS_PER_S) if unix_s >= EARLIEST_S else 0
+
+
+def sign(frame: bytes, crc_extra: int, key: bytes, link_id: int, ticks: int) -> bytes:
+    """A MAVLink 2 packet that is not signed yet, signed.
+
+    Args:
+        frame: the whole packet.
+        crc_extra: of its kind of message: the checksum covers the flag that says "signed".
+        key: 32 bytes.
+        link_id: 0 to 255.
+        ticks: since 2015, 10 us each.
+    """
+    head = bytearray(frame[:-2])
+    head[2] |= _SIGNED
+    crc = mavlink.x25crc(head[1:])
+    crc.accumulate(bytes([crc_extra]))
+    head += crc.crc.to_bytes(2, "little") + bytes([link_id]) + ticks.to_bytes(6, "little")
+    return bytes(head) + _digest(key, head)
+
+
+def _digest(key: bytes, packet: bytes | bytearray) -> bytes:
+    # Not an HMAC: the specification says so.
+    return hashlib.sha256(key + packet).digest()[:_HASH]
+
+
+class SigningClock:
+    """Time for signatures: never the same twice, never back, whatever the system's clock does.
+
+    A board without a battery-backed clock starts in 1970: then it goes on from `start`, and takes over the time of the
+    first message that is signed with our key.
+
+    Args:
+        start: ticks; later than all that was used before.
+        wall_s: Unix time.
+        uptime: as `uptime_s`.
+    """
+
+    def __init__(
+        self, start: int = 0, *, wall_s: Callable[[], float] = time.time, uptime: Callable[[], float] = uptime_s
+    ) -> None:
+        self._wall_s, self._uptime_s = wall_s, uptime
+        self._base, self._base_s = start, uptime()
+        self._used = 0
+
+    def now(self) -> int:
+        """Ticks."""
+        now_s = self._uptime_s()
+        ticks = self._base + int((now_s - self._base_s) * TICKS_PER_S)
+        wall = ticks_of(self._wall_s())
+        if wall > ticks:
+            # Taken as the new beginning, so that a clock which then steps back does not take us with it.
+            self._base, self._base_s = wall, now_s
+        return min(max(ticks, wall, self._used), LAST)
+
+    def next(self) -> int:
+        """Ticks for one message."""
+        self._used = min(max(self.now(), self._used + 1), LAST)
+        return self._used
+
+    def heard(self, ticks: int) -> None:
+        """Somebody who has the key is that far."""
+        if ticks > self.now():
+            self._base, self._base_s = ticks, self._uptime_s()
+
+
+class Signing:
+    """Signs what one link sends and judges what it receives.
+
+    Args:
+        required: whether what is not signed with the key is dropped; else it is only counted.
+        clock: of all links that have the key.
+        link_id: of this link.
+    """
+
+    def __init__(self, *, required: bool, clock: SigningClock | None = None, link_id: int = 0) -> None:
+        self.required, self.link_id = required, link_id
+        self.clock = clock or SigningClock()
+        self.key: bytes | None = None
+        """32 bytes; without it nothing can be signed or believed."""
+        self.verified = 0
+        """Messages that were signed with our key."""
+        self.doubted: Counter[Reason] = Counter()
+        """Others, by what is wrong with them; those that are dropped where a signature is required."""
+        self.strangers: Counter[tuple[Reason, int, int]] = Counter()
+        """The same by system and component that they claim to be of: the first 16 of these."""
+        self._streams: dict[tuple[int, int, int], int] = {}
+
+    def __repr__(self) -> str:
+        """Without the key."""
+        return f"Signing(required={self.required}, has_key={self.key is not None})"
+
+    def sign(self, frame: bytes, crc_extra: int) -> bytes:
+        """What is to be sent for a MAVLink 2 packet; the packet itself as long as there is no key."""
+        if self.key is None:
+            return frame
+        return sign(frame, crc_extra, self.key, self.link_id, self.clock.next())
+
+    def admits(self, frame: bytes | bytearray) -> bool:
+        """Whether a whole packet with a right checksum may have any effect."""
+        reason = self._doubt(frame)
+        if reason is None:
+            return True
+        self.doubted[reason] += 1
+        first = frame[0] == _MARKER_1
+        stranger = (reason, frame[3 if first else 5], frame[4 if first else 6])
+        if stranger in self.strangers or len(self.strangers) < MAX_STRANGERS:
+            self.strangers[stranger] += 1
+        return not self.required
+
+    def _doubt(self, frame: bytes | bytearray) -> Reason | None:
+        first = frame[0] == _MARKER_1
+        message_id = frame[5] if first else int.from_bytes(frame[7:10], "little")
+        if message_id in NEVER_SIGNED:
+            return None
+        if self.key is None:
+            return "no key"
+        if first or not frame[2] & _SIGNED:
+            return "unsigned"
+        if not hmac.compare_digest(_digest(self.key, frame[:-_HASH]), bytes(frame[-_HASH:])):
+            return "other key"
+        # Only who has the key comes as far as this.
+        ticks = int.from_bytes(frame[1 - _TAIL : -_HASH], "little")
+        stream = (frame[5], frame[6], frame[-_TAIL])
+        before = self._streams.get(stream)
+        if before is None:
+            if ticks + LATE_TICKS < self.clock.now() or len(self._streams) >= MAX_STREAMS:
+                return "old"
+        elif ticks <= before:
+            return "old"
+        self._streams[stream] = ticks
+        self.clock.heard(ticks)
+        self.verified += 1
+        return None
