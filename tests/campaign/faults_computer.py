@@ -1,0 +1,389 @@
+"""What the companion computer does: its disk, clock and power; its files, broker and people."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import shutil
+from pathlib import Path
+from typing import Any, Literal
+
+from tests.campaign.disk import Refusal
+from tests.campaign.fault import Act, Fault, Scene
+from tests.campaign.faults_devices import STILLNESS
+from tests.campaign.faults_mavlink import LOST, every
+
+DISK = r"cannot be (written|removed)|not kept|No space|read-only|Read-only|Input/output"
+
+# --- the disk
+
+
+def refuses(what: Refusal) -> tuple[Act, Act]:
+    async def strike(scene: Scene) -> None:
+        scene.stage.disk.refuses = what
+
+    async def lift(scene: Scene) -> None:
+        scene.stage.disk.refuses = None
+
+    return strike, lift
+
+
+async def slow(scene: Scene) -> None:
+    scene.stage.slow_disk_s = 6.0
+
+
+async def quick(scene: Scene) -> None:
+    scene.stage.slow_disk_s = 0.0
+
+
+async def remove_folder(scene: Scene) -> None:
+    scene.notes["records gone"] = True
+    stage = scene.stage
+    scene.spoilt.update(str(path.relative_to(stage.store)) for path in stage.store.rglob("*") if path.is_file())
+    shutil.rmtree(stage.store, ignore_errors=True)
+
+
+# --- the clock
+
+
+def sets_clock(by_s: float | None = None, to_s: float = 0.0) -> Act:
+    async def strike(scene: Scene) -> None:
+        if by_s is None:
+            scene.stage.wall.set_to(to_s)
+        else:
+            scene.stage.wall.shift_s += by_s
+
+    return strike
+
+
+async def right_clock(scene: Scene) -> None:
+    scene.stage.wall.shift_s = 0.0
+
+
+# --- the process
+
+
+async def kill(scene: Scene) -> None:
+    await scene.stage.kill()
+    await asyncio.sleep(scene.chance.uniform(0.1, 3.0))
+    await begin_again(scene)
+
+
+async def begin_again(scene: Scene) -> None:
+    scene.stage.start()
+    await asyncio.sleep(0.05)
+
+
+async def kill_again_and_again(scene: Scene) -> None:
+    await kill(scene)
+    for _ in range(3):
+        await asyncio.sleep(scene.chance.uniform(0.0, 3.0))
+        await kill(scene)
+
+
+async def end_in_order(scene: Scene) -> None:
+    await scene.stage.stop()
+    scene.stage.wire.unplug()
+    await asyncio.sleep(1.0)
+    await begin_again(scene)
+
+
+def power_cut(*, autopilot: bool) -> Act:
+    """At a random byte of one of the next writes to the disk; where there is none soon, at that instant."""
+
+    async def strike(scene: Scene) -> None:
+        stage = scene.stage
+        disk, cut = stage.disk, asyncio.Event()
+
+        def on_cut() -> None:
+            stage.die()
+            cut.set()
+
+        disk.on_cut = on_cut
+        disk.cut_at = disk.operations + scene.chance.randint(1, 5)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(6.0):
+                await cut.wait()
+        disk.cut_at = None
+        if autopilot:
+            stage.autopilot.reboot(down_s=2.0)
+        await stage.kill()
+        await stage.bury()
+        await asyncio.sleep(scene.chance.uniform(0.1, 3.0))
+        await begin_again(scene)
+
+    return strike
+
+
+# --- its files
+
+Harm = Literal["bits", "cut", "zeros", "empty", "newer"]
+
+
+def harm(path: Path, how: Harm, scene: Scene) -> None:
+    data = bytearray(path.read_bytes() if path.exists() else b'{"format_version": 1, "state": "done"}')
+    if how == "bits":
+        for _ in range(1 + len(data) // 200):
+            data[scene.chance.randrange(len(data))] ^= 1 << scene.chance.randrange(8)
+    elif how == "cut":
+        del data[scene.chance.randrange(len(data)) :]
+    elif how == "zeros":
+        data = bytearray(len(data))
+    elif how == "empty":
+        data = bytearray()
+    else:
+        data = bytearray(json.dumps({"format_version": 99, "format": 99, "what": "nobody knows"}).encode())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+    scene.spoilt.add(str(path.relative_to(scene.stage.store)))
+
+
+def spoils(name: str, how: Harm) -> Act:
+    """The daemon dies, the newest file of that name is damaged, the daemon comes back."""
+
+    async def strike(scene: Scene) -> None:
+        stage = scene.stage
+        await stage.kill()
+        stage.store.mkdir(exist_ok=True)
+        found = sorted(stage.store.glob(name))
+        plain = stage.store / name.replace("??????", "000001").replace("*", "1")
+        harm(found[-1] if found else plain, how, scene)
+        await begin_again(scene)
+
+    return strike
+
+
+async def remove_spoilt(scene: Scene) -> None:
+    """What the companion asks for: look, remove the file, restart."""
+    stage = scene.stage
+    await stage.kill()
+    for name in scene.spoilt:
+        (stage.store / name).unlink(missing_ok=True)
+    await begin_again(scene)
+
+
+async def spoil_recording(scene: Scene) -> None:
+    await spoils("recordings/*.mcap", scene.chance.choice(("bits", "cut", "zeros", "empty")))(scene)
+
+
+async def spoil_journal(scene: Scene) -> None:
+    # With it goes the knowledge of what an interrupted write had overwritten.
+    await spoils("journal.json", scene.chance.choice(("cut", "zeros", "empty")))(scene)
+    scene.notes["somebody else"] = "journal"
+
+
+# --- the broker
+
+
+async def broker_dies(scene: Scene) -> None:
+    await scene.stage.broker.stop()
+
+
+async def broker_is_back(scene: Scene) -> None:
+    broker = scene.stage.broker
+    broker.refuses = broker.deaf = False
+    await broker.stop()
+    await broker.start()
+
+
+async def broker_refuses(scene: Scene) -> None:
+    broker = scene.stage.broker
+    broker.refuses = True
+    await broker.stop()
+    await broker.start()
+
+
+async def broker_is_deaf(scene: Scene) -> None:
+    scene.stage.broker.deaf = True
+
+
+def _requests(scene: Scene) -> None:
+    broker = scene.stage.broker
+    for number in range(40):
+        topic = "companion/1/request/" + ("calibrate", "nothing", "a/b", "calibrate")[number % 4]
+        payload = (b"{", b'{"transaction": "x", "what": 7}', b"\xff" * 500, b'{"what": "none"}')[number % 4]
+        broker.publish(topic, payload)
+
+
+async def retained_request(scene: Scene) -> None:
+    for command in ("calibrate", "undo", "cancel"):
+        scene.stage.broker.publish(f"companion/1/request/{command}", b'{"transaction": "old"}', retained=True)
+
+
+# --- control socket and page
+
+
+async def _hold(scene: Scene, writers: list[asyncio.StreamWriter]) -> None:
+    scene.notes.setdefault("writers", []).extend(writers)
+
+
+async def hang_up(scene: Scene) -> None:
+    for writer in scene.notes.pop("writers", []):
+        writer.transport.abort()
+    await asyncio.sleep(0.1)
+
+
+async def _control(scene: Scene) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    return await asyncio.open_unix_connection(str(scene.stage.config.control.path))
+
+
+async def control_garbage(scene: Scene) -> None:
+    for data in (
+        b"\0\xff" * 300 + b"\n",
+        b"{}\n",
+        b"[1, 2]\n",
+        b'{"command": 5}\n',
+        b'{"command": "calibrate", "what": {"a": 1}}\n',
+        b'{"command": "history", "limit": -1e999}\n',
+        b'{"command": "record", "file": 7}\n',
+        b'{"command": "align", "plan": []}\n',
+        b'{"command": "\\ud800"}\n',
+        b"[" * 5000 + b"\n",
+        b"\n",
+    ):
+        reader, writer = await _control(scene)
+        writer.write(data)
+        answer = await asyncio.wait_for(reader.read(1 << 16), 8.0)
+        assert json.loads(answer.splitlines()[-1])["kind"] in ("error", "result"), answer
+        writer.close()
+
+
+async def control_half_lines(scene: Scene) -> None:
+    writers = []
+    for _ in range(12):
+        _, writer = await _control(scene)
+        writer.write(b'{"command": "sta')
+        writers.append(writer)
+    await _hold(scene, writers)
+
+
+async def control_huge_line(scene: Scene) -> None:
+    for _ in range(3):
+        reader, writer = await _control(scene)
+        with contextlib.suppress(ConnectionError):
+            for _ in range(160):
+                writer.write(b"a" * 65536)
+                await writer.drain()
+            await asyncio.wait_for(reader.read(100), 8.0)
+        writer.transport.abort()
+
+
+async def control_crowd(scene: Scene) -> None:
+    writers = []
+    for _ in range(200):
+        with contextlib.suppress(OSError):
+            _, writer = await _control(scene)
+            writers.append(writer)
+        if len(writers) % 20 == 0:
+            await asyncio.sleep(0.01)
+    await _hold(scene, writers)
+
+
+async def control_deaf(scene: Scene) -> None:
+    """Asks for everything and reads nothing."""
+    writers = []
+    for request in (b'{"command": "monitor"}\n',) * 3 + (b'{"command": "history"}\n', b'{"command": "status"}\n'):
+        reader, writer = await _control(scene)
+        writer.transport.pause_reading()  # type: ignore[attr-defined]
+        writer.write(request)
+        writers.append(writer)
+        del reader
+    await _hold(scene, writers)
+
+
+def _page(scene: Scene) -> tuple[str, int]:
+    page = scene.stage.service.page
+    assert page is not None
+    return "127.0.0.1", page._port
+
+
+async def page_garbage(scene: Scene) -> None:
+    host = f"Host: 127.0.0.1:{_page(scene)[1]}\r\n".encode()
+    for data in (
+        b"\0\xff" * 500,
+        b"GET / HTTP/9.9\r\n\r\n",
+        b"GET /" + b"a" * 20000 + b" HTTP/1.1\r\n\r\n",
+        b"POST /calibrate HTTP/1.1\r\n" + host + b"Content-Length: 99999999\r\n\r\n{}",
+        b"POST /undo HTTP/1.1\r\n" + host + b"Content-Length: 2\r\n\r\n{}",
+        b"POST /calibrate HTTP/1.1\r\nHost: evil.example\r\nContent-Length: 2\r\n\r\n{}",
+        b"GET /../../etc/passwd HTTP/1.1\r\n" + host + b"\r\n",
+        b"GET / HTTP/1.1\r\n" + host + b"Transfer-Encoding: chunked\r\n\r\nzzz\r\n",
+        b"\r\n" * 2000,
+    ):
+        reader, writer = await asyncio.open_connection(*_page(scene))
+        with contextlib.suppress(ConnectionError, TimeoutError):
+            writer.write(data)
+            await asyncio.wait_for(reader.read(1 << 16), 8.0)
+        writer.transport.abort()
+
+
+async def page_loris(scene: Scene) -> None:
+    writers = []
+    for _ in range(60):
+        with contextlib.suppress(OSError):
+            _, writer = await asyncio.open_connection(*_page(scene))
+            writer.write(b"GET / HTTP/1.1\r\nHost: ")
+            writers.append(writer)
+    await _hold(scene, writers)
+
+
+async def page_deaf(scene: Scene) -> None:
+    """Viewers that look at nothing."""
+    writers = []
+    for _ in range(10):
+        _, writer = await asyncio.open_connection(*_page(scene))
+        writer.transport.pause_reading()  # type: ignore[attr-defined]
+        writer.write(f"GET /events HTTP/1.1\r\nHost: 127.0.0.1:{_page(scene)[1]}\r\n\r\n".encode())
+        writers.append(writer)
+    await _hold(scene, writers)
+
+
+def faults() -> list[Fault]:
+    back: dict[str, Any] = {"excused": f"{LOST}|{STILLNESS}|companion stops|daemon's end|interrupted|reboot", "restarts": True}
+    disk: dict[str, Any] = {"excused": DISK, "recordings_mb": 1}
+    return [
+        Fault("disk-full", "disk", "no space is left", *refuses("full"), names=DISK, **disk),
+        Fault("disk-read-only", "disk", "the file system has become read-only", *refuses("read-only"), names=DISK, **disk),
+        Fault("disk-error", "disk", "fsync fails: a worn-out card", *refuses("fsync"), names=DISK, **disk),
+        Fault("disk-slow", "disk", "every write takes up to 6 s", slow, quick, lasts_s=(6.0, 10.0), recordings_mb=1, excused=STILLNESS),
+        Fault("folder-removed", "disk", "somebody removes the state directory", remove_folder, excused=DISK),
+        Fault("clock-forward", "clock", "the wall clock is set forward by an hour", sets_clock(by_s=3600.0)),
+        Fault("clock-back", "clock", "the wall clock is set back by an hour", sets_clock(by_s=-3600.0)),
+        Fault("clock-1970", "clock", "the wall clock is in 1970, and right again later", sets_clock(to_s=5.0), right_clock),
+        Fault("kill", "process", "kill -9, and started again", kill, **back),
+        Fault("kill-again-and-again", "process", "kill -9 four times within seconds", kill_again_and_again, **back),
+        Fault("stop", "process", "stopped in order, and started again", end_in_order, **back),
+        Fault("power-cut", "process", "power cut of everything at any byte of a write", power_cut(autopilot=True), recordings_mb=1, **back),
+        Fault("power-cut-companion", "process", "power cut of the companion alone, at any byte of a write", power_cut(autopilot=False), recordings_mb=1, **back),
+        *(
+            Fault(
+                f"record-{how}", "files", f"the newest record is damaged: {how}", spoils("records/??????.json", how),
+                names=r"passed over", **back,
+            )
+            for how in ("bits", "cut", "newer")
+        ),
+        *(
+            Fault(
+                f"undo-{how}", "files", f"the values for undo are damaged: {how}", spoils("undo-*.json", how),
+                remove_spoilt, names=r"cannot be read", **back,
+            )
+            for how in ("cut", "zeros")
+        ),
+        Fault("journal-damaged", "files", "the journal of a write is damaged", spoil_journal, remove_spoilt, names=r"cannot be read", **back),
+        Fault("alignment-damaged", "files", "the gradienter's alignment is damaged", spoils("alignment.json", "cut"), remove_spoilt, names=r"not a readable alignment", **back),
+        Fault("recording-damaged", "files", "the newest recording is damaged", spoil_recording, recordings_mb=1, **back),
+        Fault("broker-dies", "broker", "the MQTT broker is killed and comes back", broker_dies, broker_is_back, names=r"nobody listens|closed|lost|disconnect|gone", lasts_s=(5.0, 9.0)),
+        Fault("broker-refuses", "broker", "the broker lets us in no longer", broker_refuses, broker_is_back, names=r"refuse|not authori|denie", lasts_s=(6.0, 10.0)),
+        Fault("broker-deaf", "broker", "the broker acknowledges nothing", broker_is_deaf, broker_is_back, names=r"127.0.0.1:\d+: .*(answer|acknowledg|says nothing|timed out|no )", lasts_s=(14.0, 20.0)),
+        Fault("broker-flood", "broker", "400 nonsensical requests a second by MQTT", *every(0.1, _requests), lasts_s=(2.0, 4.0)),
+        Fault("broker-retained", "broker", "retained requests, which are never obeyed", retained_request, names=r"retained request"),
+        Fault("control-garbage", "faces", "nonsense at the control socket", control_garbage),
+        Fault("control-half-lines", "faces", "twelve clients of the control socket that never finish", control_half_lines, hang_up, lasts_s=(6.0, 9.0)),
+        Fault("control-huge-line", "faces", "lines of 10 MB at the control socket", control_huge_line),
+        Fault("control-crowd", "faces", "200 connections to the control socket", control_crowd, hang_up),
+        Fault("control-deaf", "faces", "clients of the control socket that read nothing", control_deaf, hang_up, lasts_s=(6.0, 10.0)),
+        Fault("page-garbage", "faces", "nonsense at the page", page_garbage),
+        Fault("page-slow-loris", "faces", "60 requests to the page that never end", page_loris, hang_up, lasts_s=(6.0, 9.0)),
+        Fault("page-deaf", "faces", "ten viewers of the page that read nothing", page_deaf, hang_up, lasts_s=(6.0, 10.0)),
+    ]  # fmt: skip
