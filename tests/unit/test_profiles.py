@@ -273,6 +273,15 @@ def test_a_table_that_numpy_cannot_read_is_read_line_by_line(tmp_path: Path, hal
     assert np.isnan(one.temperature_degc).all()
 
 
+def test_a_last_line_that_may_be_cut_does_not_count(tmp_path: Path, half_hour: Path) -> None:
+    lines = half_hour.read_text(encoding="utf-8").splitlines()[:200]
+    path = tmp_path / "cut.csv"
+    # Cut in its last number, which is one all the same.
+    path.write_text("\n".join(lines)[:-2], encoding="utf-8")
+    (log,) = read_logs([path])
+    assert len(log.t_s) == len(lines) - 2
+
+
 # --- recordings of our own
 
 
