@@ -7,6 +7,7 @@ by the same formulas for the whole column. The verdicts are those of the daemon'
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from typing import Final
 
 import msgspec
@@ -54,6 +55,13 @@ class Rests(msgspec.Struct, frozen=True):
     def still_s(self) -> int:
         """Seconds in the stretches."""
         return sum(len(rest.slots) for rest in self.stretches)
+
+
+def joined(parts: Sequence[Rests]) -> Rests:
+    """Those of one recording that was cut where its readings became others."""
+    stretches = tuple(rest for part in parts for rest in part.stretches)
+    obstacle = next((part.obstacle for part in parts if part.obstacle), "")
+    return Rests(stretches, sum(part.seconds for part in parts), obstacle)
 
 
 def rests(t_s: Floats, readings: Floats, temperature_degc: Floats | None, name: str, profile: NoiseProfile) -> Rests:

@@ -139,7 +139,7 @@ def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s
     from companion.calibration.allan import noise_profile
     from companion.calibration.coverage import coverage
     from companion.calibration.profile_fit import fit_profile
-    from companion.calibration.rest import rests
+    from companion.calibration.rest import joined, rests
 
     whole = [log for log in logs if not log.truncated]
     if not whole:
@@ -149,8 +149,9 @@ def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s
     against = compared or noise_profile(whole[-1].profile)
     found = []
     for log in whole:
-        part = slice(0) if not len(log.t_s) else log.t_s >= log.t_s[0] + skip_s
-        found.append(rests(log.t_s[part], log.readings[part], log.temperature_degc[part], imu, against))
+        pieces = log.pieces(skip_s)
+        parts = [rests(log.t_s[at], log.readings[at], log.temperature_degc[at], imu, against) for at in pieces]
+        found.append(joined(parts))
     obstacle = next((each.obstacle for each in found if each.obstacle), "")
     stretches = [stretch for each in found for stretch in each.stretches]
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
@@ -28,6 +29,8 @@ TRUNCATED: Final = frozenset(
     if message.kind.truncates
 )
 """Messages of whole mrad/s and mg: their steps hide what a profile is about."""
+BREAKING: Final = frozenset({"reset", "imu"})
+"""Events of the journal after which readings are not comparable with those before."""
 CONTINUED_S: Final = 60.0
 """A recording that begins within so much of another's end, on the same clock, goes on with it."""
 
@@ -50,6 +53,8 @@ class StillLog(msgspec.Struct, frozen=True, kw_only=True):
     """It came as integers only, which are left out."""
     clock_offset_s: float | None = None
     """UTC minus the recording's clock."""
+    breaks_s: tuple[float, ...] = ()
+    """When the readings became others by no noise: offsets were written, the device restarted."""
 
     @property
     def began_at(self) -> str | None:
@@ -57,6 +62,14 @@ class StillLog(msgspec.Struct, frozen=True, kw_only=True):
         if self.began_unix_s is None:
             return None
         return datetime.datetime.fromtimestamp(self.began_unix_s, tz=datetime.UTC).isoformat(timespec="seconds")
+
+    def pieces(self, skip_s: float = 0.0) -> list[slice]:
+        """The samples between the breaks, in order; without the first `skip_s` of the session."""
+        if not len(self.t_s):
+            return []
+        first = int(np.searchsorted(self.t_s, self.t_s[0] + skip_s)) if skip_s else 0
+        cuts = [first, *(max(int(at), first) for at in np.searchsorted(self.t_s, sorted(self.breaks_s))), len(self.t_s)]
+        return [slice(start, end) for start, end in itertools.pairwise(cuts) if end > start]
 
 
 def read_logs(paths: Sequence[Path], columns: str | None = None, csv_name: str = csv_log.NAME) -> list[StillLog]:
@@ -92,20 +105,27 @@ def read_logs(paths: Sequence[Path], columns: str | None = None, csv_name: str =
 
 def _read_recording(path: Path) -> list[StillLog]:
     decoder = msgspec.json.Decoder(topics.ImuEntry)
+    journal = msgspec.json.Decoder(topics.JournalEntry)
+    breaks: list[float] = []
     entries: dict[str, list[topics.ImuEntry]] = {}
     truncated: set[str] = set()
     profiles: dict[str, str | Noise | None] = {}
     offset_s: float | None = None
     for item in Recording(path):
         if isinstance(item, Message):
-            if not item.topic.startswith(topics.IMU):
+            imu = item.topic.startswith(topics.IMU)
+            if not imu and item.topic != topics.JOURNAL:
                 continue
             try:
-                entry = decoder.decode(item.data)
+                entry = (decoder if imu else journal).decode(item.data)
             except msgspec.MsgspecError as error:
                 raise StorageError(
                     f"{path}: a message on {item.topic} cannot be used by this version ({error})"
                 ) from None
+            if isinstance(entry, topics.JournalEntry):
+                if entry.event in BREAKING:
+                    breaks.append(entry.t_s)
+                continue
             name = item.topic.removeprefix(topics.IMU)
             own = entries.setdefault(name, [])
             if entry.message in TRUNCATED:
@@ -118,10 +138,11 @@ def _read_recording(path: Path) -> list[StillLog]:
             profiles = _profiles(item.data)
     if not entries:
         raise StorageError(f"{path}: no samples of an IMU in it")
-    return [
+    logs = [
         _log(path, name, own, offset_s, profiles.get(name), truncated=name in truncated)
         for name, own in entries.items()
     ]
+    return [msgspec.structs.replace(log, breaks_s=tuple(breaks)) for log in logs]
 
 
 def _log(
@@ -178,6 +199,7 @@ def _joined(logs: Iterable[StillLog]) -> list[StillLog]:
                 t_s=np.concatenate([before.t_s, log.t_s]),
                 readings=np.concatenate([before.readings, log.readings]),
                 temperature_degc=np.concatenate([before.temperature_degc, log.temperature_degc]),
+                breaks_s=(*before.breaks_s, *log.breaks_s),
             )
         else:
             result.append(log)

@@ -65,7 +65,7 @@ def test_the_session_happens_as_shown(
             for module in (client, check):
                 monkeypatch.setattr(module, "ask", ask)
             for module in (client, local):
-                monkeypatch.setattr(module, "load_config", lambda _options: rig.config)
+                monkeypatch.setattr(module, "load_config", lambda _options, **_more: rig.config)
             # The rig hands the devices' bytes over without opening a port.
             monkeypatch.setattr(ByteLink, "connected", property(lambda _link: True))
             await rig.ready()

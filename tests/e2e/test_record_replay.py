@@ -22,7 +22,7 @@ from companion.autopilot.vehicle import ArmState
 from companion.calibration.record import Record
 from companion.calibration.request import What
 from companion.cli import main as companion
-from companion.config.sections import Config
+from companion.config.sections import Config, Noise
 from companion.daemon import recorder as recorder_module
 from companion.daemon.control import Object
 from companion.errors import CompanionError, StorageError
@@ -81,6 +81,27 @@ def same(result: Result, records: list[Record]) -> None:
 
 
 # --- the round trip
+
+
+def test_a_saved_profile_goes_along_with_the_recording(tmp_path: Path) -> None:
+    """Where the replay runs nobody has that profile; its sigmas are of its figures, not of the cautious ones."""
+
+    async def main() -> list[Record]:
+        made = Rig(tmp_path, recordings_mb=64, min_still_s=5.0, max_s=6.0)
+        learned = Noise(name="mine", gyro=(3.5e-5, 2e-3, 1e-6), accel=(5e-4, 0.05, 1e-5))
+        (fc, *others) = made.config.imu
+        made.config = msgspec.structs.replace(made.config, imu=[msgspec.structs.replace(fc, profile=learned), *others])
+        async with made.running() as rig:
+            await rig.ready()
+            result, _ = await calibrated(rig)
+            assert result.outcome == "done", result
+            await asyncio.sleep(2.5)
+        return rig.service.store.history()[::-1]
+
+    records = run_virtual(main())
+    # A flicker of 2 mrad/s is far above every other profile's.
+    assert min(records[0].imus[0].gyro_sigma_use_rad_s or (0.0,)) > 2e-3
+    same(replayed(ring(tmp_path)[0]), records)
 
 
 def test_a_replay_gives_the_record_to_the_last_bit(usual: tuple[Path, Record]) -> None:

@@ -105,7 +105,7 @@ def fitted(rest: Rest, fallback: NoiseProfile = UNKNOWN) -> Finding:
 def test_one_choice_promises_too_much_for_no_axis() -> None:
     rest = rest_of(7200, (GYRO, ACCEL), 4)
     noisy = rest.means.copy()
-    noisy[:, 2] = slow(np.random.default_rng(5), 7200, 2.0 * GYRO.flicker, GYRO.walk, 2.0 * GYRO.white)
+    noisy[:, 1] = slow(np.random.default_rng(5), 7200, 2.0 * GYRO.flicker, GYRO.walk, 2.0 * GYRO.white)
     finding = fitted(Rest(rest.slots, noisy, rest.temperature_degc, ()))
     assert finding.profile.gyro.white == pytest.approx(2.0 * GYRO.white, rel=0.05)
     assert finding.profile.gyro.floor == pytest.approx(2.0 * GYRO.floor, rel=0.2)

@@ -273,10 +273,27 @@ def test_a_table_that_numpy_cannot_read_is_read_line_by_line(tmp_path: Path, hal
     assert np.isnan(one.temperature_degc).all()
 
 
+def test_a_last_line_that_may_be_cut_does_not_count(tmp_path: Path, half_hour: Path) -> None:
+    lines = half_hour.read_text(encoding="utf-8").splitlines()[:200]
+    path = tmp_path / "cut.csv"
+    # Cut in its last number, which is one all the same.
+    path.write_text("\n".join(lines)[:-2], encoding="utf-8")
+    (log,) = read_logs([path])
+    assert len(log.t_s) == len(lines) - 2
+
+
 # --- recordings of our own
 
 
-def recording(path: Path, t_s: list[float], imu: str, message: str | None, unix_s: float = 1.7e9) -> Path:
+def recording(
+    path: Path,
+    t_s: list[float],
+    imu: str,
+    message: str | None,
+    unix_s: float = 1.7e9,
+    written_s: float | None = None,
+) -> Path:
+    """A recording of noise; at `written_s` the daemon wrote offsets, which moved the gyros by 100 deg/h."""
     config = parse(SMALLEST.format("bmi088"), "x.toml")
     begin = Beginning(
         t_s=t_s[0], unix_s=unix_s + t_s[0], versions=versions(), config=msgspec.json.encode(config), state=None, lost=0
@@ -285,6 +302,11 @@ def recording(path: Path, t_s: list[float], imu: str, message: str | None, unix_
     entries: list[Entry] = []
     for t in t_s:
         gyro, accel = rng.normal(0.0, 1e-3, 3).tolist(), (rng.normal(0.0, 0.02, 3) - [0.0, 0.0, 9.8]).tolist()
+        if written_s is not None and t >= written_s:
+            gyro[1] += 100.0 * DEG_H
+        if t == written_s:
+            event = topics.JournalEntry(t, "reset", '["offsets written",null]')
+            entries.append((topics.JOURNAL, t, msgspec.json.encode, (event,)))
         sample = ImuSample(t, tuple(gyro), tuple(accel), 25.0)
         entries.append((topics.IMU + imu, t, topics.imu_json, (sample, message)))
     file = RecordingFile(path)
@@ -321,6 +343,21 @@ def test_a_recording_is_learned_from_and_compared_with_its_own_profile(
     code, _, err = run(capsys, path, "--imu", "own")
     assert code == 1
     assert "no IMU 'own' in these files; there are: fc" in err
+
+
+def test_written_offsets_are_no_noise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A step of 100 deg/h would be flicker of that size; where it was is in the journal."""
+    path = recording(tmp_path / "1.mcap", seconds(100, 1300), "fc", None, written_s=700.0)
+    (log,) = read_logs([path])
+    assert [(log.t_s[part][0], log.t_s[part][-1]) for part in log.pieces()] == [(100.0, 699.875), (700.0, 1299.875)]
+    assert [(log.t_s[part][0], log.t_s[part][-1]) for part in log.pieces(650.0)] == [(750.0, 1299.875)]
+    code, answer, _ = run(capsys, path)
+    assert code == 0
+    (imu,) = answer["imus"]
+    # White noise of 73 deg/h sqrt(s) in both parts, and nothing else by more than chance.
+    still = imu["axes"][1]["fit"]
+    assert not still["known"][1]
+    assert still["figures"][1] < 10.0 * DEG_H
 
 
 def test_whole_thousandths_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
