@@ -160,10 +160,16 @@ class LinkSigning:
             return None
         if self.trouble:
             return self.trouble
-        if not signing.doubted or self._vehicle.alive:
+        # Only who claims to be an autopilot explains why none is heard.
+        dropped = {
+            reason: number
+            for (reason, _, component), number in signing.strangers.items()
+            if component == self._vehicle.component_id
+        }
+        if not dropped or self._vehicle.alive:
             return None
-        reason = max(signing.doubted, key=lambda each: signing.doubted[each])
-        number = signing.doubted[reason]
+        reason = max(dropped, key=lambda each: dropped[each])
+        number = dropped[reason]
         return {
             "unsigned": f"{number} unsigned messages dropped: the autopilot does not sign on this link",
             "other key": f"{number} messages dropped: the autopilot signs with another key",
