@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -161,15 +162,12 @@ class LinkSigning:
         if self.trouble:
             return self.trouble
         # Only who claims to be an autopilot explains why none is heard.
-        dropped = {
-            reason: number
-            for (reason, _, component), number in signing.strangers.items()
-            if component == self._vehicle.component_id
-        }
-        if not dropped or self._vehicle.alive:
+        dropped = Counter[Reason]()
+        for (reason, _, component), number in signing.strangers.items():
+            dropped[reason] += number * (component == self._vehicle.component_id)
+        ((reason, number),) = dropped.most_common(1) or [("unsigned", 0)]
+        if number == 0 or self._vehicle.alive:
             return None
-        reason = max(dropped, key=lambda each: dropped[each])
-        number = dropped[reason]
         return {
             "unsigned": f"{number} unsigned messages dropped: the autopilot does not sign on this link",
             "other key": f"{number} messages dropped: the autopilot signs with another key",
