@@ -45,7 +45,8 @@ class ArduPilotDouble(AutopilotDouble):
     station. `run` sends what is due; answers need only the running loop. Time is the loop's clock.
 
     Not modelled: flight, notches, temperature calibration (INS_TCALn_* can be read and written, nothing more), MAVFTP,
-    missions, logs, signing, 6-position calibration, the 10 s that consistency checks must pass before arming.
+    missions, logs, SETUP_SIGNING (`require_signatures` stands for it), 6-position calibration, the 10 s that
+    consistency checks must pass before arming.
 
     Args:
         aircraft: the truth.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import hashlib
 import os
 import signal
 import sys
@@ -66,6 +67,10 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument(
                 "--firmware", choices=("ardupilot", "px4"), default="ardupilot",
                 help="whose manners the autopilot has (default ardupilot)",
+            )  # fmt: skip
+            command.add_argument(
+                "--signing", metavar="PASSPHRASE",
+                help="sign, and take only what is signed with this key, as autopilots do that were given one",
             )  # fmt: skip
             command.add_argument(
                 "--gyr-cal", action="store_true", help="INS_GYR_CAL = 1: ArduPilot calibrates its gyros at boot"
@@ -233,6 +238,12 @@ def main(argv: Sequence[str]) -> int:
         directory = Path(tempfile.mkdtemp(prefix="companion-sim-")) if made_here else arguments.dir.absolute()
     udp = arguments.udp if autopilot else None
     text = describe(scenario, devices=devices, autopilot=autopilot)
+    if autopilot and arguments.signing is not None:
+        # As Mission Planner and MAVProxy make a key of a passphrase; time is 10 us since 2015.
+        key = hashlib.sha256(arguments.signing.encode()).digest()
+        scenario.autopilot.require_signatures(key, int((time.time() - 1420070400) * 1e5))
+        text += "# It wants signatures: put the passphrase into a file (chmod 600), and below [mavlink]\n"
+        text += '# signing_key_file = "/path/of/that/file"\n'
     text += configuration(scenario, directory=directory, udp=udp)
     hands = Hands(scenario.aircraft, placement_deg=0.02, seed=arguments.seed) if arguments.hands else None
     try:

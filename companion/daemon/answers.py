@@ -227,7 +227,7 @@ class Answers:
                 "armed": self._vehicle.arm_state.value,
                 "summary": f"{self._vehicle.name}, {self._vehicle.arm_state.value}"
                 if self._vehicle.system_id is not None
-                else self._headlines.not_heard(),
+                else f"not heard yet on {self._mavlink_url}{self._headlines.why_deaf()}",
                 "heartbeat_age_s": None if age_s is None else round(age_s, 1),
                 "messages": received.total() - received["bad"],
                 "bad": received["bad"],

@@ -68,9 +68,9 @@ class Headlines:
         self.concern: Callable[[], str | None] = lambda: None
         """What else the pilot should know of at once, where the rest is well."""
 
-    def not_heard(self) -> str:
-        """That no autopilot has been heard so far, and why where that is known."""
-        return f"not heard yet on {self._mavlink_url}{f': {why}' if (why := self.deaf()) else ''}"
+    def why_deaf(self) -> str:
+        """To be said behind "not heard yet on ...": why, where that is known."""
+        return f": {why}" if (why := self.deaf()) else ""
 
     def now(self) -> Headline:
         """The headline of this moment."""
@@ -105,7 +105,7 @@ class Headlines:
     def _no_autopilot(self) -> Headline:
         age_s = self._vehicle.heartbeat_age_s
         if age_s is None:
-            return Headline("NO AUTOPILOT", self.not_heard(), "bad")
+            return Headline("NO AUTOPILOT", f"not heard yet on {self._mavlink_url}{self.why_deaf()}", "bad")
         why = self.deaf() or "power? cable?"
         return Headline("NO AUTOPILOT", f"no heartbeat for {age_s:.0f} s: {why}", "bad")
 

@@ -34,6 +34,7 @@ from companion.recording import topics
 from companion.recording.collector import RecordedCollector
 from companion.recording.files import RecordingFile, Ring, is_available, versions
 from companion.recording.journal import Beginning, Queue
+from companion.recording.redact import KeyFilter, without_key
 from companion.recording.state import freeze
 
 logger = logging.getLogger(__name__)
@@ -99,6 +100,7 @@ class Recorder:
         self.alignment: Callable[[], AlignmentUsed | None] = lambda: None
         """What is in force of the gradienter's alignment."""
         self._around = Surroundings(config, vehicle, imus)
+        self._no_keys = KeyFilter()
         link.tap = self._on_mavlink
         for sensor in self._sensors.values():
             sensor.tap = self._on_serial
@@ -106,6 +108,11 @@ class Recorder:
     # --- what happens
 
     def _on_mavlink(self, direction: Direction, data: bytes | None, t_s: float | None) -> None:
+        if direction == "in":
+            if data is None:
+                self._no_keys.restart()
+            else:
+                data = self._no_keys(data)
         if self._journal.queues:
             now_s = asyncio.get_running_loop().time() if t_s is None else t_s
             self._journal.raw(topics.MAVLINK_IN if direction == "in" else topics.MAVLINK_OUT, now_s, data)
@@ -262,7 +269,7 @@ class Recorder:
             state={
                 "collector": freeze(self._collector, RollingCollector),
                 "decoders": {name: freeze(sensor.decoder) for name, sensor in self._sensors.items()},
-                "mavlink": self._link.half_received,
+                "mavlink": without_key(self._link.half_received),
                 "windows": list(self._collector.windows)[-WINDOWS_TAKEN_ALONG:],
                 "where": self._around.where,
                 "offsets": self._around.offsets,

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, Final
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle import Vehicle
 from companion.component.statustext import Severity, Weight
@@ -64,11 +67,12 @@ class LinkSigning:
         self.trouble = ""
         """Why there is no key; empty when there is one."""
         self._reserved = 0
-        self._unwritable = False
+        self._unwritable = self._setup_told = False
         self._told: set[tuple[Reason, int, int]] = set()
         if self.mode != "off":
             # From the first byte on: what comes before the key is read is not believed either.
             self.signing = link.signing = Signing(required=self.mode == "require")
+        link.subscribe(mavlink.MAVLink_setup_signing_message, self._on_setup)
 
     def load(self) -> None:
         """Read time and key, before anything is sent; a key that cannot be read is tried again in `run`."""
@@ -114,6 +118,16 @@ class LinkSigning:
     def _fate(self) -> str:
         return "dropped" if self.mode == "require" else "taken all the same"
 
+    def _on_setup(self, message: mavlink.MAVLink_setup_signing_message, _t_s: float) -> None:
+        """Nobody gives us a key over the wire; that somebody tries is worth a line."""
+        if not self._setup_told:
+            self._setup_told = True
+            sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
+            logger.warning(
+                "mavlink: %s sends a signing key over this link in the clear; it is ignored here. Set keys over USB",
+                sender,
+            )
+
     async def _keep(self, signing: Signing, ahead_s: float) -> None:
         now = signing.clock.now()
         reserved = now + int(ahead_s * TICKS_PER_S)
@@ -147,10 +161,13 @@ class LinkSigning:
             return None
         if self.trouble:
             return self.trouble
-        if not signing.doubted or self._vehicle.alive:
+        # Only who claims to be an autopilot explains why none is heard.
+        dropped = Counter[Reason]()
+        for (reason, _, component), number in signing.strangers.items():
+            dropped[reason] += number * (component == self._vehicle.component_id)
+        ((reason, number),) = dropped.most_common(1) or [("unsigned", 0)]
+        if number == 0 or self._vehicle.alive:
             return None
-        reason = max(signing.doubted, key=lambda each: signing.doubted[each])
-        number = signing.doubted[reason]
         return {
             "unsigned": f"{number} unsigned messages dropped: the autopilot does not sign on this link",
             "other key": f"{number} messages dropped: the autopilot signs with another key",

@@ -138,7 +138,7 @@ class Signing:
 
     def __repr__(self) -> str:
         """Without the key."""
-        return f"Signing(required={self.required}, has_key={self.key is not None})"
+        return f"Signing(required={self.required})"
 
     def sign(self, frame: bytes, crc_extra: int) -> bytes:
         """What is to be sent for a MAVLink 2 packet; the packet itself as long as there is no key."""

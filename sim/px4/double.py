@@ -60,8 +60,8 @@ class PX4Double(AutopilotDouble):
     """An autopilot with up to four IMUs on a virtual aircraft; its port is TELEM2 (MAV_1), `ground` is TELEM1 (MAV_0).
 
     Not modelled: flight, thermal compensation (TC_* can be read and written, nothing more), the 6-side calibration (it
-    fails), magnetometer calibrations, factory calibration storage, MAVFTP, missions, logs, events, signing, the target
-    fields of TIMESYNC.
+    fails), magnetometer calibrations, factory calibration storage, MAVFTP, missions, logs, events,
+    SETUP_SIGNING, the target fields of TIMESYNC.
 
     Args:
         aircraft: the truth.

@@ -286,7 +286,7 @@ def test_texts_that_are_no_utf_8_spoil_nothing() -> None:
     asyncio.run(main())
 
 
-def test_over_a_signed_link_with_the_key_and_without(tmp_path: Path) -> None:
+def test_over_a_signed_link_with_the_key_and_with_another(tmp_path: Path) -> None:
     """MAVSDK has no signing: what it says and hears goes through ours, which the autopilot judges by pymavlink's."""
     right, wrong = tmp_path / "right.key", tmp_path / "wrong.key"
     for path, words in ((right, "a passphrase for the field"), (wrong, "another one altogether")):
@@ -301,16 +301,13 @@ def test_over_a_signed_link_with_the_key_and_without(tmp_path: Path) -> None:
             assert strange.code == NOBODY, strange
             assert "messages dropped because of their signature:" in strange.err
             assert "other key" in strange.err
-            without = await line.ground("cancel", "--within", "2")
-            assert without.code == NOBODY, without
-            assert "beats, but does not answer" in without.err
             cancelled = await line.ground("cancel", "--json", *key)
             assert (cancelled.code, cancelled.json["state"]) == (DONE, "idle"), cancelled
             status = await line.daemon.status()
             assert status is not None
             assert status["vehicle"]["signing"]["good"]
             assert status["vehicle"]["signing"]["mode"] == "require"
-            for said in (cancelled, strange, without):
+            for said in (cancelled, strange):
                 assert "passphrase for" not in said.err + said.out
 
     asyncio.run(main())

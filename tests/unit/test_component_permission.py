@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -13,6 +15,8 @@ from companion.component.component import Component
 from companion.component.permission import MAX_REMEMBERED, Permission
 from companion.config import parse
 from companion.config.senders import Senders
+from companion.daemon.reload import RELOADABLE
+from companion.daemon.service import Service
 from companion.errors import ConfigError
 from tests.support.component import (
     ACCEPTED,
@@ -208,3 +212,10 @@ def test_a_key_file_alone_means_that_signatures_are_required(monkeypatch: pytest
     off = parse(GOOD.replace("[[imu]]", 'signing = "off"\nsigning_key_file = "/etc/k"\n[[imu]]', 1), "x.toml").mavlink
     assert off.signing_mode == "off"
     assert str(off.signing_key_path) == "/etc/k"
+
+
+def test_a_reload_changes_who_may() -> None:
+    component = SimpleNamespace(permission=Permission())
+    RELOADABLE["mavlink.allow"](cast("Service", SimpleNamespace(component=component)), ("254",))
+    assert component.permission.refuses((255, 190), "undo") != ""
+    assert component.permission.refuses((254, 190), "undo") == ""

@@ -61,7 +61,7 @@ class Board:
         """Its signing, running; `killed`: without an orderly end."""
         text = GOOD.replace("[[imu]]", f'signing_key_file = "{self.folder}/k"\n[[imu]]', 1)
         config = parse(f'{text}[storage]\ndirectory = "{self.folder}"\n', "x.toml")
-        vehicle = cast("Vehicle", SimpleNamespace(alive=False))
+        vehicle = cast("Vehicle", SimpleNamespace(alive=False, component_id=1))
         found = LinkSigning(config, MavlinkLink(), vehicle, lambda *_: None, inline)
         found.load()
         task = asyncio.create_task(found.run())
@@ -195,7 +195,10 @@ def test_who_is_not_believed_is_told_of_once(tmp_path: Path, caplog: pytest.LogC
                 status = one.status()
                 assert status is not None
                 assert status["strangers"] == [{"sender": "255/190", "why": "does not sign", "messages": 3}]
-                assert status["summary"].startswith("3 unsigned messages dropped")
+                assert status["summary"] == "0 messages checked, 3 dropped"
+                assert one.deaf is None
+                one.signing.admits(b"\xfd\x00\x00\x00\x00\x01\x01\x00\x00\x00\x00\x00")
+                assert one.deaf == "1 unsigned messages dropped: the autopilot does not sign on this link"
 
     with caplog.at_level(logging.WARNING):
         run_virtual(main())

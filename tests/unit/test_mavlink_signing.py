@@ -63,6 +63,13 @@ def peer(
     return codec
 
 
+def parsed(codec: mavlink.MAVLink, data: bytes) -> mavlink.MAVLink_message:
+    messages = codec.parse_buffer(data)
+    assert messages is not None
+    (message,) = messages
+    return message
+
+
 def hears(link: MavlinkLink) -> list[int]:
     heard: list[int] = []
     link.subscribe(HEARTBEAT, lambda message, _t: heard.append(message.custom_mode))
@@ -85,10 +92,10 @@ def test_pymavlink_takes_ours_with_the_same_key_and_only_then() -> None:
         link.send(MESSAGE)
     right, wrong = peer(KEY, NOW), peer(OTHER, NOW)
     for data in sent:
-        (message,) = right.parse_buffer(data) or ()
+        message = parsed(right, data)
         assert message.get_type() == "HEARTBEAT"
         assert message.get_signed()
-        (message,) = wrong.parse_buffer(data) or ()
+        message = parsed(wrong, data)
         assert message.get_type() == "BAD_DATA"
     assert right.signing.goodsig_count == 3
 
@@ -186,7 +193,7 @@ def test_setup_signing_changes_nothing() -> None:
         for secret, ticks in ((OTHER, NOW), (bytes(32), 0)):
             link.receive(mavlink.MAVLink_setup_signing_message(1, 191, list(secret), ticks).pack(peer(key)), 0.0)
     link.send(MESSAGE)
-    (message,) = peer(KEY, NOW).parse_buffer(sent[0]) or ()
+    message = parsed(peer(KEY, NOW), sent[0])
     assert message.get_signed()
 
 

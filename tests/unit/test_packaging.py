@@ -177,9 +177,10 @@ def test_the_paths_of_the_dockerfile_are_there_and_let_into_the_build() -> None:
     for name in sources:
         assert (PROJECT / name).exists()
         assert any(fnmatch.fnmatch(name, pattern) for pattern in let_in), name
-    extras = re.search(r"/src\[([a-z,]+)\]", (BLUEOS / "Dockerfile").read_text())
-    assert extras is not None
-    assert set(extras[1].split(",")) <= set(PYPROJECT["project"]["optional-dependencies"])
+    # What is installed is what is locked, for parts that there are.
+    locks = set(re.findall(r"-r /src/requirements/([a-z]+)\.txt", (BLUEOS / "Dockerfile").read_text()))
+    assert locks >= {"build", "runtime"}
+    assert locks - {"build", "runtime"} <= set(PYPROJECT["project"]["optional-dependencies"])
     # All that the build of the wheel reads is copied.
     needed = {"pyproject.toml", PYPROJECT["project"]["readme"], *PYPROJECT["project"]["license-files"]}
     needed |= set(PYPROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"])

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ast
 import asyncio
+import hashlib
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -203,3 +205,18 @@ def test_mistakes_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixt
     (tmp_path / "imu").write_text("in the way")
     assert main(["devices", "--dir", str(tmp_path)]) == 1
     assert "no symlink" in capsys.readouterr().err
+
+
+def test_an_autopilot_that_was_given_a_passphrase_speaks_and_listens_to_who_has_it() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        one.settimeout(20.0)
+        command = ["autopilot", "--udp", f"127.0.0.1:{one.getsockname()[1]}", "--signing", "a field of words"]
+        with subprocess.Popen([sys.executable, "-m", "sim", *command], cwd=ROOT, stdout=subprocess.DEVNULL) as process:
+            try:
+                data = one.recv(2048)
+            finally:
+                process.terminate()
+    key = hashlib.sha256(b"a field of words").digest()
+    assert data[2] & mavlink.MAVLINK_IFLAG_SIGNED
+    assert hashlib.sha256(key + data[:-6]).digest()[:6] == data[-6:]
