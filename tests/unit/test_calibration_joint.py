@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -14,8 +15,11 @@ from scipy import linalg
 from companion.calibration.history import PowerUp
 from companion.calibration.joint import Weighed, Whole, points, weigh
 from companion.calibration.prior import Expectation, Expected, ExpectedImu
-from companion.calibration.solve import ImuSolution, Shared, Solution
+from companion.calibration.request import What
+from companion.calibration.site import Whereabouts, local_earth
+from companion.calibration.solve import CompassModel, GradienterModel, ImuSolution, Shared, Solution, solve
 from tests.prior_study import BY_READING, DEG, DEG_H, LEVEL, MG, G, imu_solution, shared_errors, solution
+from tests.support.windows import about, ideal_window, ned_from_body
 
 Array = NDArray[np.float64]
 ZERO_RAD = 0.1 * DEG
@@ -265,6 +269,12 @@ def test_all_accelerometers_off_by_one_tilt_are_the_gradienters_fault() -> None:
     assert not any(imu.prior.accel.used for imu in found.solution.imus if imu.prior and imu.prior.accel)
 
 
+def test_who_cannot_tell_is_not_weighed_with_a_gradienter_that_has_moved() -> None:
+    found = doubted([tilted(0.3, 0.0), tilted(0.3, 0.0), tilted(0.3, 0.0)], sigmas=[0.3, 0.3, 20.0])
+    assert [doubt.names for doubt in found.doubts] == [("imu0", "imu1")]
+    assert [imu.prior.accel.used for imu in found.solution.imus if imu.prior and imu.prior.accel] == [False] * 3
+
+
 def test_another_zero_than_before_is_said_to_be_another_zero() -> None:
     found = doubted([tilted(0.5, 0.0)] * 2, same_zero=0.0, other_zero_rad=0.013 * DEG)
     (doubt,) = found.doubts
@@ -339,3 +349,49 @@ def test_what_is_remembered_is_what_was_measured_not_what_became_of_it() -> None
     np.testing.assert_allclose(kept.accel.sigma_use, 0.05 * MG)
     np.testing.assert_allclose(kept.accel.sigma_shared, [0.0, 0.0, 0.3 * MG], atol=1e-9)
     assert kept.zero_sigma_rad == ZERO_RAD
+
+
+# --- what a solution says of the errors in common
+
+
+@pytest.mark.parametrize("law", ["axis", "slope", "euler"])
+def test_the_gradienters_share_is_how_its_readings_move_the_bias(law: Literal["axis", "slope", "euler"]) -> None:
+    mounting = about(2, 0.5) @ about(1, 0.2)
+    local = local_earth(Whereabouts(latitude_deg=40.0, longitude_deg=116.0, height_m=50.0, source="test"))
+    window = ideal_window(
+        ned_body=ned_from_body(12.0, -7.0, 40.0),
+        body_gradienter=mounting,
+        law=law,
+        latitude_deg=40.0,
+        gravity_m_s2=local.gravity_m_s2,
+        heading_deg=40.0,
+        gyro_bias=np.zeros(3),
+        accel_bias=np.zeros(3),
+        sigma=1e-4,
+    )
+    assert window.tilt is not None
+    both = msgspec.structs.replace(
+        window,
+        imus=(window.imus[0], msgspec.structs.replace(window.imus[0], name="own")),
+        tilt=msgspec.structs.replace(window.tilt, x_sigma_deg=0.004, y_sigma_deg=0.002),
+    )
+    gradienter = GradienterModel(law, mounting, (0.0, 0.0), 0.02)
+    compass = CompassModel(False, np.eye(3), 0.0, 1.0)
+    found = solve(both, local, gradienter, compass, What.BOTH)
+    shared = found.shared
+    assert shared is not None
+    assert shared.by_reading is not None
+    step = 1e-5
+    assert both.tilt is not None
+    for column, key in enumerate(("x_deg", "y_deg")):
+        moved = msgspec.structs.replace(both.tilt, **{key: getattr(both.tilt, key) + step / DEG})
+        other = solve(msgspec.structs.replace(both, tilt=moved), local, gradienter, compass, What.BOTH)
+        np.testing.assert_allclose(
+            (accel_of(other.imus[0]) - accel_of(found.imus[0])) / step, shared.by_reading[:, column], atol=1e-3
+        )
+    sigma = np.hypot([0.004, 0.002], 0.02) * DEG
+    up = shared.up[:, None] * local.gravity_sigma_m_s2
+    by_tilt = shared.by_reading @ np.diag(sigma**2) @ shared.by_reading.T
+    np.testing.assert_allclose(shared.covariance[3:, 3:], by_tilt + up @ up.T, rtol=1e-6, atol=1e-12)
+    np.testing.assert_array_equal(found.cross["fc", "own"], shared.covariance)
+    np.testing.assert_allclose(found.imus[0].covariance - shared.covariance, 1e-8 * np.eye(6), atol=1e-15)
