@@ -294,6 +294,20 @@ def test_one_accelerometer_off_while_the_others_agree_is_that_one() -> None:
     assert (doubt.cause, doubt.names) == ("imu", ("imu1",))
 
 
+def test_two_off_alike_are_not_the_gradienters_fault_while_a_third_sees_no_tilt() -> None:
+    found = doubted([tilted(0.3, 0.0), tilted(0.3, 0.0), np.zeros(3)])
+    assert [(doubt.cause, doubt.names) for doubt in found.doubts] == [("imu", ("imu0",)), ("imu", ("imu1",))]
+
+
+def test_what_is_unusual_and_no_contradiction_yet_takes_no_part() -> None:
+    usual, unusual = doubted([np.full(3, 80.0)], triad="gyro"), doubted([np.full(3, 160.0)], triad="gyro")
+    assert usual.doubts == unusual.doubts == ()
+    used = [
+        imu.prior.gyro.used for found in (usual, unusual) for imu in found.solution.imus if imu.prior and imu.prior.gyro
+    ]
+    assert used == [True, False]
+
+
 def test_where_the_others_cannot_tell_both_are_said() -> None:
     (doubt,) = doubted([tilted(0.2, -0.25), tilted(0.1, 0.0)], sigmas=[0.3, 20.0]).doubts
     assert (doubt.cause, doubt.names) == ("unclear", ("imu0",))
