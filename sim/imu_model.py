@@ -238,6 +238,10 @@ class ImuModel:
         self._gyro_matrix = _response(gyro_scale, gyro_misalignment_rad) @ self.mounting.T
         self._accel_matrix = _response(accel_scale, accel_misalignment_rad) @ self.mounting.T
 
+    def turn_on(self, gyro_bias_rad_s: Sequence[float] | Array, accel_bias_m_s2: Sequence[float] | Array) -> None:
+        """Another power-up: the bias begins elsewhere."""
+        self._turn_on = np.concatenate([gyro_bias_rad_s, accel_bias_m_s2]).astype(np.float64)
+
     @property
     def white(self) -> Array:
         """N of the six axes: three in rad/s * sqrt(s), three in m/s^2 * sqrt(s)."""

@@ -10,6 +10,7 @@ import argparse
 import dataclasses
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,7 +103,7 @@ def imu_solution(name: str, gyro: Array, accel: Array, stat: Array, covariance: 
 
 def solution(imus: Sequence[ImuSolution], shared: Shared) -> Solution:
     """Of several IMUs."""
-    cross = {pair: shared.covariance for pair in itertools.combinations([imu.name for imu in imus], 2)}
+    cross = dict.fromkeys(itertools.combinations([imu.name for imu in imus], 2), shared.covariance)
     return Solution(
         pose=_POSE, site=_SITE, imus=tuple(imus), warnings=(), unknown=(), magnetic=None, shared=shared, cross=cross
     )
@@ -231,9 +232,9 @@ def study(case: Case, trials: int, seed: int = 1) -> Outcome:
     )
 
 
-GOOD = dict(stat=1.6, use=5.0)
+GOOD: dict[str, Any] = {"stat": 1.6, "use": 5.0}
 """A good gyro after 30 s (method section 2.2: ICM-42688-P)."""
-OLD = dict(stat=47.0, use=63.0)
+OLD: dict[str, Any] = {"stat": 47.0, "use": 63.0}
 """An ADIS16405 after 10 s (likewise)."""
 CASES = (
     *(Case(name=f"good gyro, scatter {s:g}", scatter=s, **GOOD) for s in (70.0, 10.0, 2.0, 0.0)),

@@ -34,6 +34,8 @@ Whole = Mapping[str, tuple[Array | None, Array | None]]
 """By IMU: whole gyro and accelerometer bias by the readings alone, (3,) each, vehicle FRD."""
 
 _TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
+_OF_ONE: Final = ("imu", "unclear")
+"""Causes that concern one IMU; the others concern all."""
 AGREES: Final = 11.34
 """Chi square of three axes that is passed by chance once in a hundred: beyond it nobody is warned yet, but what may
 well be of another sensor takes no part."""
@@ -90,10 +92,13 @@ def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed
                 break
     doubted = {(doubt.triad, name) for doubt in found for name in doubt.names}
     known = [one for triad in _TRIADS for one in _known(solution, whole, expected, triad, today=False)]
+    # A tilt, a gravity or a turn that nobody expected is in all of them, whether or not each shows it.
+    shaken = {doubt.triad for doubt in found if doubt.cause not in _OF_ONE}
     used = [
         one
         for one in known
         if one.expected.weighs
+        and one.triad not in shaken
         and (one.triad, solution.imus[one.imu].name) not in doubted
         and _agrees(_witness(solution, shared, one))
     ]
@@ -104,12 +109,12 @@ def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed
             prior=_prior(k, imu.name, solution, shared, known, used, whole),
             warnings=(
                 *imu.warnings,
-                *(d.words for d in found if d.cause in ("imu", "unclear") and imu.name in d.names),
+                *(doubt.words for doubt in found if doubt.cause in _OF_ONE and imu.name in doubt.names),
             ),
         )
         for k, imu in enumerate(weighed.imus)
     )
-    common = [doubt.words for doubt in found if doubt.cause not in ("imu", "unclear")]
+    common = [doubt.words for doubt in found if doubt.cause not in _OF_ONE]
     return Weighed(dataclasses.replace(weighed, imus=imus, warnings=(*solution.warnings, *common)), tuple(found))
 
 

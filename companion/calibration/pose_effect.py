@@ -44,7 +44,7 @@ class PoseEffect:
         return mean, np.sqrt(variance)
 
     def effective(self, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> Effective:
-        """What a record says of it.
+        """What a record says of it, without misalignment, which turns the axes and is none of the sensor's bias.
 
         Args:
             gravity_m_s2: local.
@@ -53,15 +53,12 @@ class PoseEffect:
         """
         # The mean is known but not taken off what is written, so that it counts in full.
         whole = np.sqrt(np.square(self.mean) + np.square(self.sigma))
-        turned = np.sqrt(np.square(self.misalignment_mean) + np.square(self.misalignment_sigma))
         to_level = np.square(gravity_m_s2 * (LEVEL - up))
         own = np.square(whole) @ np.square(gravity_m_s2 * up)
         return Effective(
             scale_from=self.source,
             scale_sigma_m_s2=_axes(gravity_m_s2 * np.diag(whole)),
-            level_sigma_m_s2=_axes(
-                np.sqrt(np.square(sigma_use_m_s2) + (np.square(whole) + np.square(turned)) @ to_level)
-            ),
+            level_sigma_m_s2=_axes(np.sqrt(np.square(sigma_use_m_s2) + np.square(whole) @ to_level)),
             sensor_sigma_m_s2=_axes(np.sqrt(np.square(sigma_use_m_s2) + own)),
         )
 

@@ -7,8 +7,8 @@ powered all the while, is remembered besides: it says most.
 from __future__ import annotations
 
 import logging
-import uuid
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -90,8 +90,9 @@ class BiasMemory:
         self._store = BiasStore(config.storage.path)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], _Reference] = {}
-        self.host = _host()
-        """One and the same as long as this computer runs."""
+        self._host = _host()
+        self.power_up: Callable[[str, float], PowerUp] = self._power_up
+        """Since when the sensor of an IMU has been powered, at a wall clock time."""
 
     def load(self) -> None:
         """Read what was kept before this start; blocking."""
@@ -148,7 +149,7 @@ class BiasMemory:
             return ExpectedImu(name=name, effect=effect)
         now = Now(
             unix_s=unix_s,
-            power_up=self._power_up(name, unix_s),
+            power_up=self.power_up(name, unix_s),
             temperature_degc=imu.temperature_degc,
             up=_axes(shared.up),
             gravity_m_s2=shared.gravity_m_s2,
@@ -178,7 +179,7 @@ class BiasMemory:
             doubts,
             started_at=started_at,
             unix_s=unix_s,
-            power_ups={imu.name: self._power_up(imu.name, unix_s) for imu in solution.imus},
+            power_ups={imu.name: self.power_up(imu.name, unix_s) for imu in solution.imus},
             zero=self._zero(),
         )
 
@@ -231,7 +232,7 @@ class BiasMemory:
 
     def _power_up(self, name: str, unix_s: float) -> PowerUp:
         boot_s = self._vehicle.boot_s if name in self._imus else None
-        return PowerUp(host=self.host, since_unix_s=None if boot_s is None else round(unix_s - boot_s, 1))
+        return PowerUp(host=self._host, since_unix_s=None if boot_s is None else round(unix_s - boot_s, 1))
 
     def _session(self, name: str) -> str:
         """Another one as soon as the sensor may have been without power."""
@@ -293,7 +294,7 @@ def _host() -> str:
     try:
         return _BOOT_ID.read_text(encoding="ascii").strip()
     except (OSError, ValueError):
-        return str(uuid.uuid4())
+        return os.urandom(8).hex()
 
 
 def _axes(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Axes:

@@ -17,7 +17,7 @@ import numpy as np
 
 from companion.autopilot.change import WriteFailedError
 from companion.autopilot.vehicle import ArmState, Vehicle
-from companion.calibration.joint import weigh
+from companion.calibration.joint import Weighed, weigh
 from companion.calibration.machine import Event, Machine, State
 from companion.calibration.prior import Expectation
 from companion.calibration.request import What
@@ -157,7 +157,7 @@ class Course:
         )
         draft.alignment = self._alignment.used
         draft.measured_s = (measured.start_s, measured.end_s)
-        solution = self._weighed(
+        solution = await self._weighed(
             solution, draft, lambda expectation: self.on_solved(measured, window, where, job.what, expectation)
         )
         plan = await self._pusher.plan(solution, draft)
@@ -199,7 +199,7 @@ class Course:
                 await self._reboot.survived(plan, draft)
         self.machine.on(Event.VERIFIED)
 
-    def _weighed(self, solution: Solution, draft: Draft, tell: Callable[[Expectation], None]) -> Solution:
+    async def _weighed(self, solution: Solution, draft: Draft, tell: Callable[[Expectation], None]) -> Solution:
         """The solution with what is known from before; fills the draft, and says what contradicts.
 
         Raises:
@@ -209,10 +209,10 @@ class Course:
         unix_s = draft.started_at.timestamp()
         for name, words in self._memory.forgotten().items():
             draft.warn(name, words)
-        expectation = self._memory.expectation(solution, unix_s)
+        expectation: Expectation = await self._offload(self._memory.expectation, solution, unix_s)
         tell(expectation)
         whole = self._memory.whole(solution)
-        weighed = weigh(solution, whole, expectation)
+        weighed: Weighed = await self._offload(weigh, solution, whole, expectation)
         started_at = draft.started_at.isoformat(timespec="milliseconds")
         draft.points = self._memory.measured(solution, whole, weighed.doubts, started_at, unix_s)
         draft.solution = weighed.solution

@@ -476,6 +476,8 @@ class Replay:
             again,
             started_at=recorded.started_at,
             alignment=recorded.alignment,
+            # Records of earlier versions have none.
+            cross_covariance=again.cross_covariance if recorded.cross_covariance else (),
             duration_s=recorded.duration_s,
             warnings=_with_rest(again.warnings, recorded.warnings),
             imus=tuple(_imu_again(imu, before.get(imu.name)) for imu in again.imus),

@@ -7,6 +7,14 @@ from typing import Final
 
 _ADVICE: Final[tuple[tuple[str, str], ...]] = (
     (r"firmware calibrated all its gyros", "Nothing: this keeps the heading right after a write."),
+    (
+        r"gradienter has moved by|gradienter's zero differs",
+        "Fasten the gradienter, measure its zero (companion align zero), then calibrate again.",
+    ),
+    (
+        r"differ alike from before|differs by .* from|than before: are height|another one now",
+        "It contradicts earlier calibrations: see docs/messages.md on that before you fly.",
+    ),
     (r"EKF", "Wait 2 minutes, disarmed and still, before take-off, so that the attitude settles."),
     (
         r"no gradienter|need a gradienter|data from gradienter|reading from gradienter",

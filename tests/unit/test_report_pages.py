@@ -278,6 +278,8 @@ def test_a_failure_says_why_and_what_to_do(tmp_path: Path) -> None:
         ("armed during the measurement; nothing was written", "Disarm"),
         ("latitude unknown: Earth rate and gravity uncertain (set vehicle.latitude_deg or wait for GPS)", "[vehicle]"),
         ("gyro fc is stuck: axis x did not change in 10 s", "companion check"),
+        ("the gradienter has moved by 0.31 deg (x +0.25, y -0.18): all accelerometers (fc) differ", "align zero"),
+        ("accel fc: x differs by +3.2 mg from 8 earlier power-ups (usual: 0.5): look at this sensor", "contradicts"),
         ("verify failed; old values NOT back in INS_GYROFFS_X: no answer", "Do not fly"),
     ],
 )

@@ -56,8 +56,13 @@ def settings_of(imu: Imu, record: ImuRecord, local: LocalEarth, gyro_step_rad_s:
         gyro_bias_rad_s=gyro,
         gyro_covariance=covariance,
         accel_bias_m_s2=accel or _ZERO,
-        accel_sigma_m_s2=(record.accel_sigma_use_m_s2 if accel else None) or (unknown, unknown, unknown),
+        accel_sigma_m_s2=(_level_sigma(record) if accel else None) or (unknown, unknown, unknown),
     )
+
+
+def _level_sigma(record: ImuRecord) -> Axes | None:
+    """Of the bias as the level aircraft's, which it mostly is in flight, however it stood when it was calibrated."""
+    return record.accel_sigma_use_m_s2 if record.effective is None else record.effective.level_sigma_m_s2
 
 
 def _left(record: ImuRecord, residual: Axes | None, mark: str) -> Axes | None:

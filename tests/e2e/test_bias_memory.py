@@ -1,0 +1,226 @@
+"""Earlier biases across power-ups: what the daemon remembers, how good it makes it, and what it names."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from companion.calibration.history import PowerUp
+from companion.calibration.record import Record
+from companion.daemon.job import Job
+from companion.recording.walk import Recording
+from companion.replay.engine import Replay
+from companion.storage.biases import BiasStore
+from sim.devices import Gradienter
+from sim.imu_model import DEG_H, MG
+from tests.e2e.test_calibration import calibrated
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+SCATTER_DEG_H, SCATTER_MG = 70.0, 0.5
+FEW: dict[str, Any] = {"min_still_s": 5.0, "max_s": 6.0}
+
+
+def since(run: int) -> PowerUp:
+    """Days apart, which virtual time does not show."""
+    return PowerUp(host=f"power-up {run}", since_unix_s=86400.0 * run)
+
+
+def power_up(
+    folder: Path, run: int, *, before: Callable[[Rig], None] | None = None, times: int = 1, **options: Any
+) -> tuple[list[Record], dict[str, tuple[Any, Any]], Rig]:
+    """One power-up of the aircraft with biases drawn for it: its records, its true biases, and what is left of it."""
+    truths: dict[str, tuple[Any, Any]] = {}
+
+    async def main() -> tuple[list[Record], Rig]:
+        rig = Rig(folder, seed=run, **({"own_imu": True} | FEW | options))
+        random = np.random.default_rng(run)
+        models = {"fc": rig.model, **({"own": rig.own_model} if hasattr(rig, "own_model") else {})}
+        for model in models.values():
+            model.turn_on(
+                (100.0 + random.normal(0, SCATTER_DEG_H, 3)) * DEG_H, (1.0 + random.normal(0, SCATTER_MG, 3)) * MG
+            )
+        if before is not None:
+            before(rig)
+        records = []
+        async with rig.running():
+            rig.service.memory.power_up = lambda name, unix_s: since(run)
+            await rig.ready()
+            for _ in range(times):
+                result, record = await calibrated(rig)
+                assert result.outcome == "done", result
+                records.append(record)
+            for name, model in models.items():
+                truths[name] = model.true_bias(rig.aircraft.time_at(rig.now_s))
+            await asyncio.sleep(2.5 if "recordings_mb" in options else 0.1)
+        return records, rig
+
+    records, rig = run_virtual(main())
+    return records, truths, rig
+
+
+def knocked(rig: Rig) -> None:
+    """The gradienter's plate has slipped by 0.3 degrees."""
+    gradienter = rig.devices["gradienter"]
+    assert isinstance(gradienter, Gradienter)
+    gradienter.offset_deg = (0.3, 0.0)
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that remembers one power-up of the rig, and four more that are drawn by the same law."""
+    folder = tmp_path_factory.mktemp("known")
+    _, truths, _ = power_up(folder, 0)
+    store, random = BiasStore(folder), np.random.default_rng(100)
+    imus = store.read()
+    assert {name: len(imu.points) for name, imu in imus.items()} == {"fc": 1, "own": 1}
+    for run in range(1, 5):
+        for name, imu in imus.items():
+            first = imu.points[0]
+            assert first.gyro is not None
+            assert first.accel is not None
+            gyro = (100.0 + random.normal(0, SCATTER_DEG_H, 3)) * DEG_H
+            accel = (1.0 + random.normal(0, SCATTER_MG, 3)) * MG
+            # The gradienter's zero is off by the same in all of them.
+            accel += np.subtract(first.accel.bias, truths[name][1])
+            another = msgspec.structs.replace(
+                first,
+                started_at=f"power-up {run}",
+                power_up=since(run),
+                gyro=msgspec.structs.replace(first.gyro, bias=tuple(gyro.tolist())),
+                accel=msgspec.structs.replace(first.accel, bias=tuple(accel.tolist())),
+            )
+            imus[name] = msgspec.structs.replace(imus[name], points=(*imus[name].points, another))
+    store.write(imus)
+    return folder
+
+
+def copied(folder: Path, to: Path) -> Path:
+    (to / "biases.json").write_bytes((folder / "biases.json").read_bytes())
+    return to
+
+
+def test_the_next_power_up_is_right_and_knows_the_earlier_ones(known: Path, tmp_path: Path) -> None:
+    earlier = BiasStore(known).read()
+    (record,), truths, _ = power_up(copied(known, tmp_path), 5)
+    for imu in record.imus:
+        gyro, accel = truths[imu.name]
+        assert imu.gyro_bias_rad_s is not None
+        assert imu.accel_bias_m_s2 is not None
+        assert imu.gyro_sigma_use_rad_s is not None
+        assert imu.accel_sigma_use_m_s2 is not None
+        assert np.abs(np.subtract(imu.gyro_bias_rad_s, gyro) / imu.gyro_sigma_use_rad_s).max() < 3.5
+        assert np.abs(np.subtract(imu.accel_bias_m_s2, accel) / imu.accel_sigma_use_m_s2).max() < 3.5
+        assert imu.effective is not None
+        assert imu.effective.scale_from == "assumed"
+        assert not any("differs by" in words for words in imu.warnings), imu.warnings
+        assert imu.prior is not None
+        assert imu.prior.gyro is not None
+        assert imu.prior.accel is not None
+        assert imu.prior.gyro.power_ups == imu.prior.accel.power_ups == 5
+        assert imu.prior.gyro.used
+        mean = np.mean([point.gyro.bias for point in earlier[imu.name].points if point.gyro is not None], axis=0)
+        np.testing.assert_allclose(imu.prior.gyro.expected_rad_s, mean, atol=0.1 * DEG_H)
+    (pair,) = record.cross_covariance
+    assert pair.imus == ("fc", "own")
+    # What the gradienter adds is in both: their difference is known better than either.
+    own = [np.array(imu.covariance, dtype=np.float64)[3:5, 3:5] for imu in record.imus]
+    common = np.array(pair.covariance, dtype=np.float64)[3:5, 3:5]
+    assert np.trace(own[0] + own[1] - common - common.T) < 0.7 * np.trace(own[0] + own[1])
+    kept = BiasStore(tmp_path).read()
+    assert {name: len(imu.points) for name, imu in kept.items()} == {"fc": 6, "own": 6}
+
+
+def test_a_gradienter_that_has_moved_is_named_and_a_replay_says_so_without_the_disk(
+    known: Path, tmp_path: Path
+) -> None:
+    (record,), _, rig = power_up(copied(known, tmp_path), 6, before=knocked, recordings_mb=64)
+    (words,) = [words for words in record.warnings if "gradienter" in words]
+    assert words.startswith("the gradienter has moved by 0.3")
+    assert "(fc, own)" in words
+    assert "gradienter has moved" in "".join(rig.ground.texts())
+    for imu in record.imus:
+        assert imu.prior is not None
+        assert imu.prior.accel is not None
+        assert not imu.prior.accel.used
+        assert imu.prior.gyro is not None
+        assert imu.prior.gyro.used
+    last = BiasStore(tmp_path).read()["fc"].points[-1]
+    assert last.accel is not None
+    assert last.accel.suspect
+    # What was known is in the recording: what lies on the disk has changed since.
+    (tmp_path / "biases.json").unlink()
+    (again,) = Replay(Recording(min((tmp_path / "recordings").glob("0*.mcap")))).run().calibrations
+    assert again.not_recomputed is None
+    assert [str(difference) for difference in again.differences] == []
+    assert again.record.imus == record.imus
+
+
+def test_a_gradienter_that_moves_between_two_calibrations_is_named_without_any_history(tmp_path: Path) -> None:
+    async def main() -> tuple[Record, Record]:
+        async with Rig(tmp_path, own_imu=True, **FEW).running() as rig:
+            await rig.ready()
+            _, good = await calibrated(rig)
+            knocked(rig)
+            await asyncio.sleep(8.0)
+            _, bad = await calibrated(rig)
+            return good, bad
+
+    good, bad = run_virtual(main())
+    assert not any("gradienter" in words for words in good.warnings)
+    assert any(words.startswith("the gradienter has moved by 0.3") for words in bad.warnings), bad
+
+
+def test_another_profile_forgets_in_words(known: Path, tmp_path: Path) -> None:
+    def reprofiled(rig: Rig) -> None:
+        imus = [msgspec.structs.replace(imu, profile="bmi088") if imu.name == "own" else imu for imu in rig.config.imu]
+        rig.config = msgspec.structs.replace(rig.config, imu=tuple(imus))
+
+    (record,), _, _ = power_up(copied(known, tmp_path), 8, before=reprofiled)
+    fc, own = record.imus
+    assert fc.prior is not None
+    assert own.prior is None
+    assert "imu own: profile changed since then: its earlier biases are forgotten" in own.warnings
+    assert len(BiasStore(tmp_path).read()["own"].points) == 1
+
+
+def test_switched_off_nothing_is_asked_but_all_is_remembered(known: Path, tmp_path: Path) -> None:
+    def off(rig: Rig) -> None:
+        quiet = msgspec.structs.replace(rig.config.calibration, prior=False)
+        rig.config = msgspec.structs.replace(rig.config, calibration=quiet)
+        knocked(rig)
+
+    (record,), _, _ = power_up(copied(known, tmp_path), 9, before=off, own_imu=False)
+    (fc,) = record.imus
+    assert fc.prior is None
+    assert fc.effective is not None
+    assert not any("moved" in words for words in (*record.warnings, *fc.warnings))
+    assert {name: len(imu.points) for name, imu in BiasStore(tmp_path).read().items()} == {"fc": 6, "own": 5}
+
+
+def test_a_damaged_file_costs_one_line_and_what_is_undone_is_forgotten(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "biases.json").write_bytes(b'{"format_version": 1, "imus": {"fc"')
+
+    async def main() -> None:
+        async with Rig(tmp_path, **FEW).running() as rig:
+            await rig.ready()
+            result, _ = await calibrated(rig)
+            assert result.outcome == "done"
+            assert len(BiasStore(tmp_path).read()["fc"].points) == 1
+            job = rig.service.conductor.start_undo("test")
+            assert isinstance(job, Job)
+            assert (await job.finished).outcome == "done"
+            assert BiasStore(tmp_path).read()["fc"].points == ()
+
+    run_virtual(main())
+    (line,) = [each.message for each in caplog.records if "biases.json" in each.message]
+    assert line.startswith(f"{tmp_path}/biases.json: not readable: ")
+    assert line.endswith("goes on without earlier biases")
