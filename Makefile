@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 # Tests run in two processes: the boards and machines this is made for have at least two cores.
 JOBS ?= 2
 
-.PHONY: help demo test check format bench deb deb-test lock sbom audit clean
+.PHONY: help demo test check format bench accuracy campaign deb deb-test lock sbom audit clean
 
 help:
 	@echo 'make demo    watch a virtual aircraft being calibrated (about a minute)'
@@ -14,6 +14,7 @@ help:
 	@echo 'make check   formatting, lint, types, import directions'
 	@echo 'make format  put the code into the one format'
 	@echo 'make bench   speed, as ratios within one run'
+	@echo 'make accuracy  how good a calibration is, beside the bound and what else is done (three minutes)'
 	@echo 'make deb     a Debian package for machines like this one, in dist/'
 	@echo 'make deb-test  try that package in a clean root (as root; a minute or two)'
 	@echo 'make lock    requirements/*.txt anew: every dependency with its hashes (UPGRADE=1: the newest; needs the network)'
@@ -53,6 +54,9 @@ format: $(VENV)/.dev
 
 bench: $(VENV)/.dev
 	@$(BIN)/python -m tests.bench
+
+accuracy: $(VENV)/.run
+	@$(BIN)/python -m sim accuracy --jobs $(JOBS)
 
 # With Debian's Python, whatever PYTHON is: the package runs with it. EXTRAS= puts neither MQTT nor recording in.
 EXTRAS ?= mqtt,recording

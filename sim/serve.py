@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Coroutine, Iterable, Sequence
 from pathlib import Path
 
+from sim.accuracy import cli as accuracy
 from sim.aircraft import Pose
 from sim.devices import SerialDevice
 from sim.families import COMPASSES, GRADIENTERS, IMUS, Devices, fit
@@ -86,6 +87,7 @@ def parser() -> argparse.ArgumentParser:
     commands.add_parser("turntable", help="the paper's five poses, with tables beside its own")
     commands.add_parser("drive", help="the paper's drive of 180 s, many times")
     commands.add_parser("flights", help="banked circles and shuttling, beside the filters of others")
+    accuracy.add_options(commands.add_parser("accuracy", help=accuracy.HELP))
     return top
 
 

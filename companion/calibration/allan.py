@@ -125,6 +125,15 @@ def use_variance(model: AllanModel, mean_s: float, horizon_s: float) -> float:
     return model.white**2 / mean_s + float(floor_variance(model.flicker, model.walk, mean_s, horizon_s))
 
 
+def slope_variance(flicker: Floats, walk: Floats, mean_s: float) -> Floats:
+    """Variance of a straight line's slope over `mean_s` seconds that flicker and random walk make where there is none.
+
+    The line's weights on the generalised covariance -(B^2 / pi) ln|t| - (K^2 / 2)|t| of method section 2.2: the double
+    integrals are 1/16 and 1/60 of T^4 and T^5, times 144 / T^6.
+    """
+    return np.asarray(9.0 / math.pi * np.square(flicker / mean_s) + 1.2 * np.square(walk) / mean_s)
+
+
 def allan_variance(slots: NDArray[np.int64], values: Floats, span: int) -> tuple[Floats, float]:
     """Overlapping Allan variance of values on a 1 s grid with holes.
 

@@ -8,7 +8,6 @@ Sources: Huber, Annals of Mathematical Statistics 35 (1964) 73-101; the step, Yo
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 import msgspec
@@ -23,8 +22,6 @@ BIWEIGHT_C: Final = 6.0
 on clean data (Huber's mean alone 5 %), and a knock in 5 % of them costs 4 % of sigma instead of 26 %."""
 _MAD_TO_SIGMA: Final = 1.4826
 _MEAN_ABS_TO_SIGMA: Final = 1.2533
-_ONE_IN_10000: Final = 3.8906
-"""Sigmas that a normal number exceeds with this probability, on either side."""
 _EQUAL: Final = 1e-6
 _ROUNDS: Final = 30
 _CONVERGED: Final = 1e-4
@@ -82,22 +79,6 @@ def robust_mean(values: Floats, c: Floats | float = HUBER_C, least: Floats | flo
     share = np.square(residual / np.where(limit > 0.0, limit, 1.0)) * (limit > 0.0)
     weight = np.square(np.maximum(1.0 - share, 0.0))
     return np.asarray(centre + (weight * residual).sum(axis=0) / weight.sum(axis=0))
-
-
-def slope_limit(count: int, least: float) -> float:
-    """|t| beyond which a line's slope is taken for one: `least`, more for few values.
-
-    Of a window of 10 values 0.36 % show |t| > 5 by chance, and the end of such a line is far off. Student's t that
-    chance exceeds once in 10 000, by Wallace's approximation (Biometrika 46 (1959) 124-130), is 7.2 there; from 20
-    values on it is below 5.
-
-    Args:
-        count: of the values that the line goes through, at least 3.
-        least: |t| for many values.
-    """
-    freedom = count - 2.0
-    normal = _ONE_IN_10000 * (8.0 * freedom + 3.0) / (8.0 * freedom + 1.0)
-    return max(least, math.sqrt(freedom * math.expm1(normal**2 / freedom)))
 
 
 class Line(msgspec.Struct, frozen=True):

@@ -16,26 +16,25 @@ from numpy.typing import NDArray
 
 from companion.calibration.allan import (
     FLOOR_OF_FLICKER,
+    PROFILES,
     NoiseProfile,
     allan_variance,
     floor_variance,
+    slope_variance,
     white_noise,
 )
 from companion.calibration.batches import Batch
 from companion.calibration.integers import integer_columns
 from companion.calibration.pose_windows import FieldWindow, HeadingWindow, TiltWindow
 from companion.calibration.quantised import EDGE_RMS
-from companion.calibration.robust import huber_line, robust_mean, slope_limit
+from companion.calibration.ramps import RAMP_BATCHES, is_ramp
+from companion.calibration.robust import huber_line, robust_mean
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG_H, MG
 
 Floats = NDArray[np.float64]
 Axes = tuple[float, float, float]
 
-RAMP_T: Final = 5.0
-"""|t| of a slope that counts as one, more in a short window (`robust.slope_limit`). On sensors without a ramp a lower
-one costs more than it saves (2.4)."""
-RAMP_BATCHES: Final = 8
 WHITE_SHARE: Final = 0.09
 """White variance over floor variance below which more averaging buys nothing: white part 30 % of the floor."""
 _ALLAN_SPANS: Final = 5
@@ -184,6 +183,8 @@ def estimates(
     edges = np.repeat([_edges(imu) for imu in imus], 3)
     whole = integer_columns(batches, steps, np.repeat([imu.truncates for imu in imus], 6), edges)
     values = np.where(whole.of, whole.values, values)
+    flicker = _per_axis([m.flicker for m in gyros], [m.flicker for m in accels])
+    walk = _per_axis([m.walk for m in gyros], [m.walk for m in accels])
     mean = robust_mean(values, whole.huber_c, whole.least)
     leverage = np.full(values.shape[1], 1.0 / seconds)
     slope = np.zeros(values.shape[1])
@@ -191,15 +192,16 @@ def estimates(
     if len(values) >= RAMP_BATCHES:
         times = slots.astype(np.float64) + 0.5
         line = huber_line(times, values, end_s, whole.huber_c, whole.least)
-        ramps = np.abs(line.t_statistic) > slope_limit(len(values), RAMP_T)
+        # The profile of an unknown part has the floor of the worst, behind which every warm-up would hide.
+        named = np.repeat([imu.profile != PROFILES["unknown"] for imu in imus], 6)
+        ramps = is_ramp(line, len(values), np.where(named, slope_variance(flicker, walk, end_s - slots[0]), 0.0))
         mean = np.where(ramps, line.end, mean)
         leverage = np.where(ramps, line.end_leverage, leverage)
         slope = np.where(ramps, line.slope, 0.0)
         level = values - slope * (times - times.mean())[:, None]
     measured = np.maximum(white_noise(slots, level), whole.least)
     white = np.maximum(measured, _per_axis([m.white for m in gyros], [m.white for m in accels]))
-    flicker = _flicker(slots, level, measured, _per_axis([m.flicker for m in gyros], [m.flicker for m in accels]))
-    walk = _per_axis([m.walk for m in gyros], [m.walk for m in accels])
+    flicker = _flicker(slots, level, measured, flicker)
     quantum, half_step = _quantisation(
         batches,
         steps,

@@ -8,23 +8,32 @@ import math
 import sys
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
 from sim.accuracy.figures import Figure
-from sim.accuracy.tables import SECTIONS, Section, report
+
+if TYPE_CHECKING:
+    from sim.accuracy.tables import Section
+
+SECTIONS: Final = ("white", "floors", "methods", "tilt", "integers", "paper")
+HELP: Final = "errors and sigmas of the estimator, beside the physical bound and what else is done"
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run it; 0 when every claim holds, 1 when one does not."""
-    parser = argparse.ArgumentParser(
-        prog="python -m sim accuracy",
-        description="Monte Carlo of the estimator that flies, beside the physical bound and what else is done.",
-    )
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Everything that it takes."""
     parser.add_argument("--runs", type=int, default=2000, help="stands with white noise (default 2000); others scale")
     parser.add_argument("--seed", type=int, default=1, help="of everything (default 1)")
     parser.add_argument("--only", help=f"sections, comma between: {','.join(SECTIONS)}")
     parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
     parser.add_argument("--json", action="store_true", help="figures with standard errors, as one JSON object")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run it; 0 when every claim holds, 1 when one does not."""
+    from sim.accuracy.tables import report
+
+    parser = argparse.ArgumentParser(prog="python -m sim accuracy", description=f"Monte Carlo: {HELP}.")
+    add_options(parser)
     arguments = parser.parse_args(argv)
     only = SECTIONS if arguments.only is None else tuple(arguments.only.split(","))
     if arguments.runs < 1 or arguments.jobs < 1 or arguments.seed < 0:

@@ -37,7 +37,6 @@ UPRIGHT: Final = ("level", "by eye", "5/-3")
 """Where the horizontal accelerometers are the body's x and y."""
 PAPER_LEFT_UG: Final = (56.80, 36.24)
 """Mean absolute E and N of the paper's table 1, worked out again (method section 1.3)."""
-SECTIONS: Final = ("white", "floors", "methods", "tilt", "integers", "paper")
 _TRIADS: Final = (("gyro", "deg/h", DEG_H, slice(0, 3)), ("accel", "ug", UG, slice(3, 6)))
 _LSB_DEG_H: Final = STEP_RAD_S / DEG_H
 _REFERENCES: Final = f"gradienter {FIELD_TILT_DEG:g} deg, compass {FIELD_HEADING_DEG:g} deg"
@@ -87,7 +86,7 @@ def report(
     Args:
         runs: stands with white noise; a fifth of it of every part, a twentieth for every step of noise under integers.
         seed: of everything.
-        only: of `SECTIONS`.
+        only: of `cli.SECTIONS`.
         jobs: processes.
         progress: is told what begins.
     """

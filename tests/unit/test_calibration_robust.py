@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from companion.calibration.robust import HUBER_C, huber_line, huber_mean, robust_mean, slope_limit
+from companion.calibration.ramps import slope_limit
+from companion.calibration.robust import HUBER_C, huber_line, huber_mean, robust_mean
 
 
 def test_huber_mean_solves_its_own_equation() -> None:
@@ -108,11 +109,11 @@ def test_the_robust_mean_of_equal_values_is_their_value_and_moves_with_them() ->
 
 @pytest.mark.parametrize("count", [8, 10, 15])
 def test_the_limit_of_a_slope_in_a_short_window_is_students(count: int) -> None:
-    assert slope_limit(count, 5.0) == pytest.approx(stats.t.isf(0.5e-4, count - 2), rel=0.03)
-    assert slope_limit(60, 5.0) == 5.0
+    assert slope_limit(count) == pytest.approx(stats.t.isf(0.5e-4, count - 2), rel=0.03)
+    assert slope_limit(60) == 5.0
 
 
 def test_chance_seldom_makes_a_slope_of_ten_seconds() -> None:
     line = huber_line(np.arange(10.0), np.random.default_rng(9).normal(size=(10, 20_000)), 10.0)
-    assert float(np.mean(np.abs(line.t_statistic) > slope_limit(10, 5.0))) < 1e-3
+    assert float(np.mean(np.abs(line.t_statistic) > slope_limit(10))) < 1e-3
     assert float(np.mean(np.abs(line.t_statistic) > 5.0)) > 2e-3

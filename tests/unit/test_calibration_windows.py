@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.allan import AllanModel, NoiseProfile, use_variance
+from companion.calibration.allan import AllanModel, NoiseProfile, noise_profile, slope_variance, use_variance
 from companion.calibration.batches import Batch
 from companion.calibration.pose_windows import heading_window, tilt_window
 from companion.calibration.windows import ImuInput, imu_estimates
@@ -228,3 +228,33 @@ def test_heading_is_averaged_across_north() -> None:
     assert abs((window.heading_deg - 359.9 + 180.0) % 360.0 - 180.0) < 0.3
     assert 0.0 <= window.heading_deg < 360.0
     assert window.sigma_deg == pytest.approx(0.5 / math.sqrt(40.0), rel=0.4)
+
+
+def test_a_slope_of_the_parts_own_flicker_is_no_warm_up_and_a_real_one_is() -> None:
+    rng = np.random.default_rng(9)
+    model = AllanModel(0.1, 5.0, 0.05)
+    bias_only = AllanModel(0.0, model.flicker, model.walk)
+    source, nobody = imu("fc", NoiseProfile("made", model, model)), imu("fc", noise_profile("unknown"))
+    flagged = blind = 0
+    for _ in range(60):
+        bias = np.stack([coloured(rng, 4096, bias_only) for _ in range(6)], axis=1)[2000:2060]
+        readings = bias + rng.normal(0.0, model.white, (60, 6))
+        flagged += any("warm-up" in line for line in window_of(source, batches_of(readings)).warnings)
+        # Whose part nobody knows, its wander cannot be told from a warm-up.
+        blind += any("warm-up" in line for line in window_of(nobody, batches_of(readings * DEG_H)).warnings)
+    assert flagged <= 4
+    assert blind > 20
+    slope = 1.5
+    warm = batches_of(slope * np.arange(0.5, 60.0)[:, None] + rng.normal(0.0, model.white, (60, 6)))
+    assert window_of(source, warm).gyro_rad_s == pytest.approx([60.0 * slope] * 3, abs=0.5)
+
+
+def test_the_slope_that_flicker_and_walk_make_is_as_computed() -> None:
+    rng = np.random.default_rng(10)
+    times = np.arange(60.0) - 29.5
+    for model in (AllanModel(0.0, 3.0, 0.0), AllanModel(0.0, 0.0, 0.4)):
+        paths = np.stack([coloured(rng, 8192, model) for _ in range(40)], axis=1)[2000:]
+        parts = paths[: len(paths) // 60 * 60].reshape(-1, 60, 40)
+        slopes = np.einsum("t,ktc->kc", times, parts) / np.square(times).sum()
+        expected = math.sqrt(float(slope_variance(np.array(model.flicker), np.array(model.walk), 60.0)))
+        assert float(slopes.std()) == pytest.approx(expected, rel=0.06)

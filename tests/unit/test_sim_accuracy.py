@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim.accuracy import cli, experiments, paper, peers
+from companion.calibration.allan import noise_profile
+from companion.calibration.windows import ImuInput
+from sim.accuracy import cli, experiments, paper, peers, tables
 from sim.accuracy.experiments import FloorRun, IntegerRun, WhiteRun, floors, integers, predicted, white
 from sim.accuracy.figures import Figure, beside, covered, rms
-from sim.accuracy.stand import EXACT, POSTURES, Stand, biases, collected, samples, solved, stand
-from sim.accuracy.tables import SECTIONS, Claim, report
+from sim.accuracy.stand import EXACT, POSTURES, Stand, biases, collected, samples, sites, solved, stand
+from sim.accuracy.tables import Claim, report
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.earth import Array
 from sim.imu_model import DEG_H, MG, PARTS, ImuModel
@@ -222,10 +224,6 @@ def test_the_simulated_noise_is_what_it_is_called_by_an_independent_package() ->
 
 def test_a_stand_hides_nothing_from_the_estimator() -> None:
     """Of a sensor without noise on its back, upside down, anywhere, the solution is the bias to rounding."""
-    from companion.calibration.allan import noise_profile
-    from companion.calibration.windows import ImuInput
-    from sim.accuracy.stand import sites
-
     for number, posture in enumerate(POSTURES):
         standing = stand("white_only", posture, sites()[number % 4], (6, number))
         taken = ImuInput(name="imu", rotation=standing.imu.mounting, profile=noise_profile("icm42688p"))
@@ -285,13 +283,11 @@ def test_the_command_prints_tables_claims_and_one_json_object(
 def test_all_sections_are_made_of_the_same_stands_however_many_processes_share_the_work(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from sim.accuracy import tables
-
     monkeypatch.setattr(tables, "FLOORED", ("icm42688p",))
     monkeypatch.setattr(tables, "NOISE_LSB", (0.5,))
     said: list[str] = []
-    found = report(4, 7, SECTIONS, 1, said.append)
-    assert tuple(found) == SECTIONS
+    found = report(4, 7, cli.SECTIONS, 1, said.append)
+    assert tuple(found) == cli.SECTIONS
     assert len(said) == 3
     assert all(len(line) <= 100 for section in found.values() for line in section.lines)
     assert report(4, 7, ("white",), 2, said.append)["white"].lines == found["white"].lines
