@@ -197,8 +197,8 @@ def table() -> None:
     print(f"\n{'memory (MiB)':52} {'RSS':>6} {'PSS':>6} {'USS':>6} {'most':>6}")
     for words, found in rows.items():
         print(f"{words:52} {found}")
-    most = max(found.most for found in ours.values())
-    print(f"limit {LIMIT_MIB:g} MiB: most {most:.1f} MiB, {'held' if most <= LIMIT_MIB else 'NOT HELD'}")
+    resident = max(found.resident for found in ours.values())
+    print(f"limit {LIMIT_MIB:g} MiB: RSS {resident:.1f} MiB, {'held' if resident <= LIMIT_MIB else 'NOT HELD'}")
 
 
 if __name__ == "__main__":

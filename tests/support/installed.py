@@ -24,11 +24,12 @@ def install(folder: Path, *, bytecode: bool = True) -> dict[str, str]:
     package = folder / "companion"
     shutil.copytree(Path(companion.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
     kept = {name: value for name, value in os.environ.items() if name not in _WOULD_CHANGE_IT}
+    kept |= {"PYTHONPATH": str(folder), "PYTHONSAFEPATH": "1"}  # not from where it is started: that may be a checkout
     if not bytecode:
-        return {**kept, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+        return {**kept, "PYTHONDONTWRITEBYTECODE": "1"}
     if not compileall.compile_dir(package, quiet=1):
         raise RuntimeError(f"{package} cannot be compiled")
-    return {**kept, "PYTHONPATH": str(folder)}
+    return kept
 
 
 _WOULD_CHANGE_IT = frozenset(
