@@ -30,7 +30,7 @@ from companion.protocols.registry import Kind, make_decoder
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
 from companion.samples import ImuSample
-from tests import bench_attitude, bench_learning, bench_reading
+from tests import bench_attitude, bench_learning, bench_reading, bench_start
 from tests.bench_text import against_pynmeagps
 from tests.support.component import FakeVehicle, ScriptedGate
 from tests.support.frames import (
@@ -227,6 +227,7 @@ def main() -> None:
     bench_reading.main()
     bench_learning.table()
     bench_attitude.table()
+    bench_start.main()
 
 
 if __name__ == "__main__":

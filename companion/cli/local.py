@@ -24,6 +24,9 @@ async def run(options: argparse.Namespace) -> int:
     # Where the whole process stands still the watchdog's SIGABRT is the only witness: let it say where that was.
     faulthandler.enable()
     logs.set_up("debug" if options.verbose else config.log.level)
+    from companion.daemon import footprint
+
+    footprint.prepare()
     from companion.daemon import process
 
     await process.run(config, config_path(options))

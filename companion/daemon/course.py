@@ -21,7 +21,7 @@ from companion.calibration.joint import Weighed, weigh
 from companion.calibration.machine import Event, Machine, State
 from companion.calibration.prior import Expectation
 from companion.calibration.request import What
-from companion.calibration.rolling import RollingCollector, Settings, Window
+from companion.calibration.rolling import Settings, Window
 from companion.calibration.site import Whereabouts
 from companion.calibration.solve import Solution, solve_at
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
@@ -40,6 +40,7 @@ from companion.daemon.reboot import Reboot
 from companion.daemon.report import Draft
 from companion.errors import AutopilotError, CalibrationRefusedError, CompanionError
 from companion.physics.units import DEG_H, MG
+from companion.recording.collector import RecordedCollector
 
 logger = logging.getLogger(__name__)
 
@@ -47,6 +48,7 @@ Say = Callable[[Severity, str, Weight], object]
 Stage = Literal["dithering", "writing", "checking", "restarting", "settling", "putting back"]
 
 POLL_S: Final = 0.2
+"""A second that is complete is looked at when it is; so often at what else may change."""
 SAY_WAITING_EVERY_S: Final = 10.0
 READ_ATTEMPTS: Final = 2
 """So often, within one calibration, the autopilot's offsets may fail to be read."""
@@ -62,7 +64,7 @@ class Course:
         self,
         config: Config,
         vehicle: Vehicle,
-        collector: RollingCollector,
+        collector: RecordedCollector,
         imus: Mapping[str, AutopilotImu],
         pusher: Pusher,
         say: Say,
@@ -139,7 +141,11 @@ class Course:
     async def _measure_and_push(self, job: Job, draft: Draft) -> None:
         self._collector.retarget(self._wanted(job.what))
         while True:
-            measured = window = await self._measure(job)
+            self._collector.on_second = job.look_again
+            try:
+                measured = window = await self._measure(job)
+            finally:
+                self._collector.on_second = _nobody
             if await self._pusher.offsets_still_hold():
                 window = await self._refine(measured, job, draft)
                 if window is measured or await self._pusher.offsets_still_hold():
@@ -292,6 +298,10 @@ class Course:
             if job.deadline_s is not None and now_s >= job.deadline_s:
                 raise CalibrationRefusedError(f"not finished in the time given: {job.words}")
             await job.pause(POLL_S)
+
+
+def _nobody() -> None:
+    """Waits for the next second."""
 
 
 def in_words(solution: Solution | None) -> str:

@@ -65,6 +65,10 @@ class Job:
         self._cancelled_by = self._cancelled_by or by
         self._nudge.set()
 
+    def look_again(self) -> None:
+        """What it pauses for may have come: a `pause` under way ends."""
+        self._nudge.set()
+
     def check_cancelled(self) -> None:
         """The safe point.
 
@@ -75,12 +79,13 @@ class Job:
             raise JobCancelledError(f"cancelled by {self._cancelled_by}")
 
     async def pause(self, seconds: float) -> None:
-        """Wait, but not past a cancel.
+        """Wait, but not past a cancel or a `look_again`.
 
         Raises:
             JobCancelledError: somebody cancelled it.
         """
         self.check_cancelled()
+        self._nudge.clear()
         try:
             async with asyncio.timeout(seconds):
                 await self._nudge.wait()

@@ -11,9 +11,10 @@ import logging
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from companion.config import Config
+from companion.daemon import footprint
 from companion.daemon.reload import Reloader
 from companion.daemon.service import Service
 from companion.daemon.supervisor import Supervisor
@@ -21,6 +22,9 @@ from companion.errors import CompanionError
 from companion.links.service_manager import ServiceManager
 
 logger = logging.getLogger(__name__)
+
+SETTLED_AFTER_S: Final = 3.0
+"""By then what is imported only where it is used has been: MQTT, recording, the page."""
 
 
 async def run(config: Config, path: Path) -> None:
@@ -67,9 +71,11 @@ class _Process:
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self._stop, signal.Signals(number).name)
         loop.add_signal_handler(signal.SIGHUP, self._reload_wanted.set)
+        settling = loop.call_later(SETTLED_AFTER_S, footprint.settle)
         try:
             await asyncio.wait([self._work, *beside], return_when=asyncio.FIRST_COMPLETED)
         finally:
+            settling.cancel()
             if not self._work.done() and not self._supervisor.stopping:
                 self._work.cancel()
             await asyncio.wait([self._work])

@@ -14,7 +14,6 @@ import importlib
 import importlib.util
 import logging
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from companion.config import Mqtt
@@ -324,6 +323,9 @@ def _load_library() -> str | None:
         if importlib.util.find_spec("aiomqtt") is None:
             return f"MQTT needs aiomqtt, which is not installed ({INSTALL}); the companion goes on without MQTT"
         importlib.import_module("aiomqtt")
+        # Imported here: it takes as long as all of the links.
+        from importlib.metadata import version
+
         found = version("aiomqtt")
     except Exception as error:  # noqa: BLE001 - whatever a broken installation raises
         return f"aiomqtt cannot be loaded: {error} ({INSTALL}); the companion goes on without MQTT"

@@ -34,7 +34,7 @@ class RecordedCollector(RollingCollector):
         message_of: the autopilot's message that an IMU's samples come in at present; None for one of our own.
     """
 
-    not_state: Final = frozenset({"journal", "windows", "_message_of", "_windows_made"})
+    not_state: Final = frozenset({"journal", "windows", "on_second", "_message_of", "_windows_made"})
 
     def __init__(
         self,
@@ -51,6 +51,9 @@ class RecordedCollector(RollingCollector):
         self.journal = Journal()
         self.windows: deque[tuple[int, Window]] = deque(maxlen=WINDOWS_KEPT)
         """The latest windows of whole stretches, with their numbers."""
+        self.on_second: Callable[[], None] = lambda: None
+        """Called when every source has had its say on a second, from within whatever call brought that about: look
+        later, not there."""
         self._message_of = message_of
         self._windows_made = 0
         super().__init__(
@@ -86,6 +89,12 @@ class RecordedCollector(RollingCollector):
     def _take_heading(self, sample: CompassSample) -> None:
         self.journal.compass(sample)
         super()._take_heading(sample)
+
+    def _evaluate(self) -> None:
+        before = self._next
+        super()._evaluate()
+        if self._next != before:
+            self.on_second()
 
     def set_imu(self, imu: ImuInput) -> None:  # noqa: D102
         if self.journal.queues:
