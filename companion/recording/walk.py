@@ -6,6 +6,7 @@ hundred times faster than what it replays. The records are those of the MCAP spe
 
 from __future__ import annotations
 
+import functools
 import mmap
 import struct
 import zlib
@@ -137,8 +138,12 @@ class Recording:
             if kind == _MESSAGE:
                 if length < _MESSAGE_HEAD.size:
                     raise _DamagedError("damaged: a message is shorter than its head")
-                starts = np.array([at]) if outermost else _chain(data, at)
-                yield self._messages(data, starts)
+                if outermost:
+                    starts = np.array([at])
+                    yield self._messages(bytes(data[at:end]), starts - at)
+                else:
+                    starts = _chain(data, at)
+                    yield self._messages(data, starts)
                 at = int(starts[-1])
                 end = at + _HEAD.size + _HEAD.unpack_from(data, at)[1]
             at += _HEAD.size
@@ -160,7 +165,7 @@ class Recording:
         if outermost:
             raise _DamagedError(f"cut at byte {size}")
 
-    def _messages(self, data: Any, starts: NDArray[np.int64]) -> Messages:
+    def _messages(self, data: bytes, starts: NDArray[np.int64]) -> Messages:
         """Those of the messages that begin there whose topics are known and wanted."""
         numbers = self._number_of[_anywhere(data, "<u2")[starts + _HEAD.size]]
         chosen = numbers >= 0
@@ -170,7 +175,7 @@ class Recording:
         return Messages(
             numbers[chosen],
             _anywhere(data, "<u8")[starts + _LOG_TIME],
-            [bytes(data[begin:end]) for begin, end in zip(begins, ends, strict=True)],
+            [data[begin:end] for begin, end in zip(begins, ends, strict=True)],
         )
 
 
@@ -200,28 +205,39 @@ def _chain(data: bytes, at: int) -> NDArray[np.int64]:
     return np.array(starts, dtype=np.int64)
 
 
+@functools.cache
+def _unpacker() -> tuple[Any, type[Exception]]:
+    """What unpacks chunks.
+
+    Raises:
+        StorageError: it is not installed.
+    """
+    try:
+        import zstandard
+    except ImportError:
+        raise StorageError("a recording needs more than is installed: pip install 'companion[recording]'") from None
+    return zstandard.ZstdDecompressor(), zstandard.ZstdError
+
+
 def _chunk(data: Any, at: int) -> bytes:
     """The records in a chunk, unpacked and checked."""
     _, _, size, crc = _CHUNK_HEAD.unpack_from(data, 0)
     compression, start = _text(data, _CHUNK_HEAD.size)
     (length,) = _LONG.unpack_from(data, start)
-    packed = bytes(data[start + 8 : start + 8 + length])
+    packed = data[start + 8 : start + 8 + length]
     if size > MOST_CHUNK_BYTES:
         raise _DamagedError(f"damaged at byte {at}")
     if compression == "zstd":
+        unpacker, error = _unpacker()
         try:
-            import zstandard
-        except ImportError:
-            raise StorageError("a recording needs more than is installed: pip install 'companion[recording]'") from None
-        try:
-            packed = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-        except zstandard.ZstdError:
+            packed = unpacker.decompress(packed, max_output_size=size)
+        except error:
             raise _DamagedError(f"damaged at byte {at}") from None
     elif compression:
         raise _DamagedError(f"compressed by {compression}, which is not read here")
     if len(packed) != size or (crc and zlib.crc32(packed) != crc):
         raise _DamagedError(f"damaged at byte {at}")
-    return packed
+    return bytes(packed)
 
 
 def _text(data: Any, at: int) -> tuple[str, int]:
