@@ -8,11 +8,10 @@ that only the autopilot can tell: what was written and read back, and with which
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import itertools
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final
 
 import msgspec
@@ -49,6 +48,10 @@ AT_ONCE: Final = 16384
 """Messages that are gathered before they are replayed; half of them samples, they are some seconds of a 1 kHz IMU."""
 FEWEST: Final = 64
 """Reads of one IMU among them for which it is worth while to look at all of them at once."""
+_UNUSABLE: Final = (msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+"""What a handler says of a message that nobody could have written."""
+_raw: Final = msgspec.json.Decoder(topics.RawBytes)
+
 PENDING: Final = 4000
 """Telemetry that nobody has counted yet is remembered so long."""
 
@@ -214,8 +217,11 @@ class Replay:
                 continue
             its = numbers == self._recording.topics.index(topic)
             if np.count_nonzero(its) >= FEWEST:
-                with self._usable(topic):
-                    imus.append(SerialImu(name, decoder, np.flatnonzero(its), itertools.compress(data, its.tolist())))
+                messages = itertools.compress(data, its.tolist())
+                try:
+                    imus.append(SerialImu(name, decoder, np.flatnonzero(its), messages))
+                except _UNUSABLE as error:
+                    raise self._unusable(topic, error) from None
                 others &= ~its
         # Others' readings may pass samples of an IMU that lie between two ends of seconds, whoever looks may not.
         looks = others & ~self._is_of(numbers, topics.SERIAL, topics.IMU, topics.MAVLINK_IN)
@@ -236,24 +242,15 @@ class Replay:
     def _take_samples(self, imus: Sequence[SerialImu], place: int) -> None:
         """Give the collector what has come of these IMUs up to the message at that place."""
         for imu in imus:
-            with self._usable(topics.SERIAL + imu.name):
+            try:
                 if self._collector is not None:
                     imu.collect(self._collector, place)
                 self._collect(imu.name, imu.one_by_one.get(place, ()))
+            except _UNUSABLE as error:
+                raise self._unusable(topics.SERIAL + imu.name, error) from None
 
-    @contextlib.contextmanager
-    def _usable(self, topic: str) -> Iterator[None]:
-        """What cannot be made of a message is one line.
-
-        Raises:
-            StorageError: it is.
-        """
-        try:
-            yield
-        except (msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-            raise StorageError(
-                f"{self._recording.path}: a message on {topic} cannot be used by this version ({error})"
-            ) from None
+    def _unusable(self, topic: str, error: Exception) -> StorageError:
+        return StorageError(f"{self._recording.path}: a message on {topic} cannot be used by this version ({error})")
 
     def _message(self, topic: str, data: bytes) -> None:
         try:
@@ -262,8 +259,10 @@ class Replay:
             handler = self._handlers[topic] = self._handler_of(topic)
         if handler is None or (self._collector is None and topic != topics.STATE):
             return
-        with self._usable(topic):
+        try:
             handler(data)
+        except _UNUSABLE as error:
+            raise self._unusable(topic, error) from None
 
     def _handler_of(self, topic: str) -> Callable[[bytes], None] | None:
         known: dict[str, Callable[[bytes], None]] = {
@@ -321,7 +320,7 @@ class Replay:
         self._link.subscribe(kind.message, take)
 
     def _take_serial(self, name: str, data: bytes) -> None:
-        raw = msgspec.json.decode(data, type=topics.RawBytes)
+        raw = _raw.decode(data)
         self._at(raw.t_s)
         decoder = self._decoders[name]
         if raw.data is None:
@@ -336,7 +335,7 @@ class Replay:
                     collect(self._collector, role, part)
 
     def _take_mavlink(self, data: bytes) -> None:
-        raw = msgspec.json.decode(data, type=topics.RawBytes)
+        raw = _raw.decode(data)
         self._at(raw.t_s)
         if self._config is None or not any(imu.source == "autopilot" for imu in self._config.imu):
             return  # nobody takes a sample from it
