@@ -30,7 +30,7 @@ from companion.protocols.registry import Kind, make_decoder
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
 from companion.samples import ImuSample
-from tests import bench_attitude, bench_learning, bench_reading, bench_start
+from tests import bench_attitude, bench_learning, bench_reading, bench_replay, bench_start
 from tests.bench_text import against_pynmeagps
 from tests.support.component import FakeVehicle, ScriptedGate
 from tests.support.frames import (
@@ -228,6 +228,7 @@ def main() -> None:
     bench_learning.table()
     bench_attitude.table()
     bench_start.main()
+    bench_replay.main()
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from companion.calibration.allan import noise_profile
 from companion.calibration.coverage import Kept, coverage
 from companion.calibration.profile_fit import fit_profile
 from companion.calibration.rest import Rests, rests
-from companion.replay.csv_log import read_arrays
+from companion.replay.csv_columns import read_arrays
 from tests.support.made_noise import DEG_H, adis16405, write_csv
 
 SECONDS: Final = 10080

@@ -95,12 +95,12 @@ class Source:
 
     def settled(self, slots: Sequence[int]) -> list[Batch]:
         """Its batches of these seconds that do not follow a movement any more."""
-        batches = self.batches.batches
-        return [batches[slot] for slot in slots if slot in batches and slot not in self.unsettled]
+        batches, unsettled = self.batches.batches, frozenset(self.unsettled)
+        return [batches[slot] for slot in slots if slot in batches and slot not in unsettled]
 
     def lacks(self, slots: Sequence[int], needed: int, left_s: int) -> str | None:
         """What its mean over these seconds and the next `left_s` has to wait for, after a movement; else None."""
-        unsettled = sum(slot in self.unsettled for slot in slots)
+        unsettled = sum(slot in self.unsettled for slot in slots) if self.unsettled else 0
         needed -= len(slots) - unsettled
         if self.settling is None or unsettled == 0 or needed <= 0 or self.settling.left_s + needed <= left_s:
             return None

@@ -170,7 +170,8 @@ def _lines(result: Result) -> list[str]:
 
 def _replay_csv(options: argparse.Namespace) -> int:
     from companion.config.sections import Profile
-    from companion.replay.csv_log import PoseGiven, estimate, read
+    from companion.replay.csv_columns import read
+    from companion.replay.csv_log import PoseGiven, estimate
     from companion.rotations import ROTATIONS_DEG
 
     if options.mounting not in ROTATIONS_DEG:

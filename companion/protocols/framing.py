@@ -81,7 +81,8 @@ class FrameDecoder(Decoder):
         before = len(self._chunks)
         chunk_ends = np.concatenate(([end for end, _ in self._chunks], self._received + np.cumsum(lengths))).astype(int)
         chunk_s = np.concatenate(([t_s for _, t_s in self._chunks], read_at_s))
-        chunk = np.searchsorted(chunk_ends, ends)
+        # Nearly always every read was one frame.
+        chunk = np.arange(len(ends)) if np.array_equal(chunk_ends, ends) else np.searchsorted(chunk_ends, ends)
         came_s = chunk_s[chunk] - self.seconds_per_byte * (chunk_ends[chunk] - ends)
         arrival_s = came_s - frames.frame_bytes * self.seconds_per_byte
         times = self.times.place_many(arrival_s, chunk_s[chunk], frames.device_s)

@@ -9,7 +9,9 @@ from __future__ import annotations
 import mmap
 import struct
 import zlib
+from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +33,9 @@ _LENGTH: Final = struct.Struct("<I")
 _LONG: Final = struct.Struct("<Q")
 MOST_CHUNK_BYTES: Final = 64 * 1024 * 1024
 """A chunk that claims more than this is damaged: ours have a state of some MB at most."""
+
+CHUNKS_AHEAD: Final = 4
+"""Unpacked before they are asked for; a chunk is a second or less."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,49 +123,65 @@ class Recording:
         """
         self._wanted = wanted or (lambda topic: True)
         try:
-            yield from self._records(memoryview(self._data), len(MAGIC), outermost=True)
+            yield from self._file(memoryview(self._data))
         except (_DamagedError, struct.error, UnicodeDecodeError) as error:
             self.cut_short = str(error)
 
-    def _records(self, data: Any, at: int, *, outermost: bool) -> Iterator[Messages | Metadata | Attachment]:
-        size = len(data)
-        if size < at:
-            raise _DamagedError(f"cut in its first {at} bytes")
+    def _file(self, data: memoryview) -> Iterator[Messages | Metadata | Attachment]:
+        """What is in a file; a thread unpacks the next chunks meanwhile, which needs no interpreter."""
+        records, damage = _outermost(data), None
+        waiting: deque[tuple[int, int, int, Future[bytes] | None]] = deque()
+        with ThreadPoolExecutor(max_workers=1) as thread:
+            while True:
+                while damage is None and len(waiting) < CHUNKS_AHEAD:
+                    try:
+                        kind, at, end = next(records)
+                    except (StopIteration, _DamagedError) as error:
+                        damage = error
+                        break
+                    chunk = thread.submit(_chunk, data[at:end], at) if kind == _CHUNK else None
+                    waiting.append((kind, at, end, chunk))
+                if not waiting:
+                    break
+                kind, at, end, chunk = waiting.popleft()
+                if chunk is not None:
+                    yield from self._chunk(chunk.result())
+                elif kind == _MESSAGE:
+                    yield self._messages(bytes(data[at - _HEAD.size : end]), np.zeros(1, dtype=np.int64))
+                else:
+                    yield from self._other(data, kind, at)
+        if isinstance(damage, _DamagedError):
+            raise damage
+
+    def _chunk(self, data: bytes) -> Iterator[Messages | Metadata | Attachment]:
+        """What is in a chunk."""
+        at, size = 0, len(data)
         while at < size:
-            if size - at < _HEAD.size:
-                raise _DamagedError(f"cut at byte {size}")
-            kind, length = _HEAD.unpack_from(data, at)
-            end = at + _HEAD.size + length
-            if kind == 0 or end > size:
-                at += _HEAD.size
-                raise _DamagedError(f"cut at byte {size}" if kind else f"nothing but zeros from byte {at} on")
+            kind, at, end = _record(data, at)
             if kind == _MESSAGE:
-                if length < _MESSAGE_HEAD.size:
-                    raise _DamagedError("damaged: a message is shorter than its head")
-                starts = np.array([at]) if outermost else _chain(data, at)
+                starts = _chain(data, at - _HEAD.size)
                 yield self._messages(data, starts)
-                at = int(starts[-1])
-                end = at + _HEAD.size + _HEAD.unpack_from(data, at)[1]
-            at += _HEAD.size
-            if kind == _CHUNK and outermost:
-                yield from self._records(_chunk(data[at:end], at), 0, outermost=False)
-            elif kind == _CHANNEL:
-                number = int.from_bytes(data[at : at + 2], "little")
-                topic = _text(data, at + 4)[0]
-                if topic not in self.topics:
-                    self.topics.append(topic)
-                self._number_of[number] = self.topics.index(topic) if self._wanted(topic) else -1
-            elif kind == _METADATA:
-                yield _metadata(data, at)
-            elif kind == _ATTACHMENT:
-                yield _attachment(data, at)
+                _, _, end = _record(data, int(starts[-1]))
             elif kind == _DATA_END:
                 return
+            else:
+                yield from self._other(data, kind, at)
             at = end
-        if outermost:
-            raise _DamagedError(f"cut at byte {size}")
 
-    def _messages(self, data: Any, starts: NDArray[np.int64]) -> Messages:
+    def _other(self, data: Any, kind: int, at: int) -> Iterator[Metadata | Attachment]:
+        """What a record that is neither message nor chunk has in it."""
+        if kind == _CHANNEL:
+            number = int.from_bytes(data[at : at + 2], "little")
+            topic = _text(data, at + 4)[0]
+            if topic not in self.topics:
+                self.topics.append(topic)
+            self._number_of[number] = self.topics.index(topic) if self._wanted(topic) else -1
+        elif kind == _METADATA:
+            yield _metadata(data, at)
+        elif kind == _ATTACHMENT:
+            yield _attachment(data, at)
+
+    def _messages(self, data: bytes, starts: NDArray[np.int64]) -> Messages:
         """Those of the messages that begin there whose topics are known and wanted."""
         numbers = self._number_of[_anywhere(data, "<u2")[starts + _HEAD.size]]
         chosen = numbers >= 0
@@ -170,8 +191,35 @@ class Recording:
         return Messages(
             numbers[chosen],
             _anywhere(data, "<u8")[starts + _LOG_TIME],
-            [bytes(data[begin:end]) for begin, end in zip(begins, ends, strict=True)],
+            [data[begin:end] for begin, end in zip(begins, ends, strict=True)],
         )
+
+
+def _record(data: Any, at: int) -> tuple[int, int, int]:
+    """The record that begins at `at`: its kind, where its content begins, where it ends."""
+    size = len(data)
+    if size - at < _HEAD.size:
+        raise _DamagedError(f"cut at byte {size}")
+    kind, length = _HEAD.unpack_from(data, at)
+    at += _HEAD.size
+    if kind == 0 or at + length > size:
+        raise _DamagedError(f"cut at byte {size}" if kind else f"nothing but zeros from byte {at} on")
+    if kind == _MESSAGE and length < _MESSAGE_HEAD.size:
+        raise _DamagedError("damaged: a message is shorter than its head")
+    return kind, at, at + length
+
+
+def _outermost(data: Any) -> Iterator[tuple[int, int, int]]:
+    """The records of a file, as `_record` gives them, until the end of its data."""
+    at, size = len(MAGIC), len(data)
+    if size < at:
+        raise _DamagedError(f"cut in its first {at} bytes")
+    while at < size:
+        kind, begin, at = _record(data, at)
+        if kind == _DATA_END:
+            return
+        yield kind, begin, at
+    raise _DamagedError(f"cut at byte {size}")
 
 
 def _anywhere(data: Any, kind: str) -> NDArray[Any]:
@@ -205,7 +253,7 @@ def _chunk(data: Any, at: int) -> bytes:
     _, _, size, crc = _CHUNK_HEAD.unpack_from(data, 0)
     compression, start = _text(data, _CHUNK_HEAD.size)
     (length,) = _LONG.unpack_from(data, start)
-    packed = bytes(data[start + 8 : start + 8 + length])
+    packed = data[start + 8 : start + 8 + length]
     if size > MOST_CHUNK_BYTES:
         raise _DamagedError(f"damaged at byte {at}")
     if compression == "zstd":
@@ -221,7 +269,7 @@ def _chunk(data: Any, at: int) -> bytes:
         raise _DamagedError(f"compressed by {compression}, which is not read here")
     if len(packed) != size or (crc and zlib.crc32(packed) != crc):
         raise _DamagedError(f"damaged at byte {at}")
-    return packed
+    return bytes(packed)
 
 
 def _text(data: Any, at: int) -> tuple[str, int]:

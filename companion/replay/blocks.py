@@ -65,7 +65,8 @@ class SerialImu:
         self.last_s = raws[-1].t_s
         reads, times = [raw.data for raw in raws], [raw.t_s for raw in raws]
         start = 0
-        for gap in [*(index for index, data in enumerate(reads) if data is None), len(reads)]:
+        gaps = [index for index, data in enumerate(reads) if data is None] if None in reads else []
+        for gap in [*gaps, len(reads)]:
             self._decode(reads[start:gap], times[start:gap], start)  # type: ignore[arg-type] # None only at a gap
             if gap < len(reads):
                 decoder.interrupted()

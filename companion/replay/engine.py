@@ -8,24 +8,21 @@ that only the autopilot can tell: what was written and read back, and with which
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import itertools
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.autopilot import imu_messages
 from companion.autopilot.imu_calibration import ImuCalibration
-from companion.autopilot.imu_messages import ImuMessage, Reading
 from companion.calibration.joint import weigh
-from companion.calibration.prior import Expectation
 from companion.calibration.measurement import Measurement
-from companion.calibration.record import AlignmentUsed, ImuRecord, Record, from_json
+from companion.calibration.prior import Expectation
+from companion.calibration.record import AlignmentUsed, Record, from_json
 from companion.calibration.request import What
 from companion.calibration.rolling import RollingCollector, Window
 from companion.calibration.site import Whereabouts
@@ -38,22 +35,27 @@ from companion.daemon.plan import whole_of
 from companion.daemon.report import Draft
 from companion.daemon.serial_devices import Role, collect, parts_of, serial_devices
 from companion.errors import CalibrationRefusedError, StorageError
-from companion.links.mavlink import MavlinkLink
 from companion.physics.frames import Array
 from companion.protocols.base import Decoder
 from companion.recording import state, topics
 from companion.recording.files import versions
 from companion.recording.walk import Attachment, Messages, Metadata, Recording
+from companion.replay.again import record_again, refined_window
 from companion.replay.blocks import SerialImu
 from companion.replay.compare import Difference, differences
-from companion.samples import ImuSample, Sample
+from companion.replay.telemetry import Telemetry
+from companion.samples import Sample
 
 AT_ONCE: Final = 16384
 """Messages that are gathered before they are replayed; half of them samples, they are some seconds of a 1 kHz IMU."""
 FEWEST: Final = 64
 """Reads of one IMU among them for which it is worth while to look at all of them at once."""
-PENDING: Final = 4000
-"""Telemetry that nobody has counted yet is remembered so long."""
+_UNUSABLE: Final = (msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+"""What a handler says of a message that nobody could have written."""
+_raw: Final = msgspec.json.Decoder(topics.RawBytes)
+
+WINDOWS_KEPT: Final = 4000
+"""Means that were taken, for a calibration that may come of them."""
 
 
 class Replayed(msgspec.Struct, frozen=True):
@@ -108,8 +110,7 @@ class Replay:
         self._decoders: dict[str, Decoder] = {}
         self._roles: dict[str, tuple[Role, ...]] = {}
         """Of each device, by the name that its bytes have."""
-        self._link = MavlinkLink()
-        self._pending: dict[str, deque[tuple[float, Reading]]] = {}
+        self._telemetry = Telemetry(b"", 0.0)
         self._windows: dict[int, Window | Measurement | CalibrationRefusedError] = {}
         self._where = Whereabouts()
         self._offsets: dict[str, ImuCalibration | None] = {}
@@ -211,14 +212,17 @@ class Replay:
             return
         imus: list[SerialImu] = []
         others = np.ones(len(data), dtype=np.bool_)
-        for name, decoder in self._decoders.items() if self._in_blocks else ():
+        for name, roles in self._roles.items() if self._in_blocks else ():
             topic = topics.SERIAL + name
-            if topic not in self._recording.topics or [role.kind for role in self._roles[name]] != ["imu"]:
+            if topic not in self._recording.topics or [role.kind for role in roles] != ["imu"]:
                 continue
             its = numbers == self._recording.topics.index(topic)
             if np.count_nonzero(its) >= FEWEST:
-                with self._usable(topic):
-                    imus.append(SerialImu(name, decoder, np.flatnonzero(its), itertools.compress(data, its.tolist())))
+                messages = itertools.compress(data, its.tolist())
+                try:
+                    imus.append(SerialImu(name, self._decoders[name], np.flatnonzero(its), messages))
+                except _UNUSABLE as error:
+                    raise self._unusable(topic, error) from None
                 others &= ~its
         # Others' readings may pass samples of an IMU that lie between two ends of seconds, whoever looks may not.
         looks = others & ~self._is_of(numbers, topics.SERIAL, topics.IMU, topics.MAVLINK_IN)
@@ -239,24 +243,15 @@ class Replay:
     def _take_samples(self, imus: Sequence[SerialImu], place: int) -> None:
         """Give the collector what has come of these IMUs up to the message at that place."""
         for imu in imus:
-            with self._usable(topics.SERIAL + imu.name):
+            try:
                 if self._collector is not None:
                     imu.collect(self._collector, place)
                 self._collect(imu.name, imu.one_by_one.get(place, ()))
+            except _UNUSABLE as error:
+                raise self._unusable(topics.SERIAL + imu.name, error) from None
 
-    @contextlib.contextmanager
-    def _usable(self, topic: str) -> Iterator[None]:
-        """What cannot be made of a message is one line.
-
-        Raises:
-            StorageError: it is.
-        """
-        try:
-            yield
-        except (msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-            raise StorageError(
-                f"{self._recording.path}: a message on {topic} cannot be used by this version ({error})"
-            ) from None
+    def _unusable(self, topic: str, error: Exception) -> StorageError:
+        return StorageError(f"{self._recording.path}: a message on {topic} cannot be used by this version ({error})")
 
     def _message(self, topic: str, data: bytes) -> None:
         try:
@@ -265,8 +260,10 @@ class Replay:
             handler = self._handlers[topic] = self._handler_of(topic)
         if handler is None or (self._collector is None and topic != topics.STATE):
             return
-        with self._usable(topic):
+        try:
             handler(data)
+        except _UNUSABLE as error:
+            raise self._unusable(topic, error) from None
 
     def _handler_of(self, topic: str) -> Callable[[bytes], None] | None:
         known: dict[str, Callable[[bytes], None]] = {
@@ -304,27 +301,13 @@ class Replay:
         self._collector, self._decoders = known.collector, known.decoders
         self._windows.update(known.windows)
         self._where, self._offsets = known.where, known.offsets
-        self._link = MavlinkLink()
-        self._pending = {}
-        for each in {*sum(imu_messages.ARDUPILOT.values(), ()), *sum(imu_messages.PX4.values(), ())}:
-            self._listen(each)
-        self._link.receive(known.mavlink, entry.t_s)
+        self._telemetry = Telemetry(known.mavlink, entry.t_s)
         self._solution, self._no_solution = None, "it was measured before this part of the recording"
         if known.solved is not None:
             self._solve(known.solved)
 
-    def _listen(self, kind: ImuMessage) -> None:
-        pending = self._pending[kind.kind.message] = deque(maxlen=PENDING)
-
-        def take(message: Any, t_s: float) -> None:
-            reading = kind.decode(message)
-            if isinstance(reading, Reading):
-                pending.append((t_s, reading))
-
-        self._link.subscribe(kind.message, take)
-
     def _take_serial(self, name: str, data: bytes) -> None:
-        raw = msgspec.json.decode(data, type=topics.RawBytes)
+        raw = _raw.decode(data)
         self._at(raw.t_s)
         decoder = self._decoders[name]
         if raw.data is None:
@@ -339,35 +322,17 @@ class Replay:
                     collect(self._collector, role, part)
 
     def _take_mavlink(self, data: bytes) -> None:
-        raw = msgspec.json.decode(data, type=topics.RawBytes)
+        raw = _raw.decode(data)
         self._at(raw.t_s)
         if self._config is None or not any(imu.source == "autopilot" for imu in self._config.imu):
             return  # nobody takes a sample from it
-        if raw.data is None:
-            self._link.attach(None)
-        else:
-            self._link.receive(raw.data, raw.t_s)
+        self._telemetry.receive(raw.data, raw.t_s)
 
     def _take_telemetry(self, name: str, data: bytes) -> None:
-        """A sample of the autopilot that counted: find its message among those received, and take that."""
-        entry = msgspec.json.decode(data, type=topics.ImuEntry)
-        pending = self._pending.get(entry.message or "")
-        while pending:
-            t_s, reading = pending.popleft()
-            if reading.t_device_s == entry.t_device_s:
-                sample = ImuSample(
-                    t_s, reading.gyro_rad_s, reading.accel_m_s2, entry.temperature_degc, None, reading.t_device_s
-                )
-                # As the recording wrote it.
-                again = msgspec.json.decode(topics.imu_json(sample, entry.message), type=topics.ImuEntry)
-                if again != entry:
-                    self._strange[f"imu {name}: a sample does not decode as it did"] += 1
-                break
-        else:
-            self._strange[f"imu {name}: a sample is not in the MAVLink bytes"] += 1
-            sample = ImuSample(
-                entry.t_s, entry.gyro_rad_s, entry.accel_m_s2, entry.temperature_degc, None, entry.t_device_s
-            )
+        """A sample of the autopilot that counted."""
+        sample, strange = self._telemetry.sample(msgspec.json.decode(data, type=topics.ImuEntry))
+        if strange is not None:
+            self._strange[f"imu {name}: {strange}"] += 1
         if self._collector is not None:
             self._collector.add_imu(name, sample)
 
@@ -388,7 +353,7 @@ class Replay:
                     self._windows[detail] = collector.measurement(entry.t_s)
                 except CalibrationRefusedError as error:
                     self._windows[detail] = error
-                while len(self._windows) > PENDING:
+                while len(self._windows) > WINDOWS_KEPT:
                     del self._windows[next(iter(self._windows))]
             case "reset":
                 collector.reset(*detail)
@@ -423,7 +388,7 @@ class Replay:
                 raise window
             if isinstance(window, Measurement):
                 window = window.window()
-            solution = self._solved(_refined(window, detail["refined"]), What[detail["what"]])
+            solution = self._solved(refined_window(window, detail["refined"]), What[detail["what"]])
             whole = {found.name: self._whole(found) for found in solution.imus}
             self._solution = weigh(solution, whole, detail.get("expectation") or Expectation()).solution
         except CalibrationRefusedError as error:
@@ -450,38 +415,13 @@ class Replay:
             # It ended before anything was worked out; there is nothing to recompute.
             self._calibrations.append(Replayed(recorded, [], "it ended before anything was worked out"))
         elif solution is not None:
-            again = self._again(recorded, solution)
+            again = record_again(recorded, solution, self._solved_with)
             self._calibrations.append(Replayed(again, differences(recorded, again), None))
         elif why.startswith("refused here"):
             gone = msgspec.structs.replace(recorded, state="failed", reason=why, pose=None, site=None, imus=())
             self._calibrations.append(Replayed(gone, differences(recorded, gone), None))
         else:
             self._calibrations.append(Replayed(recorded, [], why))
-
-    def _again(self, recorded: Record, solution: Solution) -> Record:
-        """The recomputed record; what no recording can tell anew is the recorded one's."""
-        draft = Draft(datetime.datetime.fromtimestamp(0.0, tz=datetime.UTC), recorded.system_id, solution)
-        corrected = {imu.name for imu in recorded.imus if imu.residual_gyro_rad_s or imu.residual_accel_m_s2}
-        for found in solution.imus:
-            calibration = self._solved_with.get(found.name)
-            if calibration is not None and found.name in corrected:
-                draft.whole[found.name] = whole_of(calibration, found)
-        words = in_words(solution)
-        reason = recorded.reason
-        if recorded.state == "done":
-            reason = words + (reason[len(words) :] if reason.startswith(words) else "")
-        again = draft.record(recorded.state, reason, recorded.duration_s)
-        before = {imu.name: imu for imu in recorded.imus}
-        return msgspec.structs.replace(
-            again,
-            started_at=recorded.started_at,
-            alignment=recorded.alignment,
-            # Records of earlier versions have none.
-            cross_covariance=again.cross_covariance if recorded.cross_covariance else (),
-            duration_s=recorded.duration_s,
-            warnings=_with_rest(again.warnings, recorded.warnings),
-            imus=tuple(_imu_again(imu, before.get(imu.name)) for imu in again.imus),
-        )
 
     def _estimate(self) -> Record:
         """What a calibration would have found at the end."""
@@ -498,22 +438,3 @@ class Replay:
             if calibration is not None:
                 draft.whole[found.name] = whole_of(calibration, found)
         return draft.record("done", in_words(draft.solution), seconds)
-
-
-def _refined(window: Window, refined: Window | None) -> Window:
-    """The window with the means that a dither has found."""
-    if refined is None:
-        return window
-    found = {imu.name: imu for imu in refined.imus if imu.dithered}
-    return msgspec.structs.replace(window, imus=tuple(found.get(imu.name, imu) for imu in window.imus))
-
-
-def _with_rest(ours: tuple[str, ...], recorded: tuple[str, ...]) -> tuple[str, ...]:
-    """Our warnings first, as ever; then those that come from the autopilot."""
-    return (*ours, *recorded[len(ours) :])
-
-
-def _imu_again(imu: ImuRecord, recorded: ImuRecord | None) -> ImuRecord:
-    if recorded is None:
-        return imu
-    return msgspec.structs.replace(imu, written=recorded.written, warnings=_with_rest(imu.warnings, recorded.warnings))

@@ -17,7 +17,8 @@ from companion.config import Config, Noise
 from companion.errors import StorageError
 from companion.recording import topics
 from companion.recording.walk import MAGIC, Attachment, Message, Metadata, Recording
-from companion.replay import csv_log
+from companion.replay.csv_columns import read_arrays
+from companion.replay.csv_log import NAME
 
 Floats = NDArray[np.float64]
 
@@ -72,7 +73,7 @@ class StillLog(msgspec.Struct, frozen=True, kw_only=True):
         return [slice(start, end) for start, end in itertools.pairwise(cuts) if end > start]
 
 
-def read_logs(paths: Sequence[Path], columns: str | None = None, csv_name: str = csv_log.NAME) -> list[StillLog]:
+def read_logs(paths: Sequence[Path], columns: str | None = None, csv_name: str = NAME) -> list[StillLog]:
     """All IMUs in all files, one entry for each IMU and session.
 
     Args:
@@ -91,7 +92,7 @@ def read_logs(paths: Sequence[Path], columns: str | None = None, csv_name: str =
         except OSError as error:
             raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
         if head and not MAGIC.startswith(head) and b"\0" not in head:
-            t_s, readings, temperature = csv_log.read_arrays(path, columns)
+            t_s, readings, temperature = read_arrays(path, columns)
             found.append(
                 StillLog(
                     imu=csv_name, files=(path.name,), began_unix_s=None,

@@ -187,3 +187,12 @@ def write_recording(path: Path, *, seconds: float, rate_hz: float = 1000.0, imus
         file.write(list(second))
     file.close()
     return imus * round(seconds * rate_hz)
+
+
+def write_log(path: Path, count: int, rate_hz: float = 100.0) -> None:
+    """A log of so many lines, in SI units, of the same IMU."""
+    device_s, rows = readings(count / rate_hz, rate_hz, 3)
+    with path.open("w", encoding="utf-8") as file:
+        file.write("t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n")
+        for t_s, row in zip(device_s.tolist(), rows.tolist(), strict=True):
+            file.write(f"{t_s:.4f},{','.join([f'{value:.9g}' for value in row])}\n")

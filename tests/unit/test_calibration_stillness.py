@@ -16,7 +16,9 @@ from companion.calibration.stillness import (
     Verdict,
     compass_gate,
     gradienter_gate,
+    lower_quartile,
 )
+from companion.calibration.stretch import Stretch
 from companion.physics.units import DEG, MG
 
 Floats = NDArray[np.float64]
@@ -237,3 +239,21 @@ def test_compass_gate_works_across_north() -> None:
     assert gate.judge(batch_of(np.full((4, 1), 4.0), circle=True)).words == "compass moved by 3.98 deg > 3.00"
     turning = batch_of(np.array([[350.0], [354.0], [358.0], [2.0], [6.0]]), circle=True)
     assert gate.judge(turning).words.startswith("compass 5.")
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6, 7, 30, 59, 60])
+def test_the_lower_quartile_is_numpy_s_to_the_last_bit(count: int) -> None:
+    values = np.square(np.random.default_rng(count).normal(size=(count, 6)))
+    assert lower_quartile(values).tolist() == np.quantile(values, 0.25, axis=0).tolist()
+
+
+def test_steady_seconds_are_those_since_the_last_bad_one_also_after_a_state_that_did_not_count_them() -> None:
+    rng = np.random.default_rng(5)
+    stretch = Stretch(min_good=4, max_slots=12)
+    for slot in range(400):
+        stretch.add(slot, good=bool(rng.random() < 0.93))
+        flags = list(stretch.flags)
+        bad = [place for place, good in enumerate(flags) if not good]
+        assert stretch.steady == len(flags) - 1 - (bad[-1] if bad else -1)
+        if slot % 7 == 0:
+            del stretch._steady

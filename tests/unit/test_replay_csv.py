@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from companion.cli import main as companion
+from companion.replay.csv_columns import read
 from sim.aircraft import Pose, VirtualAircraft
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.scenario import site_at
@@ -208,3 +209,63 @@ def test_out_of_range_angles_are_refused(tmp_path: Path, capsys: pytest.CaptureF
             companion(["replay", str(path), *more])
         assert ended.value.code == 2
         assert "allowed" in capsys.readouterr().err
+
+
+def by_hand(text: str, columns: int) -> list[list[float | None]]:
+    """The numbers of a log in SI units line by line, its remarks left out; an empty field is None."""
+    found: list[list[float | None]] = []
+    for line in text.splitlines()[1:]:
+        fields = [field.strip().strip('"') for field in line.replace(";", ",").split(",")]
+        if line.strip() and not line.startswith("#"):
+            assert len(fields) == columns
+            found.append([float(field) if field else None for field in fields])
+    return found
+
+
+@pytest.mark.parametrize("separator", [",", ";"])
+def test_every_line_is_read_however_it_is_written(tmp_path: Path, separator: str) -> None:
+    """Plain lines are read many at once, others one by one: what comes out is what stands there."""
+    rng = np.random.default_rng(3)
+    lines = [GOOD.strip().replace(",", separator) + separator + "temperature_degc"]
+    for number in range(3000):
+        values = [number * 0.01, *rng.normal(size=6).tolist(), 25.0]
+        fields = [repr(value) for value in values]
+        # Long stretches of plain lines, too.
+        match -1 if 1000 < number < 2000 else rng.integers(0, 100):
+            case 0:
+                fields[3] = f'"{values[3]!r}"'
+            case 1:
+                fields[7] = ""
+            case 2:
+                fields = [f"  {field} " for field in fields]
+            case 3:
+                fields[1] = "+1."
+            case 4:
+                lines.append("# a remark, with 5 words")
+            case 5:
+                lines.append("")
+            case 6:
+                fields[2] = "1e-3"
+        lines.append(separator.join(fields))
+    for end in ("\n", "\r\n"):
+        path, text = tmp_path / "imu.csv", end.join(lines) + end
+        path.write_bytes(text.encode())
+        blocks = list(read(path))
+        found = [
+            [sample.t_s, *sample.gyro_rad_s, *sample.accel_m_s2, sample.temperature_degc]
+            for block in blocks
+            for sample in block.samples()
+        ]
+        assert found == by_hand(text, 8)
+        assert max(map(len, blocks)) > 100
+
+
+@pytest.mark.parametrize("line", ["30.5,0,0,0,0,0", "30.5,0,0,0,0,0,-9.8,1", "30.5,0,0,x,0,0,-9.8", "1,0,0,0,0,0,-9.8"])
+def test_a_mistake_far_behind_is_named_with_its_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str
+) -> None:
+    good = [f"{0.001 * number!r},0.0,0.0,0.0,0.0,0.0,-9.8" for number in range(30000)]
+    path = tmp_path / "imu.csv"
+    path.write_text(GOOD + "\n".join([*good, line, *good]) + "\n", encoding="utf-8")
+    assert companion(["replay", str(path)]) == 1
+    assert f"{path}, line 30002: " in capsys.readouterr().err

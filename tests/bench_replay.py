@@ -1,0 +1,128 @@
+"""How many IMU samples a second a replay takes, against what reading the same file alone costs.
+
+Recordings of a still aircraft, as a daemon would have written them, and a log of somebody's own. Beside each, in the
+same run: the MCAP library that reads every message of the file and does nothing with it, or `numpy.loadtxt` for the
+log. Times are the best of several rounds, in processor time and on the wall; a ratio says the same on every machine.
+
+Part of `make bench` with a tenth of the samples; by itself, with a million in each: python -m tests.bench_replay
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from mcap.reader import make_reader
+
+from companion.recording.walk import Messages, Recording
+from companion.replay.csv_columns import read
+from companion.replay.csv_log import PoseGiven, estimate
+from companion.replay.engine import Replay
+from tests.support.long_recordings import write_log, write_recording
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+ROUNDS: Final = 3
+MILLION: Final = 1_000_000
+_LIVE_S: Final = 60.0
+
+
+def best_s(work: Callable[[], object], rounds: int = ROUNDS) -> tuple[float, float]:
+    """Processor and wall time of one call, the best of several."""
+    cpu_s = wall_s = float("inf")
+    for _ in range(rounds):
+        start_cpu_s, start_wall_s = time.process_time(), time.perf_counter()
+        work()
+        cpu_s = min(cpu_s, time.process_time() - start_cpu_s)
+        wall_s = min(wall_s, time.perf_counter() - start_wall_s)
+    return cpu_s, wall_s
+
+
+def _by_the_library(path: Path) -> int:
+    with path.open("rb") as file:
+        return sum(1 for _ in make_reader(file).iter_messages(log_time_order=False))
+
+
+def _walked(path: Path) -> int:
+    return sum(len(item.data) for item in Recording(path).runs() if isinstance(item, Messages))
+
+
+def _replayed(path: Path, *, in_blocks: bool = True) -> None:
+    result = Replay(Recording(path), in_blocks=in_blocks).run()
+    assert result.estimate is not None
+    assert result.estimate.state == "done", result.estimate.reason
+
+
+def _estimated(path: Path) -> None:
+    record = estimate(read(path), PoseGiven(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0, latitude_deg=40.0))
+    assert record.state == "done", record.reason
+
+
+def _line(words: str, samples: int, took_s: tuple[float, float]) -> None:
+    cpu_s, wall_s = took_s
+    rate, per_million = samples / cpu_s, MILLION / samples
+    print(f"  {words:56} {rate:11,.0f} {per_million * cpu_s:8.2f} {per_million * wall_s:8.2f}")
+
+
+def _recordings(folder: Path, samples: int) -> None:
+    kinds: tuple[tuple[str, dict[str, Any]], ...] = (
+        ("one serial IMU at 1 kHz, a read a frame", {"seconds": samples / 1000.0}),
+        ("the same, read every 16 ms as by a USB adapter", {"seconds": samples / 1000.0, "read_s": 0.016}),
+        ("two serial IMUs at 500 Hz", {"seconds": samples / 1000.0, "rate_hz": 500.0, "imus": 2}),
+        ("one serial IMU at 200 Hz", {"seconds": samples / 200.0, "rate_hz": 200.0}),
+    )
+    for number, (words, kind) in enumerate(kinds):
+        path = folder / f"{number}.mcap"
+        count = write_recording(path, **kind)
+        _line(f"{words}: replayed", count, best_s(partial(_replayed, path)))
+        if number == 0:
+            _line("  the same, every message walked over only", count, best_s(partial(_walked, path)))
+            _line("  the same, read with the mcap library only", count, best_s(partial(_by_the_library, path), 1))
+            _line("  the same, replayed one by one", count, best_s(partial(_replayed, path, in_blocks=False), 1))
+        path.unlink()
+
+
+def _log(folder: Path, samples: int) -> None:
+    path = folder / "imu.csv"
+    write_log(path, samples)
+    _line("a log of text at 100 Hz (2.8 h a million): replayed", samples, best_s(partial(_estimated, path)))
+    _line("  the same, numpy.loadtxt only", samples, best_s(lambda: np.loadtxt(path, delimiter=",", skiprows=1)))
+
+
+async def _live(folder: Path) -> None:
+    async with Rig(folder, own_imu=True, recordings_mb=64).running() as rig:
+        await rig.ready()
+        await asyncio.sleep(_LIVE_S)
+
+
+def main(samples: int = MILLION // 10) -> None:
+    """Print the table."""
+    print(f"\nreplay, {samples:,} IMU samples in each:")
+    print(f"  {'':56} {'samples/s':>11} {'s/million':>8} {'wall':>7}")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        _recordings(folder, samples)
+        _log(folder, samples)
+        run_virtual(_live(folder / "live"))
+        path = folder / "live" / "recordings" / "000001.mcap"
+        count = sum(
+            len(item.data)
+            for item in Recording(path).runs(lambda topic: topic.startswith("/imu/"))
+            if isinstance(item, Messages)
+        )
+        _line(
+            "200 Hz serial and the autopilot's 100 Hz: replayed", count, best_s(lambda: Replay(Recording(path)).run())
+        )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--samples", type=int, default=MILLION)
+    main(parser.parse_args().samples)
