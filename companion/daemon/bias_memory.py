@@ -25,7 +25,7 @@ from companion.calibration.joint import Whole, points
 from companion.calibration.pose_effect import pose_effect
 from companion.calibration.prior import Expectation, ExpectedImu, Now, expect, expect_today
 from companion.calibration.solve import ImuSolution, Shared, Solution
-from companion.config import Config
+from companion.config import Config, Noise
 from companion.daemon.alignment import AlignmentInForce
 from companion.daemon.autopilot_imu import AutopilotImu
 from companion.daemon.ledger import Offload
@@ -254,7 +254,8 @@ class BiasMemory:
 
     def _identity(self, name: str) -> dict[str, str]:
         source = self._sources[name]
-        found: dict[str, str] = {"source": source.source, "profile": source.profile or "unknown"}
+        profile = source.profile.name if isinstance(source.profile, Noise) else source.profile
+        found: dict[str, str] = {"source": source.source, "profile": profile or "unknown"}
         if source.source == "serial":
             return {**found, "protocol": source.protocol or "", "mounting": _plain(source.mounting)}
         calibration = self._imus[name].calibration if name in self._imus else None
