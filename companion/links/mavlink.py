@@ -14,6 +14,8 @@ from typing import Literal, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.links.mavlink_frames import Codec, kind_at, read
+
 logger = logging.getLogger(__name__)
 
 Message = mavlink.MAVLink_message
@@ -44,9 +46,10 @@ class MavlinkLink:
         self.last_received_s: float | None = None
         self.tap: Callable[[Direction, bytes | None, float | None], object] | None = None
         """Called with (direction, bytes, time of arrival); without bytes: some are missing here."""
-        self._codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+        self._codec: Codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._codec.robust_parsing = True
         self._transmit: Callable[[bytes], object] | None = None
+        self._attached = 0
         self._handlers: dict[str, list[Handler[mavlink.MAVLink_message]]] = {}
 
     @property
@@ -74,6 +77,7 @@ class MavlinkLink:
         A `transmit` that returns False has dropped the bytes because its buffer is full.
         """
         self._transmit = transmit
+        self._attached += 1
         self._forget_received()
         if self.tap is not None:
             self.tap("in", None, None)
@@ -108,6 +112,12 @@ class MavlinkLink:
         """Take bytes that arrived at `t_s` (monotonic); never raises, whatever they are."""
         if self.tap is not None:
             self.tap("in", data, t_s)
+        if self._codec.buf:
+            data = self.half_received + data
+            self._forget_received()
+        data = self._take_whole(data, t_s)
+        if not data:
+            return
         message = self._next_message(data)
         while message is not None:
             self._dispatch(message, t_s)
@@ -117,6 +127,31 @@ class MavlinkLink:
         if self._codec.buf_index > _COMPACT_BYTES:
             del self._codec.buf[: self._codec.buf_index]
             self._codec.buf_index = 0
+
+    def _take_whole(self, data: bytes, t_s: float) -> bytes:
+        """Take the good frames at the front, without looking into those that nobody wants; what is left of the bytes.
+
+        The codec, which knows everything and takes several times as long, gets the rest from the first frame on that is
+        anything special: signed, of version 1, with text or arrays in it for somebody, damaged, cut off.
+        """
+        if self._codec.signing.secret_key is not None:
+            return data
+        at, attached = 0, self._attached
+        while (found := kind_at(data, at)) is not None:
+            kind, end = found
+            name = kind.msgname
+            if self._handlers.get(name):
+                message = read(kind, data, at, end)
+                if message is None:
+                    break
+                self._dispatch(message, t_s)
+                if self._attached != attached:
+                    return b""  # what came over another transport ends here
+            else:
+                self.received[name] += 1
+                self.last_received_s = t_s
+            at = end
+        return data[at:] if at else data
 
     def _next_message(self, data: bytes) -> mavlink.MAVLink_message | None:
         try:
