@@ -99,7 +99,7 @@ class AttitudeEstimator:
         self._history: deque[tuple[float, Quaternion]] = deque()
         self._aligned = False
         self._still_s = 0.0
-        self._still_angle = np.zeros(3)
+        self._still_angle: Triple = (0.0, 0.0, 0.0)
         self._waiting_s = self._missing_s = 0.0
         self._turned_rad: Triple = (0.0, 0.0, 0.0)
         self._settle(settings)
@@ -238,15 +238,18 @@ class AttitudeEstimator:
 
     def _forget_rest(self) -> None:
         self._still_s = 0.0
-        self._still_angle = np.zeros(3)
+        self._still_angle = (0.0, 0.0, 0.0)
 
     def _rest(self, stretch: Stretch) -> None:
-        self._still_s += stretch.span_s
-        self._still_angle += np.asarray(stretch.rate_rad_s) * stretch.span_s
+        span_s = stretch.span_s
+        rx, ry, rz = stretch.rate_rad_s
+        ax, ay, az = self._still_angle
+        self._still_s += span_s
+        self._still_angle = (ax + rx * span_s, ay + ry * span_s, az + rz * span_s)
         if self._still_s < REST_S:
             return
         sensor_from_ned = conjugate(multiply(self._leveller.ned_from_e, stretch.orientation))
-        left = self._still_angle / self._still_s - np.asarray(rotate(sensor_from_ned, self._earth))
+        left = np.asarray(self._still_angle) / self._still_s - np.asarray(rotate(sensor_from_ned, self._earth))
         if np.any(np.abs(left) > REST_SIGMAS * self._uncertainty.rest_sigma(self._still_s)):
             self._forget_rest()
             return
@@ -319,9 +322,8 @@ class AttitudeEstimator:
         return Attitude(t_s, (w, x, y, z), roll, pitch, yaw, rate, self._sigmas(pitch, yaw))
 
     def _sigmas(self, pitch_rad: float, yaw_rad: float) -> Triple:
-        covariance = self._uncertainty.attitude
+        nn, ee, ne, dd = self._uncertainty.attitude_terms
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-        nn, ee, ne = float(covariance[0, 0]), float(covariance[1, 1]), float(covariance[0, 1])
         about_forward = max(c * c * nn + 2.0 * c * s * ne + s * s * ee, 0.0)
         about_right = max(s * s * nn - 2.0 * c * s * ne + c * c * ee, 0.0)
         # Near +-90 degrees of pitch roll and yaw are told apart by nothing; both then may be anything.
@@ -330,5 +332,5 @@ class AttitudeEstimator:
         return (
             math.sqrt(min(about_forward / level, unknown)),
             math.sqrt(min(about_right, unknown)),
-            math.sqrt(min(float(covariance[2, 2]) + about_forward * (1.0 / level - 1.0), unknown)),
+            math.sqrt(min(dd + about_forward * (1.0 / level - 1.0), unknown)),
         )
