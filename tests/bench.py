@@ -30,7 +30,7 @@ from companion.protocols.registry import Kind, make_decoder
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
 from companion.samples import ImuSample
-from tests import bench_attitude, bench_reading
+from tests import bench_attitude, bench_daemon, bench_reading
 from tests.bench_text import against_pynmeagps
 from tests.support.component import FakeVehicle, ScriptedGate
 from tests.support.frames import (
@@ -226,6 +226,7 @@ def main() -> None:
     print(f"a recording of it is replayed {speed:.0f} times as fast as it was made")
     bench_reading.main()
     bench_attitude.table()
+    bench_daemon.table(1, bench_daemon.TABLE_S, "vectornav")
 
 
 if __name__ == "__main__":
