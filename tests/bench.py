@@ -30,7 +30,7 @@ from companion.protocols.registry import Kind, make_decoder
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
 from companion.samples import ImuSample
-from tests import bench_attitude, bench_learning, bench_reading, bench_replay, bench_start
+from tests import bench_attitude, bench_daemon, bench_learning, bench_reading, bench_replay, bench_start
 from tests.bench_text import against_pynmeagps
 from tests.support.component import FakeVehicle, ScriptedGate
 from tests.support.frames import (
@@ -229,6 +229,7 @@ def main() -> None:
     bench_attitude.table()
     bench_start.main()
     bench_replay.main()
+    bench_daemon.table(1, bench_daemon.TABLE_S, "vectornav")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ same: what the daemon asks the autopilot for is sent without being asked, too.
 from __future__ import annotations
 
 import asyncio
+import functools
 import math
 import os
 import select
@@ -50,7 +51,7 @@ STREAMS_HZ: Final[dict[int, float]] = {
 
 OTHERS_HZ: Final[tuple[tuple[mavlink.MAVLink_message, float], ...]] = (
     (mavlink.MAVLink_servo_output_raw_message(1, 0, *[1500] * 8), 10.0),
-    (mavlink.MAVLink_rc_channels_message(1, 16, *[1500] * 18, 200), 5.0),
+    (mavlink.MAVLink_rc_channels_message(1, 16, *([1500] * 18 + [200])), 5.0),
     (mavlink.MAVLink_ahrs2_message(0.05, -0.03, 0.7, 50.0, 400000000, 1160000000), 5.0),
     (mavlink.MAVLink_scaled_pressure_message(1, 1007.3, 0.1, 3200), 5.0),
     (mavlink.MAVLink_nav_controller_output_message(0.1, 0.2, 40, 0, 0, 0.0, 0.0, 0.0), 2.0),
@@ -127,7 +128,7 @@ async def _feed_rest(folder: Path, target: tuple[str, int], pipe: Connection) ->
             channel.set_stream(message_id, 1.0 / rate_hz, loop.time() + 0.0013 * number)
         world.autopilot.wake()
         others = [
-            asyncio.create_task(_repeat(lambda message=message: channel.send(message), rate_hz, 0.0017 * number))
+            asyncio.create_task(_repeat(functools.partial(channel.send, message), rate_hz, 0.0017 * number))
             for number, (message, rate_hz) in enumerate(OTHERS_HZ)
         ]
         pipe.send(None)

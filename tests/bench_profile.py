@@ -21,7 +21,7 @@ from companion.cli import main as companion
 
 PERIOD_S: Final = 0.001
 WITHIN_S: Final = 10.0
-SHOWN: Final = 45
+SHOWN: Final = 70
 _HOUSE: Final = "/companion/"
 
 
@@ -34,6 +34,7 @@ class Sampler:
         self._rooms: Counter[str] = Counter()
         self._lines: Counter[str] = Counter()
         self._roots: Counter[str] = Counter()
+        self._with_called: Counter[str] = Counter()
 
     def begin(self, number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGPROF, self._take)
@@ -54,15 +55,18 @@ class Sampler:
         self._lines[f"{innermost}:{frame.f_lineno}"] += 1
         room, root = "asyncio and the kernel's waiting", ""
         each: FrameType | None = frame
+        seen = set()
         while each is not None:
             _, ours, rest = each.f_code.co_filename.rpartition(_HOUSE)
             if ours and "/cli/" not in each.f_code.co_filename:
                 if not root:
                     room = rest.partition("/")[0]
                 root = _words(each)
+                seen.add(root)
             each = each.f_back
         self._rooms[room] += 1
         self._roots[root or "asyncio"] += 1
+        self._with_called.update(seen)
 
 
 def _words(frame: FrameType) -> str:
@@ -88,16 +92,17 @@ def stop(pid: int, out: Path) -> None:
 def tell(out: Path, share: float) -> None:
     """Print what was counted; `share` of a core in per cent is the whole."""
     found = json.loads(out.read_text())
+    whole = sum(found["_rooms"].values())
     for name, words in (
         ("_rooms", "by room (what it calls outside of ours included)"),
         ("_roots", "by what the event loop called"),
+        ("_with_called", "by function of ours, with what it calls"),
         ("_functions", "by function, itself only"),
         ("_lines", "by line"),
     ):
-        total = sum(found[name].values())
-        print(f"\n{words}; {total} samples:")
+        print(f"\n{words}; {whole} samples:")
         for one, count in list(found[name].items())[:SHOWN]:
-            print(f"  {share * count / total:6.2f} % of a core {100 * count / total:5.1f} %  {one}")
+            print(f"  {share * count / whole:6.2f} % of a core {100 * count / whole:5.1f} %  {one}")
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from typing import Any
 
 import serial
 from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 RATE_HZ = 50.0
 _VECTORNAV = struct.Struct("<Q7f")
@@ -165,7 +166,7 @@ def send(master: Any, attitude: Attitude, counts: Counter[str]) -> None:
         )
         counts["sent"] += 1
         if due_s >= beat_s:
-            master.mav.heartbeat_send(mavutil.mavlink.MAV_TYPE_ONBOARD_CONTROLLER, 8, 0, 0, 4)
+            master.mav.heartbeat_send(mavlink.MAV_TYPE_ONBOARD_CONTROLLER, 8, 0, 0, 4)
             beat_s += 1.0
         due_s += 1.0 / RATE_HZ
         time.sleep(max(due_s - time.monotonic(), 0.0))
@@ -175,7 +176,8 @@ def start(ports: dict[str, tuple[str, int]], imu: str, udp: str) -> Counter[str]
     """Start all threads; what has come and gone is counted in the result."""
     counts: Counter[str] = Counter()
     attitude = Attitude((0.0003, 0.0006, 0.0005))
-    master = mavutil.mavlink_connection(udp, source_system=1, source_component=191)
+    connect: Any = mavutil.mavlink_connection
+    master = connect(udp, source_system=1, source_component=191)
     master.wait_heartbeat()
     kinds = {"imu": VectorNav if imu == "vectornav" else ImuLine, "gradienter": Gradienter, "compass": Compass}
     for name, kind in kinds.items():

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from typing import Final
 
+import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.links.mavlink import Message
@@ -27,8 +28,7 @@ class StreamKind:
     """Whether values are cut toward zero rather than rounded."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Reading:
+class Reading(msgspec.Struct, frozen=True, gc=False):
     """One message in SI units."""
 
     t_device_s: float

@@ -315,8 +315,11 @@ class ImuStream:
     def _on_message(self, message: Message, t_s: float) -> None:
         if not self._vehicle.sent(message):
             return
-        source = next((each for each in self._sources if each.name == message.get_type()), None)
-        if source is None:
+        kind = type(message)
+        for source in self._sources:
+            if source.message.message is kind:
+                break
+        else:
             return
         reading = source.message.decode(message)
         if isinstance(reading, str):
@@ -333,7 +336,8 @@ class ImuStream:
             return
         source.device_s, source.last_s, source.zeros, source.reason = reading.t_device_s, t_s, 0, ""
         source.recent += 1
-        self._arrived.set()
+        if not self._arrived.is_set():
+            self._arrived.set()
         if reading.temperature_degc is not None:
             self._temperature = (reading.temperature_degc, t_s)
         if source is self._current:
@@ -342,16 +346,9 @@ class ImuStream:
     def _hand_on(self, reading: Reading, t_s: float) -> None:
         self.samples += 1
         self.problem = ""
-        temperature = None if self._temperature_is_old(t_s) or self._temperature is None else self._temperature[0]
-        self._on_sample(
-            ImuSample(
-                t_s=t_s,
-                gyro_rad_s=reading.gyro_rad_s,
-                accel_m_s2=reading.accel_m_s2,
-                temperature_degc=temperature,
-                t_device_s=reading.t_device_s,
-            )
-        )
+        known = self._temperature
+        temperature = None if known is None or t_s - known[1] > _TEMPERATURE_AGE_S else known[0]
+        self._on_sample(ImuSample(t_s, reading.gyro_rad_s, reading.accel_m_s2, temperature, None, reading.t_device_s))
 
     def _lose(self, problem: str) -> None:
         self._switch(None)

@@ -193,7 +193,8 @@ class Vehicle:
 
     def sent(self, message: Message) -> bool:
         """Whether a message came from the latched autopilot."""
-        return self._target() == (message.get_srcSystem(), message.get_srcComponent())
+        header = message.get_header()
+        return header.srcComponent == self.component_id and header.srcSystem == self.system_id
 
     def watch(self, callback: Callable[[VehicleEvent], None]) -> Unsubscribe:
         """Be told of events, in the order in which they are seen; returns how to stop that."""

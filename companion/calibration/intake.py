@@ -80,8 +80,18 @@ class Intake(ABC):
 
     def add_many(self, name: str, samples: Sequence[ImuSample]) -> None:
         """Take samples of the IMU of that name, one after the other."""
+        source = self._imus.get(name)
+        if source is None:
+            self.unknown_samples += len(samples)
+            return
+        add, breaks = source.batches.add, self._breaks.get(name, 0)
         for sample in samples:
-            self.add_imu(name, sample)
+            if sample.breaks != breaks:
+                breaks = self._breaks[name] = sample.breaks
+                self._forget(f"imu {name} restarted", name)
+            stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
+            if add(sample.t_s, sample.gyro_rad_s + sample.accel_m_s2, sample.temperature_degc, stamp):
+                self._evaluate()
 
     def add_block(self, name: str, block: ImuBlock, start: int = 0, stop: int | None = None) -> None:
         """Take the samples of a block from `start` up to, without, `stop`: as `add_imu` of each of them."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from companion.autopilot.ekf import EkfWatch
@@ -107,7 +107,7 @@ class Service:
         self.slots = SlotMemory()
         self._imu_rate_hz = models.imu_rate_hz(config) if imu_rate_hz is None else imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
-        self.sensors = [SerialSensor(device, self._take, offload) for device in serial_devices(config)]
+        self.sensors = [SerialSensor(device, self._take, offload, self._take_many) for device in serial_devices(config)]
         self.sensor_watch = SensorWatch(self.sensors, self.collector)
         self.recorder = Recorder(
             config, self.collector, self.link, self.vehicle, self.imus.values(), self.sensors, offload
@@ -314,6 +314,9 @@ class Service:
         reading = collect(self.collector, role, part)
         if reading is not None:
             self.pose.take(reading)
+
+    def _take_many(self, role: Role, samples: Sequence[ImuSample]) -> None:
+        self.collector.add_many(role.name, samples)
 
     async def run(self) -> None:
         """Run until cancelled, reachable on the control socket.

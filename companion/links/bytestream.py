@@ -34,6 +34,8 @@ COLLECT_S = 0.01
 What it brings is stamped that much late at worst, less than what a USB adapter adds that is left as it came. Two of
 them are the 20 ms within which an autopilot takes one heading (autopilots section 6).
 """
+JUDGED_S = 0.1
+"""So often it is looked at whether a stream is still one to be collected: what comes in bunches is no other stream."""
 FULLEST_LINE = 0.9
 """Of a line's time, where its stream may be collected."""
 OUT_BUFFER_BYTES = 16384
@@ -127,8 +129,10 @@ class ByteLink:
         self._on_bytes, self._on_state = on_bytes, on_state
         self._descriptor: int | None = None
         self._reads = 0
-        """Since `_reads_since`, a time and the bytes received by then."""
+        """That brought something since `_reads_since`, a time and the bytes received by then."""
         self._reads_since = (0.0, 0)
+        self._turns = 0
+        """Reads of a stream that is collected, since then too, whether they brought something or not."""
         self._collecting: asyncio.TimerHandle | None = None
         """The next read, while bytes are collected; None: each wakes the loop."""
         self._lost: asyncio.Future[str] | None = None
@@ -212,7 +216,7 @@ class ByteLink:
         if self._opened_before:
             self.reconnects += 1
         self._opened_before = True
-        self._reads, self._reads_since = 0, (loop.time(), self.bytes_received)
+        self._reads, self._turns, self._reads_since = 0, 0, (loop.time(), self.bytes_received)
         loop.add_reader(descriptor, self._readable)
         level = logging.DEBUG if self._quiet else logging.INFO
         logger.log(level, "%s: %s is %s", self.name, self.settings.url, "back" if self._warned else "open")
@@ -222,33 +226,38 @@ class ByteLink:
     def _readable(self) -> None:
         loop = asyncio.get_running_loop()
         now_s = loop.time()
-        if not self._read(now_s) or self._descriptor is None:
+        if not self._read(now_s) or self._descriptor is None or self._paused is not None:
             return
         self._reads += 1
         if self._reads == QUICK_READS:
-            if now_s - self._reads_since[0] < QUICK_READS * QUICK_S and self._fits_the_line(*self._reads_since, now_s):
+            if now_s - self._reads_since[0] < QUICK_READS * QUICK_S and self._fits_the_line(now_s):
                 loop.remove_reader(self._descriptor)
                 self._collecting = loop.call_later(COLLECT_S, self._collected)
-            self._reads, self._reads_since = 0, (now_s, self.bytes_received)
+            self._reads, self._turns, self._reads_since = 0, 0, (now_s, self.bytes_received)
 
     def _collected(self) -> None:
-        """Read what has come in the meantime; when that is nothing, let the next byte wake the loop again."""
+        """Read what has come in the meantime; where that is little, let the next byte wake the loop again."""
         loop = asyncio.get_running_loop()
-        now_s, before = loop.time(), (self.last_byte_s or 0.0, self.bytes_received)
-        came = self._read(now_s)
-        if self._descriptor is None:
+        now_s = loop.time()
+        self._collecting = None
+        self._turns += 1
+        self._reads += self._read(now_s)
+        if self._descriptor is None or self._paused is not None:
             return
-        if came and self._fits_the_line(*before, now_s):
-            self._collecting = loop.call_later(COLLECT_S, self._collected)
-        else:
-            self._collecting, self._reads_since = None, (now_s, self.bytes_received)
-            loop.add_reader(self._descriptor, self._readable)
+        if now_s - self._reads_since[0] >= JUDGED_S:
+            goes_on = 2 * self._reads > self._turns and self._fits_the_line(now_s)
+            self._reads, self._turns, self._reads_since = 0, 0, (now_s, self.bytes_received)
+            if not goes_on:
+                loop.add_reader(self._descriptor, self._readable)
+                return
+        self._collecting = loop.call_later(COLLECT_S, self._collected)
 
-    def _fits_the_line(self, since_s: float, bytes_then: int, now_s: float) -> bool:
-        """Whether the line, as it is set, could have carried what came since then.
+    def _fits_the_line(self, now_s: float) -> bool:
+        """Whether the line, as it is set, could have carried what came since `_reads_since`.
 
         Behind USB the speed may mean nothing, and dating a collected frame by it would put it before the one before it.
         """
+        since_s, bytes_then = self._reads_since
         carried = self.bytes_received - bytes_then
         return carried * self.settings.seconds_per_byte <= FULLEST_LINE * (now_s - since_s)
 
@@ -297,6 +306,7 @@ class ByteLink:
         except OSError:
             pass  # empty, or gone: the reader will find it
         self.on_gap()
+        self._reads, self._turns, self._reads_since = 0, 0, (loop.time(), self.bytes_received)
         loop.add_reader(self._descriptor, self._readable)
 
     def _flush(self) -> None:

@@ -52,6 +52,7 @@ class MavlinkLink:
         self._codec: Codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._codec.robust_parsing = True
         self._transmit: Callable[[bytes], object] | None = None
+        self._attached = 0
         self._handlers: dict[str, list[Handler[mavlink.MAVLink_message]]] = {}
 
     @property
@@ -79,6 +80,7 @@ class MavlinkLink:
         A `transmit` that returns False has dropped the bytes because its buffer is full.
         """
         self._transmit = transmit
+        self._attached += 1
         self._forget_received()
         if self.tap is not None:
             self.tap("in", None, None)
@@ -139,7 +141,7 @@ class MavlinkLink:
         """
         if self.signing is not None:
             return data
-        at = 0
+        at, attached = 0, self._attached
         while (found := kind_at(data, at)) is not None:
             kind, end = found
             name = kind.msgname
@@ -148,6 +150,8 @@ class MavlinkLink:
                 if message is None:
                     break
                 self._dispatch(message, t_s)
+                if self._attached != attached:
+                    return b""  # what came over another transport ends here
             else:
                 self.received[name] += 1
                 self.last_received_s = t_s

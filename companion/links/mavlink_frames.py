@@ -26,6 +26,12 @@ _EXTRA: Final[dict[Kind, bytes]] = {}
 _PLANS: Final[dict[Kind, tuple[struct.Struct, Callable[[Any], tuple[Any, ...]] | None] | None]] = {}
 """How the payload is unpacked and in which order its fields are given; None: it has text or arrays in it."""
 _ZEROS: Final = bytes(256)
+_C_CRC: Final[Callable[[bytes, int], int] | None] = getattr(mavlink, "mcrf4xx", None)
+""""CRC-16/MCRF4XX" in C, where pymavlink has found it."""
+
+
+def _crc(data: bytes) -> int:
+    return mavlink.x25crc(data).crc if _C_CRC is None else _C_CRC(data, 0xFFFF)
 
 
 def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:
@@ -42,7 +48,7 @@ def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:
     extra = _EXTRA.get(kind)
     if extra is None:
         extra = _EXTRA[kind] = bytes((kind.crc_extra,))
-    checksum = mavlink.x25crc(data[at + 1 : end - 2] + extra).crc
+    checksum = _crc(data[at + 1 : end - 2] + extra)
     return (kind, end) if checksum == data[end - 2] | data[end - 1] << 8 else None
 
 

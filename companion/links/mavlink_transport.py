@@ -25,6 +25,9 @@ PEER_SILENCE_S = 10.0
 MAX_PEERS = 8
 """Newcomers beyond these are heard but not answered: a scan of our port must not push out the autopilot."""
 OUT_BUFFER_BYTES = 65536
+MOST_DATAGRAM_BYTES = 65536
+"""UDP carries no more; asyncio makes room for four times that, afresh for every datagram, which costs more than all the
+rest of its reading: so much memory is got from the kernel, and given back, page by page."""
 RESOLVE_DEADLINE_S = 5.0
 """For the host's name; without a network a resolver takes its time."""
 _TURN_S = 1.0
@@ -155,6 +158,8 @@ class _Udp(asyncio.DatagramProtocol):
 
     def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
         self._transport = cast("_DatagramOut", transport)
+        if hasattr(transport, "max_size"):
+            transport.max_size = MOST_DATAGRAM_BYTES
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = None

@@ -241,16 +241,34 @@ class SampleTimes:
         """
         placed: list[Sample] = []
         frame_at_s, frame_t_s = math.nan, math.nan
+        clock = self.clock
         for sample in samples:
             at_s = sample.t_s
             if isinstance(sample, ImuSample):
-                found = self._imu(sample, at_s - frame_s, read_s)
-                if found is None:
+                raw_s, sequence = sample.t_device_s, sample.sequence
+                breaks = clock.restarts + clock.jumps
+                t_s: float | None = at_s - frame_s
+                device_s: float | None = None
+                if raw_s is not None and math.isfinite(raw_s):
+                    t_s = clock.host_s(raw_s, at_s - frame_s)
+                    device_s = clock.device_s
+                    anew, breaks = breaks, clock.restarts + clock.jumps
+                    if sequence is not None:
+                        sequence = self._counted(sequence, breaks > anew)
+                elif sequence is not None:
+                    sequence = self._counted(sequence, False)  # noqa: FBT003
+                if t_s is None:
                     self.dropped[LATE] += 1
                     continue
-                placed.append(found)
+                # `_in_order`, written out.
+                if t_s < self._newest_s <= read_s:
+                    t_s = self._newest_s
+                else:
+                    self._newest_s = t_s
+                gyro, accel, warm = sample.gyro_rad_s, sample.accel_m_s2, sample.temperature_degc
+                placed.append(ImuSample(t_s, gyro, accel, warm, sequence, device_s, breaks))
                 # Whatever else the same frame brought was taken at the same time.
-                frame_at_s, frame_t_s = at_s, found.t_s
+                frame_at_s, frame_t_s = at_s, t_s
             else:
                 t_s = frame_t_s if at_s == frame_at_s else self._in_order(at_s - frame_s, read_s)
                 placed.append(msgspec.structs.replace(sample, t_s=t_s))
@@ -286,27 +304,6 @@ class SampleTimes:
             "clock_jumps": self.clock.jumps,
             "too_late": self.dropped[LATE],
         }
-
-    def _imu(self, sample: ImuSample, arrival_s: float, read_s: float) -> ImuSample | None:
-        clock, raw_s = self.clock, sample.t_device_s
-        breaks = clock.breaks
-        device_s: float | None = None
-        t_s: float | None = arrival_s
-        if raw_s is not None and math.isfinite(raw_s):
-            t_s = clock.host_s(raw_s, arrival_s)
-            device_s = clock.device_s
-        sequence = None if sample.sequence is None else self._counted(sample.sequence, clock.breaks > breaks)
-        if t_s is None:
-            return None
-        return ImuSample(
-            self._in_order(t_s, read_s),
-            sample.gyro_rad_s,
-            sample.accel_m_s2,
-            sample.temperature_degc,
-            sequence,
-            device_s,
-            clock.breaks,
-        )
 
     def _in_order(self, t_s: float, read_s: float) -> float:
         """A device does not sample backwards; what seems so is the line time of bytes that came faster than that."""

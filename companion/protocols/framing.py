@@ -48,7 +48,8 @@ class FrameDecoder(Decoder):
             if end == WAIT:
                 break
             if self.accepted != accepted:
-                self.frame_bytes = end - at
+                # Where it took several, they were alike.
+                self.frame_bytes = (end - at) // (self.accepted - accepted)
             at = end
         self._buffer = buffer[at:]
         while self._chunks and self._chunks[0][0] <= origin + at:
@@ -123,6 +124,7 @@ class FrameDecoder(Decoder):
         """Read what begins at `at`, of which `origin` is the buffer's place in the stream.
 
         Returns where to go on, always further on, or `WAIT`. How much of it has arrived must not change the outcome.
+        Several frames of one length may be taken at once where all of them are accepted.
         """
 
     def _skip_to(self, start: bytes, buffer: bytes, at: int) -> int:

@@ -99,6 +99,9 @@ class VectorNavDecoder(FrameDecoder):
             self.accepted += 1
         except RejectedError as error:
             self.rejected[error.reason] += 1
+            return end
+        if layout.is_plain and end < len(buffer):
+            return self._run(buffer, end, origin, samples, layout)
         return end
 
     def _frames(self, buffer: bytes) -> Frames | None:
@@ -113,6 +116,33 @@ class VectorNavDecoder(FrameDecoder):
 
     def _took(self, frames: Frames) -> None:
         self._layouts[frames.header] = layout_of(frames.header)
+
+    def _run(self, buffer: bytes, at: int, origin: int, samples: list[Sample], layout: Layout) -> int:
+        """Take what comes right behind a plain frame as long as it is one more of them, whole and good.
+
+        Bursts of them are all that a fast IMU sends; here they cost half. Returns where to go on.
+        """
+        size, header, offset = layout.frame_bytes, self._header, layout.payload_offset
+        unpack, crc, check = layout.payload.unpack_from, binascii.crc_hqx, check_imu
+        assert layout.imu is not None
+        (gyro, accel), warm, startup = layout.imu, layout.temperature, layout.time_startup
+        last, before = len(buffer) - size, len(samples)
+        while at <= last and buffer.startswith(header, at):
+            end = at + size
+            if crc(buffer[at + 1 : end], 0) != 0:
+                break
+            values = unpack(buffer, at + offset)
+            rate, force = values[gyro : gyro + 3], values[accel : accel + 3]
+            temperature_degc = None if warm is None else values[warm]
+            try:
+                check(rate, force, temperature_degc)
+            except RejectedError:
+                break  # whoever takes it next will count it
+            t_device_s = None if startup is None else values[startup] / 1e9
+            samples.append(ImuSample(self._time_of(origin + end), rate, force, temperature_degc, None, t_device_s))
+            at = end
+        self.accepted += len(samples) - before
+        return at
 
     def _sentence(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         """Where to go on after what begins with a "$", or `WAIT` for more bytes."""

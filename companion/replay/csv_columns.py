@@ -129,6 +129,8 @@ def read(path: Path, columns: str | None = None) -> Iterator[ImuBlock]:
         path: the file.
         columns: names of the columns, where the file has none of its own.
 
+    A last line that does not end is left out: the log may have been cut there.
+
     Raises:
         StorageError: one line with the number of the line, what was found and what is allowed.
     """
@@ -141,7 +143,9 @@ def read(path: Path, columns: str | None = None) -> Iterator[ImuBlock]:
                 end = data.rfind(b"\n") + 1
                 yield from log.blocks(data[:end])
                 data = data[end:]
-            yield from log.blocks(data)
+            if log.empty:
+                yield from log.blocks(data)
+            # Else the last line may be cut in the middle of a number, which then still looks like one.
     except (OSError, UnicodeDecodeError) as error:
         raise StorageError(f"{path}: cannot be read as text: {getattr(error, 'strerror', None) or error}") from None
     if log.empty:

@@ -168,7 +168,9 @@ class _Course:
             entered = stage.entered[state]
             motion_s = 4.0 if phase == "waiting" else 1.5
             stage.aircraft.add(
-                Handling(start_s=stage.aircraft.time_at(stage.now_s), duration_s=motion_s, seed=stage.chance.randrange(99))
+                Handling(
+                    start_s=stage.aircraft.time_at(stage.now_s), duration_s=motion_s, seed=stage.chance.randrange(99)
+                )
             )
             await asyncio.sleep(0.5)
             self._asked = asyncio.create_task(self._operator.ask(CALIBRATE))
@@ -287,7 +289,9 @@ class _Course:
         result = await self._operator.ask(CALIBRATE, within_s=RECOVERED_WITHIN_S)
         if result != ACCEPTED:
             last = stage.service.conductor.last
-            self._wrong(f"no calibration afterwards: {result}, {last.reason if last else None}; {stage.ground.texts()[-3:]}")
+            self._wrong(
+                f"no calibration afterwards: {result}, {last.reason if last else None}; {stage.ground.texts()[-3:]}"
+            )
             return
         last = stage.service.conductor.last
         assert last is not None

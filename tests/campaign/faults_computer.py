@@ -340,7 +340,10 @@ async def page_deaf(scene: Scene) -> None:
 
 
 def faults() -> list[Fault]:
-    back: dict[str, Any] = {"excused": f"{LOST}|{STILLNESS}|companion stops|daemon's end|interrupted|reboot", "restarts": True}
+    back: dict[str, Any] = {
+        "excused": f"{LOST}|{STILLNESS}|companion stops|daemon's end|interrupted|reboot",
+        "restarts": True,
+    }
     disk: dict[str, Any] = {"excused": DISK, "recordings_mb": 1}
     return [
         Fault("disk-full", "disk", "no space is left", *refuses("full"), names=DISK, **disk),

@@ -202,9 +202,7 @@ def _set_id(scene: Scene, system: int) -> None:
 
 
 def autopilot_faults() -> list[Fault]:
-    write_only: dict[Phase, str] = {
-        phase: "it shows in a write only" for phase in PHASES if phase in ("armed",)
-    }
+    write_only: dict[Phase, str] = {phase: "it shows in a write only" for phase in PHASES if phase in ("armed",)}
     return [
         Fault("reboot", "autopilot", "the autopilot restarts", reboot, names=r"reboot", excused=f"{LOST}|{STILLNESS}"),
         Fault(

@@ -25,12 +25,12 @@ from companion.links.bytestream import ByteLink
 from companion.protocols.dialogue import Dialogue
 from companion.protocols.registry import PROTOCOLS, ProtocolInfo
 from companion.protocols.roles import Part
-from companion.samples import CompassSample, TiltSample
+from companion.samples import CompassSample, ImuSample, TiltSample
 from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import HMR3300
 from sim.pty_device import PtyDevice
 from sim.scenario import site_at
-from tests.support.frames import pni_data, sentence
+from tests.support.frames import pni_data, sentence, vectornav_imu
 from tests.support.virtual_time import run_virtual
 
 LINES = b"40.1, 5.0, -3.0\r\n40.2, 5.1, -3.1\r\n"
@@ -396,3 +396,48 @@ def test_what_a_device_says_against_itself_is_shown() -> None:
         assert {role.status()["warned"]["not calibrated by the user"] for role in sensor.roles} == {1}  # type: ignore[index]
 
     run_virtual(main())
+
+
+def test_a_read_with_nothing_but_readings_of_an_imu_is_handed_on_whole(tmp_path: Path) -> None:
+    """Every sample once, in order, to the role that counts it; a read with anything else in it goes one by one."""
+    text = f"""
+    [mavlink]
+    url = "udpin:127.0.0.1:14550"
+    [[imu]]
+    name = "own"
+    source = "serial"
+    port = "{tmp_path / "imu"}"
+    protocol = "vectornav"
+    """
+    (device,) = serial_devices(parse(text, "companion.toml"))
+
+    async def main() -> None:
+        single: list[tuple[Role, Part]] = []
+        whole: list[tuple[Role, list[ImuSample]]] = []
+        sensor = SerialSensor(
+            device,
+            lambda role, part: single.append((role, part)),
+            take_many=lambda role, samples: whole.append((role, list(samples))),
+        )
+        frames = [vectornav_imu(time_ns=n * 1_000_000) for n in range(7)]
+        sensor.receive(b"".join(frames[:3]), 1.0)
+        sensor.receive(b"", 1.001)
+        sensor.receive(frames[3] + VNYMR + frames[4], 1.002)
+        sensor.receive(b"".join(frames[5:]), 1.004)
+        (role,) = device.roles
+        assert [(by, [sample.t_device_s for sample in samples]) for by, samples in whole] == [
+            (role, [0.0, 0.001, 0.002]),
+            (role, [0.005, 0.006]),
+        ]
+        assert [(by, part.t_device_s) for by, part in single if isinstance(part, ImuSample)] == [
+            (role, 0.003),
+            (role, None),
+            (role, 0.004),
+        ]
+        (status,) = (each.status() for each in sensor.roles)
+        assert status["frames"] == 8
+
+    run_virtual(main())
+
+
+VNYMR = sentence("VNYMR,+010.000,-007.500,+000.500,-0.5,-0.25,+0.75,-01.500,-00.125,-09.750,-00.5,+00.25,-00.125")

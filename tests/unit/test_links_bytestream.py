@@ -24,6 +24,7 @@ import pytest
 from companion.errors import LinkError
 from companion.links import bytestream, serial_port
 from companion.links.backoff import Backoff
+from companion.links.budget import Budget
 from companion.links.bytestream import OUT_BUFFER_BYTES, QUICK_READS, ByteLink, PortSettings
 from companion.links.serial_port import SerialOpener, open_serial
 
@@ -148,6 +149,10 @@ async def collecting(port: Port, pty: Pty) -> None:
     assert reads == QUICK_READS
 
 
+def is_paused(port: Port) -> bool:
+    return port.link._paused is not None
+
+
 def test_a_fast_stream_is_collected_and_a_byte_after_it_wakes_the_loop(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -166,6 +171,52 @@ def test_a_fast_stream_is_collected_and_a_byte_after_it_wakes_the_loop(
                     while port.link._collecting is not None:
                         await asyncio.sleep(0.001)
                 await collecting(port, pty)  # as at the start: each byte by itself
+
+    asyncio.run(main())
+
+
+def test_a_moment_without_bytes_does_not_end_the_collecting(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bytestream, "QUICK_S", 10.0)
+    monkeypatch.setattr(bytestream, "JUDGED_S", 3600.0)
+
+    async def main() -> None:
+        with plugged(path) as pty:
+            async with running(path, FAST) as port:
+                await port.state(connected=True)
+                await collecting(port, pty)
+                turns = port.link._turns
+                async with asyncio.timeout(10):
+                    while port.link._turns < turns + 3:  # nothing came
+                        await asyncio.sleep(0.001)
+                for number in range(5):
+                    os.write(pty.master, bytes([number]))
+                chunk, _ = await asyncio.wait_for(port.chunks.get(), 10)
+                assert chunk == bytes(range(5))
+                assert port.link._collecting is not None
+
+    asyncio.run(main())
+
+
+def test_a_flood_ends_the_collecting_and_the_port_is_read_again_after_it(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bytestream, "QUICK_S", 10.0)
+
+    async def main() -> None:
+        with plugged(path) as pty:
+            async with running(path, FAST) as port:
+                port.link.budget = Budget(bytes_per_s=0.0, burst_bytes=QUICK_READS + 3)
+                await port.state(connected=True)
+                await collecting(port, pty)
+                os.write(pty.master, bytes(10))
+                await port.data(10)
+                assert is_paused(port)
+                assert port.link._collecting is None
+                port.link.budget = Budget()
+                async with asyncio.timeout(10):
+                    while is_paused(port):
+                        await asyncio.sleep(0.001)
+                await collecting(port, pty)
 
     asyncio.run(main())
 

@@ -213,3 +213,30 @@ def test_an_interruption_forgets_the_frame_under_way() -> None:
     decoder.feed(BINARY[20:] + BINARY, 2.0)
     assert decoder.accepted == 1
     assert decoder.rejected["cut short"] == 1
+
+
+@pytest.mark.parametrize("seconds_per_byte", [0.0, 1e-5])
+def test_a_burst_of_frames_is_read_as_one_after_the_other_with_a_bad_one_anywhere(seconds_per_byte: float) -> None:
+    good = [vectornav_imu(time_ns=n * 1_000_000, gyro=(n * 0.125, 0.0, 0.5)) for n in range(1, 13)]
+    broken = bytearray(good[6])
+    broken[20] ^= 1
+    other = vectornav_binary({3: {4: floats(25.0), 9: floats(0.5, 0.25, -9.75), 10: floats(0.25, 0.5, 0.75)}})
+    stream = b"".join(good[:3])
+    stream += vectornav_imu(gyro=(math.nan, 0.0, 0.0)) + b"".join(good[3:6]) + bytes(broken) + b"".join(good[7:9])
+    stream += other + other + good[9] + YMR + b"".join(good[10:]) + good[0][:30]
+    burst, slow = VectorNavDecoder(seconds_per_byte), VectorNavDecoder(seconds_per_byte)
+    at_once = burst.feed(stream, 5.0)
+    singly: list[Sample] = []
+    for place in range(len(stream)):
+        # Every byte comes when the line brings it; the last one when all came above.
+        t_s = 5.0 - seconds_per_byte * (len(stream) - 1 - place)
+        singly += slow.feed(stream[place : place + 1], t_s)
+    assert [sample.t_s for sample in at_once] == pytest.approx([sample.t_s for sample in singly], abs=1e-9)
+    values = [[repr(sample).partition(", ")[2] for sample in found] for found in (at_once, singly)]
+    assert values[0] == values[1]
+    assert len(at_once) == 11 + 2 + 3
+    assert (burst.accepted, burst.rejected, burst.skipped) == (slow.accepted, slow.rejected, slow.skipped)
+    assert burst.frame_bytes == slow.frame_bytes == len(good[0])
+    burst.interrupted()
+    slow.interrupted()
+    assert burst.rejected == slow.rejected

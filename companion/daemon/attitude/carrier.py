@@ -122,7 +122,8 @@ class Carrier:
         self._compass = models.compass_model(config.compass)
         self._local: LocalEarth | None = None
         self._record: ImuRecord | None = None
-        self._recent: deque[ImuSample] = deque()
+        self._recent: deque[Sequence[ImuSample]] = deque()
+        """What came on the ground within `KEPT_S`, read by read."""
         self._wanted = False
         self._checked_s = -math.inf
         self.close = vehicle.watch(self._on_event)
@@ -134,8 +135,8 @@ class Carrier:
         self.heard_s = samples[-1].t_s
         if self.phase == "ground":
             recent = self._recent
-            recent.extend(samples)
-            while recent[0].t_s < self.heard_s - KEPT_S:
+            recent.append(samples)
+            while recent[0][-1].t_s < self.heard_s - KEPT_S:
                 recent.popleft()
         if self.estimator is not None:
             self.estimator.update(samples, phase=self.phase, still=self.still, airspeed_m_s=self.airspeed_m_s)
@@ -249,7 +250,7 @@ class Carrier:
     def _align(self, stand: Stand) -> None:
         assert self.estimator is not None
         before = self.now()
-        since = [sample for sample in self._recent if sample.t_s > stand.t_s]
+        since = [sample for read in self._recent for sample in read if sample.t_s > stand.t_s]
         self.estimator.align(stand.t_s if since else None, stand.body_from_ned, stand.covariance)
         self.estimator.update(since, phase="ground")
         after = self.now()

@@ -1,0 +1,127 @@
+"""The quick way to read MAVLink: what pymavlink's own codec makes of the same bytes, and nothing else."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.links import mavlink_frames
+from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink_frames import kind_at, read
+
+KINDS: dict[int, Any] = mavlink.mavlink_map
+MIXTURE = [
+    mavlink.MAVLink_highres_imu_message,
+    mavlink.MAVLink_heartbeat_message,
+    mavlink.MAVLink_param_value_message,  # with text in it
+    mavlink.MAVLink_battery_status_message,  # with an array
+    mavlink.MAVLink_raw_imu_message,
+    mavlink.MAVLink_statustext_message,
+    mavlink.MAVLink_vfr_hud_message,
+]
+
+
+def checksum(data: bytes) -> int:
+    """CRC-16/MCRF4XX, bit by bit."""
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0x8408 if crc & 1 else 0)
+    return crc
+
+
+def frame(kind: Any, dice: random.Random, size: int | None = None) -> bytes:
+    """A frame with random bytes for values, its payload cut short as trailing zeros are."""
+    size = dice.randint(1, kind.unpacker.size) if size is None else size
+    flags = bytes((0, dice.randrange(256)))  # what may be ignored may be set
+    head = bytes((size,)) + flags + bytes(dice.randrange(256) for _ in range(3)) + kind.id.to_bytes(3, "little")
+    body: bytes = head + dice.randbytes(size)
+    return b"\xfd" + body + checksum(body + bytes((kind.crc_extra,))).to_bytes(2, "little")
+
+
+def everything(message: Any) -> str:
+    """All that a message holds; as text, for NaN is not NaN."""
+    return repr({**vars(message), "_header": vars(message.get_header())})
+
+
+def codec() -> Any:
+    made = mavlink.MAVLink(None)
+    made.robust_parsing = True
+    return made
+
+
+@pytest.mark.parametrize("message_id", KINDS, ids=lambda number: KINDS[number].msgname)
+def test_a_message_is_the_one_that_the_codec_reads(message_id: int) -> None:
+    kind, dice = KINDS[message_id], random.Random(message_id)
+    for size in (1, kind.unpacker.size, None, None):
+        data = frame(kind, dice, size)
+        (expected,) = codec().parse_buffer(data)
+        assert type(expected) is kind
+        assert kind_at(b"??" + data + b"!", 2) == (kind, 2 + len(data))
+        found = read(kind, b"??" + data + b"!", 2, 2 + len(data))
+        has_more = any(length > 1 for length in kind.lengths) or "s" in kind.unpacker.format
+        assert (found is None) == has_more
+        if found is not None:
+            assert everything(found) == everything(expected)
+
+
+@settings(deadline=None, max_examples=300)
+@given(seed=st.integers(0, 2**32), position=st.integers(0, 40), bit=st.integers(0, 7), cut=st.integers(1, 40))
+def test_what_is_damaged_signed_or_not_whole_is_left_to_the_codec(seed: int, position: int, bit: int, cut: int) -> None:
+    dice = random.Random(seed)
+    data = frame(dice.choice(MIXTURE), dice)
+    assert kind_at(data[: -min(cut, len(data))], 0) is None
+    damaged = bytearray(data)
+    # A flag of its own meaning that is set makes a frame that nobody here can read; any other bit is in the checksum.
+    damaged[position % len(data)] ^= 1 << bit
+    assert kind_at(bytes(damaged), 0) is None
+
+
+@settings(deadline=None, max_examples=150)
+@given(seed=st.integers(0, 2**32), wanted=st.sets(st.sampled_from(MIXTURE)), cuts=st.integers(0, 12))
+def test_the_link_hears_what_the_codec_alone_would_in_any_split(seed: int, wanted: set[Any], cuts: int) -> None:
+    dice = random.Random(seed)
+    pieces = [frame(dice.choice(MIXTURE), dice) for _ in range(20)]
+    for _ in range(dice.randrange(3)):
+        at = dice.randrange(len(pieces))
+        pieces[at] = pieces[at][:-1] + bytes((pieces[at][-1] ^ 1,))  # its checksum is wrong, its length is not
+    stream = b"".join(pieces)
+    expected = codec().parse_buffer(stream) or []
+    names = Counter("bad" if m.get_type() == "BAD_DATA" else m.get_type() for m in expected)
+    link, heard = MavlinkLink(), list[str]()
+    for kind in wanted:
+        link.subscribe(kind, lambda message, t_s: heard.append(everything(message)))
+    places = sorted({0, len(stream), *(dice.randrange(len(stream)) for _ in range(cuts))})
+    for start, end in pairwise(places):
+        link.receive(stream[start:end], float(end))
+    assert heard == [everything(message) for message in expected if type(message) in wanted]
+    assert link.received == names
+    assert link.half_received == b""
+
+
+def test_without_the_checksum_in_c_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = frame(mavlink.MAVLink_highres_imu_message, random.Random(1))
+    monkeypatch.setattr(mavlink_frames, "_C_CRC", None)
+    assert kind_at(data, 0) == (mavlink.MAVLink_highres_imu_message, len(data))
+    assert kind_at(data[:-1] + bytes((data[-1] ^ 1,)), 0) is None
+
+
+def test_a_transport_that_is_changed_by_a_message_leaves_nothing_behind() -> None:
+    dice = random.Random(3)
+    heartbeat, other = frame(mavlink.MAVLink_heartbeat_message, dice), frame(mavlink.MAVLink_vfr_hud_message, dice)
+    link, heard = MavlinkLink(), list[str]()
+    link.subscribe(mavlink.MAVLink_heartbeat_message, lambda message, t_s: link.attach(None))
+    link.subscribe(mavlink.MAVLink_vfr_hud_message, lambda message, t_s: heard.append(message.get_type()))
+    link.receive(heartbeat + other + other[:9], 1.0)
+    assert link.half_received == b""
+    assert heard == []
+    link.receive(other, 2.0)
+    assert heard == ["VFR_HUD"]
