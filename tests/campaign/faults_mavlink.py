@@ -128,6 +128,17 @@ async def reboot_in_write(scene: Scene) -> None:
     scene.stage.autopilot.faults.reboot_after_writes = scene.chance.randint(1, 6)
 
 
+async def echo_only(scene: Scene) -> None:
+    scene.stage.autopilot.faults.echo_without_effect = True
+
+
+async def restart_whole(scene: Scene) -> None:
+    """What is stored comes into use at a restart only."""
+    scene.stage.autopilot.faults.echo_without_effect = False
+    scene.stage.autopilot.reboot(down_s=1.0)
+    await asyncio.sleep(2.0)
+
+
 async def arm(scene: Scene) -> None:
     scene.stage.autopilot.arm()
 
@@ -229,8 +240,8 @@ def autopilot_faults() -> list[Fault]:
         ),
         Fault(
             "echoes-only", "autopilot", "PARAM_SET is stored and echoed, and the old value stays in use",
-            *switched(echo_without_effect=True), lasts_s=(14.0, 18.0), excused=r"does not use|not in use|no effect",
-            not_in=write_only,
+            echo_only, restart_whole, lasts_s=(14.0, 18.0), not_in=write_only,
+            excused=r"does not use|not in use|no effect|did not follow|still off",
         ),
         Fault(
             "other-value", "autopilot", "the answer to PARAM_SET carries another value", *at_one("wrong_echo"),
@@ -384,7 +395,8 @@ def intruder_faults() -> list[Fault]:
         Fault("signed", "intruder", "everything that comes is signed (MAVLink 2 signing)", signs, unsigned, lasts_s=(4.0, 9.0)),
         Fault(
             "signatures-demanded", "intruder", "the autopilot signs, and takes nothing that is not signed",
-            demands_signatures, unsigned, lasts_s=(8.0, 14.0), names=r"sign", excused=LOST,
+            demands_signatures, unsigned, lasts_s=(8.0, 14.0), names=r"it signs what it sends", excused=LOST,
+            named_in=tuple(phase for phase in PHASES if phase != "armed"),  # nothing is asked of it then
         ),
     ]  # fmt: skip
 

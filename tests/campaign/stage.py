@@ -32,7 +32,7 @@ from tests.campaign.mqtt_broker import Broker
 from tests.campaign.rough_wire import RoughWire
 from tests.support.rig import Rig
 
-IMU_RATE_HZ = 20.0
+IMU_RATE_HZ = 10.0
 DEVICE_RATE_HZ = 5.0
 
 
@@ -127,7 +127,7 @@ class Stage(Rig):
             max_s=8.0,
             imu_rate_hz=IMU_RATE_HZ,
             device_rate_hz=DEVICE_RATE_HZ,
-            feed_s=0.2,
+            feed_s=0.25,
             at_arm=at_arm,
             recordings_mb=recordings_mb,
             more=more,
@@ -213,6 +213,7 @@ class Stage(Rig):
             )
         context = contextvars.copy_context()
         context.run(OWNER.set, self.owner)
+        self.wire.context = context.copy()
         self._work = context.run(asyncio.create_task, self._live(), name="daemon")
         self.alive = True
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -43,6 +44,10 @@ class Witness:
         self._parsers = {True: _parser(), False: _parser()}
         stage.wire.seen = self._see
         stage.on_start = self._on_start
+
+    def silence_s(self, now_s: float) -> float:
+        """The longest between two heartbeats of the companion, the present pause included."""
+        return max(self.longest_silence_s, math.inf if self._beat_s is None else now_s - self._beat_s)
 
     @property
     def open_requests(self) -> list[int]:
@@ -189,6 +194,15 @@ def half_written(now: Values, *known: Values) -> list[str]:
     for part in (names[:3], names[3:]):
         if all(any(abs(now[name] - each[name]) > 1e-9 for name in part) for each in known):
             found.append(f"half written: {', '.join(f'{name} {now[name]:.6g}' for name in part)}")
+    return found
+
+
+def undoable(stage: Stage) -> list[Values]:
+    """What finished writes have left, as the values for undo tell: a power cut may have come before their record."""
+    found = []
+    for path in stage.store.glob("undo-*.json"):
+        with contextlib.suppress(ValueError, KeyError, TypeError):
+            found.append({c["parameter"]: c["after"] for c in json.loads(path.read_bytes())["changes"]})
     return found
 
 
