@@ -56,7 +56,9 @@ def main() -> int:
     """Run what is asked for; 1 when a cell fails."""
     parser = argparse.ArgumentParser(prog="python -m tests.campaign", description=__doc__)
     parser.add_argument("--seed", type=int, default=SEED, help=f"of everything (default {SEED})")
-    parser.add_argument("--only", action="append", metavar="FAULT", help="this fault, or all of a room (device, link ...)")
+    parser.add_argument(
+        "--only", action="append", metavar="FAULT", help="this fault, or all of a room (device, link ...)"
+    )
     parser.add_argument("--phase", action="append", choices=PHASES, help="in this phase only")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="processes (default 2)")
     parser.add_argument("--json", metavar="FILE", help="write the outcomes there")
@@ -85,7 +87,8 @@ def main() -> int:
             print(f"FAIL {outcome.fault} in {outcome.phase} ({outcome.variant})", file=sys.stderr)
             for words in outcome.problems:
                 print(f"     {words}", file=sys.stderr)
-            print(f"     again: python -m tests.campaign --only {outcome.fault} --phase {outcome.phase} --seed {outcome.seed}", file=sys.stderr)
+            again = f"--only {outcome.fault} --phase {outcome.phase} --seed {outcome.seed}"
+            print(f"     again: python -m tests.campaign {again}", file=sys.stderr)
         if options.story:
             print(f"{outcome.fault} in {outcome.phase} ({outcome.variant}, {outcome.cpu_s:.1f} s): {outcome.verdict}")
             print("\n".join(f"  {line}" for line in outcome.story))

@@ -19,8 +19,8 @@ from sim.motions import Handling
 from tests.campaign import witness as judge
 from tests.campaign.fault import Fault, Phase, Scene
 from tests.campaign.loop import run_on_campaign_loop, tasks_of
-from tests.campaign.station import Operator
 from tests.campaign.stage import VARIANTS, Stage
+from tests.campaign.station import Operator
 from tests.campaign.witness import Witness
 from tests.support.component import ACCEPTED, CALIBRATE, DENIED, TEMPORARILY_REJECTED, UNDO
 
@@ -170,7 +170,9 @@ class _Course:
             entered = stage.entered[state]
             motion_s = 4.0 if phase == "waiting" else 1.5
             stage.aircraft.add(
-                Handling(start_s=stage.aircraft.time_at(stage.now_s), duration_s=motion_s, seed=stage.chance.randrange(99))
+                Handling(
+                    start_s=stage.aircraft.time_at(stage.now_s), duration_s=motion_s, seed=stage.chance.randrange(99)
+                )
             )
             await asyncio.sleep(0.5)
             self._asked = asyncio.create_task(self._operator.ask(CALIBRATE))
@@ -271,9 +273,9 @@ class _Course:
     def _judge_words(self, last: Any) -> None:
         stage, fault = self._stage, self._fault
         said = [*self._heard, *stage.said.lines, *stage.ground.texts()]
-        if fault.names is not None and self._phase in fault.named_in:
-            if not any(re.search(fault.names, line) for line in said):
-                self._wrong(f"nobody says what is wrong ({fault.names}); last said: {stage.said.lines[-3:]}")
+        named = fault.names is None or any(re.search(fault.names, line) for line in said)
+        if not named and self._phase in fault.named_in:
+            self._wrong(f"nobody says what is wrong ({fault.names}); last said: {stage.said.lines[-3:]}")
         if last is not None and last.state == "failed":
             patterns = [p for p in (fault.names, fault.excused) if p is not None]
             self._tell(f"failed: {last.reason}")
@@ -295,7 +297,9 @@ class _Course:
             await asyncio.sleep(4.0)  # what has been heard of a second autopilot, say, counts for seconds
         if result != ACCEPTED:
             last = stage.service.conductor.last
-            self._wrong(f"no calibration afterwards: {result}, {last.reason if last else None}; {stage.ground.texts()[-3:]}")
+            self._wrong(
+                f"no calibration afterwards: {result}, {last.reason if last else None}; {stage.ground.texts()[-3:]}"
+            )
             return
         last = stage.service.conductor.last
         assert last is not None
@@ -327,5 +331,3 @@ class _Course:
             waiting = len(stage.service.mqtt.link.outbox)
             if waiting > 80:
                 self._wrong(f"{waiting} messages wait for the broker")
-
-

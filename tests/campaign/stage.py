@@ -1,7 +1,7 @@
 """The whole daemon, all faces on, on a virtual aircraft; it can be killed at any instant and started again.
 
-On top of `Rig`: devices behind `tcp://`, so that plugs can be pulled; a control socket, a page and a broker; a disk and a
-wall clock that can go wrong. Everything in one event loop on virtual time.
+On top of `Rig`: devices behind `tcp://`, so that plugs can be pulled; a control socket, a page and a broker; a disk and
+a wall clock that can go wrong. Everything in one event loop on virtual time.
 """
 
 from __future__ import annotations
@@ -45,7 +45,16 @@ class Variant(NamedTuple):
 
 VARIANTS = (
     Variant("ArduPilot 4.8", {"version": "4.8"}),
-    Variant("PX4", {"firmware": "px4", "part": "bmi088"}),
+    Variant(
+        "PX4",
+        {
+            "firmware": "px4",
+            "part": "bmi088",
+            # Its own calibrations overwrite offsets that seem off, such as those of a write that was cut off: rightly,
+            # but then nobody could tell whose value is whose.
+            "parameters": {"IMU_GYRO_CAL_EN": 0.0, "SENS_IMU_AUTOCAL": 0.0},
+        },
+    ),
     Variant("ArduPilot 4.6", {"version": "4.6"}),
 )
 

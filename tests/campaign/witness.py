@@ -18,7 +18,7 @@ from tests.support.component import CALIBRATE, CANCEL, IN_PROGRESS, UNDO
 
 COMMANDS = (CALIBRATE, CANCEL, UNDO)
 SILENT_S = 2.0
-"""Between two heartbeats of the companion, and after the autopilot's last one until nobody knows whether it is armed."""
+"""Between two heartbeats of the companion; and so long after the autopilot's last one its arming is not known."""
 SIGMAS = 5.0
 
 Values = dict[str, float]
