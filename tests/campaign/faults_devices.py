@@ -321,7 +321,7 @@ def faults() -> list[Fault]:
             unstick,
             lasts_s=(7.0, 12.0),
             names=r"stuck",
-            # While offsets are written the autopilot's IMU is not heard, so that nothing tells it from a still aircraft.
+            # While offsets are written the autopilot's IMU is not heard: nothing tells it from a still aircraft.
             named_in=("idle", "waiting", "collecting", "done"),
             excused=STILLNESS,
         ),

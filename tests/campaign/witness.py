@@ -79,7 +79,8 @@ class Witness:
             if sender == (1, 191):
                 return  # our own echo asks for nothing
             packet = bytes(message.get_msgbuf())
-            copy = t_s - self._packets.get(packet, -1e9) < 0.5
+            self._packets = {data: at_s for data, at_s in self._packets.items() if t_s - at_s < 0.5}
+            copy = packet in self._packets
             self._packets[packet] = t_s
             if copy:
                 return
@@ -131,8 +132,9 @@ class Witness:
         self._finals[key] = (t_s, message.result)
 
 
-MAY_BE_SET = r"INS_(GYR|ACC)OFFS_[XYZ]|CAL_(GYRO|ACC)0_[XYZ]OFF"
-"""Of IMU 1, which is the one that is calibrated."""
+MAY_BE_SET = r"INS_(GYR|ACC)OFFS_[XYZ]|CAL_(GYRO|ACC)[01]_[XYZ]OFF"
+"""Of IMU 1, which is the one that is calibrated. On PX4 a write shows which IMU a slot acts on; one that is another's
+is put back, so that there what counts is what `others` says once at rest."""
 WATCHED = {
     True: [f"CAL_{sensor}1_{axis}OFF" for sensor in ("ACC", "GYRO") for axis in "XYZ"],
     False: [
@@ -175,8 +177,9 @@ def vectors(stage: Stage) -> Values:
 
 
 def others(stage: Stage) -> Values:
-    """The accelerometer's offsets of IMU 2, which is none of ours."""
-    return {name: stage.autopilot.parameter(name) for name in _names(stage, "2") if "ACC" in name}
+    """The offsets of IMU 2, which is none of ours; ArduPilot's own gyro calibration sets those of all its gyros."""
+    px4 = stage.variant.name == "PX4"
+    return {name: stage.autopilot.parameter(name) for name in _names(stage, "2") if px4 or "ACC" in name}
 
 
 def _names(stage: Stage, which: str) -> list[str]:

@@ -53,7 +53,7 @@ def test_a_slice_is_the_same_every_time_and_of_every_room() -> None:
 
 def test_a_daemon_that_writes_while_armed_is_caught() -> None:
     class Reckless(Vehicle):
-        arm_state = ArmState.DISARMED  # type: ignore[assignment]
+        arm_state = ArmState.DISARMED
 
     def sabotage(stage: Stage) -> None:
         stage.service.vehicle.__class__ = Reckless
