@@ -165,10 +165,12 @@ def _hypot(sigmas: Vector, drift: float) -> Vector:
 def _no_calmer(after: Vector, before: Vector, spans_s: tuple[float, float]) -> Vector:
     """The sigmas of the later mean, but none below what the noise before the write makes of so many seconds.
 
-    A write changes no noise; and the scatter of a few seconds is, by chance, now and then a tenth of what it should be.
+    A write changes no noise, and the axes of a triad are alike; but the scatter of a few seconds on one of them is, by
+    chance, now and then a tenth of what it should be.
     """
     longer = float(np.sqrt(spans_s[0] / spans_s[1])) if spans_s[1] > 0.0 else 1.0
-    x, y, z = (max(sigma, longer * usual) for sigma, usual in zip(after, before, strict=True))
+    triad = float(np.sqrt(np.mean(np.square(before))))
+    x, y, z = (max(sigma, longer * usual, longer * triad) for sigma, usual in zip(after, before, strict=True))
     return x, y, z
 
 

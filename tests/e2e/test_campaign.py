@@ -16,6 +16,9 @@ from tests.campaign.hour import run_hour
 from tests.campaign.loop import OWNER
 from tests.campaign.stage import VARIANTS, Stage
 
+# A daemon that is killed closes no file.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
 CELLS = slice_of(SEED, 24)
 CELLS_A_TEST = 4
 
