@@ -280,7 +280,7 @@ def autopilot_faults() -> list[Fault]:
             restart_whole,
             lasts_s=(14.0, 18.0),
             not_in=write_only,
-            excused=r"does not use|not in use|no effect|did not follow|still off",
+            excused=r"does not use|not in use|no effect|did not follow|still off|reboot|restart",
         ),
         Fault(
             "other-value",
@@ -313,6 +313,8 @@ def autopilot_faults() -> list[Fault]:
             "the heartbeat stays away, all else goes on",
             *switched(heartbeat_off=True),
             lasts_s=(3.0, 8.0),
+            # PX4 answers with a heartbeat when it is asked for one, as it is then.
+            variants=("ArduPilot 4.8", "ArduPilot 4.6"),
             names=r"heartbeat",
             excused=LOST,
         ),
@@ -331,7 +333,7 @@ def autopilot_faults() -> list[Fault]:
             "the autopilot's IMU messages repeat the last values",
             *switched(frozen_imu=True),
             lasts_s=(4.0, 8.0),
-            excused=f"{STILLNESS}|frozen|same|does not use|fc|reboot",
+            excused=f"{STILLNESS}|frozen|same|does not use|fc|reboot|unknown whether",
         ),
         Fault(
             "foreign-writer",
