@@ -15,6 +15,7 @@ help:
 	@echo 'make format  put the code into the one format'
 	@echo 'make bench   speed, as ratios within one run'
 	@echo 'make accuracy  how good a calibration is, beside the bound and what else is done (three minutes)'
+	@echo 'make campaign  every fault in every phase of a calibration (about 6 minutes on two cores)'
 	@echo 'make deb     a Debian package for machines like this one, in dist/'
 	@echo 'make deb-test  try that package in a clean root (as root; a minute or two)'
 	@echo 'make lock    requirements/*.txt anew: every dependency with its hashes (UPGRADE=1: the newest; needs the network)'
@@ -57,6 +58,11 @@ bench: $(VENV)/.dev
 
 accuracy: $(VENV)/.run
 	@$(BIN)/python -m sim accuracy --jobs $(JOBS)
+# SEED= plays it with other dice.
+SEED ?= 7
+
+campaign: $(VENV)/.dev
+	@$(BIN)/python -m tests.campaign --seed $(SEED) --jobs $(JOBS)
 
 # With Debian's Python, whatever PYTHON is: the package runs with it. EXTRAS= puts neither MQTT nor recording in.
 EXTRAS ?= mqtt,recording

@@ -139,6 +139,33 @@ async def calibrate_gyros(
         answer.cancel()
 
 
+async def wait_until_over(parameters: ParameterClient, before: Mapping[str, float]) -> None:
+    """After an interruption: wait until a calibration that may have been started has surely ended, or never ran.
+
+    Offsets of before, or zero, tell nothing while it may run: it stores what it has found at its end.
+
+    Args:
+        parameters: of the autopilot.
+        before: gyro parameters from before it, by name.
+
+    Raises:
+        AutopilotError: the autopilot does not answer.
+    """
+    vehicle = parameters.vehicle
+    loop = asyncio.get_running_loop()
+    boots, since_s = vehicle.boots, loop.time()
+    vectors = [names for number in INSTANCES if set(names := parameters_of(number).gyro_offset) <= before.keys()]
+    while loop.time() < since_s + TIMEOUT_S and vehicle.boots == boots:
+        now = await parameters.read_many([name for names in vectors for name in names], optional=True)
+        fitted = [names for names in vectors if any(before[name] or now.get(name) for name in names)]
+        same = all(same_float32(now.get(name, 0.0), before[name]) for names in fitted for name in names)
+        runs = not all(any(now.get(name) for name in names) for names in fitted)
+        if fitted and not runs and (not same or loop.time() > since_s + _LOST_AFTER_S):
+            break
+        await asyncio.sleep(_LOOK_S)
+    await asyncio.sleep(_AFTERWARDS_S)
+
+
 async def _pause(answer: asyncio.Future[int | None]) -> None:
     """Until the answer or the next look; an answer that has come does not shorten the next one.
 

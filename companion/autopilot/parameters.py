@@ -72,7 +72,7 @@ class ParameterClient:
         self._absent: set[str] = set()
         """Names that this boot of the autopilot has shown not to have: told by silence, that takes seconds to learn."""
         self._types: dict[str, int] = {}
-        """MAV_PARAM_TYPE by name, as heard since the last restart."""
+        """MAV_PARAM_TYPE by name, as heard since the last restart; so these exist, however silent it is about them."""
         self._unsubscribe = [
             link.subscribe(mavlink.MAVLink_param_value_message, self._on_value),
             link.subscribe(mavlink.MAVLink_param_error_message, self._on_error),
@@ -99,6 +99,7 @@ class ParameterClient:
                     raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.words}")
         raise ParameterTimeoutError(
             f"{self.vehicle.name} does not answer for {name} ({tries} requests, {self._timeout_s:g} s each)"
+            f"{self.vehicle.why_silent}"
         )
 
     async def read_optional(self, name: str) -> float | None:
@@ -130,7 +131,19 @@ class ParameterClient:
                         return None
                     raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.words}")
         if not self.vehicle.alive or not await self._answers_at_all():
-            raise ParameterTimeoutError(f"{self.vehicle.name} answers neither for {name} nor for anything else")
+            raise ParameterTimeoutError(
+                f"{self.vehicle.name} answers neither for {name} nor for anything else{self.vehicle.why_silent}"
+            )
+        # It answers again or for others only: a silence that ends in this moment must not be taken for an absence.
+        with self._exchange(name) as inbox:
+            answer = await self._ask(inbox, name, -1)
+        if isinstance(answer, float):
+            return answer
+        if name in self._types:
+            raise ParameterTimeoutError(
+                f"{self.vehicle.name} does not answer for {name} any more ({tries + 1} requests, {self._timeout_s:g} s"
+                f" each){self.vehicle.why_silent}"
+            )
         if self.vehicle.boots == boots:
             self._absent.add(name)
         return None
@@ -207,6 +220,7 @@ class ParameterClient:
             raise ParameterMismatchError(f"{name} was set to {wanted:.9g}, {self.vehicle.name} answers {other:.9g}")
         raise ParameterTimeoutError(
             f"{self.vehicle.name} does not answer to setting {name} ({tries} times, {self._timeout_s:g} s each)"
+            f"{self.vehicle.why_silent}"
         )
 
     @property

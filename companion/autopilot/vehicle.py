@@ -94,6 +94,8 @@ class Vehicle:
         """MAV_PROTOCOL_CAPABILITY bits; None until AUTOPILOT_VERSION has come."""
         self.system_status: int | None = None
         """MAV_STATE of the last heartbeat."""
+        self.signs = False
+        """Whether its last heartbeat was signed (MAVLink 2)."""
         self.boots = 0
         """How many restarts were seen."""
         self.position: Position | None = None
@@ -177,6 +179,11 @@ class Vehicle:
             return "no autopilot"
         words = {"ardupilot": "ArduPilot", "px4": "PX4"}.get(self.firmware or "", "autopilot")
         return f"{words}{' ' + self.version if self.version else ''}, system {self.system_id}"
+
+    @property
+    def why_silent(self) -> str:
+        """To be put behind the words that it does not answer although it is heard: what is known of the cause."""
+        return "; it signs what it sends: does it refuse what is not signed?" if self.signs else ""
 
     @property
     def integers_bytewise(self) -> bool:
@@ -287,6 +294,7 @@ class Vehicle:
         self._heartbeat_s = asyncio.get_running_loop().time()
         self._armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         self.system_status = message.system_status
+        self.signs = bool(message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
         self._lost = False
         self._found.set()
         for heard in self._heartbeat_waiters:

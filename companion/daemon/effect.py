@@ -94,7 +94,7 @@ def judge_vectors(
             before=before.mean,
             before_sigma=before.sigma_stat,
             after=after.mean,
-            after_sigma=_hypot(after.sigma_stat, drift),
+            after_sigma=_hypot(_no_calmer(after.sigma_stat, before.sigma_stat, spans_s), drift),
             expected_step=rest.step,
             truth=_minus(before.mean, residual),
             tolerance=TOLERANCE_SIGMAS * max(before.sigma_use),
@@ -160,6 +160,18 @@ def _drift_sigma(model: AllanModel, most_flicker: float, spans_s: tuple[float, f
 
 def _hypot(sigmas: Vector, drift: float) -> Vector:
     x, y, z = (float(np.hypot(sigma, drift)) for sigma in sigmas)
+    return x, y, z
+
+
+def _no_calmer(after: Vector, before: Vector, spans_s: tuple[float, float]) -> Vector:
+    """The sigmas of the later mean, but none below what the noise before the write makes of so many seconds.
+
+    A write changes no noise, and the axes of a triad are alike; but the scatter of a few seconds on one of them is, by
+    chance, now and then a tenth of what it should be.
+    """
+    longer = float(np.sqrt(spans_s[0] / spans_s[1])) if spans_s[1] > 0.0 else 1.0
+    triad = float(np.sqrt(np.mean(np.square(before))))
+    x, y, z = (max(sigma, longer * usual, longer * triad) for sigma, usual in zip(after, before, strict=True))
     return x, y, z
 
 

@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager
 from typing import Final
 
 from companion.autopilot.float32 import same_float32
+from companion.autopilot.gyro_calibration import wait_until_over
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.vehicle import ArmState, Vehicle
 from companion.autopilot.writer import Change, ParameterWriter, WriteFailedError
@@ -91,6 +92,9 @@ class Mender:
             return
         while self._vehicle.arm_state is not ArmState.DISARMED:
             await asyncio.sleep(POLL_S)
+        if unknown := {changed.parameter: changed.before for changed in open_set.changes if changed.after is None}:
+            # What the firmware finds it stores at its end, over whatever was put back before.
+            await wait_until_over(self._parameters, unknown)
         ours, foreign = await self._sort(open_set)
         if ours:
             with self._changing():

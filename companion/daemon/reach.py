@@ -63,6 +63,7 @@ class Reach:
             return False, (
                 "the autopilot is heard but does not answer: it does not hear our heartbeat, so nobody can reach the"
                 " companion through it; check the wire to the autopilot's RX, the baud rate and the port's protocol"
+                f"{self._vehicle.why_silent}"
             )
         if self.heard:
             return True, "a ground station is heard; it reaches the companion as component 191 of this vehicle"

@@ -82,11 +82,13 @@ class SensorHealth:
         found = self.trouble(now_s)
         return found.words if found is not None else None
 
-    def _flood(self, now_s: float) -> Trouble | None:
+    def _is_flooded(self, now_s: float) -> bool:
         budget = self.link.budget
-        if budget is None or budget.exceeded_s is None or now_s - budget.exceeded_s >= FLOOD_S:
+        return budget is not None and budget.exceeded_s is not None and now_s - budget.exceeded_s < FLOOD_S
+
+    def _flood(self, now_s: float) -> Trouble | None:
+        if not self._is_flooded(now_s):
             return None
-        self.stream.excuse()
         rate = f"{self._bytes_per_s / 1e3:.0f} kB/s" if self._bytes_per_s else "too much"
         return Trouble(FLOOD, f"floods us ({rate}); the surplus is thrown away: another device, or a loop-back?")
 
@@ -100,6 +102,9 @@ class SensorHealth:
             self.counts[event.key] += 1
             self._tell(event, now_s)
         self.stream.events.clear()
+        if self._is_flooded(now_s):
+            # What of its frames is damaged is damaged by what was thrown away; two looks fall into FLOOD_S.
+            self.stream.excuse()
         found = self.trouble(now_s)
         if found is None:
             # Whatever is open and speaks as configured is the right one.

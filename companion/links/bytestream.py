@@ -47,8 +47,8 @@ LONGEST_PAUSE_S = 1.0
 BEAT_S = 1.0
 BEAT_WITHIN_S = 8.0
 """An open that takes all the time it may, and the longest pause after it."""
-PAUSE_S = 0.05
-"""So long a port that brings more than its budget is left alone."""
+FLOOD_PAUSE_S = 0.05
+"""So long a port that brings too much is left alone."""
 DISCARD_BYTES = 65536
 DISCARD_READS = 16
 """After a pause so much is thrown away at the most, a millisecond's work; the rest waits in the kernel, not here."""
@@ -288,7 +288,7 @@ class ByteLink:
         loop = asyncio.get_running_loop()
         assert self._descriptor is not None
         loop.remove_reader(self._descriptor)
-        self._paused = loop.call_later(PAUSE_S, self._resume)
+        self._paused = loop.call_later(FLOOD_PAUSE_S, self._resume)
 
     def _resume(self) -> None:
         self._paused = None

@@ -19,10 +19,10 @@ from sim.motions import Handling
 from tests.campaign import witness as judge
 from tests.campaign.fault import Fault, Phase, Scene
 from tests.campaign.loop import run_on_campaign_loop, tasks_of
-from tests.campaign.station import Operator
 from tests.campaign.stage import VARIANTS, Stage
+from tests.campaign.station import Operator
 from tests.campaign.witness import Witness
-from tests.support.component import ACCEPTED, CALIBRATE, CANCELLED, FAILED, UNDO
+from tests.support.component import ACCEPTED, CALIBRATE, DENIED, TEMPORARILY_REJECTED, UNDO
 
 SHORTEST_S: dict[str, dict[Phase, float]] = {
     "ArduPilot 4.8": {"waiting": 7.0, "collecting": 1.9, "solving": 0.6, "writing": 3.8, "verifying": 4.8},
@@ -32,6 +32,8 @@ SHORTEST_S: dict[str, dict[Phase, float]] = {
 """So long each phase lasts at least when nothing disturbs it: the instant of the fault is drawn from that."""
 RECOVERED_WITHIN_S = 240.0
 MOST_VIRTUAL_S = 1500.0
+REFUSALS = 3
+"""So often a request may be refused after the fault, before one is taken."""
 
 
 @dataclasses.dataclass
@@ -245,6 +247,7 @@ class _Course:
         now = judge.vectors(stage)
         last = stage.service.conductor.last
         done = [self._written(record) for record in stage.service.store.history() if record.state == "done"]
+        done += judge.undoable(stage)
         for words in judge.half_written(now, *self._known, *[{**now, **each} for each in done if each]):
             if "somebody else" not in self._scene.notes:
                 self._wrong(words)
@@ -270,9 +273,9 @@ class _Course:
     def _judge_words(self, last: Any) -> None:
         stage, fault = self._stage, self._fault
         said = [*self._heard, *stage.said.lines, *stage.ground.texts()]
-        if fault.names is not None and self._phase in fault.named_in:
-            if not any(re.search(fault.names, line) for line in said):
-                self._wrong(f"nobody says what is wrong ({fault.names}); last said: {stage.said.lines[-3:]}")
+        named = fault.names is None or any(re.search(fault.names, line) for line in said)
+        if not named and self._phase in fault.named_in:
+            self._wrong(f"nobody says what is wrong ({fault.names}); last said: {stage.said.lines[-3:]}")
         if last is not None and last.state == "failed":
             patterns = [p for p in (fault.names, fault.excused) if p is not None]
             self._tell(f"failed: {last.reason}")
@@ -286,7 +289,12 @@ class _Course:
 
     async def _recover(self) -> None:
         stage = self._stage
-        result = await self._operator.ask(CALIBRATE, within_s=RECOVERED_WITHIN_S)
+        result = None
+        for _ in range(REFUSALS):
+            result = await self._operator.ask(CALIBRATE, within_s=RECOVERED_WITHIN_S)
+            if result not in (TEMPORARILY_REJECTED, DENIED):
+                break
+            await asyncio.sleep(4.0)  # what has been heard of a second autopilot, say, counts for seconds
         if result != ACCEPTED:
             last = stage.service.conductor.last
             self._wrong(
@@ -312,8 +320,8 @@ class _Course:
             self._wrong(words)
         if self._witness.open_requests:
             self._wrong(f"no final answer to {self._witness.open_requests}")
-        if self._witness.longest_silence_s > judge.SILENT_S:
-            self._wrong(f"no heartbeat for {self._witness.longest_silence_s:.1f} s")
+        if (silence_s := self._witness.silence_s(stage.now_s)) > judge.SILENT_S:
+            self._wrong(f"no heartbeat for {silence_s:.1f} s")
         if stage.link.received["handler error"]:
             self._wrong(f"{stage.link.received['handler error']} handlers of MAVLink messages raised")
         now = stage.census()
@@ -323,6 +331,3 @@ class _Course:
             waiting = len(stage.service.mqtt.link.outbox)
             if waiting > 80:
                 self._wrong(f"{waiting} messages wait for the broker")
-
-
-__all__ = ["CANCELLED", "FAILED", "Outcome", "run_cell"]

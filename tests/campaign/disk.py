@@ -19,7 +19,7 @@ _REAL = {name: getattr(os, name) for name in ("open", "replace", "unlink", "mkdi
 class Disk:
     """Stands between the process and the files below `root`, as long as it is `mounted`.
 
-    Nothing is really synced: what a power cut leaves is decided by `snapshot`, not by the machine that the test runs on.
+    Nothing is really synced: what a power cut leaves is decided by `snapshot`, not by the machine that this runs on.
     """
 
     def __init__(self, root: Path, chance: random.Random) -> None:

@@ -57,6 +57,10 @@ def sets_clock(by_s: float | None = None, to_s: float = 0.0) -> Act:
     return strike
 
 
+async def step_clock(scene: Scene) -> None:
+    await sets_clock(by_s=scene.chance.choice((3600.0, -3600.0)))(scene)
+
+
 async def right_clock(scene: Scene) -> None:
     scene.stage.wall.shift_s = 0.0
 
@@ -161,6 +165,14 @@ async def remove_spoilt(scene: Scene) -> None:
     for name in scene.spoilt:
         (stage.store / name).unlink(missing_ok=True)
     await begin_again(scene)
+
+
+async def spoil_record(scene: Scene) -> None:
+    await spoils("records/??????.json", scene.chance.choice(("cut", "zeros", "empty")))(scene)
+
+
+async def spoil_undo(scene: Scene) -> None:
+    await spoils("undo-*.json", scene.chance.choice(("cut", "zeros", "empty")))(scene)
 
 
 async def spoil_recording(scene: Scene) -> None:
@@ -344,49 +356,156 @@ def faults() -> list[Fault]:
         "excused": f"{LOST}|{STILLNESS}|companion stops|daemon's end|interrupted|reboot",
         "restarts": True,
     }
-    disk: dict[str, Any] = {"excused": DISK, "recordings_mb": 1}
+    disk: dict[str, Any] = {"excused": DISK, "recordings_mb": 8}
     return [
         Fault("disk-full", "disk", "no space is left", *refuses("full"), names=DISK, **disk),
-        Fault("disk-read-only", "disk", "the file system has become read-only", *refuses("read-only"), names=DISK, **disk),
+        Fault(
+            "disk-read-only", "disk", "the file system has become read-only", *refuses("read-only"), names=DISK, **disk
+        ),
         Fault("disk-error", "disk", "fsync fails: a worn-out card", *refuses("fsync"), names=DISK, **disk),
-        Fault("disk-slow", "disk", "every write takes up to 6 s", slow, quick, lasts_s=(6.0, 10.0), recordings_mb=1, excused=STILLNESS),
+        Fault(
+            "disk-slow",
+            "disk",
+            "every write takes up to 6 s",
+            slow,
+            quick,
+            lasts_s=(6.0, 10.0),
+            recordings_mb=8,
+            excused=STILLNESS,
+        ),
         Fault("folder-removed", "disk", "somebody removes the state directory", remove_folder, excused=DISK),
-        Fault("clock-forward", "clock", "the wall clock is set forward by an hour", sets_clock(by_s=3600.0)),
-        Fault("clock-back", "clock", "the wall clock is set back by an hour", sets_clock(by_s=-3600.0)),
-        Fault("clock-1970", "clock", "the wall clock is in 1970, and right again later", sets_clock(to_s=5.0), right_clock),
+        Fault("clock-step", "clock", "the wall clock is set forward or back by an hour", step_clock),
+        Fault(
+            "clock-1970", "clock", "the wall clock is in 1970, and right again later", sets_clock(to_s=5.0), right_clock
+        ),
         Fault("kill", "process", "kill -9, and started again", kill, **back),
         Fault("kill-again-and-again", "process", "kill -9 four times within seconds", kill_again_and_again, **back),
         Fault("stop", "process", "stopped in order, and started again", end_in_order, **back),
-        Fault("power-cut", "process", "power cut of everything at any byte of a write", power_cut(autopilot=True), recordings_mb=1, **back),
-        Fault("power-cut-companion", "process", "power cut of the companion alone, at any byte of a write", power_cut(autopilot=False), recordings_mb=1, **back),
-        *(
-            Fault(
-                f"record-{how}", "files", f"the newest record is damaged: {how}", spoils("records/??????.json", how),
-                names=r"passed over", **back,
-            )
-            for how in ("bits", "cut", "newer")
+        Fault(
+            "power-cut",
+            "process",
+            "power cut of everything at any byte of a write",
+            power_cut(autopilot=True),
+            recordings_mb=8,
+            **back,
         ),
-        *(
-            Fault(
-                f"undo-{how}", "files", f"the values for undo are damaged: {how}", spoils("undo-*.json", how),
-                remove_spoilt, names=r"cannot be read", **back,
-            )
-            for how in ("cut", "zeros")
+        Fault(
+            "power-cut-companion",
+            "process",
+            "power cut of the companion alone, at any byte of a write",
+            power_cut(autopilot=False),
+            recordings_mb=8,
+            **back,
         ),
-        Fault("journal-damaged", "files", "the journal of a write is damaged", spoil_journal, remove_spoilt, names=r"cannot be read", **back),
-        Fault("alignment-damaged", "files", "the gradienter's alignment is damaged", spoils("alignment.json", "cut"), remove_spoilt, names=r"not a readable alignment", **back),
-        Fault("recording-damaged", "files", "the newest recording is damaged", spoil_recording, recordings_mb=1, **back),
-        Fault("broker-dies", "broker", "the MQTT broker is killed and comes back", broker_dies, broker_is_back, names=r"nobody listens|closed|lost|disconnect|gone", lasts_s=(5.0, 9.0)),
-        Fault("broker-refuses", "broker", "the broker lets us in no longer", broker_refuses, broker_is_back, names=r"refuse|not authori|denie", lasts_s=(6.0, 10.0)),
-        Fault("broker-deaf", "broker", "the broker acknowledges nothing", broker_is_deaf, broker_is_back, names=r"127.0.0.1:\d+: .*(answer|acknowledg|says nothing|timed out|no )", lasts_s=(14.0, 20.0)),
-        Fault("broker-flood", "broker", "400 nonsensical requests a second by MQTT", *every(0.1, _requests), lasts_s=(2.0, 4.0)),
-        Fault("broker-retained", "broker", "retained requests, which are never obeyed", retained_request, names=r"retained request"),
+        Fault("record-damaged", "files", "the newest record is damaged", spoil_record, names=r"passed over", **back),
+        Fault(
+            "record-newer",
+            "files",
+            "the newest record is of a later version",
+            spoils("records/??????.json", "newer"),
+            names=r"passed over",
+            **back,
+        ),
+        Fault(
+            "undo-damaged",
+            "files",
+            "the values for undo are damaged",
+            spoil_undo,
+            remove_spoilt,
+            names=r"cannot be read",
+            **back,
+        ),
+        Fault(
+            "journal-damaged",
+            "files",
+            "the journal of a write is damaged",
+            spoil_journal,
+            remove_spoilt,
+            names=r"cannot be read",
+            **back,
+        ),
+        Fault(
+            "alignment-damaged",
+            "files",
+            "the gradienter's alignment is damaged",
+            spoils("alignment.json", "cut"),
+            remove_spoilt,
+            names=r"not a readable alignment",
+            **back,
+        ),
+        Fault(
+            "recording-damaged", "files", "the newest recording is damaged", spoil_recording, recordings_mb=8, **back
+        ),
+        Fault(
+            "broker-dies",
+            "broker",
+            "the MQTT broker is killed and comes back",
+            broker_dies,
+            broker_is_back,
+            names=r"nobody listens|closed|lost|disconnect|gone",
+            lasts_s=(5.0, 9.0),
+        ),
+        Fault(
+            "broker-refuses",
+            "broker",
+            "the broker lets us in no longer",
+            broker_refuses,
+            broker_is_back,
+            names=r"asks for a user|refuse|not authori",
+            lasts_s=(6.0, 10.0),
+        ),
+        Fault(
+            "broker-deaf",
+            "broker",
+            "the broker acknowledges nothing",
+            broker_is_deaf,
+            broker_is_back,
+            names=r"127.0.0.1:\d+: .*(answer|acknowledg|says nothing|timed out|no )",
+            lasts_s=(14.0, 20.0),
+        ),
+        Fault(
+            "broker-flood",
+            "broker",
+            "400 nonsensical requests a second by MQTT",
+            *every(0.1, _requests),
+            lasts_s=(2.0, 4.0),
+        ),
+        Fault(
+            "broker-retained",
+            "broker",
+            "retained requests, which are never obeyed",
+            retained_request,
+            names=r"retained request",
+        ),
         Fault("control-garbage", "faces", "nonsense at the control socket", control_garbage),
-        Fault("control-half-lines", "faces", "twelve clients of the control socket that never finish", control_half_lines, hang_up, lasts_s=(6.0, 9.0)),
+        Fault(
+            "control-half-lines",
+            "faces",
+            "twelve clients of the control socket that never finish",
+            control_half_lines,
+            hang_up,
+            lasts_s=(6.0, 9.0),
+        ),
         Fault("control-huge-line", "faces", "lines of 10 MB at the control socket", control_huge_line),
         Fault("control-crowd", "faces", "200 connections to the control socket", control_crowd, hang_up),
-        Fault("control-deaf", "faces", "clients of the control socket that read nothing", control_deaf, hang_up, lasts_s=(6.0, 10.0)),
+        Fault(
+            "control-deaf",
+            "faces",
+            "clients of the control socket that read nothing",
+            control_deaf,
+            hang_up,
+            lasts_s=(6.0, 10.0),
+        ),
         Fault("page-garbage", "faces", "nonsense at the page", page_garbage),
-        Fault("page-slow-loris", "faces", "60 requests to the page that never end", page_loris, hang_up, lasts_s=(6.0, 9.0)),
-        Fault("page-deaf", "faces", "ten viewers of the page that read nothing", page_deaf, hang_up, lasts_s=(6.0, 10.0)),
-    ]  # fmt: skip
+        Fault(
+            "page-slow-loris",
+            "faces",
+            "60 requests to the page that never end",
+            page_loris,
+            hang_up,
+            lasts_s=(6.0, 9.0),
+        ),
+        Fault(
+            "page-deaf", "faces", "ten viewers of the page that read nothing", page_deaf, hang_up, lasts_s=(6.0, 10.0)
+        ),
+    ]

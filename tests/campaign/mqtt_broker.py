@@ -1,6 +1,6 @@
 """A small MQTT broker on the campaign's loop (3.1.1 and 5, as far as the daemon uses them), and its bad manners.
 
-Written from the OASIS documents "MQTT Version 3.1.1" and "MQTT Version 5.0", section 3; real brokers are another test's.
+Written from the OASIS documents "MQTT Version 3.1.1" and "MQTT Version 5.0", section 3; real brokers are elsewhere.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextvars
 import random
 from collections.abc import Callable
 
@@ -28,6 +29,8 @@ class RoughWire(Wire):
         """All packets are late by so much."""
         self.change: Callable[[bytes, bool], bytes | None] | None = None
         """What becomes of a packet on its way (True: to the companion); None: lost."""
+        self.context = contextvars.copy_context()
+        """In which the companion's end gets its packets."""
         self.seen: Callable[[bytes, bool, float], None] = lambda data, inbound, t_s: None
         """Told of what the companion sends and of what it gets."""
 
@@ -60,7 +63,11 @@ class RoughWire(Wire):
     def _deliver(self, data: bytes, to: End) -> None:
         if not self.cut and to is self._ends[0]:
             self.seen(data, True, asyncio.get_running_loop().time())
-        super()._deliver(data, to)
+        if to is self._ends[0]:
+            # What the daemon starts while it handles a message is the daemon's, and counted with it.
+            self.context.run(super()._deliver, data, to)
+        else:
+            super()._deliver(data, to)
 
 
 class Stranger:

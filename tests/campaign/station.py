@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import Final
 
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
 from tests.campaign.stage import Stage
 from tests.support.component import IN_PROGRESS
 
@@ -37,7 +39,7 @@ class Operator:
             if answered and now_s - heard_s > GIVE_UP_S:
                 return None
             for t_s, message in ground.received[seen:]:
-                if message.get_type() != "COMMAND_ACK" or message.command != command:
+                if not isinstance(message, mavlink.MAVLink_command_ack_message) or message.command != command:
                     continue
                 if (message.target_system, message.target_component) != (ground.system_id, ground.component_id):
                     continue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +18,7 @@ from tests.support.component import CALIBRATE, CANCEL, IN_PROGRESS, UNDO
 
 COMMANDS = (CALIBRATE, CANCEL, UNDO)
 SILENT_S = 2.0
-"""Between two heartbeats of the companion, and after the autopilot's last one until nobody knows whether it is armed."""
+"""Between two heartbeats of the companion; and so long after the autopilot's last one its arming is not known."""
 SIGMAS = 5.0
 
 Values = dict[str, float]
@@ -43,6 +44,10 @@ class Witness:
         self._parsers = {True: _parser(), False: _parser()}
         stage.wire.seen = self._see
         stage.on_start = self._on_start
+
+    def silence_s(self, now_s: float) -> float:
+        """The longest between two heartbeats of the companion, the present pause included."""
+        return max(self.longest_silence_s, math.inf if self._beat_s is None else now_s - self._beat_s)
 
     @property
     def open_requests(self) -> list[int]:
@@ -74,7 +79,8 @@ class Witness:
             if sender == (1, 191):
                 return  # our own echo asks for nothing
             packet = bytes(message.get_msgbuf())
-            copy = t_s - self._packets.get(packet, -1e9) < 0.5
+            self._packets = {data: at_s for data, at_s in self._packets.items() if t_s - at_s < 0.5}
+            copy = packet in self._packets
             self._packets[packet] = t_s
             if copy:
                 return
@@ -126,8 +132,9 @@ class Witness:
         self._finals[key] = (t_s, message.result)
 
 
-MAY_BE_SET = r"INS_(GYR|ACC)OFFS_[XYZ]|CAL_(GYRO|ACC)0_[XYZ]OFF"
-"""Of IMU 1, which is the one that is calibrated."""
+MAY_BE_SET = r"INS_(GYR|ACC)OFFS_[XYZ]|CAL_(GYRO|ACC)[01]_[XYZ]OFF"
+"""Of IMU 1, which is the one that is calibrated. On PX4 a write shows which IMU a slot acts on; one that is another's
+is put back, so that there what counts is what `others` says once at rest."""
 WATCHED = {
     True: [f"CAL_{sensor}1_{axis}OFF" for sensor in ("ACC", "GYRO") for axis in "XYZ"],
     False: [
@@ -170,8 +177,9 @@ def vectors(stage: Stage) -> Values:
 
 
 def others(stage: Stage) -> Values:
-    """The accelerometer's offsets of IMU 2, which is none of ours."""
-    return {name: stage.autopilot.parameter(name) for name in _names(stage, "2") if "ACC" in name}
+    """The offsets of IMU 2, which is none of ours; ArduPilot's own gyro calibration sets those of all its gyros."""
+    px4 = stage.variant.name == "PX4"
+    return {name: stage.autopilot.parameter(name) for name in _names(stage, "2") if px4 or "ACC" in name}
 
 
 def _names(stage: Stage, which: str) -> list[str]:
@@ -189,6 +197,15 @@ def half_written(now: Values, *known: Values) -> list[str]:
     for part in (names[:3], names[3:]):
         if all(any(abs(now[name] - each[name]) > 1e-9 for name in part) for each in known):
             found.append(f"half written: {', '.join(f'{name} {now[name]:.6g}' for name in part)}")
+    return found
+
+
+def undoable(stage: Stage) -> list[Values]:
+    """What finished writes have left, as the values for undo tell: a power cut may have come before their record."""
+    found = []
+    for path in stage.store.glob("undo-*.json"):
+        with contextlib.suppress(ValueError, KeyError, TypeError):
+            found.append({c["parameter"]: c["after"] for c in json.loads(path.read_bytes())["changes"]})
     return found
 
 

@@ -488,3 +488,24 @@ def test_every_imu_that_does_not_take_its_offsets_is_named(tmp_path: Path) -> No
             assert {w.outcome for imu in record.imus for w in imu.written.values()} == {"rolled_back"}
 
     run_virtual(main())
+
+
+@pytest.mark.parametrize("runs_s", [0.6, 6.0, 29.0])
+def test_a_daemon_that_died_while_the_firmware_calibrated_its_gyros_puts_their_offsets_back_too(
+    tmp_path: Path, runs_s: float
+) -> None:
+    """What the firmware finds is stored at its end, when the next daemon is long there; until then all reads zero."""
+    names = offset_names(1, "gyro")
+    changes = tuple(Changed(name, before=0.0, after=None) for name in names)
+    ChangeLog(tmp_path).journal.write(ChangeSet(1, changes))
+
+    async def main() -> None:
+        async with Rig(tmp_path, parameters=dict.fromkeys(names, 0.0)).running() as rig:
+            await asyncio.sleep(runs_s)
+            for name in names:
+                rig.double.set_parameter(name, 0.001)
+            await rig.until(lambda: not rig.service.mender.pending, 60.0)
+            await asyncio.sleep(1.0)
+            assert [rig.double.parameter(name) for name in names] == [0.0, 0.0, 0.0]
+
+    run_virtual(main())

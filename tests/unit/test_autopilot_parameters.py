@@ -5,6 +5,7 @@ import contextlib
 import math
 import struct
 from collections.abc import AsyncIterator
+from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -152,6 +153,59 @@ def test_optional_missing_by_silence_of_old_firmware(read_before: bool) -> None:
             if read_before:
                 await client.read(Y)
             assert await client.read_optional("INS_ACC1OFFS_X") is None
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("read_before", [False, True])
+def test_a_silence_that_ends_in_the_moment_of_the_decision_is_no_absence(read_before: bool) -> None:
+    """Silent to everything while it is asked for X, and there again for the question whether it answers at all."""
+
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets(), param_errors=False)
+        async with aboard(autopilot) as (client, _, _):
+            if read_before:
+                await client.read(X)
+            await client.read(Y)
+
+            def on_message(message: Any) -> bool:
+                asked = getattr(message, "param_id", "")
+                if asked == Y:
+                    autopilot.on_message = lambda message: True
+                return asked != X
+
+            autopilot.on_message = on_message
+            assert await client.read_optional(X) == pytest.approx(offsets()[X])
+            assert await client.read_optional(X) == pytest.approx(offsets()[X])
+
+    run_virtual(main())
+
+
+def test_what_was_there_a_moment_ago_is_not_called_absent_for_a_silence() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets(), param_errors=False)
+        async with aboard(autopilot) as (client, _, _):
+            await client.read(X)
+            await client.read(Y)
+            autopilot.on_message = lambda message: getattr(message, "param_id", "") != X
+            with pytest.raises(ParameterTimeoutError, match="any more"):
+                await client.read_optional(X)
+            autopilot.on_message = lambda message: True
+            assert await client.read_optional(X) is not None
+
+    run_virtual(main())
+
+
+def test_what_signs_and_is_silent_is_said_to_sign() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=offsets())
+        autopilot._codec.signing.secret_key = b"k" * 32
+        autopilot._codec.signing.sign_outgoing = True
+        async with aboard(autopilot) as (client, vehicle, _):
+            assert vehicle.signs
+            autopilot.on_message = lambda message: False
+            with pytest.raises(ParameterTimeoutError, match="it signs what it sends"):
+                await client.read(X)
 
     run_virtual(main())
 
