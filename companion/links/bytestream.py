@@ -28,11 +28,11 @@ READ_BYTES = 4096
 QUICK_READS = 20
 QUICK_S = 0.0015
 """So many reads, that far apart in the mean or less, are a stream whose every byte would wake the loop."""
-COLLECT_S = 0.01
+COLLECT_S = 0.0205
 """So long such a stream is collected before the next read: a wake-up costs far more than the bytes that it brings.
 
-What it brings is stamped that much late at worst, less than what a USB adapter adds that is left as it came. Two of
-them are the 20 ms within which an autopilot takes one heading (autopilots section 6).
+What it brings is stamped that much late at worst (where the device has no clock of its own), as behind a USB adapter.
+A little more than the 20 ms within which an autopilot takes one heading (autopilots section 6): each read brings one.
 """
 JUDGED_S = 0.1
 """So often it is looked at whether a stream is still one to be collected: what comes in bunches is no other stream."""
