@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from tests.e2e.test_calibration import calibrated
 from tests.support.rig import POSE, Rig
 from tests.support.virtual_time import run_virtual
 
+EARTH_RATE_RAD_S = 7.292115e-5
 SCALE = f"counts_per_gauss = {COUNTS_PER_GAUSS}\n"
 
 
@@ -75,7 +77,7 @@ def test_magnetometer_lines_give_a_heading_with_the_gradienters_tilt_and_a_bound
 
 def test_a_magnet_of_the_aircraft_is_bounded_warned_of_and_widens_the_gyros(tmp_path: Path) -> None:
     async def main() -> None:
-        sigmas = {}
+        together = {}
         for name, iron in (
             ("clean", Iron()),
             ("magnet", Iron(body_gauss=(0.012, 0.014, -0.010))),
@@ -96,11 +98,16 @@ def test_a_magnet_of_the_aircraft_is_bounded_warned_of_and_widens_the_gyros(tmp_
             if name != "clean":
                 assert error_deg > 1.0
                 assert f"off by {record.magnetic.heading_bound_deg:.0f} deg" in warned[0]
-            assert record.imus[0].gyro_sigma_use_rad_s is not None
-            sigmas[name] = record.imus[0].gyro_sigma_use_rad_s[0]
             assert record.pose.sigma_deg.psi is not None
             assert record.pose.sigma_deg.psi >= record.magnetic.heading_bound_deg - 0.01
-        assert min(sigmas["magnet"], sigmas["car"]) > sigmas["clean"]
+            # A wrong heading makes both level gyros wrong together, as no noise does: w_n (-sin psi, -cos psi) a radian.
+            assert record.imus[0].covariance is not None
+            together[name] = record.imus[0].covariance[0][1]
+            psi, sigma = math.radians(POSE.heading_deg), math.radians(record.pose.sigma_deg.psi)
+            north_rad_s = EARTH_RATE_RAD_S * math.cos(math.radians(rig.site.latitude_deg))
+            expected = (north_rad_s * sigma) ** 2 * math.sin(psi) * math.cos(psi)
+            assert together[name] == pytest.approx(expected, rel=0.15)  # up to the tilt of 5 and 3 degrees
+        assert min(together["magnet"], together["car"]) > 1.5 * together["clean"]
 
     run_virtual(main())
 
