@@ -100,7 +100,7 @@ def test_a_magnet_of_the_aircraft_is_bounded_warned_of_and_widens_the_gyros(tmp_
                 assert f"off by {record.magnetic.heading_bound_deg:.0f} deg" in warned[0]
             assert record.pose.sigma_deg.psi is not None
             assert record.pose.sigma_deg.psi >= record.magnetic.heading_bound_deg - 0.01
-            # A wrong heading makes both level gyros wrong together, as no noise does: w_n (-sin psi, -cos psi) a radian.
+            # A wrong heading makes both level gyros wrong together, as no noise does: w_n (-sin psi, -cos psi) each.
             assert record.imus[0].covariance is not None
             together[name] = record.imus[0].covariance[0][1]
             psi, sigma = math.radians(POSE.heading_deg), math.radians(record.pose.sigma_deg.psi)
