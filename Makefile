@@ -10,11 +10,11 @@ JOBS ?= 2
 
 help:
 	@echo 'make demo    watch a virtual aircraft being calibrated (about a minute)'
-	@echo 'make test    run all tests (about 7 minutes on two cores)'
+	@echo 'make test    run all tests (about 14 minutes on two cores)'
 	@echo 'make check   formatting, lint, types, import directions'
 	@echo 'make format  put the code into the one format'
 	@echo 'make bench   speed, as ratios within one run'
-	@echo 'make accuracy  how good a calibration is, beside the bound and what else is done (three minutes)'
+	@echo 'make accuracy  how good a calibration is, beside the bound and what else is done (about four minutes on two cores)'
 	@echo 'make campaign  every fault in every phase of a calibration (about 6 minutes on two cores)'
 	@echo 'make deb     a Debian package for machines like this one, in dist/'
 	@echo 'make deb-test  try that package in a clean root (as root; a minute or two)'
