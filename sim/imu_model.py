@@ -171,9 +171,14 @@ class _SlowPath:
             return self._blocks[block]
         except KeyError:
             raise ValueError(
-                f"the bias at {block * _BLOCK * SLOW_STEP_S:.0f} s is no longer kept;"
+                f"the bias at {block * _BLOCK * SLOW_STEP_S:.0f} s is no longer kept; at most"
                 f" the last {_KEPT_BLOCKS * _BLOCK * SLOW_STEP_S / 3600:.1f} h are"
             ) from None
+
+    def forget_before(self, t_s: float) -> None:
+        """Let go of all values before a time that nobody will ask for any more."""
+        for block in [each for each in self._blocks if (each + 1) * _BLOCK * SLOW_STEP_S <= t_s]:
+            del self._blocks[block]
 
     def _make_block(self) -> None:
         """Values of one block, and the first of the next one so that interpolation stays inside a block."""
@@ -241,6 +246,10 @@ class ImuModel:
     def turn_on(self, gyro_bias_rad_s: Sequence[float] | Array, accel_bias_m_s2: Sequence[float] | Array) -> None:
         """Another power-up: the bias begins elsewhere."""
         self._turn_on = np.concatenate([gyro_bias_rad_s, accel_bias_m_s2]).astype(np.float64)
+
+    def forget_before(self, t_s: float) -> None:
+        """Let go of the bias before a time: an hour of it is 1.7 MB."""
+        self._slow.forget_before(t_s)
 
     @property
     def white(self) -> Array:

@@ -74,6 +74,26 @@ class Doubt:
     """Of the IMUs whose readings are not to be believed."""
     words: str
 
+    @property
+    def of_all(self) -> bool:
+        """Whether it concerns this triad of all IMUs, not only of those named."""
+        return self.cause not in _OF_ONE
+
+    @property
+    def in_short(self) -> str:
+        """The same in a few words."""
+        return _IN_SHORT[self.cause]
+
+
+_OF_ONE: Final = ("imu", "unclear")
+_IN_SHORT: Final[dict[Cause, str]] = {
+    "gradienter": "gradienter or its zero moved",
+    "gravity": "gravity differs",
+    "turn": "it turns",
+    "imu": "unlike before",
+    "unclear": "unlike before",
+}
+
 
 def doubts(
     triad: Triad, witnesses: Sequence[Witness], up: Array, by_reading: Matrix | None, *, today: bool

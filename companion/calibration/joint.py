@@ -34,8 +34,6 @@ Whole = Mapping[str, tuple[Array | None, Array | None]]
 """By IMU: whole gyro and accelerometer bias by the readings alone, (3,) each, vehicle FRD."""
 
 _TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
-_OF_ONE: Final = ("imu", "unclear")
-"""Causes that concern one IMU; the others concern all."""
 AGREES: Final = 11.34
 """Chi square of three axes that is passed by chance once in a hundred: beyond it nobody is warned yet, but what may
 well be of another sensor takes no part."""
@@ -47,6 +45,15 @@ class Weighed:
 
     solution: Solution
     doubts: tuple[Doubt, ...]
+
+    @property
+    def doubted(self) -> dict[tuple[str, Triad], Doubt]:
+        """By IMU and triad, what speaks against it; a tilt or a turn is in all, whether each shows it or not."""
+        return {
+            (name, doubt.triad): doubt
+            for doubt in reversed(self.doubts)
+            for name in ([imu.name for imu in self.solution.imus] if doubt.of_all else doubt.names)
+        }
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +100,7 @@ def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed
     doubted = {(doubt.triad, name) for doubt in found for name in doubt.names}
     known = [one for triad in _TRIADS for one in _known(solution, whole, expected, triad, today=False)]
     # A tilt, a gravity or a turn that nobody expected is in all of them, whether or not each shows it.
-    shaken = {doubt.triad for doubt in found if doubt.cause not in _OF_ONE}
+    shaken = {doubt.triad for doubt in found if doubt.of_all}
     used = [
         one
         for one in known
@@ -109,12 +116,12 @@ def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed
             prior=_prior(k, imu.name, solution, shared, known, used, whole),
             warnings=(
                 *imu.warnings,
-                *(doubt.words for doubt in found if doubt.cause in _OF_ONE and imu.name in doubt.names),
+                *(doubt.words for doubt in found if not doubt.of_all and imu.name in doubt.names),
             ),
         )
         for k, imu in enumerate(weighed.imus)
     )
-    common = [doubt.words for doubt in found if doubt.cause not in _OF_ONE]
+    common = [doubt.words for doubt in found if doubt.of_all]
     return Weighed(dataclasses.replace(weighed, imus=imus, warnings=(*solution.warnings, *common)), tuple(found))
 
 

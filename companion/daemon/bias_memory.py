@@ -32,7 +32,7 @@ from companion.daemon.ledger import Offload
 from companion.daemon.plan import whole_of
 from companion.daemon.sensors import SerialSensor
 from companion.errors import StorageError
-from companion.storage.biases import BiasStore, KnownImu
+from companion.storage.biases import KEEP_POINTS, BiasStore, KnownImu
 
 logger = logging.getLogger(__name__)
 
@@ -187,7 +187,8 @@ class BiasMemory:
         """Remember a calibration that has come to a good end; that it cannot be kept on disk is only logged."""
         for name, point in found.items():
             known = self._known.get(name) or KnownImu(identity=self._identity(name))
-            self._known[name] = msgspec.structs.replace(known, points=(*known.points, point))
+            # As many as the disk keeps: what is asked must not depend on when the daemon was started.
+            self._known[name] = msgspec.structs.replace(known, points=(*known.points, point)[-KEEP_POINTS:])
             for triad in _TRIADS:
                 self._refer(name, triad, point)
         await self._write()

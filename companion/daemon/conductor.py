@@ -138,7 +138,8 @@ class Conductor:
         """
         deadline_s = None if timeout_s is None else asyncio.get_running_loop().time() + timeout_s
         running = self._by_itself()
-        if running is not None and not running.cancelled and running.what in (what, What.BOTH):
+        whole = running is not None and not running.cancelled and not running.held_back
+        if running is not None and whole and running.what in (what, What.BOTH):
             running.adopt(requester, deadline_s)
             running.reboot |= reboot
             return running

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from typing import Final, Literal
 
 import msgspec
@@ -17,6 +17,7 @@ import numpy as np
 
 from companion.autopilot.change import WriteFailedError
 from companion.autopilot.vehicle import ArmState, Vehicle
+from companion.calibration.history import Point, Triad
 from companion.calibration.joint import Weighed, weigh
 from companion.calibration.machine import Event, Machine, State
 from companion.calibration.prior import Expectation
@@ -27,7 +28,7 @@ from companion.calibration.solve import Solution, solve_at
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity, Weight
 from companion.config import Config
-from companion.daemon import estimating, models
+from companion.daemon import estimating, held_back, models
 from companion.daemon.alignment import AlignmentInForce
 from companion.daemon.autopilot_imu import AutopilotImu, not_ready
 from companion.daemon.bias_memory import BiasMemory
@@ -85,6 +86,8 @@ class Course:
         self.on_solved: Callable[[Window, Window, Whereabouts, What, Expectation], None] = lambda *of_what: None
         """Told of every solution: the window measured, the one used, the place, what was asked for, and what was known
         from before."""
+        self._written = {imu.name for imu in config.imu if imu.name in imus or imu.autopilot_instance is not None}
+        """IMUs whose offsets are in the autopilot."""
         self._late: Stage = "checking"
         """Of State.VERIFYING."""
         self._settled_by_s = 0.0
@@ -133,10 +136,12 @@ class Course:
                 draft.begin_again(f"{error.reason}; put back, and written where it belongs")
                 job.check_cancelled()
             else:
-                await self._memory.keep(draft.points)
-                return
-        await self._measure_and_push(job, draft)
+                break
+        else:
+            await self._measure_and_push(job, draft)
         await self._memory.keep(draft.points)
+        if draft.held_back:
+            draft.notes.append(f"{held_back.in_words(draft.held_back)} held back")
 
     async def _measure_and_push(self, job: Job, draft: Draft) -> None:
         self._collector.retarget(self._wanted(job.what))
@@ -164,7 +169,7 @@ class Course:
         draft.alignment = self._alignment.used
         draft.measured_s = (measured.start_s, measured.end_s)
         solution = await self._weighed(
-            solution, draft, lambda expectation: self.on_solved(measured, window, where, job.what, expectation)
+            solution, job, draft, lambda expectation: self.on_solved(measured, window, where, job.what, expectation)
         )
         plan = await self._pusher.plan(solution, draft)
         job.check_cancelled()
@@ -205,8 +210,13 @@ class Course:
                 await self._reboot.survived(plan, draft)
         self.machine.on(Event.VERIFIED)
 
-    async def _weighed(self, solution: Solution, draft: Draft, tell: Callable[[Expectation], None]) -> Solution:
+    async def _weighed(
+        self, solution: Solution, job: Job, draft: Draft, tell: Callable[[Expectation], None]
+    ) -> Solution:
         """The solution with what is known from before; fills the draft, and says what contradicts.
+
+        What contradicts is written where somebody has asked for it. Of a calibration by itself it is held back: what
+        is in force was right once, and a gradienter that has moved would spoil it without anybody having looked.
 
         Raises:
             AutopilotError: the offsets in force are not known at the moment.
@@ -222,8 +232,18 @@ class Course:
         started_at = draft.started_at.isoformat(timespec="milliseconds")
         draft.points = self._memory.measured(solution, whole, weighed.doubts, started_at, unix_s)
         draft.solution = weighed.solution
+        # From here on nobody can make this job theirs, so that a request is never answered with half of it.
+        writes = job.automatic and self._pusher.enabled
+        job.held_back = {key: doubt for key, doubt in weighed.doubted.items() if writes and key[0] in self._written}
+        draft.held_back = dict(job.held_back)
+        draft.points = _less(draft.points, draft.held_back)
         for doubt in weighed.doubts:
             self._say(Severity.WARNING, doubt.words, Weight.NEWS)
+        if draft.held_back:
+            what = held_back.in_words(draft.held_back)
+            self._say(
+                Severity.WARNING, f"Held back: {what}; calibrate on request to write it all the same", Weight.NEWS
+            )
         return weighed.solution
 
     async def _settle(self, job: Job, plan: Plan, draft: Draft) -> None:
@@ -302,6 +322,19 @@ class Course:
 
 def _nobody() -> None:
     """Waits for the next second."""
+
+
+def _less(points: Mapping[str, Point], less: Container[tuple[str, Triad]]) -> dict[str, Point]:
+    """What is to be remembered: what was held back must not become a habit by being measured again and again."""
+    left = {
+        name: msgspec.structs.replace(
+            point,
+            gyro=None if (name, "gyro") in less else point.gyro,
+            accel=None if (name, "accel") in less else point.accel,
+        )
+        for name, point in points.items()
+    }
+    return {name: point for name, point in left.items() if point.gyro is not None or point.accel is not None}
 
 
 def in_words(solution: Solution | None) -> str:

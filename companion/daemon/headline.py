@@ -145,6 +145,8 @@ class Headlines:
     def _uncalibrated(self, words: str, now_s: float) -> Headline:
         if (reading := self._readiness.in_force.reading()) is not None:
             return Headline("WAIT", f"reading {reading}", "wait")
+        if self._readiness.in_force.held_back is not None:
+            return self._failed() or Headline("NOT CALIBRATED", words, "bad")
         todo = self._automatic.why_not()
         if todo is not None:
             return self._failed() or Headline("NOT CALIBRATED", f"{words}: {todo}" if todo != words else words, "bad")

@@ -19,6 +19,7 @@ import numpy as np
 from companion.autopilot.imu_calibration import ImuCalibration
 from companion.autopilot.vehicle import Vehicle
 from companion.calibration.allan import noise_profile
+from companion.calibration.doubt import Doubt
 from companion.calibration.record import ImuRecord, Record
 from companion.calibration.request import What
 from companion.calibration.rolling import RollingCollector
@@ -39,6 +40,7 @@ from companion.component.service import JobResult
 from companion.config import Config, Imu
 from companion.daemon import estimating, models
 from companion.daemon.autopilot_imu import AutopilotImu
+from companion.daemon.held_back import HeldBack, Key
 from companion.daemon.job import ALIGNMENT, Job
 from companion.daemon.ledger import Offload
 from companion.errors import CalibrationRefusedError
@@ -51,7 +53,6 @@ _ZERO: Final[Axes] = (0.0, 0.0, 0.0)
 _SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED})
 SETTLED_EVERY_S: Final = 5
 """So often the output is looked at while nothing speaks against what is in force; else every second."""
-Key = tuple[str, Triad]
 
 
 class _Known(msgspec.Struct, frozen=True):
@@ -101,6 +102,7 @@ class InForce:
         """What no calibration can settle, and is not judged."""
         self._shelved: dict[Key, Held] = {}
         """What was in force before a restart that kept the offsets: it counts again once a window agrees."""
+        self._held_back = HeldBack()
         self._present: dict[Key, Present] = {}
         self._temperatures: dict[str, float] = {}
         self._measured_s = self._looked_s = -1.0
@@ -130,10 +132,10 @@ class InForce:
         for (name, triad), held in self._held.items():
             if isinstance(held, Why):
                 if not any(finding.why is held for finding in found):
-                    found.append(Finding(held, held.value))
+                    found += self._held_back.left_of((name, triad), [Finding(held, held.value)])
                 continue
             profile = noise_profile(self._sources[name].profile)
-            found += judge(
+            against = judge(
                 triad,
                 name,
                 held,
@@ -143,7 +145,13 @@ class InForce:
                 temperature_degc=self._temperatures.get(name),
                 present=self._present.get((name, triad)),
             )
+            found += self._held_back.left_of((name, triad), against)
         return found
+
+    @property
+    def held_back(self) -> str | None:
+        """What was measured and not written, and why, in one short line; None when nothing was."""
+        return self._held_back.words
 
     @property
     def worth_writing_s(self) -> float:
@@ -179,7 +187,10 @@ class InForce:
 
     def record_of(self, name: str) -> ImuRecord | None:
         """What the last calibration found in one IMU; None when nothing did, or something has replaced it."""
-        if self.calibration is None or any(isinstance(self._held.get((name, t)), Why) for t in ("gyro", "accel")):
+        keys: list[Key] = [(name, "gyro"), (name, "accel")]
+        if self.calibration is None or any(
+            isinstance(self._held.get(key), Why) or key in self._held_back for key in keys
+        ):
             return None
         return next((imu for imu in self.calibration.imus if imu.name == name), None)
 
@@ -205,6 +216,7 @@ class InForce:
         if job.kind == "undo":
             if done:
                 self.undone, self.calibration = True, None
+                self._held_back.let_go()
                 self._held = dict.fromkeys(self._held, Why.UNDONE)
             return
         if not job.automatic and job.kind != ALIGNMENT:
@@ -215,7 +227,7 @@ class InForce:
             self._asked_restart = job.reboot
             for imu in job.record.imus:
                 if imu.name in self._sources:
-                    self._take(imu, asyncio.get_running_loop().time())
+                    self._take(imu, asyncio.get_running_loop().time(), job.held_back)
                     self._written[imu.name] = {name: one.after for name, one in imu.written.items()}
 
     def realigned(self) -> None:
@@ -223,10 +235,11 @@ class InForce:
         for key, held in self._held.items():
             if key[1] == "accel" and isinstance(held, Held):
                 self._held[key] = Why.ALIGNED
+        self._held_back.let_go(triad="accel")
         self._forget()
 
-    def _take(self, imu: ImuRecord, now_s: float) -> None:
-        """Hold what a calibration has found in one IMU."""
+    def _take(self, imu: ImuRecord, now_s: float, held_back: Mapping[Key, Doubt]) -> None:
+        """Hold what a calibration has found in one IMU, save what it has not written for doubt."""
         corrected = imu.name in self._imus
         for triad, sigma, bias in (
             ("gyro", imu.gyro_sigma_use_rad_s, imu.gyro_bias_rad_s),
@@ -237,7 +250,7 @@ class InForce:
                 continue
             mark = "GYR" if triad == "gyro" else "ACC"
             outcomes = {one.outcome for name, one in imu.written.items() if mark in name}
-            self._held[key] = Held(
+            found = Held(
                 calibrated_s=now_s,
                 confirmed_s=now_s,
                 temperature_degc=imu.temperature_degc,
@@ -247,6 +260,14 @@ class InForce:
                 seen=outcomes <= {"verified"} or not corrected,
                 averaged_s=self._config.calibration.min_still_s,
             )
+            doubt = held_back.get(key)
+            if doubt is None:
+                self._held[key] = found
+                self._held_back.let_go(name=imu.name, triad=triad)
+                continue
+            residual = imu.residual_gyro_rad_s if triad == "gyro" else imu.residual_accel_m_s2
+            seen = msgspec.structs.replace(found, expected=residual if corrected and residual is not None else bias)
+            self._held_back.hold(key, doubt, seen)
 
     def poll(self, *, writing: bool) -> None:
         """Compare the autopilot's offsets with those that were there before.
@@ -301,6 +322,8 @@ class InForce:
         self._forget()
 
     def _lose(self, name: str, why: Why) -> None:
+        if why is not Why.REBOOTED:  # which has kept them
+            self._held_back.let_go(name=name)
         for triad in ("gyro", "accel"):
             key: Key = (name, "gyro" if triad == "gyro" else "accel")
             held = self._held.get(key)
@@ -372,6 +395,8 @@ class InForce:
                 self._present[key] = present
                 self._confirm(key, present, imu.temperature_degc, end_s, averaged_s)
                 held = self._held[key]
+                if self._held_back.still(key, held, present, end_s, self._limits.max_age_s):
+                    continue
                 worth |= worth_writing(present, held if isinstance(held, Held) else None, self._floors[key[1]])
         if not worth:
             self._worth_since_s = None

@@ -6,6 +6,8 @@ import asyncio
 from typing import Final
 
 from companion.calibration.align_record import AlignmentRecord
+from companion.calibration.doubt import Doubt
+from companion.calibration.history import Triad
 from companion.calibration.record import Record, WrittenParameter
 from companion.calibration.request import What
 from companion.component.service import JobResult
@@ -35,6 +37,8 @@ class Job:
         self.record: Record | None = None
         self.alignment: AlignmentRecord | None = None
         self.written: dict[str, WrittenParameter] = {}
+        self.held_back: dict[tuple[str, Triad], Doubt] = {}
+        """By IMU and triad, what is measured but not written, and why: only of what nobody asked for."""
         self.words = ""
         """What is going on now, for people."""
         self._percent = 0

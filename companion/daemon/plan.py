@@ -97,7 +97,7 @@ class Planner:
 
         Args:
             solution: what was found.
-            draft: gets the whole biases and what a pilot should know.
+            draft: gets the whole biases and what a pilot should know; what it holds back is not planned.
             push: whether anything is to be written at all.
 
         Raises:
@@ -107,9 +107,10 @@ class Planner:
         targets: list[Target] = []
         for found in solution.imus:
             imu, source = self._imus.get(found.name), self._sources[found.name]
+            whole, found = found, _to_be_written(found, draft)
             if imu is not None:
                 calibration = imu.in_force
-                draft.whole[found.name] = whole_of(calibration, found)
+                draft.whole[found.name] = whole_of(calibration, whole)
                 gyro, accel = found.gyro_rad_s, found.accel_m_s2
             elif source.autopilot_instance is not None:
                 calibration = await read_calibration(self._parameters, source.autopilot_instance, self._memory)
@@ -156,6 +157,15 @@ class Planner:
                         f"imu {other} and imu {target.name} seem to share {name}, which cannot be; what was learned"
                         " about PX4's slots is forgotten; calibrate again"
                     )
+
+
+def _to_be_written(found: ImuSolution, draft: Draft) -> ImuSolution:
+    """What was found in one IMU, less what is held back."""
+    return dataclasses.replace(
+        found,
+        gyro_rad_s=None if (found.name, "gyro") in draft.held_back else found.gyro_rad_s,
+        accel_m_s2=None if (found.name, "accel") in draft.held_back else found.accel_m_s2,
+    )
 
 
 def whole_of(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:

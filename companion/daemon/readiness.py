@@ -169,6 +169,13 @@ class Readiness:
 
     def state(self, now_s: float) -> tuple[Literal["calibrated", "checked", "uncalibrated"], str]:
         """In which state it would arm now, in a word and in one short line."""
+        state, words = self._state(now_s)
+        held_back = self.in_force.held_back
+        if held_back is None or self._conductor.stage is not None:
+            return state, words
+        return state, f"{words}; {held_back}; calibrate to write it" if words else f"{held_back}; calibrate to write it"
+
+    def _state(self, now_s: float) -> tuple[Literal["calibrated", "checked", "uncalibrated"], str]:
         stage = self._conductor.stage
         if stage is not None:
             return "uncalibrated", _IN_THE_MIDDLE[stage]
@@ -183,7 +190,7 @@ class Readiness:
             return "calibrated", f"calibrated {_ago(now_s - calibrated_s)} ago, {sigmas}"
         if confirmed_s is not None:
             return "checked", f"offsets checked {_ago(now_s - confirmed_s)} ago, {sigmas}"
-        return "uncalibrated", "not calibrated yet"
+        return "uncalibrated", "not calibrated yet" if self.in_force.held_back is None else ""
 
     def in_words(self, now_s: float) -> str:
         """The state in one short line."""
@@ -207,6 +214,7 @@ class Readiness:
             "words": answer.words,
             "state": state,
             "in_force": words,
+            "held_back": self.in_force.held_back,
             "against": [finding.words for finding in self.in_force.findings(now_s)],
         }
 

@@ -6,7 +6,8 @@ import dataclasses
 import datetime
 from typing import Literal
 
-from companion.calibration.history import Point
+from companion.calibration.doubt import Doubt
+from companion.calibration.history import Point, Triad
 from companion.calibration.record import AlignmentUsed, Axes, CrossCovariance, ImuRecord, Record, WrittenParameter
 from companion.calibration.solve import ImuSolution, Solution
 from companion.physics.frames import Array, Matrix
@@ -34,6 +35,9 @@ class Draft:
     points: dict[str, Point] = dataclasses.field(default_factory=dict)
     """By IMU: what later calibrations may know of this one, once it has come to a good end."""
 
+    held_back: dict[tuple[str, Triad], Doubt] = dataclasses.field(default_factory=dict)
+    """By IMU and triad, what is not to be written, and why."""
+
     def warn(self, imu: str, words: str) -> None:
         """Add a warning to one IMU, once."""
         warnings = self.imu_warnings.setdefault(imu, [])
@@ -47,6 +51,7 @@ class Draft:
         self.written.clear()
         self.imu_warnings.clear()
         self.points.clear()
+        self.held_back.clear()
         self.warnings.append(why)
 
     def record(self, state: Literal["done", "failed", "cancelled"], reason: str, duration_s: float) -> Record:

@@ -16,7 +16,7 @@ from companion.calibration.record import Record
 from companion.daemon.job import Job
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
-from companion.storage.biases import BiasStore
+from companion.storage.biases import KEEP_POINTS, BiasStore
 from sim.devices import Gradienter
 from sim.imu_model import DEG_H, MG
 from tests.e2e.test_calibration import calibrated
@@ -202,6 +202,21 @@ def test_switched_off_nothing_is_asked_but_all_is_remembered(known: Path, tmp_pa
     assert fc.effective is not None
     assert not any("moved" in words for words in (*record.warnings, *fc.warnings))
     assert {name: len(imu.points) for name, imu in BiasStore(tmp_path).read().items()} == {"fc": 6, "own": 5}
+
+
+def test_no_more_is_held_in_memory_than_on_the_disk(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, own_imu=False, **FEW).running() as rig:
+            await rig.ready()
+            await calibrated(rig)
+            memory = rig.service.memory
+            (point,) = memory._known["fc"].points
+            for k in range(KEEP_POINTS + 5):
+                await memory.keep({"fc": msgspec.structs.replace(point, started_at=str(k))})
+            assert memory._known["fc"].points == BiasStore(tmp_path).read()["fc"].points
+            assert len(memory._known["fc"].points) == KEEP_POINTS
+
+    run_virtual(main())
 
 
 def test_a_damaged_file_costs_one_line_and_what_is_undone_is_forgotten(

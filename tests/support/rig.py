@@ -129,7 +129,8 @@ class Rig:
             # Nobody looks at them, and half of the time goes there; but they are what a serial line has to carry.
             autopilot.setdefault("default_streams", baud is not None)
         others = [ImuModel(self.aircraft, part, seed=seed + 10 + k, mounting_deg=mounting_deg) for k in range(imus - 1)]
-        models = [self.model, *others]
+        self.models = models = [self.model, *others]
+        """The autopilot's IMUs."""
         kind, usual = _FIRMWARES[firmware]
         self.autopilot = kind(
             self.aircraft, models, vehicle=vehicle, parameters={**usual, **(parameters or {})}, seed=seed, **autopilot

@@ -117,6 +117,15 @@ def test_scale_misalignment_and_mounting_in_the_right_frames() -> None:
     assert mounted.error_in_vehicle(0.0).accel_m_s2 == pytest.approx([0.0, 0.1, 0.0], abs=1e-12)
 
 
+def test_what_was_let_go_of_is_refused_and_changes_nothing_of_the_rest() -> None:
+    imu, other = (ImuModel(VirtualAircraft(), "icm42688p", seed=1) for _ in range(2))
+    imu.true_bias(600.0)
+    imu.forget_before(500.0)
+    assert np.array_equal(imu.mean_bias(500.0, 700.0).gyro_rad_s, other.mean_bias(500.0, 700.0).gyro_rad_s)
+    with pytest.raises(ValueError, match="no longer kept"):
+        imu.true_bias(400.0)
+
+
 def test_a_bias_too_far_back_is_refused_not_invented() -> None:
     imu = ImuModel(VirtualAircraft(), "icm42688p", seed=1)
     imu.true_bias(6.0 * 3600.0)

@@ -1,0 +1,158 @@
+"""What contradicts earlier calibrations is not written by itself: it is said, the gate stays as it is, people may."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.calibration.machine import State
+from companion.calibration.request import What
+from companion.component.service import Refusal
+from companion.daemon import automatic
+from companion.daemon.job import Job
+from sim.devices import Gradienter
+from tests.e2e.test_automatic import calibrated_by_itself, values
+from tests.e2e.test_bias_memory import knocked
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+SLOW: dict[str, Any] = {
+    "own_imu": True, "imu_rate_hz": 10.0, "device_rate_hz": 2.0, "feed_s": 0.5, "min_still_s": 5.0, "max_s": 6.0,
+}  # fmt: skip
+AGAIN_WITHIN_S = 150.0
+
+
+@pytest.fixture(autouse=True)
+def _soon_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(automatic, "SPACING_S", 30.0)
+
+
+def accelerometers(rig: Rig) -> dict[str, float]:
+    return {name: value for name, value in values(rig).items() if "ACC" in name}
+
+
+def put_back(rig: Rig) -> None:
+    gradienter = rig.devices["gradienter"]
+    assert isinstance(gradienter, Gradienter)
+    gradienter.offset_deg = (0.0, 0.0)
+
+
+async def held_back(rig: Rig) -> dict[str, float]:
+    """Calibrated by itself, then the gradienter slips, and the next one by itself is over; accelerometers as before."""
+    await calibrated_by_itself(rig)
+    before = accelerometers(rig)
+    knocked(rig)
+    await rig.until(lambda: len(rig.service.store.history()) >= 2, AGAIN_WITHIN_S)
+    await asyncio.sleep(10.0)
+    return before
+
+
+@pytest.mark.parametrize("at_arm", ["gate", "warn"])
+def test_accelerometers_are_held_back_when_the_gradienter_has_moved_until_somebody_asks(
+    tmp_path: Path, at_arm: str
+) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, at_arm=at_arm, **SLOW).running() as rig:
+            before = await held_back(rig)
+            (record, first), said = rig.service.store.history(), "".join(rig.ground.texts())
+            assert record.state == "done"
+            assert record.reason.endswith("accelerometers of fc held back")
+            fc = record.imus[0]
+            assert {"GYR" in name for name in fc.written} == {True}, "the gyros are in no doubt"
+            assert {"GYR" in name for name in first.imus[0].written} == {True, False}
+            assert fc.accel_bias_m_s2 is not None, "what was measured is kept"
+            assert accelerometers(rig) == before
+            assert "the gradienter has moved by 0.3" in said
+            assert "Held back: accelerometers of fc; calibrate on request to write it all the same" in said
+            # With what is in force it may arm as ever, and everybody is told.
+            answer = rig.service.readiness.answer()
+            assert answer.verdict == "accept"
+            told = "held back: accelerometers of fc (gradienter or its zero moved); calibrate to write it"
+            assert answer.words.endswith(told)
+            assert told in str(rig.service.status())
+            # Nor does it call for another calibration; one that the gyros call for holds it back again.
+            for _ in range(60):
+                await asyncio.sleep(1.0)
+                assert not any("accel" in found.words for found in rig.service.in_force.findings(rig.now_s))
+            await rig.until(lambda: rig.service.conductor.state is State.DONE, 60.0)
+            assert accelerometers(rig) == before
+            assert rig.service.in_force.held_back is not None
+            job = rig.service.conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(job, Job)
+            assert (await job.finished).outcome == "done"
+            asked = rig.service.store.history(1)[0]
+            assert {"GYR" in name for name in asked.imus[0].written} == {True, False}
+            assert any(words.startswith("the gradienter has moved by 0.3") for words in asked.warnings)
+            assert all(accelerometers(rig)[name] != value for name, value in before.items())
+            await asyncio.sleep(10.0)
+            assert "held back" not in rig.service.readiness.answer().words
+
+    run_virtual(main())
+
+
+def test_nothing_is_held_back_any_more_once_the_gradienter_is_where_it_was(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
+            before = await held_back(rig)
+            assert rig.service.in_force.held_back is not None
+            put_back(rig)
+            await rig.until(lambda: rig.service.in_force.held_back is None, 60.0)
+            await rig.until(lambda: rig.service.readiness.answer().verdict == "accept", 60.0)
+            assert accelerometers(rig) == before
+
+    run_virtual(main())
+
+
+def test_a_restart_that_keeps_the_offsets_keeps_what_is_held_back_and_the_gate_opens_again(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
+            before = await held_back(rig)
+            rig.autopilot.reboot()
+            await rig.until(lambda: rig.service.vehicle.boots == 1, 10.0)
+            await rig.until(lambda: rig.service.readiness.answer().verdict == "accept", 40.0)
+            assert len(rig.service.store.history()) == 2, "nothing had to be measured anew"
+            assert rig.service.in_force.held_back is not None
+            assert accelerometers(rig) == before
+
+    run_virtual(main())
+
+
+def test_who_asks_in_the_middle_is_not_answered_with_half_of_it(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
+            await calibrated_by_itself(rig)
+            knocked(rig)
+            conductor = rig.service.conductor
+            await rig.until(lambda: len(rig.service.store.history()) == 1 and conductor.state is State.VERIFYING, 150.0)
+            assert conductor.job is not None
+            assert conductor.job.held_back
+            refused = conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(refused, Refusal)
+            assert refused.kind == "busy"
+            await conductor.job.finished
+            job = conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(job, Job)
+            assert (await job.finished).outcome == "done"
+            assert any("ACC" in name for name in rig.service.store.history(1)[0].imus[0].written)
+
+    run_virtual(main())
+
+
+def test_a_request_that_comes_first_is_written_with_the_warning(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
+            await calibrated_by_itself(rig)
+            before = accelerometers(rig)
+            knocked(rig)
+            await asyncio.sleep(20.0)
+            job = rig.service.conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(job, Job)
+            assert (await job.finished).outcome == "done"
+            assert all(accelerometers(rig)[name] != value for name, value in before.items())
+            assert "Held back" not in "".join(rig.ground.texts())
+            assert "the gradienter has moved" in "".join(rig.ground.texts())
+
+    run_virtual(main())
