@@ -519,7 +519,8 @@ def intruder_faults() -> list[Fault]:
             lasts_s=(14.0, 20.0),
             names=r"it signs what it sends",
             excused=LOST,
-            named_in=tuple(phase for phase in PHASES if phase != "armed"),  # nothing is asked of it then
+            # While it waits, and armed, nothing may be asked of the autopilot for as long as the fault lasts.
+            named_in=tuple(phase for phase in PHASES if phase not in ("armed", "waiting")),
         ),
     ]
 
