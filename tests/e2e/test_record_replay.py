@@ -617,7 +617,7 @@ def test_a_disk_that_hangs_holds_nothing_up_and_the_hole_is_in_the_file(
             hangs_s = 40.0
             result, during = await calibrated(rig)
             assert result.outcome == "done"
-            assert during.duration_s < 25.0
+            assert during.duration_s < 30.0  # some 25, and not 40 more
             most = 0
             for _ in range(30):
                 await asyncio.sleep(1.0)
