@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
-import selectors
+import os
+import socket
 import weakref
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
-from tests.support.virtual_time import MOST_TURNS_A_SECOND
+from tests.campaign import loopback
+from tests.support.virtual_time import VirtualTimeLoop
 
 T = TypeVar("T")
 
@@ -19,42 +21,12 @@ OWNER: contextvars.ContextVar[str] = contextvars.ContextVar("owner", default="st
 _owners: weakref.WeakKeyDictionary[asyncio.Task[Any], str] = weakref.WeakKeyDictionary()
 
 
-class _JumpingSelector(selectors.EpollSelector):
-    """As that of tests.support.virtual_time, for many descriptors: all of them are of this process."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.now_s = 1000.0
-        self._second_began_s = self.now_s
-        self._turns = 0
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        self._turns += 1
-        if self.now_s - self._second_began_s >= 1.0:
-            self._second_began_s, self._turns = self.now_s, 0
-        elif self._turns > MOST_TURNS_A_SECOND:
-            msg = f"livelock: {self._turns} turns of the loop within one second of virtual time"
-            raise RuntimeError(msg)
-        ready = super().select(0)
-        if ready or timeout == 0:
-            return ready
-        if timeout is None:
-            msg = "deadlock: every task waits for something that no timer will bring"
-            raise RuntimeError(msg)
-        self.now_s += max(timeout, 1e-9)
-        return ready
-
-
-class CampaignLoop(asyncio.SelectorEventLoop):
+class CampaignLoop(VirtualTimeLoop):
     """Virtual time; what would go to a thread is done on the spot, since threads live on the real clock."""
 
     def __init__(self) -> None:
-        self._jumping = _JumpingSelector()
-        super().__init__(self._jumping)
+        super().__init__()
         self.set_task_factory(_owned)
-
-    def time(self) -> float:
-        return self._jumping.now_s
 
     def run_in_executor(  # type: ignore[override]
         self, executor: Any, func: Callable[..., Any], *args: Any
@@ -66,6 +38,15 @@ class CampaignLoop(asyncio.SelectorEventLoop):
         except Exception as error:  # noqa: BLE001 - handed to whoever awaits it
             future.set_exception(error)
         return future
+
+    async def sock_connect(self, sock: socket.socket, address: Any) -> None:
+        """As asyncio's, but ports of `loopback` are within this process."""
+        if not loopback.leads_here(address):
+            await super().sock_connect(sock, address)
+            return
+        with loopback.connect(address[1]) as end:
+            os.dup2(end.fileno(), sock.fileno())
+        os.set_blocking(sock.fileno(), False)
 
 
 def _owned(loop: asyncio.AbstractEventLoop, work: Any, **options: Any) -> asyncio.Task[Any]:

@@ -16,7 +16,7 @@ MOST_TURNS_A_SECOND: Final = 50_000
 """Of the loop, in one virtual second: far more than the busiest rig needs (under 2000). It is work without a pause."""
 
 
-class _JumpingSelector(selectors.SelectSelector):
+class JumpingSelector(selectors.EpollSelector):
     """A selector that, instead of sleeping, moves its loop's clock by the time it would have slept."""
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
     """A selector loop on virtual time; `time()` starts at 1000 s."""
 
     def __init__(self) -> None:
-        self._jumping = _JumpingSelector()
+        self._jumping = JumpingSelector()
         super().__init__(self._jumping)
 
     def time(self) -> float:
