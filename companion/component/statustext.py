@@ -2,7 +2,8 @@
 
 Three limits protect a slow telemetry link: the same text is not repeated within seconds unless a result came between
 (who cancels and asks again wants to hear that it has started), a token bucket bounds the lines per second, and the
-queue is bounded. What is dropped from a full queue is the least weighty text, and among those the oldest, so that a stream of news or of refused commands can never push out a result.
+queue is bounded. What is dropped from a full queue is the least weighty text, and among those the oldest, so that a
+stream of news or of refused commands can never push out a result.
 
 Texts must not begin with "[cal]": QGroundControl takes such lines from any component of the vehicle as the progress
 of PX4's own calibration.
