@@ -8,12 +8,15 @@ import os
 import socket
 import weakref
 from collections.abc import Callable, Coroutine
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from tests.campaign import loopback
 from tests.support.virtual_time import VirtualTimeLoop
 
 T = TypeVar("T")
+
+REAL_GRACE_S: Final = 0.002
+"""So long the kernel may take to carry bytes from one TCP socket of this process to another."""
 
 OWNER: contextvars.ContextVar[str] = contextvars.ContextVar("owner", default="stage")
 """Inherited by every task and callback: which daemon started it, directly or not."""
@@ -27,6 +30,11 @@ class CampaignLoop(VirtualTimeLoop):
     def __init__(self) -> None:
         super().__init__()
         self.set_task_factory(_owned)
+        self._real: weakref.WeakSet[asyncio.Transport] = weakref.WeakSet()
+        self._jumping.grace_s = self._grace_s
+
+    def _grace_s(self) -> float:
+        return REAL_GRACE_S if any(not transport.is_closing() for transport in self._real) else 0.0
 
     def run_in_executor(  # type: ignore[override]
         self, executor: Any, func: Callable[..., Any], *args: Any
@@ -38,6 +46,12 @@ class CampaignLoop(VirtualTimeLoop):
         except Exception as error:  # noqa: BLE001 - handed to whoever awaits it
             future.set_exception(error)
         return future
+
+    async def create_connection(self, *what: Any, **options: Any) -> Any:
+        """As asyncio's; whoever looks at the page, which is on TCP, is waited for."""
+        transport, protocol = await super().create_connection(*what, **options)
+        self._real.add(transport)
+        return transport, protocol
 
     async def sock_connect(self, sock: socket.socket, address: Any) -> None:
         """As asyncio's, but ports of `loopback` are within this process."""
