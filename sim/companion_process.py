@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-READY_WITHIN_S: Final = 20.0
+READY_WITHIN_S: Final = 40.0
 
 Record = dict[str, Any]
 

@@ -480,7 +480,7 @@ def test_a_device_that_starts_anew_and_says_who_it_is(path: Path, caplog: pytest
             device.say(b"HMR3300 V1.00\r\n")
             device.muted = False
             await one.data(RECOVERY_S)
-            await one.until(lambda: one.counts.get("restarted") == 1, 2.0)
+            await one.until(lambda: one.counts.get("restarted") == 1)
             assert len(said(caplog, "compass", "'HMR3300 V1.00'")) == 1
 
     asyncio.run(main())
