@@ -81,6 +81,7 @@ class Replay:
         self._recording = recording
         self._in_blocks = in_blocks
         self._gathered: list[Messages] = []
+        self._how_many = 0
         self._config: Config | None = None
         self._versions: dict[str, str] = {}
         self._collector: RollingCollector | None = None
@@ -166,12 +167,13 @@ class Replay:
 
     def _gather(self, messages: Messages) -> None:
         self._gathered.append(messages)
-        if sum(len(each.data) for each in self._gathered) >= AT_ONCE:
+        self._how_many += len(messages.data)
+        if self._how_many >= AT_ONCE:
             self._flush()
 
     def _flush(self) -> None:
         """Replay what has been gathered."""
-        gathered, self._gathered = self._gathered, []
+        gathered, self._gathered, self._how_many = self._gathered, [], 0
         if not gathered:
             return
         numbers = np.concatenate([each.numbers for each in gathered])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Collection, Iterator, Sequence
 from typing import Final
 
@@ -91,8 +90,9 @@ class Row:
         self.topic = topic
         if topic not in self.topics:
             return np.empty(0, dtype=np.intp), []
-        its = self._numbers == self.topics.index(topic)
-        return np.flatnonzero(its), list(itertools.compress(self._data, its.tolist()))
+        places = np.flatnonzero(self._numbers == self.topics.index(topic))
+        data = self._data
+        return places, [data[place] for place in places.tolist()]
 
     def order(self) -> Iterator[tuple[int, list[Share], Share | None]]:
         """Place by place in their order: shares of which all until then is to be taken first, and whose it is.
