@@ -43,7 +43,7 @@ class Seconds:
             even = _even(np.diff(block.stamps), starts - 1, stops - 1)
             starts, stops = starts[even], stops[even]
         counts = stops - starts
-        for n in np.unique(counts).tolist():
+        for n in set(counts.tolist()):
             if n > 1:
                 chosen = counts == n
                 self._summarise(starts[chosen], n, slots, limits, circle=circle)

@@ -56,14 +56,14 @@ def frames_of(data: bytes, wanted: Collection[Kind]) -> tuple[dict[Kind, Frames]
     octets = np.frombuffer(data, np.uint8)
     lengths = octets[begins + 1].astype(np.int64)
     numbers = octets[begins[:, None] + np.arange(7, 10)] @ np.array([1, 1 << 8, 1 << 16])
-    for number in np.unique(numbers).tolist():
+    for number in set(numbers.tolist()):
         kind = KINDS.get(number)
         if kind is None:
             return None
         own = np.flatnonzero(numbers == number)
         record = _record(kind.unpacker.format, tuple(kind.ordered_fieldnames)) if kind in wanted else np.dtype([])
         payloads = np.zeros((len(own), record.itemsize), dtype=np.uint8)
-        for length in np.unique(lengths[own]).tolist():
+        for length in set(lengths[own].tolist()):
             chosen = np.flatnonzero(lengths[own] == length)
             frames = octets[begins[own[chosen], None] + np.arange(_AROUND + length)]
             if not _sound(frames, kind.crc_extra):

@@ -98,6 +98,7 @@ _FORGOTTEN: Final[dict[tuple[str, str], Callable[[], Any]]] = {
     ("RollingCollector", "_estimates"): Estimates,
     ("RollingCollector", "_trace"): TraceLog,
     ("BatchSource", "_block"): lambda: None,
+    ("ImuGate", "_ordered"): lambda: None,
     ("VectorNavDecoder", "_layouts"): dict,
 }
 _DEEPEST: Final = 40
