@@ -28,7 +28,14 @@ from numpy.typing import NDArray
 
 from companion.calibration.allan import NoiseProfile
 from companion.calibration.batches import Batch
-from companion.calibration.channels import beyond, farthest, lower_quartile, mean_of, mean_over
+from companion.calibration.channels import (
+    beyond,
+    farthest,
+    lower_quartile,
+    mean_of,
+    mean_over,
+    scatter_of_difference,
+)
 from companion.physics.units import DEG, MG
 
 Floats = NDArray[np.float64]
@@ -176,6 +183,8 @@ class ImuGate:
         """The still stretch has ended: references start again. Noise and rest level stay known."""
         self._recent: deque[Floats] = deque(maxlen=_RECENT)
         self._start: list[Floats] = []
+        self._means: tuple[list[float], list[float]] | None = None
+        """Of both; None: to be worked out when they are needed."""
 
     def forget_level(self) -> None:
         """The readings are not comparable with earlier ones: an offset was written, the owner restarted."""
@@ -186,10 +195,13 @@ class ImuGate:
     def accept(self, batch: Batch, *, settled: bool) -> None:
         """The second counts as still for all sources; `settled` when the stretch is long enough to be believed."""
         self._recent.append(batch.mean[:3])
+        start = None if self._means is None else self._means[1]
         if len(self._start) < _REFERENCE:
             self._start.append(batch.mean[3:])
+            start = None
+        self._means = mean_of(self._recent), start or mean_of(self._start)
         if settled:
-            self._rest = np.array(mean_of(self._recent))
+            self._rest = np.array(self._means[0])
             self._off_level = 0
 
     def judge(self, batch: Batch) -> Verdict:
@@ -290,12 +302,15 @@ class ImuGate:
         if self._noise is not None:
             noise = list(map(max, noise, self._noise.tolist()))
         chance = [_CHANCE * math.sqrt(each / batch.n) for each in noise]
-        if self._recent:
-            found = beyond(rate, self._recent, chance[:3])
+        if self._recent and self._means is None:
+            self._means = mean_of(self._recent), mean_of(self._start)
+        if self._means is not None:
+            both = scatter_of_difference(self._recent)
+            found = beyond(rate, self._means[0], [each * both for each in chance[:3]])
             if found > GYRO_STEP_RAD_S:
                 return _words(f"gyro {name} moved by", found / DEG, GYRO_STEP_RAD_S / DEG, "deg/s")
-        if self._start:
-            found = beyond(force, self._start, chance[3:])
+            both = scatter_of_difference(self._start)
+            found = beyond(force, self._means[1], [each * both for each in chance[3:]])
             if found > ACCEL_STEP_M_S2:
                 return _words(f"accel {name} tilted by", found / MG, ACCEL_STEP_M_S2 / MG, "mg")
         return self._off_rest(rate)
@@ -328,11 +343,14 @@ class PoseGate:
     def new_stretch(self) -> None:
         """The still stretch has ended: the reference pose starts again."""
         self._start: list[Floats] = []
+        self._refined: list[float] | None = None
+        """What the others add to the first; None: to be worked out when it is needed."""
 
     def accept(self, batch: Batch) -> None:
         """The second counts as still for all sources."""
         if len(self._start) < _REFERENCE:
             self._start.append(batch.mean)
+            self._refined = None
 
     def judge(self, batch: Batch) -> Verdict:
         """Whether this second was still for this sensor."""
@@ -344,11 +362,13 @@ class PoseGate:
         if self._start:
             # Against the first good second, so that averaging on the circle needs no care; the others refine it.
             first = self._start[0].tolist()
-            turns = [self._deviations(each.tolist(), first) for each in self._start]
-            pairs = zip(self._deviations(batch.mean.tolist(), first), *turns, strict=True)
+            if self._refined is None:
+                turns = [self._deviations(each.tolist(), first) for each in self._start]
+                self._refined = [sum(of_one) / len(turns) for of_one in zip(*turns, strict=True)]
+            turned = self._deviations(batch.mean.tolist(), first)
             off = [
-                abs(turn - sum(refined) / len(turns)) - _CHANCE * math.sqrt(white / batch.n)
-                for (turn, *refined), white in zip(pairs, batch.white.tolist(), strict=True)
+                abs(turn - refined) - _CHANCE * math.sqrt(white / batch.n)
+                for turn, refined, white in zip(turned, self._refined, batch.white.tolist(), strict=True)
             ]
             if max(off) > self._step_deg:
                 return _words(f"{self._name} moved by", max(off), self._step_deg, "deg")

@@ -98,7 +98,9 @@ _FORGOTTEN: Final[dict[tuple[str, str], Callable[[], Any]]] = {
     ("RollingCollector", "_estimates"): Estimates,
     ("RollingCollector", "_trace"): TraceLog,
     ("BatchSource", "_block"): lambda: None,
+    ("ImuGate", "_means"): lambda: None,
     ("ImuGate", "_ordered"): lambda: None,
+    ("PoseGate", "_refined"): lambda: None,
     ("VectorNavDecoder", "_layouts"): dict,
 }
 _DEEPEST: Final = 40
