@@ -19,6 +19,8 @@ from companion.protocols.base import Decoder
 from companion.protocols.bulk import ImuBlock, PoseBlock, fixed_point
 from companion.protocols.registry import make_decoder
 from companion.recording import topics
+from companion.recording.collector import RecordedCollector
+from companion.recording.journal import Beginning, Queue
 from companion.recording.state import freeze, to_json
 from companion.replay.blocks import SerialShare
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
@@ -248,3 +250,21 @@ def test_a_collector_gets_the_same_from_blocks_of_the_pose(seed: int) -> None:
     for each in (one, other):
         each.glance(now_s + 2.0)
     assert to_json(freeze(one)) == to_json(freeze(other))
+
+
+def test_a_recorded_collector_writes_down_what_is_in_a_block() -> None:
+    collector = RecordedCollector(
+        still.settings(), [still.imu("fc")], gradienter=True, compass=True, message_of=lambda name: None
+    )
+    queue = Queue()
+    collector.journal.queues.append(queue)
+    t_s = np.array([1.0, 1.1, 1.2])
+    collector.add_tilts(PoseBlock(t_s, np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), np.arange(3)), 1)
+    collector.add_headings(PoseBlock(t_s, np.array([[10.0], [20.0], [30.0]]), np.arange(3)), 0, 2)
+    written = [(entry[0], *entry[3]) for entry in queue.take() if not isinstance(entry, Beginning)]
+    assert written == [
+        (topics.GRADIENTER, TiltSample(1.1, 3.0, 4.0)),
+        (topics.GRADIENTER, TiltSample(1.2, 5.0, 6.0)),
+        (topics.COMPASS, CompassSample(1.0, 10.0)),
+        (topics.COMPASS, CompassSample(1.1, 20.0)),
+    ]
