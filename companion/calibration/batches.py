@@ -9,68 +9,50 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.protocols.bulk import ImuBlock
+from companion.calibration.batch import (
+    MAX_LEVELS,
+    Batch,
+    Counts,
+    Floats,
+    counts_of,
+    first_of_each,
+    is_clipped,
+    missing_of,
+    unrolled,
+)
+from companion.protocols.bulk import Block
 
-Floats = NDArray[np.float64]
+if TYPE_CHECKING:
+    from companion.calibration.seconds import Seconds
+
+__all__ = ["MAX_LEVELS", "MAX_SAMPLES", "Batch", "BatchSource", "Counts"]
+
 _Piece = tuple[Floats, Floats, Floats | None]
 """Times, rows and stamps."""
 
 MAX_SAMPLES: Final = 4096
 """Kept of one slot; what comes beyond is dropped and counted. Ten times the fastest stream."""
 
-MAX_LEVELS: Final = 1024
-"""Integers between the lowest and the highest of one second that are counted one by one; at rest it is a tenth."""
-
 _MAX_TIME_S: Final = 1e12
 _BACKWARD_SAMPLES: Final = 20
 """So many samples in a row from the past mean that the clock went back, not that some were late."""
 _BACKWARD_S: Final = 2.0
-_EVEN: Final = 1.4999
-"""Steps of a counter that are all within so much of each other are one step each, whatever the usual one is."""
-_PINNED_SAMPLES: Final = 5
-_PINNED_DISTINCT: Final = 8
-_PINNED_SIGMAS: Final = 4.0
 
 
-class Counts(msgspec.Struct, frozen=True):
-    """How often every integer came in one second."""
+class _Block:
+    """A block that is being taken, and which part of it the second under way is, where it is nothing else."""
 
-    lowest: NDArray[np.int64]
-    """(c,) integer of the first row, in steps of the stream."""
-    table: NDArray[np.int32]
-    """(k, c), k at most `MAX_LEVELS`."""
+    __slots__ = ("block", "seconds", "start", "stop")
 
-
-class Batch(msgspec.Struct, frozen=True):
-    """What one source said in one second; arrays are (c,) over its channels, in the source's units."""
-
-    slot: int
-    n: int
-    first_s: float
-    last_s: float
-    mean: Floats
-    variance: Floats
-    """Of one sample, n - 1 in the denominator; zero for a single sample."""
-    white: Floats
-    """Half the mean square of successive differences (von Neumann): the part of the variance that is white."""
-    low: Floats
-    high: Floats
-    distinct: NDArray[np.int64]
-    clipped: bool
-    """Some channel's commonest value is its extreme one: readings pile up at the end of the range."""
-    largest_gap_s: float
-    """Between samples, and to both ends of the slot."""
-    missing: int | None
-    """By the device's sequence counter or clock; None where it has neither."""
-    temperature_degc: float | None
-    counts: Counts | None = None
-    """Of a stream of integers; None for floats, and for a second that spans more than `MAX_LEVELS`."""
+    def __init__(self, block: Block, seconds: Seconds) -> None:
+        self.block, self.seconds = block, seconds
+        self.start = self.stop = -1
 
 
 class BatchSource:
@@ -86,6 +68,9 @@ class BatchSource:
     """Of the second under way, what came in blocks; what came later one by one is in the lists."""
     _in_pieces = 0
     """Samples of the second under way that are in `_pieces`."""
+
+    _block: _Block | None = None
+    """That is being taken, to save work."""
 
     steps: NDArray[np.float64] | None = None
     """(c,) of a stream of integers, of which every second keeps how often each one came; None for floats."""
@@ -120,6 +105,8 @@ class BatchSource:
         self._stamps: list[float | None] = []
         self._pieces = ()
         self._in_pieces = 0
+        if self._block is not None:
+            self._block.start = self._block.stop = -1
         self._temperature_sum = 0.0
         self._temperature_count = 0
 
@@ -156,7 +143,7 @@ class BatchSource:
             self._temperature_count += 1
         return ended
 
-    def take(self, block: ImuBlock, start: int, stop: int) -> tuple[int, bool]:
+    def take(self, block: Block, start: int, stop: int) -> tuple[int, bool]:
         """Take samples of a block up to `stop`, or to the end of a second: `add` of each, at once.
 
         Returns:
@@ -164,17 +151,21 @@ class BatchSource:
         """
         times = block.t_s
         first_s = float(times[start])
+        ended = False
         if not self._newest <= first_s < self._slot_end:
-            stamp = None if block.stamps is None else float(block.stamps[start])
-            temperature_degc = None if block.temperature_degc is None else float(block.temperature_degc[start])
-            return start + 1, self.add(first_s, tuple(block.rows[start].tolist()), temperature_degc, stamp)
-        stop = start + int(np.searchsorted(times[start:stop], self._slot_end))
+            if not self._newest <= first_s < _MAX_TIME_S:
+                stamp = None if block.stamps is None else float(block.stamps[start])
+                temperature_degc = None if block.temperature_degc is None else float(block.temperature_degc[start])
+                return start + 1, self.add(first_s, tuple(block.rows[start].tolist()), temperature_degc, stamp)
+            ended = self._open(math.floor(first_s))
+        stop = start + int(times[start:stop].searchsorted(self._slot_end))
         self._newest = self.last_s = float(times[stop - 1])
         self._backward = 0
         room = MAX_SAMPLES - len(self._rows) - self._in_pieces
         kept = slice(start, min(stop, start + max(room, 0)))
         if stop > kept.stop:
             self.dropped["too many a second"] += stop - kept.stop
+        self._note(block, start, kept.stop)
         self._collect_piece()
         stamps = None if block.stamps is None else block.stamps[kept]
         self._pieces = (*self._pieces, (times[kept], block.rows[kept], stamps))
@@ -184,7 +175,21 @@ class BatchSource:
             readings = np.concatenate(([self._temperature_sum], block.temperature_degc[kept]))
             self._temperature_sum = float(np.add.accumulate(readings)[-1])
             self._temperature_count += kept.stop - start
-        return stop, False
+        return stop, ended
+
+    def _note(self, block: Block, start: int, stop: int) -> None:
+        """Remember which part of a block the second under way is."""
+        known = self._block
+        if known is None or known.block is not block:
+            from companion.calibration.seconds import Seconds
+
+            known = self._block = _Block(block, Seconds(block, self._limits, circle=self._circle))
+        if not self._in_pieces and not self._rows:
+            known.start, known.stop = start, stop
+        elif known.stop == start:
+            known.stop = stop
+        else:
+            known.start = known.stop = -1
 
     def _collect_piece(self) -> None:
         """Put what came one by one behind the pieces."""
@@ -256,10 +261,30 @@ class BatchSource:
                     del self.batches[next(iter(self.batches))]
         self._clear()
 
+    def _worked_out(self) -> Batch | None:
+        """The second under way, where it has been summarised together with others; else None."""
+        known = self._block
+        if known is None or known.stop - known.start != len(self._rows) + self._in_pieces:
+            return None
+        batch = known.seconds.of(known.start, known.stop)
+        if batch is None:
+            return None
+        block = known.block
+        if (stamps := block.stamps) is not None:
+            if self._last_stamp != stamps[known.start - 1]:
+                self.lost += missing_of(np.concatenate(((self._last_stamp,), stamps[known.start : known.stop])))
+            self._last_stamp = stamps[known.stop - 1]
+        if self.steps is not None:
+            counts = counts_of(block.rows[known.start : known.stop], self.steps)
+            batch = msgspec.structs.replace(batch, counts=counts)
+        return batch
+
     def _summarise(self, slot: int) -> Batch | None:
+        if (batch := self._worked_out()) is not None:
+            return batch
         times, rows, stamps = self._whole()
         if self._circle:
-            rows = _unrolled(rows)
+            rows = unrolled(rows)
         # NaN compares false, so this drops it too.
         believable = np.abs(rows) <= self._limits
         if not believable.all():
@@ -268,7 +293,7 @@ class BatchSource:
             rows, times = rows[sound], times[sound]
             stamps = None if stamps is None else stamps[sound]
         if stamps is not None:
-            fresh = _first_of_each(stamps, rows)
+            fresh = first_of_each(stamps, rows)
             if fresh is not None:
                 self.dropped["repeated"] += int((~fresh).sum())
                 rows, times, stamps = rows[fresh], times[fresh], stamps[fresh]
@@ -276,7 +301,7 @@ class BatchSource:
         if n == 0:
             return None
         if stamps is not None:
-            self.lost += _missing(np.concatenate(((self._last_stamp,), stamps)))
+            self.lost += missing_of(np.concatenate(((self._last_stamp,), stamps)))
             self._last_stamp = stamps[-1]
         ordered = np.sort(rows, axis=0)
         distinct = 1 + (ordered[1:] != ordered[:-1]).sum(axis=0)
@@ -296,80 +321,9 @@ class BatchSource:
             low=ordered[0],
             high=ordered[-1],
             distinct=np.asarray(distinct, dtype=np.int64),
-            clipped=_clipped(ordered, distinct),
+            clipped=is_clipped(ordered, distinct),
             largest_gap_s=max(*edges, float(gaps.max()) if n > 1 else 0.0),
-            missing=None if stamps is None else _missing(stamps),
+            missing=None if stamps is None else missing_of(stamps),
             temperature_degc=self._temperature_sum / self._temperature_count if self._temperature_count else None,
-            counts=None if self.steps is None else _counts(rows, self.steps),
+            counts=None if self.steps is None else counts_of(rows, self.steps),
         )
-
-
-def _counts(rows: Floats, steps: Floats) -> Counts | None:
-    integers = np.rint(rows / steps).astype(np.int64)
-    lowest = integers.min(axis=0)
-    place = integers - lowest
-    levels = int(place.max()) + 1
-    if levels > MAX_LEVELS:
-        return None
-    width = rows.shape[1]
-    flat = np.bincount((place * width + np.arange(width)).ravel(), minlength=levels * width)
-    return Counts(lowest, flat.reshape(levels, width).astype(np.int32))
-
-
-def _unrolled(rows: Floats) -> Floats:
-    """Angles in degrees, continued across north from the first finite one."""
-    finite = rows[np.isfinite(rows[:, 0]), 0]
-    if len(finite) == 0:
-        return rows
-    with np.errstate(invalid="ignore"):
-        return np.asarray(finite[0] + np.mod(rows - finite[0] + 180.0, 360.0) - 180.0)
-
-
-def _first_of_each(stamps: Floats, rows: Floats) -> NDArray[np.bool_] | None:
-    """False for a row whose stamp and values were already seen: the same packet over a second route; None: none was.
-
-    A stamp alone is not enough: counters wrap, and some devices' clocks stand still.
-    """
-    if (stamps[1:] > stamps[:-1]).all():
-        return None
-    _, first, inverse = np.unique(stamps, return_index=True, return_inverse=True)
-    if len(first) == len(stamps):
-        return None
-    original = first[inverse]
-    fresh = np.asarray((original == np.arange(len(stamps))) | (rows != rows[original]).any(axis=1))
-    return None if fresh.all() else fresh
-
-
-def _missing(stamps: Floats) -> int:
-    """Samples that a counter says were lost; a clock in seconds counts in its own steps just as well.
-
-    The step is learned (some devices count at an internal rate), and going down, as after a restart, is nobody's loss.
-    """
-    steps = stamps[1:] - stamps[:-1]
-    steps = steps[steps > 0]
-    if len(steps) == 0 or steps.max() < _EVEN * steps.min():
-        return 0
-    usual = float(np.median(steps))
-    return int(np.maximum(np.rint(steps / usual) - 1.0, 0.0).sum())
-
-
-def _clipped(ordered: Floats, distinct: NDArray[np.int64]) -> bool:
-    """Whether some channel's lowest or highest value is by far its commonest.
-
-    Noise thins out towards its ends; a pile at an end is the end of the range. Few distinct values prove nothing:
-    a quantised stream of a still sensor looks like that. And of 50 integers the lowest is the commonest by chance now
-    and then, so that it must be so by four standard deviations of such counts.
-    """
-    if len(ordered) <= _PINNED_SAMPLES:
-        return False
-    tail = _PINNED_SAMPLES - 1
-    suspects = np.flatnonzero(
-        (distinct >= _PINNED_DISTINCT) & ((ordered[0] == ordered[tail]) | (ordered[-1] == ordered[-1 - tail]))
-    )
-    for channel in suspects:
-        _, counts = np.unique(ordered[:, channel], return_counts=True)
-        if counts.argmax() in {0, len(counts) - 1}:
-            pile, next_most = np.sort(counts)[[-1, -2]]
-            if pile > next_most + _PINNED_SIGMAS * math.sqrt(next_most):
-                return True
-    return False

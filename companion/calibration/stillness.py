@@ -18,8 +18,8 @@ One set of constants serves all sensors; nothing here is tuned to a recording. T
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, insort
 from collections import deque
-from collections.abc import Collection, Sized
 from typing import Final
 
 import msgspec
@@ -28,6 +28,14 @@ from numpy.typing import NDArray
 
 from companion.calibration.allan import NoiseProfile
 from companion.calibration.batches import Batch
+from companion.calibration.channels import (
+    beyond,
+    farthest,
+    lower_quartile,
+    mean_of,
+    mean_over,
+    scatter_of_difference,
+)
 from companion.physics.units import DEG, MG
 
 Floats = NDArray[np.float64]
@@ -121,14 +129,16 @@ def _fault(words: str) -> Verdict:
     return Verdict(still=False, words=words, fault=True)
 
 
-def _motion(variance: Floats, white: Floats, n: int, gate: float, rest: tuple[float, float]) -> tuple[float, float]:
+def _motion(
+    variance: list[float], white: list[float], n: int, gate: float, rest: tuple[float, float]
+) -> tuple[float, float]:
     """Rms of the slow part over the channels, and what is allowed: the gate, and chance.
 
     The difference of the two variance estimates of white noise has a variance of about sigma^4 / n a channel; that
     sigma^2 is the batch's own white part within the bounds `rest`, for fast motion looks white in part.
     """
-    noise = _over(white)
-    slow = _over(variance) - noise
+    noise = mean_over(white)
+    slow = mean_over(variance) - noise
     least, most = rest
     chance = _CHANCE * min(max(noise, least), most) / math.sqrt(n * len(white)) if n >= MIN_IMU_SAMPLES else 0.0
     return math.sqrt(max(slow, 0.0)), math.sqrt(gate**2 + chance)
@@ -138,41 +148,6 @@ def _lower_quartile(freedom: int) -> float:
     """Lower quartile of a variance estimate over the variance (Wilson and Hilferty's chi-square)."""
     spread = 2.0 / (9.0 * freedom)
     return (1.0 - spread - 0.6745 * math.sqrt(spread)) ** 3
-
-
-def lower_quartile(values: Floats) -> Floats:
-    """(c,) `np.quantile(values, 0.25, axis=0)` of (n, c) finite ones, to the last bit, at a tenth of its price."""
-    ordered = np.sort(values, axis=0)
-    place = 0.25 * (len(values) - 1)
-    below = int(place)
-    share = place - below
-    low, high = ordered[below], ordered[min(below + 1, len(values) - 1)]
-    step = high - low
-    return np.asarray(low + step * share if share < 0.5 else high - step * (1.0 - share))
-
-
-def _over(values: Floats) -> float:
-    """The mean over a few channels; `mean` itself takes ten times as long for the same sum."""
-    total = 0.0
-    for value in values.tolist():
-        total += value
-    return total / len(values)
-
-
-def _rows(values: Collection[Floats]) -> Floats:
-    """(n, c) of n arrays (c,); numpy takes ten times as long to find that out by itself."""
-    return np.concatenate(tuple(values)).reshape(len(values), -1)
-
-
-def _mean(values: Collection[Floats] | Floats) -> Floats:
-    """(c,) the mean of n arrays (c,) or of (n, c)."""
-    rows = values if isinstance(values, np.ndarray) else _rows(values)
-    return np.asarray(np.add.reduce(rows, axis=0) / len(rows))
-
-
-def _both(reference: Sized) -> float:
-    """Scatter of a difference of one mean and the mean of several, over that of one."""
-    return math.sqrt(1.0 + 1.0 / len(reference))
 
 
 class ImuGate:
@@ -197,6 +172,8 @@ class ImuGate:
         self._steps = np.repeat(np.asarray(steps, dtype=np.float64), 3)
         self._prior = gyro_prior_rad_s
         self._learned: deque[Floats] = deque(maxlen=_LEARN_FROM)
+        self._ordered: list[list[float]] | None = None
+        """The same, channel by channel in ascending order; None: to be made when it is needed."""
         self._noise: Floats | None = None
         self._rest: Floats | None = None
         self._off_level = 0
@@ -206,6 +183,8 @@ class ImuGate:
         """The still stretch has ended: references start again. Noise and rest level stay known."""
         self._recent: deque[Floats] = deque(maxlen=_RECENT)
         self._start: list[Floats] = []
+        self._means: tuple[list[float], list[float]] | None = None
+        """Of both; None: to be worked out when they are needed."""
 
     def forget_level(self) -> None:
         """The readings are not comparable with earlier ones: an offset was written, the owner restarted."""
@@ -216,10 +195,13 @@ class ImuGate:
     def accept(self, batch: Batch, *, settled: bool) -> None:
         """The second counts as still for all sources; `settled` when the stretch is long enough to be believed."""
         self._recent.append(batch.mean[:3])
+        start = None if self._means is None else self._means[1]
         if len(self._start) < _REFERENCE:
             self._start.append(batch.mean[3:])
+            start = None
+        self._means = mean_of(self._recent), start or mean_of(self._start)
         if settled:
-            self._rest = _mean(self._recent)
+            self._rest = np.array(self._means[0])
             self._off_level = 0
 
     def judge(self, batch: Batch) -> Verdict:
@@ -234,82 +216,109 @@ class ImuGate:
             return _fault(f"imu {name} was silent for {batch.largest_gap_s:.1f} s > {MAX_IMU_GAP_S}")
         if batch.clipped:
             return _fault(f"imu {name} hits the end of its range")
-        same = (batch.distinct == 1) & (self._steps == 0.0)
-        if batch.n >= STUCK_SAMPLES and (bool(same[:3].all()) or bool(same[3:].all())):
-            part = "gyro" if same[:3].all() else "accel"
-            return _fault(f"{part} {name} is stuck: {batch.n} equal readings")
+        distinct = batch.distinct.tolist()
+        if batch.n >= STUCK_SAMPLES and 1 in distinct:
+            same = [count == 1 and step == 0.0 for count, step in zip(distinct, self._steps.tolist(), strict=True)]
+            if all(same[:3]) or all(same[3:]):
+                part = "gyro" if all(same[:3]) else "accel"
+                return _fault(f"{part} {name} is stuck: {batch.n} equal readings")
         return None
 
     def _moving(self, batch: Batch) -> Verdict | None:
         n, name = batch.n, self._name
         # What unfiltered white noise of the profile's density makes of one sample at this rate.
-        floor = np.square(self._white) * n
-        sigma2 = self._noise = self._sigma2(floor, n)
-        variance, white = batch.variance, batch.white
+        floor = [noise * noise * n for noise in self._white.tolist()]
+        sigma2 = self._sigma2(floor, n)
+        self._noise = None if sigma2 is None else np.array(sigma2)
+        variance, white = batch.variance.tolist(), batch.white.tolist()
         for part, triad, motion, vibration, unit, unit_name in _TRIADS:
-            noise = math.sqrt(float(floor[triad][0]))
+            noise = math.sqrt(floor[triad.start])
             shaking = max(vibration, 1.5 * noise)
             rest = (0.0, shaking**2)
             if sigma2 is not None:
-                known = _over(sigma2[triad])
+                known = mean_over(sigma2[triad])
                 rest = (known, GLRT_RATIO * known)
             # A known noisy sensor behind a low-pass looks like slow motion, hence the profile's noise here too.
             found, allowed = _motion(variance[triad], white[triad], n, max(motion, noise), rest)
             if found > allowed:
                 return _words(f"{part} {name}", found / unit, allowed / unit, unit_name)
-            found = math.sqrt(_over(variance[triad]))
+            found = math.sqrt(mean_over(variance[triad]))
             if found > shaking:
                 return _words(f"{part} {name} shakes", found / unit, shaking / unit, unit_name)
-        self._learned.append(variance)
-        return None if sigma2 is None else self._likelihood(batch, sigma2)
+        self._learn(batch.variance)
+        return None if sigma2 is None else self._likelihood(variance, n, sigma2)
 
-    def _sigma2(self, floor: Floats, n: int) -> Floats | None:
+    def _learn(self, variance: Floats) -> None:
+        learned = self._learned
+        if self._ordered is not None:
+            if len(learned) == learned.maxlen:
+                for column, value in zip(self._ordered, learned[0].tolist(), strict=True):
+                    del column[bisect_left(column, value)]
+            for column, value in zip(self._ordered, variance.tolist(), strict=True):
+                insort(column, value)
+        learned.append(variance)
+
+    def _sigma2(self, floor: list[float], n: int) -> list[float] | None:
         """Variance of one sample at rest, learned; None until there is enough to learn from."""
         if len(self._learned) < _LEARNED_ENOUGH:
             return None
-        quiet = lower_quartile(_rows(self._learned)) / _lower_quartile(n - 1)
+        if self._ordered is None:
+            rows = [variance.tolist() for variance in self._learned]
+            self._ordered = [sorted(column) for column in zip(*rows, strict=True)]
+        least = _lower_quartile(n - 1)
         # A truncated reading that toggles between two steps has up to a quarter of a step squared.
-        return np.asarray(np.maximum(quiet, floor + np.square(self._steps) / 4.0))
+        return [
+            max(lower_quartile(ordered) / least, known + step * step / 4.0)
+            for ordered, known, step in zip(self._ordered, floor, self._steps.tolist(), strict=True)
+        ]
 
-    def _likelihood(self, batch: Batch, sigma2: Floats) -> Verdict | None:
-        ratio = batch.variance / sigma2
-        allowed = GLRT_RATIO * (1.0 + _CHANCE * math.sqrt(2.0 / (6.0 * batch.n)))
+    def _likelihood(self, variance: list[float], n: int, sigma2: list[float]) -> Verdict | None:
+        ratio = [found / known for found, known in zip(variance, sigma2, strict=True)]
+        allowed = GLRT_RATIO * (1.0 + _CHANCE * math.sqrt(2.0 / (6.0 * n)))
         # T / (6 (W - 1) / W), the variances having n - 1 in their denominators.
-        if _over(ratio) <= allowed:
+        if mean_over(ratio) <= allowed:
             return None
-        gyro, accel = _over(ratio[:3]), _over(ratio[3:])
+        gyro, accel = mean_over(ratio[:3]), mean_over(ratio[3:])
         if gyro >= accel:
-            found = math.sqrt(_over(batch.variance[:3])) / DEG
+            found = math.sqrt(mean_over(variance[:3])) / DEG
             return _words(f"gyro {self._name}", found, found * math.sqrt(allowed / gyro), "deg/s")
-        found = math.sqrt(_over(batch.variance[3:])) / MG
+        found = math.sqrt(mean_over(variance[3:])) / MG
         return _words(f"accel {self._name}", found, found * math.sqrt(allowed / accel), "mg")
 
     def _displaced(self, batch: Batch) -> Verdict | None:
-        name, rate, force = self._name, batch.mean[:3], batch.mean[3:]
-        size = float(np.linalg.norm(force))
-        if abs(size - GRAVITY_M_S2) > GRAVITY_GATE_M_S2:
+        name, mean = self._name, batch.mean.tolist()
+        rate, force = mean[:3], mean[3:]
+        size = math.sqrt(sum(each * each for each in force))
+        if not abs(size - GRAVITY_M_S2) <= GRAVITY_GATE_M_S2:
             return _fault(f"accel {name} reads {size:.1f} m/s^2, not gravity")
-        level, allowed = (0.0, GYRO_BIAS_RAD_S) if self._prior is None else (self._prior, GYRO_PRIOR_RAD_S)
-        found = float(np.abs(rate - level).max())
+        level, allowed = (
+            ([0.0] * 3, GYRO_BIAS_RAD_S) if self._prior is None else (self._prior.tolist(), GYRO_PRIOR_RAD_S)
+        )
+        found = farthest(rate, level)
         if found > allowed:
             return _words(f"gyro {name} turns or is biased by", found / DEG, allowed / DEG, "deg/s")
         # A few samples say little about their own scatter; what was learned says more.
-        noise = batch.variance if self._noise is None else np.maximum(batch.variance, self._noise)
-        chance = _CHANCE * np.sqrt(noise / batch.n)
-        if self._recent:
-            off = np.abs(rate - _mean(self._recent)) - chance[:3] * _both(self._recent)
-            if float(off.max()) > GYRO_STEP_RAD_S:
-                return _words(f"gyro {name} moved by", float(off.max()) / DEG, GYRO_STEP_RAD_S / DEG, "deg/s")
-        if self._start:
-            off = np.abs(force - _mean(self._start)) - chance[3:] * _both(self._start)
-            if float(off.max()) > ACCEL_STEP_M_S2:
-                return _words(f"accel {name} tilted by", float(off.max()) / MG, ACCEL_STEP_M_S2 / MG, "mg")
+        noise = batch.variance.tolist()
+        if self._noise is not None:
+            noise = list(map(max, noise, self._noise.tolist()))
+        chance = [_CHANCE * math.sqrt(each / batch.n) for each in noise]
+        if self._recent and self._means is None:
+            self._means = mean_of(self._recent), mean_of(self._start)
+        if self._means is not None:
+            both = scatter_of_difference(self._recent)
+            found = beyond(rate, self._means[0], [each * both for each in chance[:3]])
+            if found > GYRO_STEP_RAD_S:
+                return _words(f"gyro {name} moved by", found / DEG, GYRO_STEP_RAD_S / DEG, "deg/s")
+            both = scatter_of_difference(self._start)
+            found = beyond(force, self._means[1], [each * both for each in chance[3:]])
+            if found > ACCEL_STEP_M_S2:
+                return _words(f"accel {name} tilted by", found / MG, ACCEL_STEP_M_S2 / MG, "mg")
         return self._off_rest(rate)
 
-    def _off_rest(self, rate: Floats) -> Verdict | None:
+    def _off_rest(self, rate: list[float]) -> Verdict | None:
         if self._rest is None:
             return None
-        found = float(np.abs(rate - self._rest).max())
+        found = farthest(rate, self._rest.tolist())
         if found <= GYRO_REST_RAD_S:
             self._off_level = 0
             return None
@@ -334,29 +343,40 @@ class PoseGate:
     def new_stretch(self) -> None:
         """The still stretch has ended: the reference pose starts again."""
         self._start: list[Floats] = []
+        self._refined: list[float] | None = None
+        """What the others add to the first; None: to be worked out when it is needed."""
 
     def accept(self, batch: Batch) -> None:
         """The second counts as still for all sources."""
         if len(self._start) < _REFERENCE:
             self._start.append(batch.mean)
+            self._refined = None
 
     def judge(self, batch: Batch) -> Verdict:
         """Whether this second was still for this sensor."""
         if batch.n > 1:
-            found, allowed = _motion(batch.variance, batch.white, batch.n, self._motion_deg, (0.0, self._motion_deg**2))
+            variance, white = batch.variance.tolist(), batch.white.tolist()
+            found, allowed = _motion(variance, white, batch.n, self._motion_deg, (0.0, self._motion_deg**2))
             if found > allowed:
                 return _words(self._name, found, allowed, "deg")
         if self._start:
             # Against the first good second, so that averaging on the circle needs no care; the others refine it.
-            turn = self._deviation(batch.mean - self._start[0])
-            turn = turn - _mean(self._deviation(_rows(self._start) - self._start[0]))
-            off = np.abs(turn) - _CHANCE * np.sqrt(batch.white / batch.n)
-            if float(off.max()) > self._step_deg:
-                return _words(f"{self._name} moved by", float(off.max()), self._step_deg, "deg")
+            first = self._start[0].tolist()
+            if self._refined is None:
+                turns = [self._deviations(each.tolist(), first) for each in self._start]
+                self._refined = [sum(of_one) / len(turns) for of_one in zip(*turns, strict=True)]
+            turned = self._deviations(batch.mean.tolist(), first)
+            off = [
+                abs(turn - refined) - _CHANCE * math.sqrt(white / batch.n)
+                for turn, refined, white in zip(turned, self._refined, batch.white.tolist(), strict=True)
+            ]
+            if max(off) > self._step_deg:
+                return _words(f"{self._name} moved by", max(off), self._step_deg, "deg")
         return STILL
 
-    def _deviation(self, difference: Floats) -> Floats:
-        return np.asarray(np.mod(difference + 180.0, 360.0) - 180.0) if self._circle else difference
+    def _deviations(self, values: list[float], first: list[float]) -> list[float]:
+        differences = [value - begin for value, begin in zip(values, first, strict=True)]
+        return [(each + 180.0) % 360.0 - 180.0 for each in differences] if self._circle else differences
 
 
 def gradienter_gate() -> PoseGate:

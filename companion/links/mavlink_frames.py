@@ -20,8 +20,8 @@ Kind = type[Message]
 
 HEADER_BYTES: Final = 10
 CHECKSUM_BYTES: Final = 2
-_MARKER: Final = 0xFD
-_KINDS: Final[dict[int, Kind]] = mavlink.mavlink_map
+MARKER: Final = 0xFD
+KINDS: Final[dict[int, Kind]] = mavlink.mavlink_map
 _EXTRA: Final[dict[Kind, bytes]] = {}
 _PLANS: Final[dict[Kind, tuple[struct.Struct, Callable[[Any], tuple[Any, ...]] | None] | None]] = {}
 """How the payload is unpacked and in which order its fields are given; None: it has text or arrays in it."""
@@ -37,12 +37,12 @@ def _crc(data: bytes) -> int:
 def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:
     """Which message begins there and where it ends; None where it is not the common case."""
     size = len(data)
-    if size - at < HEADER_BYTES + CHECKSUM_BYTES or data[at] != _MARKER or data[at + 2]:
+    if size - at < HEADER_BYTES + CHECKSUM_BYTES or data[at] != MARKER or data[at + 2]:
         return None
     end = at + HEADER_BYTES + data[at + 1] + CHECKSUM_BYTES
     if end > size:
         return None
-    kind = _KINDS.get(data[at + 7] | data[at + 8] << 8 | data[at + 9] << 16)
+    kind = KINDS.get(data[at + 7] | data[at + 8] << 8 | data[at + 9] << 16)
     if kind is None:
         return None
     extra = _EXTRA.get(kind)

@@ -68,6 +68,39 @@ class ImuBlock:
             yield ImuSample(t_s, (gx, gy, gz), (ax, ay, az), temperature_degc, None, stamp, self.breaks)
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class Lines:
+    """The readings in a row of whole lines; (n,) arrays."""
+
+    rows: Floats
+    """(n, c)"""
+    ends: NDArray[np.int64]
+    """Where in the text each one's last line ends, behind its line feed."""
+    frame_bytes: NDArray[np.int64]
+    """Of all its lines."""
+    state: dict[str, Any]
+    """Attributes that the decoder has behind them."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class PoseBlock:
+    """Readings of a gradienter or a compass in their order; (n,) arrays, times never decrease."""
+
+    t_s: Floats
+    rows: Floats
+    """(n, 2) degrees of a gradienter's axes, or (n, 1) of a compass' heading, without its tilt."""
+    reads: NDArray[np.intp]
+    """Which of the reads has completed each."""
+    temperature_degc: None = None
+    stamps: None = None
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+
+Block = ImuBlock | PoseBlock
+
+
 def all_believable(rows: Floats, temperature_degc: Floats | None) -> bool:
     """Whether `checks.check_imu` finds nothing wrong with any of them."""
     # Not a number compares false.
@@ -82,6 +115,20 @@ def field(frames: NDArray[np.uint8], offset: int, kind: str, count: int = 1) -> 
     """(n, count) of a field that has the same place in every frame; `kind` with its byte order."""
     size = np.dtype(kind).itemsize * count
     return np.ascontiguousarray(frames[:, offset : offset + size]).view(kind)
+
+
+def fixed_point(texts: NDArray[np.uint8], decimals: int) -> Floats | None:
+    """(n,) numbers of equal length with a sign and so many decimals, as `float` reads them; None: one is none.
+
+    At most 15 digits: they and the power of ten are whole numbers then, and their quotient is rounded once.
+    """
+    signs, point = texts[:, 0], texts.shape[1] - decimals - 1
+    digits = np.delete(texts[:, 1:], point - 1, axis=1) - np.uint8(ord("0"))
+    negative = signs == ord("-")
+    if not ((negative | (signs == ord("+"))).all() and (texts[:, point] == ord(".")).all() and (digits <= 9).all()):
+        return None
+    whole = digits @ 10.0 ** np.arange(digits.shape[1] - 1, -1, -1)
+    return np.asarray(np.where(negative, -1.0, 1.0) * (whole / 10.0**decimals))
 
 
 def crc16_xmodem(frames: NDArray[np.uint8]) -> NDArray[np.uint16]:

@@ -50,6 +50,7 @@ class VectorNavDecoder(FrameDecoder):
     """VectorNav outputs; gives `ImuSample`, `AttitudeSample` and `MagSample` as far as a frame has them."""
 
     device_clock_wraps_s: ClassVar[float | None] = 2**64 / 1e9
+    many = "imu"
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)

@@ -34,8 +34,15 @@ _LONG: Final = struct.Struct("<Q")
 MOST_CHUNK_BYTES: Final = 64 * 1024 * 1024
 """A chunk that claims more than this is damaged: ours have a state of some MB at most."""
 
-CHUNKS_AHEAD: Final = 4
-"""Unpacked before they are asked for; a chunk is a second or less."""
+AT_ONCE: Final = 8
+"""Records that are given together to the thread that unpacks them: to hand one over costs half of unpacking it."""
+AT_ONCE_BYTES: Final = 2 * 1024 * 1024
+"""The last of them may be beyond that, unpacked; a chunk is a second or less."""
+GROUPS_AHEAD: Final = 2
+"""Unpacked before they are asked for."""
+
+_Record = tuple[int, int, int]
+"""Its kind, where its content begins, where it ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,26 +137,24 @@ class Recording:
     def _file(self, data: memoryview) -> Iterator[Messages | Metadata | Attachment]:
         """What is in a file; a thread unpacks the next chunks meanwhile, which needs no interpreter."""
         records, damage = _outermost(data), None
-        waiting: deque[tuple[int, int, int, Future[bytes] | None]] = deque()
+        waiting: deque[tuple[list[_Record], Future[list[bytes | Exception | None]]]] = deque()
         with ThreadPoolExecutor(max_workers=1) as thread:
             while True:
-                while damage is None and len(waiting) < CHUNKS_AHEAD:
-                    try:
-                        kind, at, end = next(records)
-                    except (StopIteration, _DamagedError) as error:
-                        damage = error
-                        break
-                    chunk = thread.submit(_chunk, data[at:end], at) if kind == _CHUNK else None
-                    waiting.append((kind, at, end, chunk))
+                while damage is None and len(waiting) < GROUPS_AHEAD:
+                    group, damage = _group(data, records)
+                    waiting.append((group, thread.submit(_unpack, data, group)))
                 if not waiting:
                     break
-                kind, at, end, chunk = waiting.popleft()
-                if chunk is not None:
-                    yield from self._chunk(chunk.result())
-                elif kind == _MESSAGE:
-                    yield self._messages(bytes(data[at - _HEAD.size : end]), np.zeros(1, dtype=np.int64))
-                else:
-                    yield from self._other(data, kind, at)
+                group, unpacking = waiting.popleft()
+                for (kind, at, end), chunk in zip(group, unpacking.result(), strict=False):
+                    if isinstance(chunk, Exception):
+                        raise chunk
+                    if chunk is not None:
+                        yield from self._chunk(chunk)
+                    elif kind == _MESSAGE:
+                        yield self._messages(bytes(data[at - _HEAD.size : end]), np.zeros(1, dtype=np.int64))
+                    else:
+                        yield from self._other(data, kind, at)
         if isinstance(damage, _DamagedError):
             raise damage
 
@@ -195,7 +200,7 @@ class Recording:
         )
 
 
-def _record(data: Any, at: int) -> tuple[int, int, int]:
+def _record(data: Any, at: int) -> _Record:
     """The record that begins at `at`: its kind, where its content begins, where it ends."""
     size = len(data)
     if size - at < _HEAD.size:
@@ -209,7 +214,7 @@ def _record(data: Any, at: int) -> tuple[int, int, int]:
     return kind, at, at + length
 
 
-def _outermost(data: Any) -> Iterator[tuple[int, int, int]]:
+def _outermost(data: Any) -> Iterator[_Record]:
     """The records of a file, as `_record` gives them, until the end of its data."""
     at, size = len(MAGIC), len(data)
     if size < at:
@@ -220,6 +225,50 @@ def _outermost(data: Any) -> Iterator[tuple[int, int, int]]:
             return
         yield kind, begin, at
     raise _DamagedError(f"cut at byte {size}")
+
+
+def _group(data: Any, records: Iterator[_Record]) -> tuple[list[_Record], Exception | None]:
+    """The next records, and what came instead of one more: the end, or a cut."""
+    group: list[_Record] = []
+    size = 0
+    while len(group) < AT_ONCE and size < AT_ONCE_BYTES:
+        try:
+            kind, at, end = next(records)
+        except (StopIteration, _DamagedError) as error:
+            return group, error
+        group.append((kind, at, end))
+        if kind == _CHUNK and end - at >= _CHUNK_HEAD.size:
+            size += _CHUNK_HEAD.unpack_from(data, at)[2]
+    return group, None
+
+
+def _unpack(data: Any, group: list[_Record]) -> list[bytes | Exception | None]:
+    """What is in the chunks among these records, as far as they are sound; in its place what is wrong with one."""
+    found: list[bytes | Exception | None] = []
+    decompress = _decompressor()
+    for kind, at, end in group:
+        try:
+            found.append(_chunk(data[at:end], at, decompress) if kind == _CHUNK else None)
+        except (_DamagedError, StorageError, struct.error, UnicodeDecodeError) as error:
+            return [*found, error]
+    return found
+
+
+def _decompressor() -> Callable[[Any, int], bytes] | None:
+    """Unpacks to so many bytes at most, or raises `_DamagedError`; None where the library is not installed."""
+    try:
+        import zstandard
+    except ImportError:
+        return None
+    unpack = zstandard.ZstdDecompressor().decompress
+
+    def decompress(packed: Any, size: int) -> bytes:
+        try:
+            return unpack(packed, max_output_size=size)
+        except zstandard.ZstdError as error:
+            raise _DamagedError from error
+
+    return decompress
 
 
 def _anywhere(data: Any, kind: str) -> NDArray[Any]:
@@ -248,7 +297,7 @@ def _chain(data: bytes, at: int) -> NDArray[np.int64]:
     return np.array(starts, dtype=np.int64)
 
 
-def _chunk(data: Any, at: int) -> bytes:
+def _chunk(data: Any, at: int, decompress: Callable[[Any, int], bytes] | None) -> bytes:
     """The records in a chunk, unpacked and checked."""
     _, _, size, crc = _CHUNK_HEAD.unpack_from(data, 0)
     compression, start = _text(data, _CHUNK_HEAD.size)
@@ -257,13 +306,11 @@ def _chunk(data: Any, at: int) -> bytes:
     if size > MOST_CHUNK_BYTES:
         raise _DamagedError(f"damaged at byte {at}")
     if compression == "zstd":
+        if decompress is None:
+            raise StorageError("a recording needs more than is installed: pip install 'companion[recording]'")
         try:
-            import zstandard
-        except ImportError:
-            raise StorageError("a recording needs more than is installed: pip install 'companion[recording]'") from None
-        try:
-            packed = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-        except zstandard.ZstdError:
+            packed = decompress(packed, size)
+        except _DamagedError:
             raise _DamagedError(f"damaged at byte {at}") from None
     elif compression:
         raise _DamagedError(f"compressed by {compression}, which is not read here")

@@ -9,6 +9,7 @@ that only the autopilot can tell: what was written and read back, and with which
 from __future__ import annotations
 
 import datetime
+import gc
 import itertools
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -16,55 +17,32 @@ from typing import Any, Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.autopilot.imu_calibration import ImuCalibration
-from companion.calibration.joint import weigh
-from companion.calibration.measurement import Measurement
-from companion.calibration.prior import Expectation
-from companion.calibration.record import AlignmentUsed, Record, from_json
-from companion.calibration.request import What
+from companion.calibration.record import Record, from_json
 from companion.calibration.rolling import RollingCollector, Window
 from companion.calibration.site import Whereabouts
-from companion.calibration.solve import ImuSolution, Solution, solve_at
 from companion.config import Config
-from companion.daemon import models
-from companion.daemon.alignment import aligned
-from companion.daemon.course import in_words
-from companion.daemon.plan import whole_of
 from companion.daemon.report import Draft
 from companion.daemon.serial_devices import Role, collect, parts_of, serial_devices
 from companion.errors import CalibrationRefusedError, StorageError
-from companion.physics.frames import Array
 from companion.protocols.base import Decoder
 from companion.recording import state, topics
 from companion.recording.files import versions
 from companion.recording.walk import Attachment, Messages, Metadata, Recording
-from companion.replay.again import record_again, refined_window
-from companion.replay.blocks import SerialImu
-from companion.replay.compare import Difference, differences
+from companion.replay.blocks import Share
+from companion.replay.calibrations import Calibrations, Replayed
+from companion.replay.rows import Numbers, Row, is_of
 from companion.replay.telemetry import Telemetry
 from companion.samples import Sample
 
+__all__ = ["Replay", "Replayed", "Result"]
+
 AT_ONCE: Final = 16384
 """Messages that are gathered before they are replayed; half of them samples, they are some seconds of a 1 kHz IMU."""
-FEWEST: Final = 64
-"""Reads of one IMU among them for which it is worth while to look at all of them at once."""
 _UNUSABLE: Final = (msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 """What a handler says of a message that nobody could have written."""
 _raw: Final = msgspec.json.Decoder(topics.RawBytes)
-
-WINDOWS_KEPT: Final = 4000
-"""Means that were taken, for a calibration that may come of them."""
-
-
-class Replayed(msgspec.Struct, frozen=True):
-    """One calibration again."""
-
-    record: Record
-    differences: list[Difference]
-    not_recomputed: str | None
-    """Why its estimates were taken from the recording, if so."""
 
 
 class Result(msgspec.Struct, frozen=True):
@@ -104,23 +82,18 @@ class Replay:
         self._recording = recording
         self._in_blocks = in_blocks
         self._gathered: list[Messages] = []
+        self._how_many = 0
         self._config: Config | None = None
         self._versions: dict[str, str] = {}
         self._collector: RollingCollector | None = None
         self._decoders: dict[str, Decoder] = {}
         self._roles: dict[str, tuple[Role, ...]] = {}
         """Of each device, by the name that its bytes have."""
+        self._autopilots: list[str] = []
+        """IMUs whose samples come over MAVLink."""
         self._telemetry = Telemetry(b"", 0.0)
-        self._windows: dict[int, Window | Measurement | CalibrationRefusedError] = {}
-        self._where = Whereabouts()
-        self._offsets: dict[str, ImuCalibration | None] = {}
-        self._solution: Solution | None = None
-        self._solved_with: dict[str, ImuCalibration | None] = {}
-        """The offsets in force when that was measured; by now others may have been written."""
-        self._no_solution = ""
-        self._alignment: AlignmentUsed | None = None
+        self._calibrations = Calibrations()
         self._handlers: dict[str, Callable[[bytes], None] | None] = {}
-        self._calibrations: list[Replayed] = []
         self._notes: list[str] = []
         self._strange: Counter[str] = Counter()
         self._first_s: float | None = None
@@ -132,6 +105,17 @@ class Replay:
         Raises:
             StorageError: one line: it is not one of ours, or it was made by a version whose state is not known here.
         """
+        # Nothing here goes round in circles, however long it takes; looking for that among all the samples that are
+        # held for a moment takes a tenth of the time, with the autopilot's a quarter.
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            return self._run()
+        finally:
+            if collecting:
+                gc.enable()
+
+    def _run(self) -> Result:
         for item in self._recording.runs(self._is_wanted):
             if isinstance(item, Messages):
                 self._gather(item)
@@ -153,12 +137,22 @@ class Replay:
             raise StorageError(f"{self._recording.path}: {whose}; nothing to replay")
         notes = [*self._version_notes(), *self._notes, *(f"{words}: {n} times" for words, n in self._strange.items())]
         return Result(
-            calibrations=self._calibrations,
-            estimate=None if self._calibrations else self._estimate(),
-            seconds=0.0 if self._first_s is None else self._now_s - self._first_s,
+            calibrations=self._calibrations.again,
+            estimate=None if self._calibrations.again else self._estimate(self._collector),
+            seconds=self._seconds,
             cut_short=self._recording.cut_short,
             notes=notes,
         )
+
+    @property
+    def _seconds(self) -> float:
+        return 0.0 if self._first_s is None else self._now_s - self._first_s
+
+    def _estimate(self, collector: RollingCollector) -> Record:
+        """What a calibration would have found at the end."""
+        unix_s = float(self._versions.get("unix_s", "0"))
+        draft = Draft(datetime.datetime.fromtimestamp(unix_s, tz=datetime.UTC))
+        return self._calibrations.estimate(collector, self._now_s, draft, self._seconds)
 
     def _version_notes(self) -> list[str]:
         ours = versions()
@@ -174,7 +168,9 @@ class Replay:
             self._config = msgspec.json.decode(data, type=Config)
         except msgspec.MsgspecError as error:
             raise StorageError(f"{self._recording.path}: its configuration is of another version: {error}") from None
+        self._calibrations.config = self._config
         self._roles = {device.name: device.roles for device in serial_devices(self._config)}
+        self._autopilots = [imu.name for imu in self._config.imu if imu.source == "autopilot"]
 
     # --- what comes, in its order
 
@@ -183,72 +179,63 @@ class Replay:
 
     def _gather(self, messages: Messages) -> None:
         self._gathered.append(messages)
-        if sum(len(each.data) for each in self._gathered) >= AT_ONCE:
+        self._how_many += len(messages.data)
+        if self._how_many >= AT_ONCE:
             self._flush()
 
     def _flush(self) -> None:
         """Replay what has been gathered."""
-        gathered, self._gathered = self._gathered, []
+        gathered, self._gathered, self._how_many = self._gathered, [], 0
         if not gathered:
             return
         numbers = np.concatenate([each.numbers for each in gathered])
         data = list(itertools.chain.from_iterable(each.data for each in gathered))
         start = 0
         # A state brings other decoders.
-        for state_at in np.flatnonzero(self._is_of(numbers, topics.STATE)).tolist():
+        for state_at in np.flatnonzero(is_of(numbers, self._recording.topics, topics.STATE)).tolist():
             self._row(numbers[start:state_at], data[start:state_at])
             self._message(topics.STATE, data[state_at])
             start = state_at + 1
         self._row(numbers[start:], data[start:])
 
-    def _is_of(self, numbers: NDArray[np.int64], *begins: str) -> NDArray[np.bool_]:
-        """Which of the messages are on a topic that begins so."""
-        found = [number for number, topic in enumerate(self._recording.topics) if topic.startswith(begins)]
-        return np.isin(numbers, found)
-
-    def _row(self, numbers: NDArray[np.int64], data: list[bytes]) -> None:
+    def _row(self, numbers: Numbers, data: list[bytes]) -> None:
         """Replay messages among which no state is."""
         if self._collector is None or not data:
             return
-        imus: list[SerialImu] = []
-        others = np.ones(len(data), dtype=np.bool_)
-        for name, roles in self._roles.items() if self._in_blocks else ():
-            topic = topics.SERIAL + name
-            if topic not in self._recording.topics or [role.kind for role in roles] != ["imu"]:
-                continue
-            its = numbers == self._recording.topics.index(topic)
-            if np.count_nonzero(its) >= FEWEST:
-                messages = itertools.compress(data, its.tolist())
-                try:
-                    imus.append(SerialImu(name, self._decoders[name], np.flatnonzero(its), messages))
-                except _UNUSABLE as error:
-                    raise self._unusable(topic, error) from None
-                others &= ~its
-        # Others' readings may pass samples of an IMU that lie between two ends of seconds, whoever looks may not.
-        looks = others & ~self._is_of(numbers, topics.SERIAL, topics.IMU, topics.MAVLINK_IN)
-        ends = {place: imu for imu in imus for place in (*imu.ends, *imu.one_by_one)}
-        for place in sorted({*np.flatnonzero(others).tolist(), *ends}):
-            if looks[place]:
-                self._take_samples(imus, place)
-            if (imu := ends.get(place)) is not None:
-                self._take_samples([imu], place)
-            else:
-                self._message(self._recording.topics[numbers[place]], data[place])
-        self._take_samples(imus, len(data))
-        timed = np.flatnonzero(others & ~self._is_of(numbers, topics.IMU))
-        last = max(imus, key=lambda imu: imu.last_place, default=None)
-        if last is not None and (len(timed) == 0 or last.last_place > timed[-1]):
-            self._at(last.last_s)
-
-    def _take_samples(self, imus: Sequence[SerialImu], place: int) -> None:
-        """Give the collector what has come of these IMUs up to the message at that place."""
-        for imu in imus:
+        row = Row(numbers, data, self._recording.topics)
+        if self._in_blocks:
             try:
-                if self._collector is not None:
-                    imu.collect(self._collector, place)
-                self._collect(imu.name, imu.one_by_one.get(place, ()))
+                for name, roles in self._roles.items():
+                    row.share_serial(name, roles, self._decoders[name])
+                row.share_telemetry(self._telemetry, self._autopilots)
             except _UNUSABLE as error:
-                raise self._unusable(topics.SERIAL + imu.name, error) from None
+                raise self._unusable(row.topic, error) from None
+        self._strange.update(row.strange)
+        for place, looking, share in row.order():
+            for each in looking:
+                self._take_samples(each, place)
+            if share is not None:
+                self._take_samples(share, place)
+                self._collect_singles(share, place)
+            elif place < len(data):
+                self._message(row.topics[numbers[place]], data[place])
+        last_s = row.last_s
+        if last_s is not None:
+            self._at(last_s)
+
+    def _take_samples(self, share: Share, place: int) -> None:
+        """Give the collector what has come in a share up to the message at that place."""
+        if self._collector is not None:
+            try:
+                share.collect(self._collector, place)
+            except _UNUSABLE as error:
+                raise self._unusable(share.topic, error) from None
+
+    def _collect_singles(self, share: Share, place: int) -> None:
+        try:
+            self._collect((share.role,), share.one_by_one.get(place, ()))
+        except _UNUSABLE as error:
+            raise self._unusable(share.topic, error) from None
 
     def _unusable(self, topic: str, error: Exception) -> StorageError:
         return StorageError(f"{self._recording.path}: a message on {topic} cannot be used by this version ({error})")
@@ -279,7 +266,7 @@ class Replay:
             return lambda data: self._take_serial(name, data)
         if topic.startswith(topics.IMU) and self._config is not None:
             name = topic.removeprefix(topics.IMU)
-            if any(imu.name == name and imu.source == "autopilot" for imu in self._config.imu):
+            if name in self._autopilots:
                 return lambda data: self._take_telemetry(name, data)
         # Samples of serial devices come from their bytes.
         return None
@@ -299,12 +286,8 @@ class Replay:
         plain = state.from_json(entry.state)
         known = _State(**plain)
         self._collector, self._decoders = known.collector, known.decoders
-        self._windows.update(known.windows)
-        self._where, self._offsets = known.where, known.offsets
         self._telemetry = Telemetry(known.mavlink, entry.t_s)
-        self._solution, self._no_solution = None, "it was measured before this part of the recording"
-        if known.solved is not None:
-            self._solve(known.solved)
+        self._calibrations.begin(known.windows, known.where, known.offsets, known.solved)
 
     def _take_serial(self, name: str, data: bytes) -> None:
         raw = _raw.decode(data)
@@ -313,18 +296,18 @@ class Replay:
         if raw.data is None:
             decoder.interrupted()
             return
-        self._collect(name, decoder.receive(raw.data, raw.t_s))
+        self._collect(self._roles[name], decoder.receive(raw.data, raw.t_s))
 
-    def _collect(self, name: str, samples: Iterable[Sample]) -> None:
+    def _collect(self, roles: Sequence[Role], samples: Iterable[Sample]) -> None:
         for sample in samples:
-            for role, part in parts_of(sample, self._roles[name]):
+            for role, part in parts_of(sample, roles):
                 if self._collector is not None:
                     collect(self._collector, role, part)
 
     def _take_mavlink(self, data: bytes) -> None:
         raw = _raw.decode(data)
         self._at(raw.t_s)
-        if self._config is None or not any(imu.source == "autopilot" for imu in self._config.imu):
+        if not self._autopilots:
             return  # nobody takes a sample from it
         self._telemetry.receive(raw.data, raw.t_s)
 
@@ -349,12 +332,9 @@ class Replay:
         match entry.event:
             case "window":
                 try:
-                    # Most are never asked for.
-                    self._windows[detail] = collector.measurement(entry.t_s)
+                    self._calibrations.measured(detail, collector.measurement(entry.t_s))
                 except CalibrationRefusedError as error:
-                    self._windows[detail] = error
-                while len(self._windows) > WINDOWS_KEPT:
-                    del self._windows[next(iter(self._windows))]
+                    self._calibrations.measured(detail, error)
             case "reset":
                 collector.reset(*detail)
             case "imu":
@@ -364,77 +344,14 @@ class Replay:
             case "expect":
                 collector.expect(gradienter=detail[0], compass=detail[1])
             case "place":
-                self._where = detail
+                self._calibrations.where = detail
             case "offsets":
-                self._offsets = detail
+                self._calibrations.offsets = detail
             case "solved":
-                self._solve(detail)
-
-    # --- calibrations
-
-    def _solve(self, detail: dict[str, Any]) -> None:
-        self._solution, self._no_solution = None, ""
-        window = self._windows.get(detail["window"])
-        self._where, self._solved_with = detail["where"], detail["offsets"]
-        used = detail.get("alignment")
-        self._alignment = (
-            AlignmentUsed(measured_at="", offset_deg=(used[0], used[1]), sigma_deg=used[2]) if used else None
-        )
-        if window is None:
-            self._no_solution = "its measurement is not in the recording"
-            return
-        try:
-            if isinstance(window, CalibrationRefusedError):
-                raise window
-            if isinstance(window, Measurement):
-                window = window.window()
-            solution = self._solved(refined_window(window, detail["refined"]), What[detail["what"]])
-            whole = {found.name: self._whole(found) for found in solution.imus}
-            self._solution = weigh(solution, whole, detail.get("expectation") or Expectation()).solution
-        except CalibrationRefusedError as error:
-            self._no_solution = f"refused here: {error}"
-
-    def _solved(self, window: Window, what: What) -> Solution:
-        config = self._config
-        assert config is not None
-        gradienter = aligned(models.gradienter_model(config.gradienter), self._alignment)
-        compass = models.compass_model(config.compass)
-        return solve_at(window, self._where, gradienter, compass, what)
-
-    def _whole(self, found: ImuSolution) -> tuple[Array | None, Array | None]:
-        calibration = self._solved_with.get(found.name)
-        return (found.gyro_rad_s, found.accel_m_s2) if calibration is None else whole_of(calibration, found)
+                self._calibrations.solve(detail)
 
     def _take_record(self, data: bytes) -> None:
         entry = msgspec.json.decode(data, type=topics.RecordEntry)
         recorded = from_json(entry.record.encode())
         self._at(entry.t_s)
-        solution, self._solution = self._solution, None
-        why = self._no_solution
-        if recorded.pose is None:
-            # It ended before anything was worked out; there is nothing to recompute.
-            self._calibrations.append(Replayed(recorded, [], "it ended before anything was worked out"))
-        elif solution is not None:
-            again = record_again(recorded, solution, self._solved_with)
-            self._calibrations.append(Replayed(again, differences(recorded, again), None))
-        elif why.startswith("refused here"):
-            gone = msgspec.structs.replace(recorded, state="failed", reason=why, pose=None, site=None, imus=())
-            self._calibrations.append(Replayed(gone, differences(recorded, gone), None))
-        else:
-            self._calibrations.append(Replayed(recorded, [], why))
-
-    def _estimate(self) -> Record:
-        """What a calibration would have found at the end."""
-        unix_s = float(self._versions.get("unix_s", "0"))
-        draft = Draft(datetime.datetime.fromtimestamp(unix_s, tz=datetime.UTC))
-        seconds = 0.0 if self._first_s is None else self._now_s - self._first_s
-        try:
-            assert self._collector is not None
-            draft.solution = self._solved(self._collector.window(self._now_s), What.BOTH)
-        except CalibrationRefusedError as error:
-            return draft.record("failed", str(error), seconds)
-        for found in draft.solution.imus:
-            calibration = self._offsets.get(found.name)
-            if calibration is not None:
-                draft.whole[found.name] = whole_of(calibration, found)
-        return draft.record("done", in_words(draft.solution), seconds)
+        self._calibrations.recorded(recorded)

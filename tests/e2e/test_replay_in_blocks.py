@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import random
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ from companion.recording.walk import Message, Recording
 from companion.replay.engine import Replay
 from tests.e2e.test_record_replay import rewritten
 from tests.support.long_recordings import GYRO_BIAS, NOISE, write_recording
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
 
 KINDS: dict[str, dict[str, Any]] = {
     "a read a frame": {"seconds": 30.0, "rate_hz": 400.0},
@@ -71,6 +74,40 @@ def test_a_replay_in_blocks_gives_what_one_by_one_does(tmp_path: Path, kind: dic
     assert msgspec.to_builtins(found.estimate) != msgspec.to_builtins(whole.estimate)
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
     assert both(path).cut_short
+
+
+async def _live(folder: Path) -> None:
+    async with Rig(folder, own_imu=True, recordings_mb=64).running() as rig:
+        await rig.ready()
+        await asyncio.sleep(30.0)
+
+
+def test_the_autopilot_s_samples_are_the_same_in_blocks(tmp_path: Path) -> None:
+    """What a daemon recorded, with messages damaged, missing and changed."""
+    run_virtual(_live(tmp_path))
+    path = tmp_path / "recordings" / "000001.mcap"
+    assert not both(path).notes
+    rng, count = random.Random(8), 0
+
+    def damage(topic: str, data: bytes) -> bytes | None:
+        nonlocal count
+        if topic != topics.MAVLINK_IN and not topic.startswith(topics.IMU):
+            return data
+        count += 1
+        if count % 907 == 0:
+            return None
+        if topic == topics.MAVLINK_IN and count % 397 == 0:
+            raw = msgspec.json.decode(data, type=topics.RawBytes)
+            assert raw.data is not None
+            place = rng.randrange(len(raw.data))
+            return msgspec.json.encode(topics.RawBytes(raw.t_s, raw.data[:place] + b"\xfa" + raw.data[place + 1 :]))
+        if topic != topics.MAVLINK_IN and count % 501 == 0:
+            return data.replace(b'"gyro_rad_s":[', b'"gyro_rad_s":[1')
+        return data
+
+    found = both(rewritten(path, tmp_path / "damaged.mcap", damage))
+    assert any("is not in the MAVLink bytes" in note for note in found.notes)
+    assert any("does not decode as it did" in note for note in found.notes)
 
 
 def test_a_message_that_is_none_of_raw_bytes_is_named(tmp_path: Path) -> None:

@@ -13,13 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.calibration.rolling import RollingCollector
+from companion.daemon.serial_devices import Role
 from companion.protocols.base import Decoder
 from companion.protocols.bulk import ImuBlock, crc16_xmodem
 from companion.protocols.registry import make_decoder
 from companion.protocols.vectornav import VectorNavDecoder
 from companion.recording import topics
 from companion.recording.state import freeze, to_json
-from companion.replay.blocks import SerialImu
+from companion.replay.blocks import SerialShare
 from companion.samples import ImuSample, Sample
 from tests.support import frames
 from tests.support import still_aircraft as still
@@ -127,7 +128,7 @@ class Taker:
 
 def in_blocks(decoder: Decoder, reads: list[tuple[bytes | None, float]]) -> tuple[list[list[ImuSample]], int]:
     data = [msgspec.json.encode(topics.RawBytes(t_s, each)) for each, t_s in reads]
-    imu = SerialImu("own", decoder, np.arange(len(reads)), data)
+    imu = SerialShare(Role("own", "imu"), "own", decoder, np.arange(len(reads)), data)
     assert imu.last_place == len(reads) - 1
     found, taker = [], Taker()
     for place in range(len(reads)):
@@ -227,6 +228,8 @@ def blocks_of(rng: random.Random, seconds: float) -> list[ImuBlock]:
         rows[numbers.integers(0, count, 3), 2] = [1e9, np.nan, np.inf]
     if rng.random() < 0.3:
         rows = np.trunc(rows / 1e-3) * 1e-3
+    if rng.random() < 0.2:  # the end of its range
+        rows[:, 1] = np.minimum(rows[:, 1], np.quantile(rows[:, 1], 0.8))
     temperature = None if rng.random() < 0.5 else 25.0 + numbers.normal(0.0, 0.1, count)
     cuts = sorted({0, count, *numbers.integers(0, count, rng.randrange(6)).tolist()})
     made, breaks = [], 0

@@ -1,0 +1,145 @@
+"""The calibrations of a recording again: from the means that were taken to the record that was written."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import msgspec
+
+from companion.autopilot.imu_calibration import ImuCalibration
+from companion.calibration.joint import weigh
+from companion.calibration.measurement import Measurement
+from companion.calibration.prior import Expectation
+from companion.calibration.record import AlignmentUsed, Record
+from companion.calibration.request import What
+from companion.calibration.rolling import RollingCollector, Window
+from companion.calibration.site import Whereabouts
+from companion.calibration.solve import ImuSolution, Solution, solve_at
+from companion.config import Config
+from companion.daemon import models
+from companion.daemon.alignment import aligned
+from companion.daemon.course import in_words
+from companion.daemon.plan import whole_of
+from companion.daemon.report import Draft
+from companion.errors import CalibrationRefusedError
+from companion.physics.frames import Array
+from companion.replay.again import record_again, refined_window
+from companion.replay.compare import Difference, differences
+
+WINDOWS_KEPT: Final = 4000
+"""Means that were taken, for a calibration that may come of them."""
+
+
+class Replayed(msgspec.Struct, frozen=True):
+    """One calibration again."""
+
+    record: Record
+    differences: list[Difference]
+    not_recomputed: str | None
+    """Why its estimates were taken from the recording, if so."""
+
+
+class Calibrations:
+    """What has been measured, solved and recorded so far."""
+
+    def __init__(self) -> None:
+        self.config: Config | None = None
+        """The daemon's; nothing is solved before it is known."""
+        self.again: list[Replayed] = []
+        self.where = Whereabouts()
+        self.offsets: dict[str, ImuCalibration | None] = {}
+        self._windows: dict[int, Window | Measurement | CalibrationRefusedError] = {}
+        self._solution: Solution | None = None
+        self._solved_with: dict[str, ImuCalibration | None] = {}
+        """The offsets in force when that was measured; by now others may have been written."""
+        self._no_solution = ""
+        self._alignment: AlignmentUsed | None = None
+
+    def begin(
+        self,
+        windows: list[tuple[int, Window]],
+        where: Whereabouts,
+        offsets: dict[str, ImuCalibration | None],
+        solved: dict[str, Any] | None,
+    ) -> None:
+        """Go on from what was known when a part of the recording began."""
+        self._windows.update(windows)
+        self.where, self.offsets = where, offsets
+        self._solution, self._no_solution = None, "it was measured before this part of the recording"
+        if solved is not None:
+            self.solve(solved)
+
+    def measured(self, number: int, found: Measurement | CalibrationRefusedError) -> None:
+        """Means were taken; most of them nobody ever asks for."""
+        self._windows[number] = found
+        while len(self._windows) > WINDOWS_KEPT:
+            del self._windows[next(iter(self._windows))]
+
+    def solve(self, detail: dict[str, Any]) -> None:
+        """Work out what was solved from means that were taken before."""
+        self._solution, self._no_solution = None, ""
+        window = self._windows.get(detail["window"])
+        self.where, self._solved_with = detail["where"], detail["offsets"]
+        used = detail.get("alignment")
+        self._alignment = (
+            AlignmentUsed(measured_at="", offset_deg=(used[0], used[1]), sigma_deg=used[2]) if used else None
+        )
+        if window is None:
+            self._no_solution = "its measurement is not in the recording"
+            return
+        try:
+            if isinstance(window, CalibrationRefusedError):
+                raise window
+            if isinstance(window, Measurement):
+                window = window.window()
+            solution = self._solved(refined_window(window, detail["refined"]), What[detail["what"]])
+            whole = {found.name: self._whole(found) for found in solution.imus}
+            self._solution = weigh(solution, whole, detail.get("expectation") or Expectation()).solution
+        except CalibrationRefusedError as error:
+            self._no_solution = f"refused here: {error}"
+
+    def _solved(self, window: Window, what: What) -> Solution:
+        config = self.config
+        assert config is not None
+        gradienter = aligned(models.gradienter_model(config.gradienter), self._alignment)
+        compass = models.compass_model(config.compass)
+        return solve_at(window, self.where, gradienter, compass, what)
+
+    def _whole(self, found: ImuSolution) -> tuple[Array | None, Array | None]:
+        calibration = self._solved_with.get(found.name)
+        return (found.gyro_rad_s, found.accel_m_s2) if calibration is None else whole_of(calibration, found)
+
+    def recorded(self, recorded: Record) -> None:
+        """Take the record that ended a calibration."""
+        solution, self._solution = self._solution, None
+        why = self._no_solution
+        if recorded.pose is None:
+            # It ended before anything was worked out; there is nothing to recompute.
+            self.again.append(Replayed(recorded, [], "it ended before anything was worked out"))
+        elif solution is not None:
+            again = record_again(recorded, solution, self._solved_with)
+            self.again.append(Replayed(again, differences(recorded, again), None))
+        elif why.startswith("refused here"):
+            gone = msgspec.structs.replace(recorded, state="failed", reason=why, pose=None, site=None, imus=())
+            self.again.append(Replayed(gone, differences(recorded, gone), None))
+        else:
+            self.again.append(Replayed(recorded, [], why))
+
+    def estimate(self, collector: RollingCollector, now_s: float, draft: Draft, seconds: float) -> Record:
+        """What a calibration would have found now.
+
+        Args:
+            collector: as it stands.
+            now_s: the samples' clock.
+            draft: of the record.
+            seconds: that it took.
+        """
+        try:
+            draft.solution = self._solved(collector.window(now_s), What.BOTH)
+        except CalibrationRefusedError as error:
+            return draft.record("failed", str(error), seconds)
+        for found in draft.solution.imus:
+            calibration = self.offsets.get(found.name)
+            if calibration is not None:
+                draft.whole[found.name] = whole_of(calibration, found)
+        return draft.record("done", in_words(draft.solution), seconds)
