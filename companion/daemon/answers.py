@@ -98,6 +98,7 @@ class Answers:
         link: MavlinkLink,
         pose: PoseNow,
         trouble: Callable[[], str | None],
+        lies: Callable[[], str | None],
         alignment: AlignmentInForce,
     ) -> None:
         self._conductor, self._vehicle, self._collector, self._devices = conductor, vehicle, collector, devices
@@ -106,6 +107,8 @@ class Answers:
         self._armings, self._gate_setup, self._automatic = armings, gate_setup, automatic
         self._recorder, self._link, self._pose, self._alignment = recorder, link, pose, alignment
         self._headlines = Headlines(vehicle, collector, conductor, mender, readiness, automatic, mavlink_url, trouble)
+        self._concerns: list[Callable[[], str | None]] = [lies]
+        self._headlines.concern = lambda: next(filter(None, (concern() for concern in self._concerns)), None)
         self._carried: Carried | None = None
         self._signing: LinkSigning | None = None
         self._permission = Permission()
@@ -125,7 +128,7 @@ class Answers:
         """Tell of the attitude that is carried, too."""
         self._carried = attitude
         if attitude is not None:
-            self._headlines.concern = lambda: attitude.concern
+            self._concerns.append(lambda: attitude.concern)
 
     async def answer(self, request: Object, face: str = "companion") -> AsyncIterator[Object]:
         """Answer one request of the control socket, or of another face that speaks its words.

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from companion.autopilot.ekf import EkfWatch
+from companion.autopilot.imu_calibration import accel_taken_off
 from companion.autopilot.imu_stream import StreamKind
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.px4_slots import SlotMemory
@@ -56,7 +57,7 @@ from companion.links.mavlink import MavlinkLink
 from companion.links.mavlink_transport import run_transport
 from companion.protocols.roles import Part
 from companion.recording.collector import RecordedCollector
-from companion.samples import ImuSample
+from companion.samples import ImuSample, Vector
 from companion.storage.changes import ChangeLog
 from companion.storage.records import RecordStore
 
@@ -108,7 +109,7 @@ class Service:
         self._imu_rate_hz = models.imu_rate_hz(config) if imu_rate_hz is None else imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
         self.sensors = [SerialSensor(device, self._take, offload, self._take_many) for device in serial_devices(config)]
-        self.sensor_watch = SensorWatch(self.sensors, self.collector)
+        self.sensor_watch = SensorWatch(self.sensors, self.collector, self._taken_off, self._say)
         self.recorder = Recorder(
             config, self.collector, self.link, self.vehicle, self.imus.values(), self.sensors, offload
         )
@@ -216,6 +217,7 @@ class Service:
             link=self.link,
             pose=self.pose,
             trouble=self.sensor_watch.worst,
+            lies=self.sensor_watch.lies,
             alignment=self.alignment,
         )
         self.answers.carry(self.attitude)
@@ -276,6 +278,12 @@ class Service:
     def _message_of(self, name: str) -> str | None:
         imu = self.imus.get(name)
         return imu.stream.kind.message if imu is not None and imu.stream.kind is not None else None
+
+    def _taken_off(self, name: str) -> Vector | None:
+        imu = self.imus.get(name)
+        if imu is None:
+            return 0.0, 0.0, 0.0
+        return None if imu.calibration is None else accel_taken_off(imu.calibration)
 
     def _say(self, *what: Any) -> object:
         return self.component.say(*what)
