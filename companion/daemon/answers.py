@@ -123,6 +123,7 @@ class Answers:
         """Tell of who is not believed and who was refused, too."""
         self._signing, self._permission = signing, permission
         self._headlines.deaf = lambda: signing.deaf
+        self._concerns.append(lambda: signing.worry)
 
     def carry(self, attitude: Carried | None) -> None:
         """Tell of the attitude that is carried, too."""
