@@ -139,7 +139,11 @@ class Course:
                 break
         else:
             await self._measure_and_push(job, draft)
-        await self._memory.keep(draft.points)
+        points = draft.points
+        if self._pusher.enabled and not job.automatic:
+            # Who has asked was told of every contradiction, and has what was measured in force: that is true now.
+            points = {name: point.as_chosen() for name, point in points.items()}
+        await self._memory.keep(points)
         if draft.held_back:
             draft.notes.append(f"{held_back.in_words(draft.held_back)} held back")
 

@@ -14,6 +14,7 @@ from companion.component.service import Refusal
 from companion.daemon import automatic
 from companion.daemon.job import Job
 from sim.devices import Gradienter
+from sim.imu_model import MG
 from tests.e2e.test_automatic import calibrated_by_itself, values
 from tests.e2e.test_bias_memory import knocked
 from tests.support.rig import Rig
@@ -89,6 +90,50 @@ def test_accelerometers_are_held_back_when_the_gradienter_has_moved_until_somebo
             assert all(accelerometers(rig)[name] != value for name, value in before.items())
             await asyncio.sleep(10.0)
             assert "held back" not in rig.service.readiness.answer().words
+
+    run_virtual(main())
+
+
+def test_what_somebody_asked_for_is_true_from_then_on_also_for_calibrations_by_itself(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
+            before = await held_back(rig)
+            conductor, store = rig.service.conductor, rig.service.store
+            job = conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(job, Job)
+            assert (await job.finished).outcome == "done"
+            asked = accelerometers(rig)
+            assert all(asked[name] != value for name, value in before.items())
+            for _ in range(2):
+                await asyncio.sleep(10.0)
+                job = conductor.start_calibration(What.BOTH, "the companion", automatic=True)
+                assert isinstance(job, Job)
+                assert (await job.finished).outcome == "done"
+                record = store.history(1)[0]
+                assert "held back" not in record.reason
+                assert not any("gradienter" in words for words in record.warnings)
+                assert rig.service.in_force.held_back is None
+                now = accelerometers(rig)
+                assert all(abs(now[name] - value) < 0.5 * MG for name, value in asked.items()), "the gradienter slipped by 5 mg"
+
+    run_virtual(main())
+
+
+def test_an_undo_of_what_was_asked_for_makes_the_earlier_ones_count_again(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
+            before = await held_back(rig)
+            conductor, known = rig.service.conductor, rig.service.store
+            job = conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(job, Job)
+            assert (await job.finished).outcome == "done"
+            undo = conductor.start_undo("test")
+            assert isinstance(undo, Job)
+            assert (await undo.finished).outcome == "done"
+            assert accelerometers(rig) == before
+            for each in rig.service.memory._known.values():
+                assert not any(point.accel is not None and point.accel.chosen for point in each.points)
+            assert known.history(1)[0].undone_at is not None
 
     run_virtual(main())
 
