@@ -129,11 +129,15 @@ class Course:
             try:
                 await self._measure_and_push(job, draft)
             except WriteFailedError as error:
-                if error.kind != "not as believed" or error.left_changed:
+                if error.kind not in ("not as believed", "without effect") or error.left_changed:
                     raise
-                self.machine.on(Event.AGAIN)
-                logger.warning("%s; put back, measuring again for the right one", error.reason)
-                draft.begin_again(f"{error.reason}; put back, and written where it belongs")
+                self.machine.on(Event.AGAIN if self.machine.state is State.WRITING else Event.MOVED)
+                if error.kind == "not as believed":
+                    logger.warning("%s; put back, measuring again for the right one", error.reason)
+                    draft.begin_again(f"{error.reason}; put back, and written where it belongs")
+                else:
+                    logger.warning("%s; put back, measuring again", error.reason)
+                    draft.begin_again(f"{error.reason}; put back, and tried again")
                 job.check_cancelled()
             else:
                 break

@@ -196,7 +196,7 @@ class FarStepWatch:
                 self._learn(step, NO_IMU)
                 return words
             # Every slot is somebody's: there is another reason, and what would be tried next is another IMU's.
-            return f"{words}: PX4 does not use what it has stored"
+            return f"{words}: PX4 does not use what it has stored, or it moved"
         if len(moved) > 1:
             return f"the offsets in {step.slot} seem to act on IMU {' and '.join(map(str, moved))} at once"
         logger.warning("%s: it cannot be told yet which IMU its offsets act on", step.slot)

@@ -68,7 +68,7 @@ class Px4Writes:
                 # Between the steps the offsets are wrong on purpose, and while it is armed nobody may mend that.
                 self._say(Severity.CRITICAL, "DISARM NOW: gyro/accel offsets are off", Weight.RESULT)
             if error.kind == "not as believed" and not self._watch.learned:
-                # The same again would do the same again.
+                # Nothing was learned: the same slot again, and not for ever.
                 raise WriteFailedError("without effect", error.reason, error.written, error.left_changed) from error
             raise
         # Only a write that came to its end comes here.
