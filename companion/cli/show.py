@@ -57,9 +57,9 @@ def _imu_lines(imu: Object) -> list[str]:
     lines = [
         f"{imu['name']}: {imu['samples']} samples" + (f", {temperature:.1f} degC" if temperature is not None else "")
     ]
-    for words, unit, scale, form, bias, sigma in (
-        ("gyro bias ", "deg/h", DEG_H, "+9.1f", "gyro_bias_rad_s", "gyro_sigma_use_rad_s"),
-        ("accel bias", "mg   ", MG, "+9.3f", "accel_bias_m_s2", "accel_sigma_use_m_s2"),
+    for triad, unit, scale, form, bias, sigma in (
+        ("gyro", "deg/h", DEG_H, "+9.1f", "gyro_bias_rad_s", "gyro_sigma_use_rad_s"),
+        ("accel", "mg   ", MG, "+9.3f", "accel_bias_m_s2", "accel_sigma_use_m_s2"),
     ):
         if imu[bias] is None:
             continue
@@ -67,7 +67,7 @@ def _imu_lines(imu: Object) -> list[str]:
             f"{axis} {value / scale:{form}} +- {one / scale:.{form[-2]}f}"
             for axis, value, one in zip("xyz", imu[bias], imu[sigma], strict=True)
         )
-        lines.append(f"  {words} {unit} {axes}")
+        lines.append(f"  {triad:5} bias {unit} {axes}{_held_back(imu, triad)}")
     for name, written in imu["written"].items():
         lines.append(
             f"  {name:16} {_number(written['before'], '+.6f')} -> {written['after']:+.6f}  {written['outcome']}"
@@ -206,8 +206,12 @@ def _bias_lines(calibration: Object | None) -> list[str]:
                 f"{axis} {bias:{form}} +- {sigma:.{form[-2]}f}"
                 for axis, bias, sigma in zip("xyz", biases, sigmas, strict=True)
             )
-            lines.append(f"{imu['name']:8} {words:5} {unit.replace('_', '/'):5} {axes}")
+            lines.append(f"{imu['name']:8} {words:5} {unit.replace('_', '/'):5} {axes}{_held_back(imu, words)}")
     return lines
+
+
+def _held_back(imu: Object, triad: str) -> str:
+    return "  held back: not written" if triad in imu.get("held_back", ()) else ""
 
 
 def history_lines(records: Sequence[Object], armings: Sequence[Object]) -> list[str]:
