@@ -114,6 +114,7 @@ def status_lines(status: Object) -> list[str]:
         + (f", {arming['words']}" if arming["verdict"] != "accept" else "")
     )
     lines.append(f"in force: {arming['in_force']}")
+    lines += [f"profile {each['imu']}: {each['summary']}" for each in status["profiles"]]
     if status["page"] is not None:
         lines.append(f"page: {'' if status['page']['good'] else 'none: '}{status['page']['summary']}")
     lines.append(_last_line(status))

@@ -114,6 +114,8 @@ class Answers:
         self._permission = Permission()
         self.page: Callable[[], Object | None] = lambda: None
         """What is to be said of the page; None where none is configured."""
+        self.profiles: list[Object] = []
+        """Whose noise figures the sigmas of each IMU are made of."""
         self.setup: Callable[[Object], Awaitable[Object]] | None = None
         """Sets the autopilot up for our heading."""
         self.mqtt: Callable[[], Object] = dict
@@ -257,6 +259,7 @@ class Answers:
             "automatic": self._automatic.status(),
             "recording": self._recorder.status(),
             "mqtt": self.mqtt() or None,
+            "profiles": self.profiles,
             "calibration": shown_calibration(self._readiness.in_force, conductor.last, now_s),
             "last": _summary(conductor.last),
             "page": self.page(),

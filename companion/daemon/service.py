@@ -222,6 +222,7 @@ class Service:
         )
         self.answers.carry(self.attitude)
         self.answers.setup = self.setup.answer
+        self.answers.profiles = models.profiles(config)
         self.answers.watch_access(self.signing, self.component.permission)
         self.mqtt = self._mqtt_face(offload)
         self.page = self._page(offload)
