@@ -215,20 +215,20 @@ def _held_back(imu: Object, triad: str) -> str:
     return "  held back: not written" if triad in imu.get("held_back", ()) else ""
 
 
-def history_lines(records: Sequence[Object], armings: Sequence[Object]) -> list[str]:
-    """Past calibrations and the latest armings, one line each, newest first."""
+def history_lines(numbers: Sequence[int], records: Sequence[Object], armings: Sequence[Object]) -> list[str]:
+    """Past calibrations and the latest armings, one line each, newest first; numbers as `companion report` takes."""
     if not records:
         return ["no calibrations yet"]
-    lines = [f"{'started (UTC)':20} {'vehicle':>7} {'state':10} {'took':>6}  what came of it"]
+    lines = [f"{'no.':>4} {'started (UTC)':20} {'vehicle':>7} {'state':10} {'took':>6}  what came of it"]
     lines += [
-        f"{record['started_at'][:19]:20} {record.get('system_id') or '?':>7} {record['state']:10}"
+        f"{number:4} {record['started_at'][:19]:20} {record.get('system_id') or '?':>7} {record['state']:10}"
         f" {record['duration_s']:5.0f}s  {record['reason']}{_what_became(record)}"
-        for record in records
+        for number, record in zip(numbers, records, strict=True)
     ]
     if armings:
-        lines.append(f"{'armed (UTC)':20} in force")
+        lines.append(f"{'':4} {'armed (UTC)':20} in force")
         lines += [
-            f"{arming['armed_at'][:19]:20} {'' if arming['state'] != 'uncalibrated' else 'UNCALIBRATED: '}"
+            f"{'':4} {arming['armed_at'][:19]:20} {'' if arming['state'] != 'uncalibrated' else 'UNCALIBRATED: '}"
             f"{arming['reason']}"
             for arming in armings
         ]

@@ -164,8 +164,8 @@ class Answers:
             limit = request.get("limit")
             number = limit if isinstance(limit, int) and limit > 0 else None
             # A thousand records take longer to read than a ground station waits for an answer.
-            records, armings = await self._offload(self._history, number)
-            yield {"kind": "result", "records": records, "armings": armings}
+            numbers, records, armings = await self._offload(self._history, number)
+            yield {"kind": "result", "numbers": numbers, "records": records, "armings": armings}
         elif command == "record":
             async for reply in self._recorder.answer(request):
                 yield reply
@@ -178,10 +178,11 @@ class Answers:
         else:
             yield {"kind": "error", "reason": f"unknown command {command!r}"}
 
-    def _history(self, limit: int | None) -> tuple[list[Object], list[Object]]:
+    def _history(self, limit: int | None) -> tuple[list[int], list[Object], list[Object]]:
         armings = self._armings.history()
-        records = with_armings(self._store.history(limit), armings)
-        return [_plain(record) for record in records], [_plain(arming) for arming in armings[:limit]]
+        found = self._store.numbered(limit)
+        records = with_armings(list(found.values()), armings)
+        return list(found), [_plain(record) for record in records], [_plain(arming) for arming in armings[:limit]]
 
     async def _answer_calibrate(self, request: Object, face: str) -> AsyncIterator[Object]:
         try:
