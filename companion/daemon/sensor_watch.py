@@ -8,16 +8,15 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from companion.calibration.batches import Batch
 from companion.calibration.rolling import RollingCollector
 from companion.component.statustext import Severity, Weight
-from companion.physics.frames import Array
+from companion.physics.frames import Array, Matrix
 from companion.protocols.stream_health import Trouble
-from companion.samples import Vector
 
 if TYPE_CHECKING:
     from companion.daemon.sensors import SerialSensor
@@ -30,12 +29,26 @@ TILTED_DEG: Final = 3.0
 """Far more than the mean of a second in somebody's hands is off, and 300 steps of the coarsest gradienter."""
 TILTED_SECONDS: Final = 3
 BEFORE_S: Final = 3.0
-"""So long before the first of its equal readings a sensor may have begun to hang: until then it was near them."""
+"""So long before the first of its equal headings a compass may have begun to hang: until then it was near them."""
 QUIET_S: Final = 3.0
 """An IMU that is so far behind the others is no witness: the autopilot's, while its offsets are being written."""
+LATE_S: Final = 1.0
+"""Nor is one that begins so much later than another: it has not seen how the aircraft stood."""
 TURNED_DEG: Final = 15.0
 TURNING_RAD_S: Final = math.radians(12.0)
 """Less may be a bias: what is called still may have 10 deg/s."""
+
+
+class Corrected(NamedTuple):
+    """What an owner has made of an IMU's readings."""
+
+    back: Matrix = np.eye(3)
+    """(3, 3), from the axes that it has turned them to into the IMU's own."""
+    accel_m_s2: Array = np.zeros(3)
+    """(3,), what it takes off the accelerometer, in the IMU's own axes."""
+
+
+UNTOUCHED: Final = Corrected()
 
 
 class MotionWitness:
@@ -47,20 +60,20 @@ class MotionWitness:
     def __init__(self) -> None:
         self._seconds: dict[str, deque[tuple[int, Array, float]]] = {}
 
-    def look(self, latest: Mapping[str, Batch], taken_off: Callable[[str], Vector | None]) -> None:
+    def look(self, latest: Mapping[str, Batch], corrected: Callable[[str], Corrected | None]) -> None:
         """Take note of the last whole second of each IMU.
 
         Args:
             latest: by IMU.
-            taken_off: of the accelerometer, m/s^2 in the vehicle's axes, before its readings came to us; None while
-                that is not known. It is added again: new offsets must not look like a tilt.
+            corrected: what was done to its readings before they came to us; None while that is not known. It is taken
+                back: new offsets, or another orientation of the board, must not look like a tilt.
         """
         for name, batch in latest.items():
             seconds = self._seconds.setdefault(name, deque(maxlen=REMEMBERED_S))
-            off = taken_off(name)
-            if off is None or (seconds and seconds[-1][0] == batch.slot):
+            known = corrected(name)
+            if known is None or (seconds and seconds[-1][0] == batch.slot):
                 continue
-            rate, force = batch.mean[:3], batch.mean[3:] + np.asarray(off)
+            rate, force = known.back @ batch.mean[:3], known.back @ batch.mean[3:] + known.accel_m_s2
             size = float(np.linalg.norm(force))
             if size > 0.0:
                 down = force / size
@@ -92,14 +105,16 @@ class MotionWitness:
         return min(turns, default=0.0)
 
     def _heard(self, since_s: float, until_s: float) -> list[list[tuple[int, Array, float]]]:
-        """The whole seconds in between, of each IMU that is as up to date as the others."""
+        """The whole seconds in between, of each IMU that has seen as much as the others."""
         # Not as the clock: while a sensor lies, nothing is collected of any IMU.
         newest = max((seconds[-1][0] for seconds in self._seconds.values() if seconds), default=0)
-        return [
+        found = [
             [second for second in seconds if since_s <= second[0] <= until_s - 1.0]
             for seconds in self._seconds.values()
             if seconds and seconds[-1][0] >= newest - QUIET_S
         ]
+        first = min((seconds[0][0] for seconds in found if seconds), default=0)
+        return [seconds for seconds in found if seconds and seconds[0][0] <= first + LATE_S]
 
 
 class SensorWatch:
@@ -108,7 +123,7 @@ class SensorWatch:
     Args:
         sensors: ours.
         collector: what must not be measured with readings that look good and are not.
-        taken_off: as `MotionWitness.look`.
+        corrected: as `MotionWitness.look`.
         say: tells people at the ground stations.
     """
 
@@ -116,11 +131,11 @@ class SensorWatch:
         self,
         sensors: Sequence[SerialSensor],
         collector: RollingCollector,
-        taken_off: Callable[[str], Vector | None] = lambda name: (0.0, 0.0, 0.0),
+        corrected: Callable[[str], Corrected | None] = lambda name: UNTOUCHED,
         say: Callable[[Severity, str, Weight], object] = lambda *what: None,
     ) -> None:
         self._sensors, self._collector = sensors, collector
-        self._taken_off = taken_off
+        self._corrected = corrected
         self._witness = MotionWitness()
         self._has_failed = False
         self._say = say
@@ -146,7 +161,7 @@ class SensorWatch:
 
     def look(self, now_s: float) -> None:
         """One look at all of them."""
-        self._witness.look(self._collector.imu_seconds(), self._taken_off)
+        self._witness.look(self._collector.imu_seconds(), self._corrected)
         for sensor in self._sensors:
             if "imu" not in sensor.kinds:
                 sensor.health.stuck = self._stuck(sensor)
@@ -160,8 +175,10 @@ class SensorWatch:
         last_s = sensor.health.stream.last_sample_s
         if since_s is None or last_s is None:
             return None
-        near_s = max(sensor.health.stream.near_since_s or since_s, since_s - BEFORE_S)
+        near_s = sensor.health.stream.near_since_s or since_s
         tilted_deg = self._witness.tilted_deg(near_s, since_s, last_s)
+        # Turns are summed up, and what is not seen of one adds up likewise.
+        near_s = max(near_s, since_s - BEFORE_S)
         turned_deg = self._witness.turned_deg(near_s, last_s) if "compass" in sensor.kinds else 0.0
         if turned_deg > TURNED_DEG:
             how = f"turned by {turned_deg:.0f} deg"

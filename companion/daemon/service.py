@@ -49,7 +49,7 @@ from companion.daemon.readiness import Readiness
 from companion.daemon.reboot import Reboot
 from companion.daemon.recorder import Recorder
 from companion.daemon.rivalry import Rivalry
-from companion.daemon.sensor_watch import SensorWatch
+from companion.daemon.sensor_watch import UNTOUCHED, Corrected, SensorWatch
 from companion.daemon.sensors import SerialSensor
 from companion.daemon.serial_devices import Role, collect, serial_devices
 from companion.daemon.signing import LinkSigning
@@ -57,7 +57,7 @@ from companion.links.mavlink import MavlinkLink
 from companion.links.mavlink_transport import run_transport
 from companion.protocols.roles import Part
 from companion.recording.collector import RecordedCollector
-from companion.samples import ImuSample, Vector
+from companion.samples import ImuSample
 from companion.storage.changes import ChangeLog
 from companion.storage.records import RecordStore
 
@@ -109,7 +109,7 @@ class Service:
         self._imu_rate_hz = models.imu_rate_hz(config) if imu_rate_hz is None else imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
         self.sensors = [SerialSensor(device, self._take, offload, self._take_many) for device in serial_devices(config)]
-        self.sensor_watch = SensorWatch(self.sensors, self.collector, self._taken_off, self._say)
+        self.sensor_watch = SensorWatch(self.sensors, self.collector, self._corrected, self._say)
         self.recorder = Recorder(
             config, self.collector, self.link, self.vehicle, self.imus.values(), self.sensors, offload
         )
@@ -280,11 +280,12 @@ class Service:
         imu = self.imus.get(name)
         return imu.stream.kind.message if imu is not None and imu.stream.kind is not None else None
 
-    def _taken_off(self, name: str) -> Vector | None:
+    def _corrected(self, name: str) -> Corrected | None:
         imu = self.imus.get(name)
         if imu is None:
-            return 0.0, 0.0, 0.0
-        return None if imu.calibration is None else accel_taken_off(imu.calibration)
+            return UNTOUCHED
+        known = imu.calibration
+        return None if known is None else Corrected(known.orientation.T, accel_taken_off(known))
 
     def _say(self, *what: Any) -> object:
         return self.component.say(*what)

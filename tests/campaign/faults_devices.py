@@ -139,6 +139,8 @@ async def unstick(scene: Scene) -> None:
     """It has been said by now, whatever goes on: by the status, in the log, and to the ground stations."""
     stage = scene.stage
     faces = {"status": stage.words(), "log": stage.said.lines, "ground station": stage.ground.texts()}
+    if scene.phase == "armed":
+        faces["headline"] = [stage.service.status()["headline"]["reason"]]
     silent = [
         face
         for face, lines in faces.items()

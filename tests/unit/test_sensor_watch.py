@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from companion.component.statustext import Severity
-from companion.daemon.sensor_watch import SensorWatch
+from companion.daemon.sensor_watch import UNTOUCHED, Corrected, SensorWatch
 from companion.protocols.stream_health import Trouble
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample, Vector
 from tests.support.chatter import Listening
@@ -34,10 +34,12 @@ class Bench:
         self.resets: list[str] = []
         self.said: list[tuple[Severity, str]] = []
         self.offset: Vector | None = (0.0, 0.0, 0.0)
+        self.turned = np.eye(3)
+        """From its own axes to the vehicle's, as the autopilot believes it to be mounted."""
         """What the autopilot takes off its accelerometer; None: not known, its samples do not come."""
         collector, sensor = self.one.collector, self.one.sensor
         self.one.watch = SensorWatch(
-            [sensor], collector, lambda name: self.offset if name == "fc" else (0.0, 0.0, 0.0),
+            [sensor], collector, self.corrected,
             lambda severity, words, _: self.said.append((severity, words)),
         )  # fmt: skip
         reset = self.one.collector.reset
@@ -47,6 +49,11 @@ class Bench:
             reset(why, imu)
 
         self.one.collector.reset = told  # type: ignore[method-assign]
+
+    def corrected(self, name: str) -> Corrected | None:
+        if name != "fc":
+            return UNTOUCHED
+        return None if self.offset is None else Corrected(self.turned.T, np.array(self.offset))
 
     def run(
         self, seconds: float, sample: Callable[[float], Sample], *, pitch_deg: float = 0.0, turn_deg_s: float = 0.0,
@@ -62,8 +69,9 @@ class Bench:
             rate = math.radians(turn_deg_s + bias_deg_s)
             gyro = (0.0, 0.0, rate + noise[0] * 1e-3)
             if self.offset is not None:
-                x, y, z = np.subtract(force, self.offset).tolist()
-                self.one.collector.add_imu("fc", ImuSample(t_s, gyro, (x, y, z)))
+                x, y, z = (self.turned @ np.subtract(force, self.offset)).tolist()
+                p, q, r = (self.turned @ gyro).tolist()
+                self.one.collector.add_imu("fc", ImuSample(t_s, (p, q, r), (x, y, z)))
             if self.second:
                 self.one.collector.add_imu("second", ImuSample(t_s, gyro, force))
             if tick % 5 == 0:
@@ -193,6 +201,19 @@ def test_the_autopilots_imu_is_no_witness_while_its_offsets_are_being_written() 
     on_the_clock(check)
 
 
+def test_an_imu_that_comes_back_after_the_tilt_has_not_seen_it() -> None:
+    def check() -> None:
+        bench = Bench("gradienter")
+        bench.one.collector.set_imu(imu("second"))
+        bench.second, bench.offset = True, None
+        bench.run(8.0, tilt)
+        bench.run(1.0, tilt, pitch_deg=8.0)
+        bench.offset = (0.0, 0.0, 0.0)
+        assert bench.run(5.0, tilt, pitch_deg=8.0) is not None
+
+    on_the_clock(check)
+
+
 def test_a_write_over_which_the_aircraft_was_tilted_hides_nothing_and_new_offsets_are_no_tilt() -> None:
     """Only the autopilot's IMU: before and after the write tell."""
 
@@ -204,6 +225,9 @@ def test_a_write_over_which_the_aircraft_was_tilted_hides_nothing_and_new_offset
         bench.offset = (1.0, -0.5, 0.3)
         bench.one.collector.reset("offsets written", "fc")
         assert bench.run(10.0, tilt) is None, "the output has stepped by 6 deg"
+        bench.turned = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+        bench.one.collector.reset("the autopilot's offsets were read anew", "fc")
+        assert bench.run(10.0, tilt) is None, "AHRS_ORIENTATION was set right"
         bench.offset = None
         bench.run(6.0, tilt, pitch_deg=8.0)
         bench.offset = (0.0, 0.0, 0.0)
