@@ -1,8 +1,9 @@
 """STATUSTEXT: words for people, in few and short lines.
 
-Three limits protect a slow telemetry link: the same text is not repeated within seconds, a token bucket bounds the
-lines per second, and the queue is bounded. What is dropped from a full queue is the least weighty text, and among
-those the oldest, so that a stream of news or of refused commands can never push out a result.
+Three limits protect a slow telemetry link: the same text is not repeated within seconds unless a result came between
+(who cancels and asks again wants to hear that it has started), a token bucket bounds the lines per second, and the
+queue is bounded. What is dropped from a full queue is the least weighty text, and among those the oldest, so that a
+stream of news or of refused commands can never push out a result.
 
 Texts must not begin with "[cal]": QGroundControl takes such lines from any component of the vehicle as the progress
 of PX4's own calibration.
@@ -109,9 +110,15 @@ class StatusText:
         self._next_id = 1
 
     def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
-        """Queue a text; False when it repeats one said within the last seconds, or when the queue is full."""
+        """Queue a text; False when it repeats one said within the last seconds, or when the queue is full.
+
+        A result is no repeat, whatever it says: each ends a request of its own. What was said before it belongs to that
+        request, and may be said of the next at once.
+        """
         text = to_ascii(text)
         now_s = asyncio.get_running_loop().time()
+        if weight is Weight.RESULT:
+            self._said_s.clear()
         if not text or self._is_repeat(severity, text, now_s):
             return False
         if sum(map(len, self._waiting.values())) >= QUEUE_TEXTS and not self._make_room(weight):

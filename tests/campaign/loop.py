@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
-import selectors
+import os
+import socket
 import weakref
 from collections.abc import Callable, Coroutine
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
-from tests.support.virtual_time import MOST_TURNS_A_SECOND
+from tests.campaign import loopback
+from tests.support.virtual_time import VirtualTimeLoop
 
 T = TypeVar("T")
+
+REAL_GRACE_S: Final = 0.002
+"""So long the kernel may take to carry bytes from one TCP socket of this process to another."""
 
 OWNER: contextvars.ContextVar[str] = contextvars.ContextVar("owner", default="stage")
 """Inherited by every task and callback: which daemon started it, directly or not."""
@@ -19,42 +24,17 @@ OWNER: contextvars.ContextVar[str] = contextvars.ContextVar("owner", default="st
 _owners: weakref.WeakKeyDictionary[asyncio.Task[Any], str] = weakref.WeakKeyDictionary()
 
 
-class _JumpingSelector(selectors.EpollSelector):
-    """As that of tests.support.virtual_time, for many descriptors: all of them are of this process."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.now_s = 1000.0
-        self._second_began_s = self.now_s
-        self._turns = 0
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        self._turns += 1
-        if self.now_s - self._second_began_s >= 1.0:
-            self._second_began_s, self._turns = self.now_s, 0
-        elif self._turns > MOST_TURNS_A_SECOND:
-            msg = f"livelock: {self._turns} turns of the loop within one second of virtual time"
-            raise RuntimeError(msg)
-        ready = super().select(0)
-        if ready or timeout == 0:
-            return ready
-        if timeout is None:
-            msg = "deadlock: every task waits for something that no timer will bring"
-            raise RuntimeError(msg)
-        self.now_s += max(timeout, 1e-9)
-        return ready
-
-
-class CampaignLoop(asyncio.SelectorEventLoop):
+class CampaignLoop(VirtualTimeLoop):
     """Virtual time; what would go to a thread is done on the spot, since threads live on the real clock."""
 
     def __init__(self) -> None:
-        self._jumping = _JumpingSelector()
-        super().__init__(self._jumping)
+        super().__init__()
         self.set_task_factory(_owned)
+        self._real: weakref.WeakSet[asyncio.Transport] = weakref.WeakSet()
+        self._jumping.grace_s = self._grace_s
 
-    def time(self) -> float:
-        return self._jumping.now_s
+    def _grace_s(self) -> float:
+        return REAL_GRACE_S if any(not transport.is_closing() for transport in self._real) else 0.0
 
     def run_in_executor(  # type: ignore[override]
         self, executor: Any, func: Callable[..., Any], *args: Any
@@ -66,6 +46,21 @@ class CampaignLoop(asyncio.SelectorEventLoop):
         except Exception as error:  # noqa: BLE001 - handed to whoever awaits it
             future.set_exception(error)
         return future
+
+    async def create_connection(self, *what: Any, **options: Any) -> Any:
+        """As asyncio's; whoever looks at the page, which is on TCP, is waited for."""
+        transport, protocol = await super().create_connection(*what, **options)
+        self._real.add(transport)
+        return transport, protocol
+
+    async def sock_connect(self, sock: socket.socket, address: Any) -> None:
+        """As asyncio's, but ports of `loopback` are within this process."""
+        if not loopback.leads_here(address):
+            await super().sock_connect(sock, address)
+            return
+        with loopback.connect(address[1]) as end:
+            os.dup2(end.fileno(), sock.fileno())
+        os.set_blocking(sock.fileno(), False)
 
 
 def _owned(loop: asyncio.AbstractEventLoop, work: Any, **options: Any) -> asyncio.Task[Any]:

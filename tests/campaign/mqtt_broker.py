@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import socket
 from typing import Final
+
+from tests.campaign import loopback
 
 CONNECT, PUBLISH, SUBSCRIBE, PINGREQ = 1, 3, 8, 12
 _V5: Final = 5
@@ -18,8 +19,7 @@ class Broker:
     """Listens on a port of its own; `start` and `stop` it as often as you like."""
 
     def __init__(self) -> None:
-        self._listener: socket.socket | None = socket.create_server(("127.0.0.1", 0))
-        self.port: int = self._listener.getsockname()[1]
+        self.port = loopback.new_port()
         self.refuses = False
         """Connections are refused: "not authorised"."""
         self.deaf = False
@@ -32,10 +32,7 @@ class Broker:
 
     async def start(self) -> None:
         """Listen."""
-        listener, self._listener = self._listener, None
-        if listener is None:
-            listener = socket.create_server(("127.0.0.1", self.port))
-        self._server = await asyncio.start_server(self._serve, sock=listener)
+        self._server = await asyncio.start_server(self._serve, sock=loopback.listen(self.port))
 
     async def stop(self) -> None:
         """As a power cut: every connection is gone, nobody listens."""

@@ -14,7 +14,6 @@ import os
 import random
 import re
 import shutil
-import socket
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +24,7 @@ from companion.daemon.control import ControlServer
 from companion.daemon.service import Service
 from companion.links.mavlink import MavlinkLink
 from sim.devices import Frame, SerialDevice, VectorNavBinary
+from tests.campaign import loopback
 from tests.campaign.clock import WallClock
 from tests.campaign.disk import Disk
 from tests.campaign.loop import OWNER, tasks_of
@@ -63,17 +63,14 @@ class Plug:
     """A device's end of a `tcp://` port: in, or out."""
 
     def __init__(self) -> None:
-        self._listener: socket.socket | None = socket.create_server(("127.0.0.1", 0))
-        self.port: int = self._listener.getsockname()[1]
+        self.port = loopback.new_port()
         self._server: asyncio.Server | None = None
         self._writers: list[asyncio.StreamWriter] = []
         self.heard = 0
 
     async def put_in(self) -> None:
-        listener, self._listener = self._listener, None
         if self._server is None:
-            listener = listener or socket.create_server(("127.0.0.1", self.port))
-            self._server = await asyncio.start_server(self._accept, sock=listener)
+            self._server = await asyncio.start_server(self._accept, sock=loopback.listen(self.port))
 
     async def pull_out(self) -> None:
         if self._server is not None:
@@ -179,7 +176,7 @@ class Stage(Rig):
         root_logger = logging.getLogger("companion")
         root_logger.addHandler(self.said)
         propagate, root_logger.propagate = root_logger.propagate, False
-        with self.disk.mounted(), self.wall.worn():
+        with self.disk.mounted(), self.wall.worn(), loopback.taken():
             await self.broker.start()
             for plug in self.plugs.values():
                 await plug.put_in()

@@ -27,7 +27,8 @@ CELLS_A_TEST = 4
 def test_a_slice_of_the_table(first: int) -> None:
     for name, phase, seed in CELLS[first : first + CELLS_A_TEST]:
         outcome = run_cell(FAULTS[name], phase, seed)
-        assert outcome.problems == [], f"python -m tests.campaign --only {name} --phase {phase} --seed {seed}"
+        again = f"python -m tests.campaign --only {name} --phase {phase} --seed {seed}"
+        assert outcome.problems == [], f"{again}: {outcome.story}"
 
 
 def test_a_few_minutes_of_the_hour() -> None:

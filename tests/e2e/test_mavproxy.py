@@ -159,7 +159,7 @@ def test_over_a_signed_link(tmp_path: Path) -> None:
             await station.prints(r"Setup signing key", after=place)
             refused = line.scenario.autopilot.channels[1].received["bad"]
             await station.type("long MAV_CMD_USER_2 0 0 0 0 0 0 0")
-            async with asyncio.timeout(10.0):
+            async with asyncio.timeout(40.0):
                 while line.scenario.autopilot.channels[1].received["bad"] == refused:
                     await asyncio.sleep(0.05)
 

@@ -45,7 +45,7 @@ class Watched:
     def close(self) -> None:
         asyncio.get_running_loop().remove_reader(self._ours)
 
-    async def until(self, seen: Callable[[str], Any], within_s: float = 20.0) -> None:
+    async def until(self, seen: Callable[[str], Any], within_s: float = 60.0) -> None:
         """Wait until something has been printed."""
         async with asyncio.timeout(within_s):
             while not seen(self.text):
@@ -56,7 +56,7 @@ class Watched:
     async def interrupt(self) -> int:
         """Ctrl-C; the exit code."""
         self.process.send_signal(signal.SIGINT)
-        async with asyncio.timeout(10.0):
+        async with asyncio.timeout(40.0):
             return await self.process.wait()
 
 

@@ -117,7 +117,7 @@ class Broker:
     async def start(self) -> Broker:
         """Start it and wait until it listens."""
         self._spawn()
-        async with asyncio.timeout(15.0):
+        async with asyncio.timeout(60.0):
             while True:
                 assert self._process is not None
                 assert self._process.poll() is None, (self.folder / "log").read_text()
@@ -200,7 +200,7 @@ class Peer:
         await self._client.publish(topic, data, qos=qos, retain=retain)
 
     async def until(
-        self, topic: str, fits: Callable[[Heard], bool] = lambda heard: True, within_s: float = 10.0
+        self, topic: str, fits: Callable[[Heard], bool] = lambda heard: True, within_s: float = 40.0
     ) -> Heard:
         """The first message on a topic that fits, whether it has come already or comes yet."""
 
@@ -217,7 +217,7 @@ class Peer:
         assert heard is not None
         return heard
 
-    async def response(self, base: str, command: str, transaction: object, *states: str, within_s: float = 10.0) -> Any:
+    async def response(self, base: str, command: str, transaction: object, *states: str, within_s: float = 40.0) -> Any:
         """The response to a transaction, in one of some states if any are given."""
 
         def fits(heard: Heard) -> bool:

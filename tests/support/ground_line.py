@@ -40,6 +40,8 @@ class GroundLine(NamedTuple):
     scenario: Scenario
     port: int
     daemon: CompanionProcess
+    started: list[asyncio.subprocess.Process]
+    """Every command, so that none outlives a test."""
 
     async def ground(self, command: str, *words: str, chosen: bool = True, within_s: float = 60.0) -> Said:
         """`companion ground COMMAND --url ... WORDS`; `chosen`: with --system 1, so that it looks for no others."""
@@ -48,7 +50,9 @@ class GroundLine(NamedTuple):
     async def start(self, command: str, *words: str, chosen: bool = True) -> asyncio.subprocess.Process:
         """The same, not waited for."""
         system = ("--system", "1") if chosen else ()
-        return await ground(command, "--url", f"udpout:127.0.0.1:{self.port}", *system, *words)
+        process = await ground(command, "--url", f"udpout:127.0.0.1:{self.port}", *system, *words)
+        self.started.append(process)
+        return process
 
 
 async def ground(*words: str) -> asyncio.subprocess.Process:
@@ -57,6 +61,14 @@ async def ground(*words: str) -> asyncio.subprocess.Process:
         sys.executable, "-m", "companion", "ground", *words,
         stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
     )  # fmt: skip
+
+
+async def _end(started: list[asyncio.subprocess.Process]) -> None:
+    """A test that fails leaves nothing running; and no pipes, of which a later test would be accused."""
+    for process in started:
+        if process.returncode is None:
+            process.kill()
+            await process.communicate()
 
 
 async def finish(process: asyncio.subprocess.Process, within_s: float = 60.0) -> Said:
@@ -101,4 +113,6 @@ async def ground_line(
         if daemon:
             await stack.enter_async_context(process)
             await process.ready()
-        yield GroundLine(scenario, radio.local[1], process)
+        started: list[asyncio.subprocess.Process] = []
+        stack.push_async_callback(_end, started)
+        yield GroundLine(scenario, radio.local[1], process, started)

@@ -112,6 +112,20 @@ def test_severity_is_kept_and_ids_differ() -> None:
     run_virtual(main())
 
 
+def test_a_request_cancelled_and_made_again_at_once_is_heard_to_start_again() -> None:
+    async def main() -> None:
+        async with bench() as b:
+            story = ["Calibration started", "Calibration cancelled", "Calibration started", "Calibration cancelled"]
+            for text in story:
+                weight = Weight.RESULT if text.endswith("cancelled") else Weight.NEWS
+                assert b.component.texts.say(Severity.NOTICE, text, weight)
+                await asyncio.sleep(0.3)
+            await asyncio.sleep(1.0)
+            assert put_together(statustexts(b.ground)) == story
+
+    run_virtual(main())
+
+
 def test_repeats_within_seconds_are_said_once() -> None:
     async def main() -> None:
         async with bench() as b:

@@ -75,7 +75,7 @@ class Port:
 
     async def state(self, *, connected: bool) -> str:
         """Wait for the next report of that state; return its reason."""
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(40):
             while True:
                 found, reason = await self.states.get()
                 if found == connected:
@@ -83,7 +83,7 @@ class Port:
 
     async def data(self, count: int) -> bytes:
         received = b""
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(40):
             while len(received) < count:
                 received += (await self.chunks.get())[0]
         return received
@@ -167,7 +167,7 @@ def test_a_fast_stream_is_collected_and_a_byte_after_it_wakes_the_loop(
                     os.write(pty.master, bytes([number]))
                 chunk, _ = await asyncio.wait_for(port.chunks.get(), 10)
                 assert chunk == bytes(range(5))  # written in one turn of the loop, they come together
-                async with asyncio.timeout(10):
+                async with asyncio.timeout(40):
                     while port.link._collecting is not None:
                         await asyncio.sleep(0.001)
                 await collecting(port, pty)  # as at the start: each byte by itself
@@ -185,7 +185,7 @@ def test_a_moment_without_bytes_does_not_end_the_collecting(path: Path, monkeypa
                 await port.state(connected=True)
                 await collecting(port, pty)
                 turns = port.link._turns
-                async with asyncio.timeout(10):
+                async with asyncio.timeout(40):
                     while port.link._turns < turns + 3:  # nothing came
                         await asyncio.sleep(0.001)
                 for number in range(5):
@@ -213,7 +213,7 @@ def test_a_flood_ends_the_collecting_and_the_port_is_read_again_after_it(
                 assert is_paused(port)
                 assert port.link._collecting is None
                 port.link.budget = Budget()
-                async with asyncio.timeout(10):
+                async with asyncio.timeout(40):
                     while is_paused(port):
                         await asyncio.sleep(0.001)
                 await collecting(port, pty)

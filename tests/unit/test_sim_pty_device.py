@@ -32,7 +32,7 @@ class Port:
         return self.data
 
     async def wait_for(self, size: int) -> bytes:
-        async with asyncio.timeout(5.0):
+        async with asyncio.timeout(30.0):
             while len(self.read()) < size:
                 await asyncio.sleep(0.005)
         return self.data
@@ -115,7 +115,7 @@ def test_a_reader_that_does_not_read_loses_bytes_and_stops_nobody(tmp_path: Path
         device.baud = 4_000_000
         async with PtyDevice(device, tmp_path / "imu") as pty:
             port = Port(tmp_path / "imu")
-            async with asyncio.timeout(5.0):
+            async with asyncio.timeout(30.0):
                 while pty.bytes_dropped == 0:
                     await asyncio.sleep(0.02)
             sent = pty.frames_sent
@@ -151,7 +151,7 @@ def test_commands_reach_the_device_and_a_muted_one_is_silent(tmp_path: Path) -> 
             port = Port(tmp_path / "g")
             await port.wait_for(22)
             os.write(port.descriptor, b"sV")
-            async with asyncio.timeout(5.0):
+            async with asyncio.timeout(30.0):
                 while b"DPL2" not in port.read():
                     await asyncio.sleep(0.01)
             os.write(port.descriptor, b"S")

@@ -1,0 +1,75 @@
+"""Ports that lead from the daemon to its devices and its broker within this process.
+
+On a loaded machine the kernel delivers what was written to a TCP socket of 127.0.0.1 some time later, and virtual time
+does not wait for it. What is written to a Unix socket is there when the write returns, so that a cell is the same every
+time. `CampaignLoop.sock_connect` leads here; `taken` leads blocking libraries here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import socket
+from collections.abc import Iterator
+from typing import Any, Final
+
+_FIRST: Final = 20_000
+_PORTS: Final = 40_000
+_numbers = itertools.count()
+_open: set[int] = set()
+_real_create_connection = socket.create_connection
+
+
+def new_port() -> int:
+    """One that nobody has; nobody listens there yet."""
+    port = _FIRST + next(_numbers) % _PORTS
+    _open.add(port)
+    return port
+
+
+def listen(port: int) -> socket.socket:
+    """A listening socket at a port of `new_port`, to be given to `asyncio.start_server`."""
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    listener.bind(_name(port))
+    listener.listen(100)
+    return listener
+
+
+def leads_here(address: Any) -> bool:
+    """Whether it is an address of ours."""
+    return isinstance(address, tuple) and len(address) >= 2 and address[1] in _open
+
+
+def connect(port: int) -> socket.socket:
+    """A connected socket.
+
+    Raises:
+        ConnectionRefusedError: nobody listens.
+    """
+    end = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        end.connect(_name(port))
+    except OSError:
+        end.close()
+        raise
+    return end
+
+
+@contextlib.contextmanager
+def taken() -> Iterator[None]:
+    """Blocking connections to a port of ours lead to it, too: that is how MQTT's library connects."""
+
+    def create_connection(address: Any, *arguments: Any, **options: Any) -> socket.socket:
+        return connect(address[1]) if leads_here(address) else _real_create_connection(address, *arguments, **options)
+
+    socket.create_connection = create_connection
+    try:
+        yield
+    finally:
+        socket.create_connection = _real_create_connection
+
+
+def _name(port: int) -> str:
+    """Abstract (unix(7)): it is gone with the socket."""
+    return f"\0campaign {os.getpid()} {port}"
