@@ -18,6 +18,7 @@ FailureKind = Literal[
     "arm state unknown",
     "changed by someone else",
     "not as believed",
+    "without effect",
     "cancelled",
 ]
 

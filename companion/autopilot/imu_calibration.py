@@ -211,8 +211,13 @@ def whole_bias(
     """
     rotation = calibration.orientation
     gyro = np.asarray(gyro_residual_rad_s) + rotation @ np.asarray(calibration.gyro_offset_rad_s)
-    scaled = np.asarray(calibration.accel_scale) * np.asarray(calibration.accel_offset_m_s2)
-    return _plain(gyro), _plain(np.asarray(accel_residual_m_s2) + rotation @ scaled)
+    return _plain(gyro), _plain(np.asarray(accel_residual_m_s2) + rotation @ accel_taken_off(calibration))
+
+
+def accel_taken_off(calibration: ImuCalibration) -> Array:
+    """What the offsets take off the accelerometer: diag(accel_scale) accel_offset, (3,), m/s^2, its own axes."""
+    scaled: Array = np.asarray(calibration.accel_scale) * np.asarray(calibration.accel_offset_m_s2)
+    return scaled
 
 
 def _require_plausible(what: str, vector: Vector, limit: float, unit: float, words: str, instance: int) -> None:

@@ -38,6 +38,7 @@ class SlotMemory:
 
     def __init__(self) -> None:
         self._instance_of: dict[tuple[Sensor, int], int] = {}
+        self._enabled: dict[Sensor, int] = {}
         self._in_use: dict[tuple[str, str, str], tuple[int, Vector]] = {}
         self.rivals = RivalMemory()
 
@@ -51,6 +52,10 @@ class SlotMemory:
     def known(self, sensor: Sensor, device_id: int) -> int | None:
         """The IMU that a device was seen to be; NO_IMU: none in the telemetry."""
         return self._instance_of.get((sensor, device_id))
+
+    def holds_strangers(self, sensor: Sensor, imus: int) -> bool:
+        """Whether more slots are in use than there may be IMUs: then one may be of a sensor that is not there."""
+        return self._enabled.get(sensor, 0) > imus
 
     def forget(self) -> None:
         """What was learned cannot be true."""
@@ -77,6 +82,7 @@ class SlotMemory:
             AutopilotError: there is none.
         """
         prefix, word = PREFIX[sensor], WORDS[sensor]
+        self._enabled[sensor] = sum(slot.enabled for slot in slots)
         if not slots:
             raise AutopilotError(
                 f"PX4 has no {word} in {prefix}0_ID to {prefix}{SLOTS - 1}_ID: calibrate its {word}s once with the"

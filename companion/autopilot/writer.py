@@ -38,6 +38,9 @@ HOLD_S: Final = 2.5
 """So long a value on the way (`Change.via`) stays: PX4 looks at its parameters at most once a second (autopilots 9.2),
 and 2.5 s is what a real one was tried with (9.3.2)."""
 
+TAKEN_S: Final = 1.3
+"""So long after the last value of a way PX4 has taken it into use; until then the one on the way acts."""
+
 _LATE_ECHO_S: Final = 0.3
 """Let answers to earlier writes pass before reading back: ArduPilot answers to X with Y and Z, old ones, as well."""
 
@@ -166,6 +169,9 @@ class ParameterWriter:
         """
         swapped = [dataclasses.replace(c, before=c.after, after=c.before) for c in reversed(changes)]
         done = await self.apply(swapped)
+        if any(change.via is not None for change in changes):
+            # Nobody looks at the telemetry after this, and who is told that it is done may arm.
+            await let_pass(self._vehicle, moment(self._vehicle), TAKEN_S)
         self.written = {
             change.parameter: WrittenParameter(
                 before=change.before,
@@ -318,7 +324,7 @@ class ParameterWriter:
                     await asyncio.sleep(HOLD_S)
                 for item in remaining:
                     await self._put_back_one(item, item.change.before, leave_foreign=foreign)
-                await asyncio.sleep(_LATE_ECHO_S)
+                await asyncio.sleep(TAKEN_S if indirect and self._vehicle.alive else _LATE_ECHO_S)
                 for item in touched:
                     item.read_back = await self._look(item.change.parameter)
                     item.left = not _same(item.read_back, item.change.before)

@@ -51,6 +51,13 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True):
     """What the place and the heading add; of an accelerometer without the gradienter's zero."""
     suspect: bool = False
     """It contradicted what was known."""
+    chosen: bool = False
+    """It did, and was written all the same, because somebody had asked for it: what was known counts no more."""
+
+    @property
+    def is_outlier(self) -> bool:
+        """Whether it contradicted, and nobody has decided for it."""
+        return self.suspect and not self.chosen
 
 
 class Point(msgspec.Struct, frozen=True, kw_only=True):
@@ -73,6 +80,14 @@ class Point(msgspec.Struct, frozen=True, kw_only=True):
         """One half of it."""
         return self.gyro if triad == "gyro" else self.accel
 
+    def as_chosen(self) -> Point:
+        """The same, of a calibration that somebody has asked for and that is in force now."""
+        return msgspec.structs.replace(self, gyro=_as_chosen(self.gyro), accel=_as_chosen(self.accel))
+
+
+def _as_chosen(found: Measured | None) -> Measured | None:
+    return msgspec.structs.replace(found, chosen=True) if found is not None and found.suspect else found
+
 
 def by_power_up(points: Sequence[Point]) -> list[list[Point]]:
     """The points of each power-up, in the order in which they were measured."""
@@ -90,9 +105,12 @@ def by_power_up(points: Sequence[Point]) -> list[list[Point]]:
 def believed(points: Sequence[Point], triad: Triad) -> list[list[Point]]:
     """By power-up, what of these points is worth a prior for one triad.
 
-    Outliers are left out. `NEW_AFTER` of them in a row are none: then it is what was before them that is left out.
+    Outliers are left out. `NEW_AFTER` of them in a row are none: then it is what was before them that is left out. So
+    it is at once with one that somebody has decided for.
     """
-    groups = by_power_up([point for point in points if point.of(triad) is not None])
+    measured = [point for point in points if point.of(triad) is not None]
+    start = max((k for k, point in enumerate(measured) if _is_chosen(point, triad)), default=0)
+    groups = by_power_up(measured[start:])
     outliers = [all(_is_suspect(point, triad) for point in group) for group in groups]
     first = row = 0
     accepted: set[int] = set()
@@ -111,4 +129,9 @@ def believed(points: Sequence[Point], triad: Triad) -> list[list[Point]]:
 
 def _is_suspect(point: Point, triad: Triad) -> bool:
     found = point.of(triad)
-    return found is not None and found.suspect
+    return found is not None and found.is_outlier
+
+
+def _is_chosen(point: Point, triad: Triad) -> bool:
+    found = point.of(triad)
+    return found is not None and found.chosen

@@ -183,6 +183,8 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     """None: nothing was known from before, or nothing is to be made of it."""
     effective: Effective | None = None
     """None where the accelerometers were not determined."""
+    held_back: tuple[Literal["gyro", "accel"], ...] = ()
+    """Measured and not written, since it contradicts earlier ones and nobody had asked: the offsets are as before."""
 
 
 class Arming(msgspec.Struct, frozen=True, kw_only=True):

@@ -77,6 +77,20 @@ def load_config(options: argparse.Namespace, *, profiles: bool = False) -> confi
     return config.load(config_path(options), saved)
 
 
+def storage_path(options: argparse.Namespace) -> Path:
+    """The storage directory of the configuration; where none is named and the default one is not there, the usual one.
+
+    Raises:
+        ConfigError: the configuration that -c names cannot be read.
+    """
+    try:
+        return load_config(options).storage.path
+    except ConfigError:
+        if hasattr(options, "config"):
+            raise
+        return config.Storage().path
+
+
 def config_path(options: argparse.Namespace) -> Path:
     """The file that -c names, or the default one."""
     path: Path = getattr(options, "config", config.DEFAULT_PATH)

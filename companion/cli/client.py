@@ -80,5 +80,6 @@ async def history(options: argparse.Namespace) -> int:
     reply = await _request(options, {"command": "history", "limit": options.limit})
     records = reply.get("records", [])
     armings = reply.get("armings", [])
-    answer = {"records": records, "armings": armings}
-    return _finish(options, reply, answer, show.history_lines(records, armings), good=True)
+    numbers = reply.get("numbers", [])
+    answer = {"numbers": numbers, "records": records, "armings": armings}
+    return _finish(options, reply, answer, show.history_lines(numbers, records, armings), good=True)

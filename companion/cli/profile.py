@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
-from companion.cli import DONE, FAILED, Command, load_config, print_json, seconds
+from companion.cli import DONE, FAILED, Command, load_config, print_json, seconds, storage_path
 from companion.errors import CalibrationRefusedError, ConfigError, StorageError
 from companion.physics.units import DEG_H, MG
 
@@ -115,8 +115,11 @@ async def profile(options: argparse.Namespace) -> int:
 
 def _compared(options: argparse.Namespace) -> NoiseProfile | None:
     from companion.calibration.allan import noise_profile
+    from companion.storage.profiles import given_profile
 
-    return None if options.profile is None else noise_profile(options.profile)
+    if options.profile is None:
+        return None
+    return noise_profile(given_profile(options.profile, lambda: options.storage or storage_path(options)))
 
 
 def _by_imu(logs: Sequence[StillLog], wanted: str | None) -> dict[str, list[StillLog]]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from companion.cli import DONE, FAILED, load_config, print_json, seconds, show
+from companion.cli import DONE, FAILED, load_config, print_json, seconds, show, storage_path
 from companion.daemon.control import ask
 from companion.errors import ConfigError
 
@@ -50,7 +50,9 @@ def add_commands(
     )
     csv.add_argument("--heading-sigma-deg", type=_number(1e-3, 180.0), default=3.0, metavar="DEG", help="default 3")
     csv.add_argument("--mounting", default="ROTATION_NONE", metavar="ROTATION", help="sensor to vehicle")
-    csv.add_argument("--profile", metavar="PART", help="the sensor's model, such as icm42688p")
+    csv.add_argument(
+        "--profile", metavar="PART", help="the sensor's model, such as icm42688p, or a saved profile's name or file"
+    )
 
 
 def _number(least: float, most: float) -> Callable[[str], float]:
@@ -169,15 +171,13 @@ def _lines(result: Result) -> list[str]:
 
 
 def _replay_csv(options: argparse.Namespace) -> int:
-    from companion.config.sections import Profile
     from companion.replay.csv_columns import read
     from companion.replay.csv_log import PoseGiven, estimate
     from companion.rotations import ROTATIONS_DEG
+    from companion.storage.profiles import given_profile
 
     if options.mounting not in ROTATIONS_DEG:
         raise ConfigError(f"--mounting: found {options.mounting}; allowed: a MAVLink rotation such as ROTATION_YAW_90")
-    if options.profile is not None and options.profile not in (known := Profile.__args__):  # type: ignore[attr-defined]
-        raise ConfigError(f"--profile: found {options.profile}; allowed: {', '.join(known)}")
     if (options.pitch_deg is None) != (options.roll_deg is None):
         raise ConfigError("found only one of --pitch-deg and --roll-deg; allowed: both or neither")
     pose = PoseGiven(
@@ -189,9 +189,9 @@ def _replay_csv(options: argparse.Namespace) -> int:
         latitude_deg=options.latitude_deg,
         height_m=options.height_m,
     )
-    found: Record = estimate(
-        read(options.file, options.columns), pose, mounting=options.mounting, profile=options.profile
-    )
+    wanted = options.profile
+    profile = None if wanted is None else given_profile(wanted, lambda: storage_path(options))
+    found: Record = estimate(read(options.file, options.columns), pose, mounting=options.mounting, profile=profile)
     if getattr(options, "json", False):
         print_json(msgspec.to_builtins(found))
     else:

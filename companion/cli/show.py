@@ -57,9 +57,9 @@ def _imu_lines(imu: Object) -> list[str]:
     lines = [
         f"{imu['name']}: {imu['samples']} samples" + (f", {temperature:.1f} degC" if temperature is not None else "")
     ]
-    for words, unit, scale, form, bias, sigma in (
-        ("gyro bias ", "deg/h", DEG_H, "+9.1f", "gyro_bias_rad_s", "gyro_sigma_use_rad_s"),
-        ("accel bias", "mg   ", MG, "+9.3f", "accel_bias_m_s2", "accel_sigma_use_m_s2"),
+    for triad, unit, scale, form, bias, sigma in (
+        ("gyro", "deg/h", DEG_H, "+9.1f", "gyro_bias_rad_s", "gyro_sigma_use_rad_s"),
+        ("accel", "mg   ", MG, "+9.3f", "accel_bias_m_s2", "accel_sigma_use_m_s2"),
     ):
         if imu[bias] is None:
             continue
@@ -67,7 +67,7 @@ def _imu_lines(imu: Object) -> list[str]:
             f"{axis} {value / scale:{form}} +- {one / scale:.{form[-2]}f}"
             for axis, value, one in zip("xyz", imu[bias], imu[sigma], strict=True)
         )
-        lines.append(f"  {words} {unit} {axes}")
+        lines.append(f"  {triad:5} bias {unit} {axes}{_held_back(imu, triad)}")
     for name, written in imu["written"].items():
         lines.append(
             f"  {name:16} {_number(written['before'], '+.6f')} -> {written['after']:+.6f}  {written['outcome']}"
@@ -114,6 +114,7 @@ def status_lines(status: Object) -> list[str]:
         + (f", {arming['words']}" if arming["verdict"] != "accept" else "")
     )
     lines.append(f"in force: {arming['in_force']}")
+    lines += [f"profile {each['imu']}: {each['summary']}" for each in status["profiles"]]
     if status["page"] is not None:
         lines.append(f"page: {'' if status['page']['good'] else 'none: '}{status['page']['summary']}")
     lines.append(_last_line(status))
@@ -206,24 +207,28 @@ def _bias_lines(calibration: Object | None) -> list[str]:
                 f"{axis} {bias:{form}} +- {sigma:.{form[-2]}f}"
                 for axis, bias, sigma in zip("xyz", biases, sigmas, strict=True)
             )
-            lines.append(f"{imu['name']:8} {words:5} {unit.replace('_', '/'):5} {axes}")
+            lines.append(f"{imu['name']:8} {words:5} {unit.replace('_', '/'):5} {axes}{_held_back(imu, words)}")
     return lines
 
 
-def history_lines(records: Sequence[Object], armings: Sequence[Object]) -> list[str]:
-    """Past calibrations and the latest armings, one line each, newest first."""
+def _held_back(imu: Object, triad: str) -> str:
+    return "  held back: not written" if triad in imu.get("held_back", ()) else ""
+
+
+def history_lines(numbers: Sequence[int], records: Sequence[Object], armings: Sequence[Object]) -> list[str]:
+    """Past calibrations and the latest armings, one line each, newest first; numbers as `companion report` takes."""
     if not records:
         return ["no calibrations yet"]
-    lines = [f"{'started (UTC)':20} {'vehicle':>7} {'state':10} {'took':>6}  what came of it"]
+    lines = [f"{'no.':>4} {'started (UTC)':20} {'vehicle':>7} {'state':10} {'took':>6}  what came of it"]
     lines += [
-        f"{record['started_at'][:19]:20} {record.get('system_id') or '?':>7} {record['state']:10}"
+        f"{number:4} {record['started_at'][:19]:20} {record.get('system_id') or '?':>7} {record['state']:10}"
         f" {record['duration_s']:5.0f}s  {record['reason']}{_what_became(record)}"
-        for record in records
+        for number, record in zip(numbers, records, strict=True)
     ]
     if armings:
-        lines.append(f"{'armed (UTC)':20} in force")
+        lines.append(f"{'':4} {'armed (UTC)':20} in force")
         lines += [
-            f"{arming['armed_at'][:19]:20} {'' if arming['state'] != 'uncalibrated' else 'UNCALIBRATED: '}"
+            f"{'':4} {arming['armed_at'][:19]:20} {'' if arming['state'] != 'uncalibrated' else 'UNCALIBRATED: '}"
             f"{arming['reason']}"
             for arming in armings
         ]

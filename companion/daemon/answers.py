@@ -98,6 +98,7 @@ class Answers:
         link: MavlinkLink,
         pose: PoseNow,
         trouble: Callable[[], str | None],
+        lies: Callable[[], str | None],
         alignment: AlignmentInForce,
     ) -> None:
         self._conductor, self._vehicle, self._collector, self._devices = conductor, vehicle, collector, devices
@@ -106,11 +107,15 @@ class Answers:
         self._armings, self._gate_setup, self._automatic = armings, gate_setup, automatic
         self._recorder, self._link, self._pose, self._alignment = recorder, link, pose, alignment
         self._headlines = Headlines(vehicle, collector, conductor, mender, readiness, automatic, mavlink_url, trouble)
+        self._concerns: list[Callable[[], str | None]] = [lies]
+        self._headlines.concern = lambda: next(filter(None, (concern() for concern in self._concerns)), None)
         self._carried: Carried | None = None
         self._signing: LinkSigning | None = None
         self._permission = Permission()
         self.page: Callable[[], Object | None] = lambda: None
         """What is to be said of the page; None where none is configured."""
+        self.profiles: list[Object] = []
+        """Whose noise figures the sigmas of each IMU are made of."""
         self.setup: Callable[[Object], Awaitable[Object]] | None = None
         """Sets the autopilot up for our heading."""
         self.mqtt: Callable[[], Object] = dict
@@ -120,12 +125,13 @@ class Answers:
         """Tell of who is not believed and who was refused, too."""
         self._signing, self._permission = signing, permission
         self._headlines.deaf = lambda: signing.deaf
+        self._concerns.append(lambda: signing.worry)
 
     def carry(self, attitude: Carried | None) -> None:
         """Tell of the attitude that is carried, too."""
         self._carried = attitude
         if attitude is not None:
-            self._headlines.concern = lambda: attitude.concern
+            self._concerns.append(lambda: attitude.concern)
 
     async def answer(self, request: Object, face: str = "companion") -> AsyncIterator[Object]:
         """Answer one request of the control socket, or of another face that speaks its words.
@@ -158,8 +164,8 @@ class Answers:
             limit = request.get("limit")
             number = limit if isinstance(limit, int) and limit > 0 else None
             # A thousand records take longer to read than a ground station waits for an answer.
-            records, armings = await self._offload(self._history, number)
-            yield {"kind": "result", "records": records, "armings": armings}
+            numbers, records, armings = await self._offload(self._history, number)
+            yield {"kind": "result", "numbers": numbers, "records": records, "armings": armings}
         elif command == "record":
             async for reply in self._recorder.answer(request):
                 yield reply
@@ -172,10 +178,11 @@ class Answers:
         else:
             yield {"kind": "error", "reason": f"unknown command {command!r}"}
 
-    def _history(self, limit: int | None) -> tuple[list[Object], list[Object]]:
+    def _history(self, limit: int | None) -> tuple[list[int], list[Object], list[Object]]:
         armings = self._armings.history()
-        records = with_armings(self._store.history(limit), armings)
-        return [_plain(record) for record in records], [_plain(arming) for arming in armings[:limit]]
+        found = self._store.numbered(limit)
+        records = with_armings(list(found.values()), armings)
+        return list(found), [_plain(record) for record in records], [_plain(arming) for arming in armings[:limit]]
 
     async def _answer_calibrate(self, request: Object, face: str) -> AsyncIterator[Object]:
         try:
@@ -253,6 +260,7 @@ class Answers:
             "automatic": self._automatic.status(),
             "recording": self._recorder.status(),
             "mqtt": self.mqtt() or None,
+            "profiles": self.profiles,
             "calibration": shown_calibration(self._readiness.in_force, conductor.last, now_s),
             "last": _summary(conductor.last),
             "page": self.page(),

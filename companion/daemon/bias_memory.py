@@ -220,7 +220,7 @@ class BiasMemory:
         session = self._session(name)
         before = self._today.get((name, triad))
         same = before is not None and before.session == session and before.point.zero == point.zero
-        if before is not None and same and found.suspect and before.contradicted < 2:
+        if before is not None and same and found.is_outlier and before.contradicted < 2:
             before.contradicted += 1
             return
         self._today[name, triad] = _Reference(session, point)

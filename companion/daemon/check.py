@@ -9,10 +9,10 @@ import dataclasses
 import os
 from pathlib import Path
 
-from companion.config import Config, Imu, Noise
+from companion.config import Config
 from companion.daemon.control import Object, ask, process_behind
 from companion.daemon.doctor import Diagnosis, sensor_findings, system_findings, where_it_may_be
-from companion.daemon.models import cannot_work, doubtful
+from companion.daemon.models import cannot_work, doubtful, profile_in_words
 from companion.daemon.sensor_health import ABSENT
 from companion.daemon.service import Service
 from companion.errors import DaemonDeniedError, DaemonUnreachableError
@@ -72,7 +72,8 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
     findings.append(Finding("ground stations", good=ground["good"], words=ground["summary"]))
     if (mqtt := status["mqtt"]) is not None:
         findings.append(Finding("mqtt", good=mqtt["good"], words=mqtt["summary"]))
-    findings += map(_profile, config.imu)
+    # Whose noise figures an IMU's sigmas are made of.
+    findings += [Finding(f"profile {imu.name}", good=True, words=profile_in_words(imu.profile)) for imu in config.imu]
     if config.calibration.at_arm == "gate":
         findings.append(_gate(config, status["arming"]["setup"]))
     for kind in ("gradienter", "compass"):
@@ -80,17 +81,6 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
             without = {"gradienter": "gyros only", "compass": "gyro sigma widened by the Earth's rate"}[kind]
             findings.append(Finding(kind, good=True, words=f"not configured: {without}"))
     return findings
-
-
-def _profile(imu: Imu) -> Finding:
-    """Whose noise figures an IMU's sigmas are made of."""
-    if isinstance(imu.profile, Noise):
-        words = f"{imu.profile.name}, {imu.profile.origin}"
-    elif imu.profile is None:
-        words = "none: sigmas are those of the worst common parts"
-    else:
-        words = f"{imu.profile}, of the catalogue"
-    return Finding(f"profile {imu.name}", good=True, words=words)
 
 
 def _device(device: Object, elsewhere: Diagnosis | None) -> Finding:

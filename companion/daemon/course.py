@@ -129,17 +129,25 @@ class Course:
             try:
                 await self._measure_and_push(job, draft)
             except WriteFailedError as error:
-                if error.kind != "not as believed" or error.left_changed:
+                if error.kind not in ("not as believed", "without effect") or error.left_changed:
                     raise
-                self.machine.on(Event.AGAIN)
-                logger.warning("%s; put back, measuring again for the right one", error.reason)
-                draft.begin_again(f"{error.reason}; put back, and written where it belongs")
+                self.machine.on(Event.AGAIN if self.machine.state is State.WRITING else Event.MOVED)
+                if error.kind == "not as believed":
+                    logger.warning("%s; put back, measuring again for the right one", error.reason)
+                    draft.begin_again(f"{error.reason}; put back, and written where it belongs")
+                else:
+                    logger.warning("%s; put back, measuring again", error.reason)
+                    draft.begin_again(f"{error.reason}; put back, and tried again")
                 job.check_cancelled()
             else:
                 break
         else:
             await self._measure_and_push(job, draft)
-        await self._memory.keep(draft.points)
+        points = draft.points
+        if self._pusher.enabled and not job.automatic:
+            # Who has asked was told of every contradiction, and has what was measured in force: that is true now.
+            points = {name: point.as_chosen() for name, point in points.items()}
+        await self._memory.keep(points)
         if draft.held_back:
             draft.notes.append(f"{held_back.in_words(draft.held_back)} held back")
 

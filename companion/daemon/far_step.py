@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
+import functools
 import logging
 import math
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
@@ -92,17 +93,23 @@ class FarStepWatch:
         self.means: Mapping[tuple[int, Sensor], FarMean] = {}
         """By instance, from the last look: only of what moved as it should."""
         self._link, self._vehicle, self._memory = link, vehicle, memory
+        self.learned = False
+        """Whether the last look has told anything of the slots that was not known."""
         self._sums: _Sums | None = None
         self._heard: set[int] = set()
+        self._unknown: set[int] = set()
+        """IMUs of which nobody could say whether there is such a one."""
 
     @contextlib.asynccontextmanager
     async def watching(self, steps: Sequence[FarStep]) -> AsyncIterator[Callable[[], Awaitable[str | None]] | None]:
         """Collect from now on; gives what to call while the far values are in force (None: there are none)."""
-        self.means = {}
+        self.means, self.learned = {}, False
         if not steps:
             yield None
             return
         self._heard.clear()
+        self._unknown.clear()
+        boots = self._vehicle.boots
         subscriptions = [self._subscribe(instance) for instance in imu_messages.PX4]
         asked: list[int] = []
         try:
@@ -110,7 +117,9 @@ class FarStepWatch:
             for instance, (message, *_) in imu_messages.PX4.items():
                 if instance not in self._heard:
                     asked.append(message.message.id)
-                    self._vehicle.commands.request_message_interval(message.message.id, RATE_HZ)
+                    self._unknown.add(instance)
+                    answer = self._vehicle.commands.request_message_interval(message.message.id, RATE_HZ)
+                    answer.add_done_callback(functools.partial(self._answered, instance))
             self._sums = before = _Sums()
             await let_pass(self._vehicle, moment(self._vehicle), BEFORE_S)
             self._sums = None
@@ -120,7 +129,8 @@ class FarStepWatch:
                 self._sums = during = _Sums()
                 await let_pass(self._vehicle, moment(self._vehicle), LOOK_S)
                 self._sums = None
-                return self._judge(steps, before, during)
+                # A restart brings other offsets into use by itself: whoever moved or did not, it says nothing.
+                return None if self._vehicle.boots != boots else self._judge(steps, before, during)
 
             yield look
         finally:
@@ -129,6 +139,10 @@ class FarStepWatch:
                 unsubscribe()
             for message_id in asked:
                 self._vehicle.commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 0.0)
+
+    def _answered(self, instance: int, answer: asyncio.Future[int | None]) -> None:
+        if answer.result() is not None:
+            self._unknown.discard(instance)
 
     def _subscribe(self, instance: int) -> Callable[[], None]:
         kind = imu_messages.PX4[instance][0]
@@ -174,15 +188,23 @@ class FarStepWatch:
             self._memory.learn(step.sensor, step.device_id, step.instance)
             return None
         if len(moved) == 1 and step.instance in still:
-            self._memory.learn(step.sensor, step.device_id, moved[0])
+            self._learn(step, moved[0])
             return f"the offsets in {step.slot} act on the {word} of IMU {moved[0]}, not of IMU {step.instance}"
         if not moved and step.instance in still:
-            self._memory.learn(step.sensor, step.device_id, NO_IMU)
-            return f"the offsets in {step.slot} do not act on the {word} of IMU {step.instance}"
+            words = f"the offsets in {step.slot} do not act on the {word} of IMU {step.instance}"
+            if self._memory.holds_strangers(step.sensor, len(self._heard | self._unknown)):
+                self._learn(step, NO_IMU)
+                return words
+            # Every slot is somebody's: there is another reason, and what would be tried next is another IMU's.
+            return f"{words}: PX4 does not use what it has stored, or it moved"
         if len(moved) > 1:
             return f"the offsets in {step.slot} seem to act on IMU {' and '.join(map(str, moved))} at once"
         logger.warning("%s: it cannot be told yet which IMU its offsets act on", step.slot)
         return None
+
+    def _learn(self, step: FarStep, instance: int) -> None:
+        self.learned = True
+        self._memory.learn(step.sensor, step.device_id, instance)
 
 
 def _cause(made: Array, steps: Sequence[FarStep]) -> FarStep | None:

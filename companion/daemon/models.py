@@ -12,11 +12,12 @@ from companion.calibration.rolling import ImuInput, Settings
 from companion.calibration.settling import AT_ONCE, Lag
 from companion.calibration.site import Whereabouts
 from companion.calibration.solve import CompassModel, GradienterModel
-from companion.config import Compass, Config, Gradienter, Imu
+from companion.config import Compass, Config, Gradienter, Imu, Noise
 from companion.config.sections import GradienterProtocol
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H, MG
 from companion.protocols.registry import PROTOCOLS
+from companion.storage.profiles import ProfileStore
 
 IMU_RATE_HZ: Final = 100.0
 """Asked of the autopilot for each IMU where the connection does not limit it; its own filters pass 20 Hz."""
@@ -49,6 +50,32 @@ def settings(config: Config) -> Settings:
         target_accel_sigma_m_s2=wanted.target_accel_sigma_mg * MG,
         dither=config.push.dither and config.push.parameters,
     )
+
+
+def profile_in_words(profile: str | Noise | None) -> str:
+    """Whose noise figures an IMU's sigmas are made of."""
+    if isinstance(profile, Noise):
+        return f"{profile.name}, {profile.origin}"
+    return "none: sigmas are those of the worst common parts" if profile is None else f"{profile}, of the catalogue"
+
+
+def profiles(config: Config) -> list[dict[str, object]]:
+    """Whose noise figures the sigmas of each IMU are made of, for `companion status`."""
+    store = ProfileStore(config.storage.path)
+    found: list[dict[str, object]] = []
+    for imu in config.imu:
+        fitted = isinstance(imu.profile, Noise)
+        name = imu.profile.name if isinstance(imu.profile, Noise) else imu.profile
+        found.append(
+            {
+                "imu": imu.name,
+                "name": name,
+                "fitted": fitted,
+                "file": str(store.path(imu.profile.name)) if isinstance(imu.profile, Noise) else None,
+                "summary": profile_in_words(imu.profile),
+            }
+        )
+    return found
 
 
 def imu_rate_hz(config: Config) -> float:

@@ -93,6 +93,7 @@ class Draft:
             written=self.written.get(estimate.name, {}),
             prior=estimate.prior,
             effective=estimate.effective,
+            held_back=tuple(triad for name, triad in self.held_back if name == estimate.name),
         )
 
 

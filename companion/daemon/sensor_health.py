@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import Counter
+from collections.abc import Callable
 from typing import Final
 
 from companion.links.bytestream import ByteLink
@@ -43,6 +44,8 @@ class SensorHealth:
         """How often each trouble has begun, and each event happened."""
         self.stuck: Trouble | None = None
         """That its reading stays while the aircraft does not: found out by who sees the other sensors too."""
+        self.on_lie: Callable[[Trouble], object] = lambda lie: None
+        """Told, as often as the log, when its readings begin to look good without being so."""
         self._renew_after_s = RENEW_POLLED_AFTER_S if polled else RENEW_AFTER_S
         self._opened_s = self._grace_since_s = 0.0
         self._renewed = False
@@ -132,9 +135,11 @@ class SensorHealth:
             self._began_s = now_s
         self._said = found.key
         self.counts[found.key] += 1
-        self._tell(found, now_s)
+        if self._tell(found, now_s) and found.lies:
+            self.on_lie(found)
 
-    def _tell(self, what: Trouble, now_s: float) -> None:
+    def _tell(self, what: Trouble, now_s: float) -> bool:
+        """In the log; whether in the ordinary one."""
         told_s = self._told_s.get(what.key)
         again = told_s is not None and now_s - told_s < AGAIN_S
         self._told_s[what.key] = now_s
@@ -142,6 +147,7 @@ class SensorHealth:
             logging.DEBUG if again else logging.WARNING, "%s: %s (%d so far)", self.link.name, what.words,
             self.counts[what.key],
         )  # fmt: skip
+        return not again
 
     def _renew(self, now_s: float) -> None:
         """A peer behind tcp:// that vanished without a word, or that accepts and says nothing."""

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from companion.autopilot.ekf import EkfWatch
+from companion.autopilot.imu_calibration import accel_taken_off
 from companion.autopilot.imu_stream import StreamKind
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.px4_slots import SlotMemory
@@ -48,7 +49,7 @@ from companion.daemon.readiness import Readiness
 from companion.daemon.reboot import Reboot
 from companion.daemon.recorder import Recorder
 from companion.daemon.rivalry import Rivalry
-from companion.daemon.sensor_watch import SensorWatch
+from companion.daemon.sensor_watch import UNTOUCHED, Corrected, SensorWatch
 from companion.daemon.sensors import SerialSensor
 from companion.daemon.serial_devices import Role, collect, serial_devices
 from companion.daemon.signing import LinkSigning
@@ -108,7 +109,7 @@ class Service:
         self._imu_rate_hz = models.imu_rate_hz(config) if imu_rate_hz is None else imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
         self.sensors = [SerialSensor(device, self._take, offload, self._take_many) for device in serial_devices(config)]
-        self.sensor_watch = SensorWatch(self.sensors, self.collector)
+        self.sensor_watch = SensorWatch(self.sensors, self.collector, self._corrected, self._say)
         self.recorder = Recorder(
             config, self.collector, self.link, self.vehicle, self.imus.values(), self.sensors, offload
         )
@@ -216,10 +217,12 @@ class Service:
             link=self.link,
             pose=self.pose,
             trouble=self.sensor_watch.worst,
+            lies=self.sensor_watch.lies,
             alignment=self.alignment,
         )
         self.answers.carry(self.attitude)
         self.answers.setup = self.setup.answer
+        self.answers.profiles = models.profiles(config)
         self.answers.watch_access(self.signing, self.component.permission)
         self.mqtt = self._mqtt_face(offload)
         self.page = self._page(offload)
@@ -276,6 +279,13 @@ class Service:
     def _message_of(self, name: str) -> str | None:
         imu = self.imus.get(name)
         return imu.stream.kind.message if imu is not None and imu.stream.kind is not None else None
+
+    def _corrected(self, name: str) -> Corrected | None:
+        imu = self.imus.get(name)
+        if imu is None:
+            return UNTOUCHED
+        known = imu.calibration
+        return None if known is None else Corrected(known.orientation.T, accel_taken_off(known))
 
     def _say(self, *what: Any) -> object:
         return self.component.say(*what)

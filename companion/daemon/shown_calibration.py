@@ -43,6 +43,7 @@ def _imu(imu: ImuRecord, now_degc: float | None) -> dict[str, object]:
         "gyro_sigma_deg_h": _scaled(imu.gyro_sigma_use_rad_s, DEG_H, 2),
         "accel_bias_mg": _scaled(imu.accel_bias_m_s2, MG, 4),
         "accel_sigma_mg": _scaled(imu.accel_sigma_use_m_s2, MG, 4),
+        "held_back": list(imu.held_back),
     }
 
 

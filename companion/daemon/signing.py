@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import Counter
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -18,6 +17,7 @@ from companion.autopilot.vehicle import Vehicle
 from companion.component.statustext import Severity, Weight
 from companion.config import Config
 from companion.daemon.ledger import Offload
+from companion.daemon.signature_watch import SignatureWatch
 from companion.errors import LinkError, StorageError
 from companion.links.mavlink import MavlinkLink
 from companion.links.mavlink_keys import read_key
@@ -72,6 +72,7 @@ class LinkSigning:
         if self.mode != "off":
             # From the first byte on: what comes before the key is read is not believed either.
             self.signing = link.signing = Signing(required=self.mode == "require")
+        self._watch = SignatureWatch(link, vehicle, self.signing, say)
         link.subscribe(mavlink.MAVLink_setup_signing_message, self._on_setup)
 
     def load(self) -> None:
@@ -85,7 +86,9 @@ class LinkSigning:
         """Keep the time and tell of strangers, until cancelled."""
         signing = self.signing
         if signing is None:
-            return
+            while True:
+                await asyncio.sleep(LOOK_S)
+                self._watch.look(asyncio.get_running_loop().time())
         while signing.key is None:
             await asyncio.sleep(KEY_AGAIN_S)
             self._take_key(signing)
@@ -94,6 +97,7 @@ class LinkSigning:
                 if signing.clock.now() > self._reserved - int(RESERVE_BEFORE_S * TICKS_PER_S):
                     await self._keep(signing, AHEAD_S)
                 self._tell(signing)
+                self._watch.look(asyncio.get_running_loop().time())
                 await asyncio.sleep(LOOK_S)
         finally:
             # An orderly end reserves nothing: the next start goes on from here.
@@ -162,10 +166,7 @@ class LinkSigning:
         if self.trouble:
             return self.trouble
         # Only who claims to be an autopilot explains why none is heard.
-        dropped = Counter[Reason]()
-        for (reason, _, component), number in signing.strangers.items():
-            dropped[reason] += number * (component == self._vehicle.component_id)
-        ((reason, number),) = dropped.most_common(1) or [("unsigned", 0)]
+        ((reason, number),) = self._watch.dropped().most_common(1) or [("unsigned", 0)]
         if number == 0 or self._vehicle.alive:
             return None
         return {
@@ -175,19 +176,33 @@ class LinkSigning:
             "no key": f"{number} messages dropped: the signing key is still being read",
         }[reason]
 
+    @property
+    def worry(self) -> str | None:
+        """That the autopilot and we do not believe each other, and what to do; None where they do."""
+        return self._watch.worry
+
     def status(self) -> dict[str, Any] | None:
-        """For `companion status`; None while signing is off."""
+        """For `companion status`; None while signing is off and nothing asks for it."""
         signing = self.signing
         if signing is None:
-            return None
+            if self.worry is None:
+                return None
+            return {
+                "good": False,
+                "mode": self.mode,
+                "summary": self.worry,
+                "verified": 0,
+                "doubted": {},
+                "strangers": [],
+            }
         doubted = sum(signing.doubted.values())
-        summary = self.deaf or self.trouble
+        summary = self.deaf or self.trouble or self.worry
         if not summary:
             summary = f"{signing.verified} messages checked"
             if doubted:
                 summary += f", {doubted} {'dropped' if signing.required else 'not signed with our key'}"
         return {
-            "good": self.deaf is None and not self.trouble,
+            "good": self.deaf is None and not self.trouble and self.worry is None,
             "mode": self.mode,
             "summary": summary,
             "verified": signing.verified,

@@ -134,6 +134,8 @@ class Signing:
         """Others, by what is wrong with them; those that are dropped where a signature is required."""
         self.strangers: Counter[tuple[Reason, int, int]] = Counter()
         """The same by system and component that they claim to be of: the first 16 of these."""
+        self.believed: Counter[tuple[int, int]] = Counter()
+        """What was signed with our key, by system and component."""
         self._streams: dict[tuple[int, int, int], int] = {}
 
     def __repr__(self) -> str:
@@ -181,4 +183,5 @@ class Signing:
         self._streams[stream] = ticks
         self.clock.heard(ticks)
         self.verified += 1
+        self.believed[frame[5], frame[6]] += 1
         return None

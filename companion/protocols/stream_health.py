@@ -38,6 +38,9 @@ STUCK_S: Final = 1.0
 STUCK_SAMPLES: Final = 20
 """Of an IMU: in six channels of a living one some last digit moves. Of a gradienter or compass nothing follows from
 equal digits; whether it has turned meanwhile decides, and that others know."""
+NEAR_DEG: Final = 0.5
+"""Far less than what would have to be seen of a tilt or a turn. Whoever takes the aircraft in hand may be the cause of
+the hang: then the first of the equal readings comes in the middle of the motion, and the pose before it counts."""
 
 RAILS_DEG: Final = {"jewell": (math.degrees(330e-6), "330 microradians, the end of a LILY's range")}
 """Readings that look like data and are the end of the range (OOI's logs of a Jewell LILY: -202.490,-330.000)."""
@@ -89,6 +92,8 @@ class StreamHealth:
         self.last_byte_s: float | None = None
         self.unchanged_since_s: float | None = None
         """Since when all readings have been the same, digit for digit."""
+        self.near_since_s: float | None = None
+        """Since when they have been near that; of a gradienter or compass."""
         self.speaks: str | None = None
         """The protocol that the bytes are instead."""
         self.events: list[Trouble] = []
@@ -96,6 +101,7 @@ class StreamHealth:
         self._tail = b""
         self._first_bad_s: float | None = None
         self._reading: object = None
+        self._near: tuple[float, ...] | None = None
         self._same = 0
         self._rail = 0
         self._clock_s: float | None = None
@@ -108,6 +114,7 @@ class StreamHealth:
         """The port was opened (again): what came before has no continuation."""
         self._tail, self._first_bad_s, self._clock_s = b"", None, None
         self.last_byte_s = self.unchanged_since_s = self._reading = None
+        self.near_since_s = self._near = None
         self._same = self._rail = 0
         self.speaks, self._guess, self._guessed_s = None, "", -math.inf
 
@@ -149,15 +156,28 @@ class StreamHealth:
             self._look_at_clock(sample.t_device_s)
         elif isinstance(sample, TiltSample):
             reading = (sample.x_deg, sample.y_deg)
+            self._look_whether_near(reading, t_s)
             self._look_at_rail(sample)
         elif isinstance(sample, CompassSample):
             reading = (sample.heading_deg, sample.pitch_deg, sample.roll_deg)
+            self._look_whether_near((sample.heading_deg,), t_s)
         else:
             return
         if reading == self._reading:
             self._same += count
             return
         self._reading, self._same, self.unchanged_since_s = reading, 0, t_s
+
+    def _look_whether_near(self, angles_deg: tuple[float, ...], t_s: float) -> None:
+        near = self._near
+        if (
+            near is None
+            or len(near) != len(angles_deg)
+            or any(
+                abs(math.remainder(one - other, 360.0)) > NEAR_DEG for one, other in zip(near, angles_deg, strict=True)
+            )
+        ):
+            self._near, self.near_since_s = angles_deg, t_s
 
     def _look_at_clock(self, clock_s: float | None) -> None:
         before_s, self._clock_s = self._clock_s, clock_s

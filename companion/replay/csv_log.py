@@ -24,7 +24,7 @@ from companion.calibration.rolling import RollingCollector, Settings, Window
 from companion.calibration.site import Whereabouts
 from companion.calibration.solve import CompassModel, GradienterModel, solve_at
 from companion.calibration.windows import ImuInput
-from companion.config import Mounting
+from companion.config import Mounting, Noise
 from companion.daemon.course import in_words
 from companion.daemon.report import Draft
 from companion.errors import CalibrationRefusedError
@@ -60,7 +60,11 @@ class PoseGiven(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def estimate(
-    blocks: Iterable[ImuBlock], pose: PoseGiven, *, mounting: Mounting = "ROTATION_NONE", profile: str | None = None
+    blocks: Iterable[ImuBlock],
+    pose: PoseGiven,
+    *,
+    mounting: Mounting = "ROTATION_NONE",
+    profile: str | Noise | None = None,
 ) -> Record:
     """The biases from the longest still stretch of a log.
 
@@ -68,7 +72,7 @@ def estimate(
         blocks: samples in order of time, by any clock in seconds.
         pose: how it stood.
         mounting: sensor to vehicle FRD.
-        profile: the sensor's model, for its Allan figures.
+        profile: the sensor's model, or figures learned, for its Allan figures.
 
     Raises:
         StorageError: as `csv_columns.read`, where the blocks are its.

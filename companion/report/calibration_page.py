@@ -183,9 +183,11 @@ def _triad(imu: ImuRecord, triad: Triad, material: Material) -> Markup:
             )
         )
     heads = ["", "bias", "σ use", "σ stat", *(["residual"] if left else [])]
+    held = card("caution", "Held back: measured, not written. What was in force before still is.")
     return tag(
         "div",
         title,
+        held if triad in imu.held_back else None,
         tag("table", tag("tr", *(tag("th", words) for words in heads)), *rows),
         _sigmas(imu.name, triad, stat, use, model),
         tag("p", _against_the_floor(stat, use, model, unit, unit_name, profile)),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,7 +14,7 @@ import msgspec
 from companion.calibration.allan import AllanModel, NoiseProfile
 from companion.config import Noise
 from companion.config.profiles import CATALOGUE
-from companion.errors import StorageError
+from companion.errors import ConfigError, StorageError
 from companion.storage.atomic import write_atomically
 
 FORMAT_VERSION: Final = 1
@@ -121,15 +123,7 @@ class ProfileStore:
             StorageError: one line: it cannot be read, is damaged, or of a newer version.
         """
         path = self.path(name)
-        try:
-            with path.open("rb") as file:
-                data = file.read(MOST_BYTES + 1)
-        except OSError as error:
-            raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from error
-        try:
-            found = _from_json(data)
-        except (ValueError, msgspec.MsgspecError) as error:
-            raise StorageError(f"{path}: not a readable profile: {error}") from error
+        found = read_profile(path)
         if found.name != name:
             raise StorageError(f"{path}: not a readable profile: it is of {found.name!r}")
         return found
@@ -153,6 +147,51 @@ class ProfileStore:
         # Nothing in it is secret, and whoever may enter the folder may run `check` on what it says.
         write_atomically(path, msgspec.json.format(msgspec.json.encode(profile), indent=2) + b"\n", mode=0o644)
         return path
+
+
+def read_profile(path: Path) -> SavedProfile:
+    """A profile out of a file, wherever that lies and whatever it is called.
+
+    Raises:
+        StorageError: one line: it cannot be read, is damaged, or of a newer version.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from error
+    try:
+        return _from_json(data)
+    except (ValueError, msgspec.MsgspecError) as error:
+        raise StorageError(f"{path}: not a readable profile: {error}") from error
+
+
+def given_profile(wanted: str, directory: Callable[[], Path]) -> str | Noise:
+    """What somebody has named: a part of the catalogue, a saved profile, or the file of one.
+
+    Args:
+        wanted: a name, or a path (with a slash in it, or .json at its end).
+        directory: the storage directory, where names of saved profiles are looked for; only asked where it matters.
+
+    Raises:
+        ConfigError: no such profile; says what is allowed.
+        StorageError: the file cannot be read.
+    """
+    plain = re.sub(r"[-_ ]", "", wanted.strip().lower())
+    if plain in CATALOGUE:
+        return plain
+    if "/" in wanted or wanted.endswith(".json"):
+        return read_profile(Path(wanted)).noise
+    store = ProfileStore(directory())
+    names = store.names()
+    if wanted in names:
+        return store.noise(wanted)
+    near = difflib.get_close_matches(plain, [*CATALOGUE, *names], n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise ConfigError(
+        f"--profile: found {wanted}; allowed: {', '.join((*CATALOGUE, *names))}, or the file of a profile"
+        f" (companion profile --save){hint}"
+    )
 
 
 def _from_json(data: bytes) -> SavedProfile:

@@ -96,11 +96,15 @@ class RecordStore:
 
     def history(self, limit: int | None = None) -> list[Record]:
         """The latest records, newest first; a file that cannot be read is logged and passed over."""
-        records: list[Record] = []
+        return list(self.numbered(limit).values())
+
+    def numbered(self, limit: int | None = None) -> dict[int, Record]:
+        """The same by their numbers, by which people ask for one."""
+        records: dict[int, Record] = {}
         entries = self.entries()
         while (limit is None or len(records) < limit) and (entry := next(entries, None)) is not None:
             if entry.record is not None:
-                records.append(entry.record)
+                records[entry.number] = entry.record
             else:
                 logger.warning("%s: %s, passed over", entry.path, entry.problem)
         return records

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable
 
@@ -135,7 +136,18 @@ async def stick_and_tilt(scene: Scene) -> None:
 
 
 async def unstick(scene: Scene) -> None:
-    scene.stage.mangle.pop(TILT, None)
+    """It has been said by now, whatever goes on: by the status, in the log, and to the ground stations."""
+    stage = scene.stage
+    faces = {"status": stage.words(), "log": stage.said.lines, "ground station": stage.ground.texts()}
+    if scene.phase == "armed":
+        faces["headline"] = [stage.service.status()["headline"]["reason"]]
+    silent = [
+        face
+        for face, lines in faces.items()
+        if not any(re.search(r"gradienter.*stuck|: stuck:", line) for line in lines)
+    ]
+    stage.mangle.pop(TILT, None)
+    assert not silent, f"a stuck gradienter is not named by: {', '.join(silent)}"
 
 
 async def handle(scene: Scene) -> None:
@@ -319,10 +331,8 @@ def faults() -> list[Fault]:
             "the gradienter hangs while somebody tilts the aircraft",
             stick_and_tilt,
             unstick,
-            lasts_s=(7.0, 12.0),
+            lasts_s=(9.0, 14.0),
             names=r"stuck",
-            # While offsets are written the autopilot's IMU is not heard: nothing tells it from a still aircraft.
-            named_in=("idle", "waiting", "collecting", "done"),
             excused=STILLNESS,
         ),
         Fault(

@@ -281,7 +281,8 @@ def autopilot_faults() -> list[Fault]:
             restart_whole,
             lasts_s=(14.0, 18.0),
             not_in=write_only,
-            excused=r"does not use|not in use|no effect|did not follow|still off|reboot|restart",
+            # It ends with a restart, which may come in the middle of the next attempt.
+            excused=r"does not use|not in use|no effect|did not follow|still off|reboot|restart|unknown whether",
         ),
         Fault(
             "other-value",
@@ -459,7 +460,24 @@ async def demands_signatures(scene: Scene) -> None:
 
 
 async def unsigned(scene: Scene) -> None:
+    """An autopilot that takes what is unsigned as well is not complained of."""
     scene.stage.wire.change = None
+    assert not _told_of_signatures(scene), "said of an autopilot that takes unsigned messages"
+
+
+async def no_longer_demanded(scene: Scene) -> None:
+    """It has been said by now, once, whether or not anybody has asked the autopilot for something."""
+    told, status = _told_of_signatures(scene), any(_WANTS in words for words in scene.stage.words())
+    scene.stage.wire.change = None
+    assert told == 1, f"that it wants signatures is said {told} times in the log"
+    assert status, "the status does not say that it wants signatures"
+
+
+_WANTS = "the autopilot signs, and answers nothing that is not signed"
+
+
+def _told_of_signatures(scene: Scene) -> int:
+    return sum(_WANTS in line for line in scene.stage.said.lines)
 
 
 def intruder_faults() -> list[Fault]:
@@ -515,12 +533,10 @@ def intruder_faults() -> list[Fault]:
             "intruder",
             "the autopilot signs, and takes nothing that is not signed",
             demands_signatures,
-            unsigned,
+            no_longer_demanded,
             lasts_s=(14.0, 20.0),
-            names=r"it signs what it sends",
+            names=r"it signs what it sends|the autopilot signs, and answers nothing that is not signed",
             excused=LOST,
-            # While it waits, and armed, nothing may be asked of the autopilot for as long as the fault lasts.
-            named_in=tuple(phase for phase in PHASES if phase not in ("armed", "waiting")),
         ),
     ]
 

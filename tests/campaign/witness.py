@@ -132,9 +132,9 @@ class Witness:
         self._finals[key] = (t_s, message.result)
 
 
-MAY_BE_SET = r"INS_(GYR|ACC)OFFS_[XYZ]|CAL_(GYRO|ACC)[01]_[XYZ]OFF"
-"""Of IMU 1, which is the one that is calibrated. On PX4 a write shows which IMU a slot acts on; one that is another's
-is put back, so that there what counts is what `others` says once at rest."""
+MAY_BE_SET = r"INS_(GYR|ACC)OFFS_[XYZ]|CAL_(GYRO|ACC)0_[XYZ]OFF"
+"""Of IMU 1, which is the one that is calibrated, at every instant. Its slot on PX4 is the first, as on a board whose
+drivers start in the order of the slots: docs/faults.md tells of the others."""
 WATCHED = {
     True: [f"CAL_{sensor}1_{axis}OFF" for sensor in ("ACC", "GYRO") for axis in "XYZ"],
     False: [

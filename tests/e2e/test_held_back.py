@@ -6,14 +6,17 @@ import asyncio
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from companion.calibration.machine import State
 from companion.calibration.request import What
+from companion.cli.show import monitor_lines, record_lines
 from companion.component.service import Refusal
 from companion.daemon import automatic
 from companion.daemon.job import Job
 from sim.devices import Gradienter
+from sim.imu_model import MG
 from tests.e2e.test_automatic import calibrated_by_itself, values
 from tests.e2e.test_bias_memory import knocked
 from tests.support.rig import Rig
@@ -64,6 +67,12 @@ def test_accelerometers_are_held_back_when_the_gradienter_has_moved_until_somebo
             assert {"GYR" in name for name in fc.written} == {True}, "the gyros are in no doubt"
             assert {"GYR" in name for name in first.imus[0].written} == {True, False}
             assert fc.accel_bias_m_s2 is not None, "what was measured is kept"
+            assert [imu.held_back for imu in record.imus] == [("accel",), ()]
+            (line,) = [line for line in record_lines(msgspec.to_builtins(record)) if "held back: not written" in line]
+            assert line.strip().startswith("accel bias mg")
+            drawn = monitor_lines(msgspec.to_builtins(rig.service.status()))
+            assert [line[:14] for line in drawn if "held back: not written" in line] == ["fc       accel"]
+            assert [imu["held_back"] for imu in rig.service.status()["calibration"]["imus"]] == [["accel"], []]
             assert accelerometers(rig) == before
             assert "the gradienter has moved by 0.3" in said
             assert "Held back: accelerometers of fc; calibrate on request to write it all the same" in said
@@ -85,10 +94,57 @@ def test_accelerometers_are_held_back_when_the_gradienter_has_moved_until_somebo
             assert (await job.finished).outcome == "done"
             asked = rig.service.store.history(1)[0]
             assert {"GYR" in name for name in asked.imus[0].written} == {True, False}
+            assert asked.imus[0].held_back == ()
             assert any(words.startswith("the gradienter has moved by 0.3") for words in asked.warnings)
             assert all(accelerometers(rig)[name] != value for name, value in before.items())
             await asyncio.sleep(10.0)
             assert "held back" not in rig.service.readiness.answer().words
+
+    run_virtual(main())
+
+
+def test_what_somebody_asked_for_is_true_from_then_on_also_for_calibrations_by_itself(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
+            before = await held_back(rig)
+            conductor, store = rig.service.conductor, rig.service.store
+            job = conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(job, Job)
+            assert (await job.finished).outcome == "done"
+            asked = accelerometers(rig)
+            assert all(asked[name] != value for name, value in before.items())
+            for _ in range(2):
+                await asyncio.sleep(10.0)
+                job = conductor.start_calibration(What.BOTH, "the companion", automatic=True)
+                assert isinstance(job, Job)
+                assert (await job.finished).outcome == "done"
+                record = store.history(1)[0]
+                assert "held back" not in record.reason
+                assert not any("gradienter" in words for words in record.warnings)
+                assert rig.service.in_force.held_back is None
+                now = accelerometers(rig)
+                assert all(abs(now[name] - value) < 0.5 * MG for name, value in asked.items()), (
+                    "the gradienter slipped by 5 mg"
+                )
+
+    run_virtual(main())
+
+
+def test_an_undo_of_what_was_asked_for_makes_the_earlier_ones_count_again(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
+            before = await held_back(rig)
+            conductor, known = rig.service.conductor, rig.service.store
+            job = conductor.start_calibration(What.BOTH, "test")
+            assert isinstance(job, Job)
+            assert (await job.finished).outcome == "done"
+            undo = conductor.start_undo("test")
+            assert isinstance(undo, Job)
+            assert (await undo.finished).outcome == "done"
+            assert accelerometers(rig) == before
+            for each in rig.service.memory._known.values():
+                assert not any(point.accel is not None and point.accel.chosen for point in each.points)
+            assert known.history(1)[0].undone_at is not None
 
     run_virtual(main())
 

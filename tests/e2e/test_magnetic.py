@@ -69,6 +69,7 @@ def test_magnetometer_lines_give_a_heading_with_the_gradienters_tilt_and_a_bound
             assert any(line.startswith("compass: heading good to 1.") for line in lines)
             status = rig.service.status()
             assert any(line.startswith("compass: heading good to 1.") for line in status_lines(status))
+            assert "profile fc: icm42688p, of the catalogue" in status_lines(status)
             pose = status["pose"]
             assert pose["heading_deg"] == pytest.approx(POSE.heading_deg - rig.site.declination_deg, abs=0.5)
 

@@ -13,6 +13,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import pytest
 
 from companion.calibration.record import Record, from_json
@@ -78,10 +79,22 @@ async def read_the_record(here: Scene, record: Record) -> None:
     gyro = [record.imus[0].gyro_bias_rad_s, record.imus[0].gyro_sigma_use_rad_s]
     x_deg_h, sigma_deg_h = (math.degrees(axes[0]) * 3600.0 for axes in gyro if axes is not None)
     assert shown == f"{x_deg_h:+.1f} ± {sigma_deg_h:.1f}"
+    # What was held back is not to be taken for what is in force.
+    titles = await tab.value("[...document.querySelectorAll('#imus h3')].map(it => it.textContent)")
+    marked = [title.endswith(", held back") for title in titles if "bias" in title]
+    assert marked == [triad in imu.held_back for imu in record.imus for triad in ("gyro", "accel")]
+    words = await tab.value("[...document.querySelectorAll('#imus .note')].map(it => it.textContent)")
+    assert words == ["held back: measured, not written; what was in force before still is"]
+    assert await tab.value("document.querySelectorAll('.axis.held').length") == 3
     await here.picture("phone_bars")
+    await tab.value("document.querySelector('#imus .held').scrollIntoView({block: 'center'})")
+    await here.picture("phone_held_back")
     await tab.value("document.querySelector('#records details').open = true")
     await tab.value("document.querySelector('#records').scrollIntoView()")
     await here.picture("phone_records")
+    told = await tab.value("document.querySelector('#records details').textContent")
+    assert told.count("(held back, not written)") == 1
+    assert "accelerometer (held back, not written) " in told
     assert await pixels_needed(tab) == 0
     link = await tab.value("document.querySelector('#records details a').href")
     text = await tab.value(f"fetch({link!r}).then(answer => answer.text())")
@@ -96,6 +109,11 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             return (await calibrated(rig))[1]
 
     record = run_virtual(on_the_bench())
+    fc, own = record.imus
+    fc = msgspec.structs.replace(
+        fc, held_back=("accel",), written={name: what for name, what in fc.written.items() if "GYR" in name}
+    )
+    record = msgspec.structs.replace(record, imus=(fc, own), reason=f"{record.reason}; accelerometers of fc held back")
     RecordStore(tmp_path / "state").save(record)
 
     async def main() -> None:

@@ -251,3 +251,113 @@ def test_a_signature_does_not_replace_a_permission(tmp_path: Path) -> None:
             assert rig.service.status()["vehicle"]["refused"] == {"255/190": 1}
 
     run_virtual(main())
+
+
+def lines(caplog: pytest.LogCaptureFixture, words: str) -> int:
+    return sum(words in record.getMessage() for record in caplog.records)
+
+
+def no_longer_signing(rig: Rig) -> None:
+    for channel in rig.autopilot.channels:
+        channel._codec.signing = mavlink.MAVLinkSigning()
+
+
+@pytest.mark.parametrize("armed", [False, True])
+def test_an_autopilot_that_wants_signatures_is_named_though_nobody_asks_it_for_anything(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, armed: bool
+) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            if armed:
+                rig.autopilot.arm()
+            await asyncio.sleep(3.0)
+            rig.autopilot.require_signatures(KEY, now())
+            await asyncio.sleep(8.0)
+            status = rig.service.status()
+            assert "give the companion its key" in status["vehicle"]["signing"]["summary"]
+            assert not status["vehicle"]["signing"]["good"]
+            await asyncio.sleep(40.0)
+            assert lines(caplog, "the autopilot signs, and answers nothing that is not signed") == 1
+            no_longer_signing(rig)
+            await asyncio.sleep(5.0)
+            assert rig.service.status()["vehicle"]["signing"] is None
+            texts = "\n".join(rig.ground.texts())
+            assert "Autopilot answers again" in texts
+
+    run_virtual(main())
+
+
+def test_an_autopilot_that_signs_and_takes_unsigned_messages_is_not_complained_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As over USB."""
+
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            rig.autopilot.require_signatures(KEY, now())
+            for channel in rig.autopilot.channels:
+                channel._codec.signing.allow_unsigned_callback = lambda *_: True
+            await asyncio.sleep(20.0)
+            assert rig.service.vehicle.signs
+            assert rig.service.status()["vehicle"]["signing"] is None
+            assert lines(caplog, "answers nothing") == 0
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("mode", ["sign", "require"])
+def test_another_key_is_named_once_and_forgotten_when_the_keys_are_the_same(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, mode: str
+) -> None:
+    caplog.set_level(logging.INFO, "companion")
+
+    async def main() -> None:
+        rig = signed_rig(tmp_path, mode=mode)
+        rig.autopilot.require_signatures(KEY, now())
+        async with rig.running():
+            await rig.ready()
+            await asyncio.sleep(3.0)
+            assert rig.service.status()["vehicle"]["signing"]["good"]
+            assert lines(caplog, "another key") == 0
+            rig.autopilot.require_signatures(OTHER, now())
+            await asyncio.sleep(20.0)
+            status = rig.service.status()
+            assert "another key" in status["vehicle"]["signing"]["summary"]
+            assert not status["vehicle"]["signing"]["good"]
+            assert status["headline"]["tone"] != "good"
+            # A headline that is bad anyway tells what is worse.
+            assert mode == "sign" or "another key" in status["headline"]["reason"]
+            assert lines(caplog, "the autopilot signs with another key than the companion: give both the same one") == 1
+            rig.autopilot.require_signatures(KEY, now() + 100 * 100_000)
+            await asyncio.sleep(6.0)
+            status = rig.service.status()
+            assert status["vehicle"]["signing"]["good"]
+            assert "another key" not in str(status["headline"])
+            assert lines(caplog, "Autopilot's signatures are right again") == 1
+            # A cable that is pulled afterwards is not blamed on keys that once were wrong.
+            rig.wire.unplug()
+            await asyncio.sleep(5.0)
+            assert "another key" not in str(rig.service.status()["headline"])
+
+    run_virtual(main())
+
+
+def test_forged_packets_between_good_ones_are_no_reason_to_change_keys(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def main() -> None:
+        rig = signed_rig(tmp_path)
+        rig.autopilot.require_signatures(KEY, now())
+        liar = Ground(1, 1)
+        liar.sign(OTHER, now())
+        async with rig.running():
+            await rig.ready()
+            for _ in range(100):
+                rig.wire.carry_from_other(liar.pack(mavlink.MAVLink_heartbeat_message(2, 3, 209, 0, 4, 3)))
+                await asyncio.sleep(0.1)
+            assert rig.service.status()["vehicle"]["signing"]["good"]
+            assert lines(caplog, "give both the same one") == 0
+
+    run_virtual(main())

@@ -133,6 +133,22 @@ def test_outliers_are_left_out_until_they_are_the_rule() -> None:
 # --- the mean and its scatter
 
 
+def test_what_somebody_has_decided_for_counts_at_once_and_nothing_before_it() -> None:
+    first = [point(bias, f"run{k}") for k, bias in enumerate(some(5))]
+    odd = point([5, 5, 5], "run4", suspect=True)
+    agrees, after = point([5, 5, 5], "run4"), point([5, 5, 5], "run5")
+
+    def names(points: Sequence[Point]) -> list[str]:
+        return [each.power_up.host for group in believed(points, "gyro") for each in group]
+
+    assert odd.as_chosen().gyro != odd.gyro
+    assert agrees.as_chosen() == agrees, "what agrees has nothing to put an end to"
+    assert names([*first, odd]) == [f"run{k}" for k in range(5)]
+    assert names([*first, odd.as_chosen()]) == ["run4"]
+    assert names([*first, odd.as_chosen(), agrees, after]) == ["run4", "run4", "run5"]
+    assert names([*first, odd.as_chosen(), after, point([9, 9, 9], "run6", suspect=True)]) == ["run4", "run5"]
+
+
 def test_two_power_ups_say_nothing_three_guard_five_weigh() -> None:
     points = [point(bias, str(k)) for k, bias in enumerate(some(9))]
     assert expect(points[:2], "gyro", now(), ASSUMED) is None

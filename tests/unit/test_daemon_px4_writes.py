@@ -191,6 +191,91 @@ def test_a_slot_of_a_sensor_that_is_not_there_moves_nobody(tmp_path: Path) -> No
     run_virtual(main())
 
 
+class DeafPx4(ScriptedPx4):
+    """Stores and answers, and goes on with what it had."""
+
+    def changed(self) -> None:
+        pass
+
+
+def test_where_every_slot_is_somebodys_a_write_without_effect_is_not_tried_on_another_imu(tmp_path: Path) -> None:
+    px4 = DeafPx4(devices=(ICM, BMI))
+    before = dict(px4.parameters)
+
+    async def main() -> None:
+        async with aboard(px4, tmp_path) as stage:
+            for _ in range(2):
+                with pytest.raises(WriteFailedError, match="CAL_GYRO0 do not act on the gyro of IMU 1: PX4") as caught:
+                    await stage.write(1)
+                assert caught.value.kind == "without effect"
+            assert stage.memory.known("gyro", ICM) is None
+            written = {m.param_id for m in px4.requests if m.get_type() == "PARAM_SET"}
+            assert {name[:9] for name in written} == {"CAL_GYRO0", "CAL_ACC0_"}
+            assert px4.parameters == before
+
+    run_virtual(main())
+
+
+def test_an_imu_that_nobody_could_be_asked_for_may_be_there(tmp_path: Path) -> None:
+    """The second IMU's telemetry must be asked for, and the packets that do so are lost."""
+    px4 = DeafPx4(devices=(ICM, BMI))
+    heard = px4._handle
+
+    def handle(message: Any) -> None:
+        if message.get_type() != "COMMAND_LONG" or (message.command, message.param1) != (511, 116):
+            heard(message)
+
+    px4._handle = handle  # type: ignore[method-assign]
+
+    async def main() -> None:
+        async with aboard(px4, tmp_path) as stage:
+            with pytest.raises(WriteFailedError, match="without effect"):
+                await stage.write(1)
+            assert stage.memory.known("accel", ICM) is None
+
+    run_virtual(main())
+
+
+def test_over_a_restart_nothing_is_concluded(tmp_path: Path) -> None:
+    """It starts with what it has stored: neither who moved nor who did not says whose slot that is."""
+    px4 = DeafPx4(devices=(ICM,))
+    px4.parameters |= {"CAL_GYRO1_ID": BMI, "CAL_ACC1_ID": BMI}  # a stranger, so that the first might be one too
+
+    async def main() -> None:
+        async with aboard(px4, tmp_path) as stage:
+            found = await stage.read(1)
+            async with stage.writes.standing_by([(found, small_changes(found))]) as look:
+                assert look is not None
+                stage.client.vehicle.boots += 1
+                assert await look() is None
+            assert stage.memory.known("gyro", ICM) is None
+
+    run_virtual(main())
+
+
+def test_old_values_that_are_back_are_in_use(tmp_path: Path) -> None:
+    px4 = ScriptedPx4(devices=(ICM, BMI))
+
+    async def main() -> None:
+        async with aboard(px4, tmp_path) as stage:
+            found = await stage.read(1)
+            changes = small_changes(found)
+            async with stage.writes.standing_by([(found, changes)]) as look:
+                await stage.writer.apply(changes, look)
+            await asyncio.sleep(2.0)
+            await stage.writer.undo(changes)
+            assert not np.any(list(px4.used.values()))
+
+            async def refuses() -> str:
+                return "not as believed"
+
+            with pytest.raises(WriteFailedError):
+                await stage.writer.apply(changes, refuses)
+            assert not np.any(list(px4.used.values()))
+
+    run_virtual(main())
+
+
 def test_while_the_aircraft_moves_nothing_is_concluded(tmp_path: Path) -> None:
     px4 = ScriptedPx4(devices=(ICM, BMI))
 

@@ -61,7 +61,7 @@ class Board:
         """Its signing, running; `killed`: without an orderly end."""
         text = GOOD.replace("[[imu]]", f'signing_key_file = "{self.folder}/k"\n[[imu]]', 1)
         config = parse(f'{text}[storage]\ndirectory = "{self.folder}"\n', "x.toml")
-        vehicle = cast("Vehicle", SimpleNamespace(alive=False, component_id=1))
+        vehicle = cast("Vehicle", SimpleNamespace(alive=False, component_id=1, system_id=None))
         found = LinkSigning(config, MavlinkLink(), vehicle, lambda *_: None, inline)
         found.load()
         task = asyncio.create_task(found.run())

@@ -21,8 +21,8 @@ NOT_MESSAGES = {
     "USB device", "on-board port", "on-board port (…)",
     # Headings and labels of `status`, `history`, `calibrate` and `check`.
     "started (UTC)", "armed (UTC)", "last calibration: …",
-    "pitch …  roll …  heading …", "NOT ready", "not yet", "… in force", "in force: …",
-    "ground stations: …", "ground stations", "at arming (…): …", "… … … …  what came of it", "; … parameters written",
+    "pitch …  roll …  heading …", "NOT ready", "not yet", "… … in force", "in force: …",
+    "ground stations: …", "ground stations", "at arming (…): …", "… … … … …  what came of it", "; … parameters written",
     "an undo",
     # Names of tasks, in the line of the watchdog, and of what failed, in the log.
     "MAVLink component", "MAVLink connection", "automatic calibration", "the state for MQTT",

@@ -14,7 +14,7 @@ import pytest
 from companion.calibration.allan import PROFILES, AllanModel, noise_profile
 from companion.cli import main as companion
 from companion.config import Config, Noise, parse
-from companion.daemon.check import _profile
+from companion.daemon import models
 from companion.errors import ConfigError, StorageError
 from companion.recording import topics
 from companion.recording.files import RecordingFile, versions
@@ -116,7 +116,7 @@ def test_a_saved_name_brings_its_figures_along(tmp_path: Path) -> None:
     assert isinstance(profile, Noise)
     noise = noise_profile(profile)
     assert (noise.name, noise.gyro, noise.accel) == ("mine", GYRO, ACCEL)
-    assert _profile(config.imu[0]).words == "mine, learned from 1.5 h at rest in 1 recording, saved 2026-11-21"
+    assert models.profile_in_words(profile) == "mine, learned from 1.5 h at rest in 1 recording, saved 2026-11-21"
     # As a recording takes it along: a replay elsewhere has the figures.
     assert msgspec.json.decode(msgspec.json.encode(config), type=Config) == config
 
@@ -180,6 +180,59 @@ def test_learned_saved_and_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[
     toml.write_text(SMALLEST.format("mine") + f'[storage]\ndirectory = "{tmp_path}"\n', encoding="utf-8")
     config = parse(toml.read_text(encoding="utf-8"), "x.toml", ProfileStore)
     assert noise_profile(config.imu[0].profile).gyro == profile.gyro
+    # Whose figures they are, for `companion status`.
+    (shown,) = models.profiles(config)
+    assert (shown["imu"], shown["name"], shown["fitted"]) == (config.imu[0].name, "mine", True)
+    assert shown["file"] == str(tmp_path / "profiles" / "mine.json")
+    assert str(shown["summary"]).startswith("mine, learned from 0.5 h at rest in 1 recording, saved ")
+    # A log is replayed with it, and compared with it, by its name or as a file, wherever that lies.
+    elsewhere = tmp_path / "from a laptop.json"
+    elsewhere.write_bytes((tmp_path / "profiles" / "mine.json").read_bytes())
+    short = tmp_path / "short.csv"
+    short.write_text("".join(half_hour.read_text().splitlines(keepends=True)[:600]), encoding="utf-8")
+    sigmas = {}
+    for wanted in ("mine", str(elsewhere), "adis16405", "ADIS-16405"):
+        assert companion(["-c", str(toml), "replay", str(short), "--json", "--profile", wanted]) == 0
+        sigmas[wanted] = json.loads(capsys.readouterr().out)["imus"][0]["gyro_sigma_use_rad_s"]
+    assert sigmas["mine"] == sigmas[str(elsewhere)] != sigmas["adis16405"] == sigmas["ADIS-16405"]
+    code, answer, _ = run(capsys, "-c", toml, half_hour, "--profile", "mine")
+    assert (code, answer["imus"][0]["compared"]["name"]) == (0, "mine")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "code", "words"),
+    [
+        (
+            "mein",
+            2,
+            "--profile: found mein; allowed: icm42688p, bmi088, adis16470, adis16405, unknown, damaged, mine, or",
+        ),
+        ("mein", 2, "did you mean 'mine'?"),
+        ("./mine.json", 1, "mine.json: cannot be read: No such file or directory"),
+        ("mine.json", 1, "mine.json: cannot be read: No such file or directory"),
+        ("damaged", 1, "damaged.json: not a readable profile: "),
+    ],
+)
+@pytest.mark.parametrize("command", ["replay", "profile"])
+def test_a_profile_that_is_not_there_is_one_line(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    command: str,
+    wanted: str,
+    code: int,
+    words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ProfileStore(tmp_path).write(saved("mine"))
+    (tmp_path / "profiles" / "damaged.json").write_text("{", encoding="utf-8")
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    log = write_csv(tmp_path / "a.csv", *adis16405(30, 20, 1))
+    # Without a configuration: a laptop has none.
+    assert companion([command, str(log), "--profile", wanted]) == code
+    said = capsys.readouterr()
+    assert words in said.err
+    assert said.err.count("\n") == 1
 
 
 def test_the_table_says_what_it_found(capsys: pytest.CaptureFixture[str], half_hour: Path) -> None:

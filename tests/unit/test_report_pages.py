@@ -444,6 +444,12 @@ def test_gyros_alone_are_shown_alone(tmp_path: Path) -> None:
     assert "Not determined: not asked for" in found.text
 
 
+def test_what_was_held_back_is_not_shown_as_in_force(tmp_path: Path) -> None:
+    imu = msgspec.structs.replace(imu_record(), held_back=("accel",))
+    RecordStore(tmp_path).save(record(imus=(imu, imu_record("own", 1))))
+    assert Page(_calibration(tmp_path)).text.count("Held back: measured, not written.") == 1
+
+
 _floats = st.floats(allow_nan=False, allow_infinity=False)
 _axes = st.tuples(_floats, _floats, _floats)
 _times = st.one_of(st.datetimes().map(lambda t: t.isoformat()), st.text(max_size=30))

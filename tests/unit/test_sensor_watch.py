@@ -10,9 +10,12 @@ from typing import Literal
 import numpy as np
 import pytest
 
+from companion.component.statustext import Severity
+from companion.daemon.sensor_watch import UNTOUCHED, Corrected, SensorWatch
 from companion.protocols.stream_health import Trouble
-from companion.samples import CompassSample, ImuSample, Sample, TiltSample
+from companion.samples import CompassSample, ImuSample, Sample, TiltSample, Vector
 from tests.support.chatter import Listening
+from tests.support.still_aircraft import imu
 from tests.support.virtual_time import run_virtual
 
 START_S = 1000.0
@@ -27,7 +30,18 @@ class Bench:
         self.one.sensor.link._descriptor = -1
         self.random = np.random.default_rng(5)
         self.now_s = START_S
+        self.second = False
         self.resets: list[str] = []
+        self.said: list[tuple[Severity, str]] = []
+        self.offset: Vector | None = (0.0, 0.0, 0.0)
+        self.turned = np.eye(3)
+        """From its own axes to the vehicle's, as the autopilot believes it to be mounted."""
+        """What the autopilot takes off its accelerometer; None: not known, its samples do not come."""
+        collector, sensor = self.one.collector, self.one.sensor
+        self.one.watch = SensorWatch(
+            [sensor], collector, self.corrected,
+            lambda severity, words, _: self.said.append((severity, words)),
+        )  # fmt: skip
         reset = self.one.collector.reset
 
         def told(why: str, imu: str | None = None) -> None:
@@ -35,6 +49,11 @@ class Bench:
             reset(why, imu)
 
         self.one.collector.reset = told  # type: ignore[method-assign]
+
+    def corrected(self, name: str) -> Corrected | None:
+        if name != "fc":
+            return UNTOUCHED
+        return None if self.offset is None else Corrected(self.turned.T, np.array(self.offset))
 
     def run(
         self, seconds: float, sample: Callable[[float], Sample], *, pitch_deg: float = 0.0, turn_deg_s: float = 0.0,
@@ -48,7 +67,13 @@ class Bench:
             noise = self.random.normal(0.0, 0.02, 3)
             force = (9.8 * math.sin(pitch) + noise[0], noise[1], -9.8 * math.cos(pitch) + noise[2])
             rate = math.radians(turn_deg_s + bias_deg_s)
-            self.one.collector.add_imu("fc", ImuSample(t_s, (0.0, 0.0, rate + noise[0] * 1e-3), force))
+            gyro = (0.0, 0.0, rate + noise[0] * 1e-3)
+            if self.offset is not None:
+                x, y, z = (self.turned @ np.subtract(force, self.offset)).tolist()
+                p, q, r = (self.turned @ gyro).tolist()
+                self.one.collector.add_imu("fc", ImuSample(t_s, (p, q, r), (x, y, z)))
+            if self.second:
+                self.one.collector.add_imu("second", ImuSample(t_s, gyro, force))
             if tick % 5 == 0:
                 self.one.sensor.health.stream.took(b"x", [sample(t_s)], t_s)
             if tick % 25 == 0:
@@ -92,6 +117,10 @@ def test_a_gradienter_that_repeats_its_digits_while_the_aircraft_tilts_is_stuck(
         bench.run(10.0, tilt)
         assert bench.run(2.0, tilt, pitch_deg=2.0) is None, "one second may be a jolt"
         found = bench.run(8.0, tilt, pitch_deg=8.0)
+        ((severity, said),) = bench.said
+        assert severity is Severity.WARNING
+        assert said.startswith("gradienter: stuck: the same reading for ")
+        assert said.endswith("; switch its power off and on")
         assert found is not None
         assert (found.key, found.lies) == ("stuck", True)
         assert "while the aircraft tilted by 8 deg" in found.words
@@ -122,12 +151,98 @@ def test_a_compass_is_stuck_when_the_aircraft_turned_and_not_when_a_gyro_is_bias
     on_the_clock(check)
 
 
+def test_a_gradienter_that_begins_to_hang_while_it_is_tilted_is_stuck() -> None:
+    """Whoever takes the aircraft in hand pulls at the cable: its last reading is of the middle of the motion."""
+
+    def check() -> None:
+        bench = Bench("gradienter")
+
+        def lives(t_s: float) -> TiltSample:
+            return TiltSample(t_s, 0.43 + 1e-3 * (t_s % 3), -0.084)
+
+        bench.run(10.0, lives)
+        bench.run(0.5, lives, pitch_deg=8.0)
+        found = bench.run(6.0, tilt, pitch_deg=8.0)
+        assert found is not None
+        assert "while the aircraft tilted by 8 deg" in found.words
+
+    on_the_clock(check)
+
+
+def test_a_gradienter_that_follows_and_then_rests_is_left_in_peace() -> None:
+    """With a lag of its own, and coarse enough to repeat its digits from then on."""
+
+    def check() -> None:
+        bench = Bench("gradienter")
+        bench.run(10.0, tilt)
+        since_s = bench.now_s
+
+        def follows(t_s: float) -> TiltSample:
+            return TiltSample(t_s, 0.43, round(8.0 * (1.0 - math.exp(-(t_s - since_s) / 0.5)), 2))
+
+        for _ in range(30):
+            assert bench.run(1.0, follows, pitch_deg=8.0) is None
+        assert bench.resets == []
+
+    on_the_clock(check)
+
+
+def test_the_autopilots_imu_is_no_witness_while_its_offsets_are_being_written() -> None:
+    def check() -> None:
+        bench = Bench("gradienter")
+        bench.one.collector.set_imu(imu("second"))
+        bench.second = True
+        bench.run(10.0, tilt)
+        bench.offset = None
+        found = bench.run(8.0, tilt, pitch_deg=8.0)
+        assert found is not None, "the other IMU has seen it"
+        assert bench.run(5.0, tilt, pitch_deg=8.0) is not None, "and it is not forgotten while nothing is collected"
+
+    on_the_clock(check)
+
+
+def test_an_imu_that_comes_back_after_the_tilt_has_not_seen_it() -> None:
+    def check() -> None:
+        bench = Bench("gradienter")
+        bench.one.collector.set_imu(imu("second"))
+        bench.second, bench.offset = True, None
+        bench.run(8.0, tilt)
+        bench.run(1.0, tilt, pitch_deg=8.0)
+        bench.offset = (0.0, 0.0, 0.0)
+        assert bench.run(5.0, tilt, pitch_deg=8.0) is not None
+
+    on_the_clock(check)
+
+
+def test_a_write_over_which_the_aircraft_was_tilted_hides_nothing_and_new_offsets_are_no_tilt() -> None:
+    """Only the autopilot's IMU: before and after the write tell."""
+
+    def check() -> None:
+        bench = Bench("gradienter")
+        bench.run(10.0, tilt)
+        bench.offset = None
+        bench.run(6.0, tilt)
+        bench.offset = (1.0, -0.5, 0.3)
+        bench.one.collector.reset("offsets written", "fc")
+        assert bench.run(10.0, tilt) is None, "the output has stepped by 6 deg"
+        bench.turned = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+        bench.one.collector.reset("the autopilot's offsets were read anew", "fc")
+        assert bench.run(10.0, tilt) is None, "AHRS_ORIENTATION was set right"
+        bench.offset = None
+        bench.run(6.0, tilt, pitch_deg=8.0)
+        bench.offset = (0.0, 0.0, 0.0)
+        bench.one.collector.reset("offsets written", "fc")
+        found = bench.run(6.0, tilt, pitch_deg=8.0)
+        assert found is not None
+        assert "tilted by 8 deg" in found.words
+
+    on_the_clock(check)
+
+
 def test_one_imu_that_is_broken_convicts_nobody() -> None:
     def check() -> None:
         bench = Bench("gradienter")
         add = bench.one.collector.add_imu
-        from tests.support.still_aircraft import imu
-
         bench.one.collector.set_imu(imu("second"))
 
         def both(name: str, sample: ImuSample) -> None:
