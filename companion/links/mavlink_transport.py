@@ -11,10 +11,12 @@ import asyncio
 import errno
 import logging
 import re
+import socket
 from collections.abc import Callable
 from typing import Any, Protocol, cast
 
 from companion.errors import LinkError
+from companion.links import telemetry_socket
 from companion.links.backoff import Backoff
 from companion.links.bytestream import ByteLink, PortSettings
 from companion.links.mavlink import MavlinkLink
@@ -193,7 +195,7 @@ class _Speaker(_Udp):
         self.link.attach(lambda data: self.send_to(data, None))
 
     def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
-        self.link.receive(data, self.now_s())
+        self.link.arrived(data, self.now_s())
 
 
 class _Listener(_Udp):
@@ -202,14 +204,30 @@ class _Listener(_Udp):
     def __init__(self, link: MavlinkLink) -> None:
         super().__init__(link)
         self._heard_s: dict[tuple[Any, ...], float] = {}
+        self._telemetry: _Telemetry | None = None
+
+    def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        endpoint = telemetry_socket.beside(transport.get_extra_info("socket"))
+        if endpoint is not None:
+            self._telemetry = _Telemetry(endpoint, self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._telemetry is not None:
+            self._telemetry.close()
+        super().connection_lost(exc)
 
     def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
         now_s = self.now_s()
-        if addr in self._heard_s or len(self._heard_s) < MAX_PEERS:
-            self._heard_s[addr] = now_s
+        self.hear(addr, now_s)
+        self.link.arrived(data, now_s)
+
+    def hear(self, peer: tuple[Any, ...], t_s: float) -> None:
+        """A peer spoke."""
+        if peer in self._heard_s or len(self._heard_s) < MAX_PEERS:
+            self._heard_s[peer] = t_s
             if not self.link.connected:
                 self.link.attach(self._send_to_all)
-        self.link.receive(data, now_s)
 
     def error_received(self, exc: Exception) -> None:
         # One peer that cannot be reached is its own trouble; it is forgotten once silent.
@@ -224,3 +242,30 @@ class _Listener(_Udp):
         self._heard_s = {peer: heard_s for peer, heard_s in self._heard_s.items() if now_s - heard_s <= PEER_SILENCE_S}
         if not self._heard_s:
             self.link.attach(None)
+
+
+class _Telemetry:
+    """The socket for telemetry beside a listener's own: read as it comes, or with a fast stream while there is one."""
+
+    def __init__(self, endpoint: socket.socket, listener: _Listener) -> None:
+        self._endpoint, self._listener, self._link = endpoint, listener, listener.link
+        self._loop = asyncio.get_running_loop()
+        self._leave = self._link.together.join(self)
+
+    def take(self) -> None:
+        heard: tuple[Any, ...] | None = None
+        for data, peer, t_s in telemetry_socket.drain(self._endpoint, self._listener.now_s()):
+            if peer != heard:
+                heard = peer
+                self._listener.hear(peer, t_s)
+            self._link.receive(data, t_s)
+
+    def listen(self, *, at_once: bool) -> None:
+        if at_once:
+            self._loop.add_reader(self._endpoint, self._link.together.take)
+        else:
+            self._loop.remove_reader(self._endpoint)
+
+    def close(self) -> None:
+        self._leave()
+        self._endpoint.close()

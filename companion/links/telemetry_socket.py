@@ -1,0 +1,148 @@
+"""A second socket on a UDP port, to which the kernel gives the autopilot's streams of telemetry and nothing else.
+
+Half of what an asyncio program spends on 200 small datagrams a second is waking up for each. Telemetry may wait for the
+next turn that has something to do anyway, a question may not; so the kernel tells them apart, before anybody wakes up:
+both sockets are bound to the port (SO_REUSEPORT), and a classic BPF program chooses one of them for each datagram
+(SO_ATTACH_REUSEPORT_CBPF, Linux 4.5; socket(7)). Each datagram of telemetry has the kernel's time of its arrival
+(SO_TIMESTAMPNS), so that it loses nothing by waiting.
+
+The program says "telemetry" of a datagram that holds one to `MOST_FRAMES` whole unsigned frames of MAVLink 2, all of
+them streams by their message id: the same as `mavlink_frames.may_wait`.
+"""
+
+from __future__ import annotations
+
+import array
+import errno
+import logging
+import socket
+import struct
+import time
+from collections.abc import Iterable
+from typing import Any, Final, Protocol
+
+from companion.links.mavlink_frames import CHECKSUM_BYTES, HEADER_BYTES, MARKER, STREAMS
+
+logger = logging.getLogger(__name__)
+
+MOST_FRAMES: Final = 4
+MOST_BYTES: Final = 2048
+"""Of a datagram of telemetry: a frame has 280 bytes at most."""
+MOST_AT_ONCE: Final = 256
+"""Datagrams that are taken in one turn; the rest waits in the kernel, which bounds it."""
+OLDEST_S: Final = 0.1
+"""What seems to have waited longer, or not yet to have come, was stamped by a clock that has been set meanwhile."""
+
+# <asm-generic/socket.h>, of all architectures that Python's wheels are made for; the module `socket` has no names.
+_SO_TIMESTAMPNS: Final = 35
+_SO_ATTACH_REUSEPORT_CBPF: Final = 51
+_TIMESTAMP: Final = {16: struct.Struct("qq"), 8: struct.Struct("ii")}
+"""struct timespec by its length."""
+
+# <linux/bpf_common.h>
+_LOAD_BYTE: Final = 0x50  # BPF_LD | BPF_B | BPF_IND: A = payload[X + k]
+_LOAD_HALF: Final = 0x48  # BPF_LD | BPF_H | BPF_IND, most significant byte first
+_LOAD_LENGTH: Final = 0x80  # BPF_LD | BPF_W | BPF_LEN: A = bytes of the datagram
+_LOAD_X: Final = 0x01  # BPF_LDX | BPF_IMM: X = k
+_EQUAL: Final = 0x15  # BPF_JMP | BPF_JEQ | BPF_K
+_EQUAL_X: Final = 0x1D  # BPF_JMP | BPF_JEQ | BPF_X
+_ADD: Final = 0x04  # BPF_ALU | BPF_ADD | BPF_K
+_ADD_X: Final = 0x0C  # BPF_ALU | BPF_ADD | BPF_X
+_TO_X: Final = 0x07  # BPF_MISC | BPF_TAX: X = A
+_RETURN: Final = 0x06  # BPF_RET | BPF_K
+_FIRST, _SECOND = 0, 1
+"""Which socket of the port: in the order in which they were bound. Reading beyond the end returns 0 as well."""
+
+Address = tuple[Any, ...]
+Instruction = tuple[int, int, int, int]
+"""Code, jump if true, jump if false, k (struct sock_filter)."""
+
+
+class Endpoint(Protocol):
+    """A socket, or asyncio's stand-in for one."""
+
+    @property
+    def family(self) -> int:
+        """Of its addresses."""
+
+    def getsockname(self) -> Any:
+        """Its own address."""
+
+    def setsockopt(self, level: int, option: int, value: int | bytes, /) -> None:
+        """Set an option."""
+
+
+def program(streams: Iterable[int] = STREAMS, frames: int = MOST_FRAMES) -> list[Instruction]:
+    """Classic BPF that returns 1 for a datagram of whole frames of these messages, and 0 for any other."""
+    # The two low bytes of the id, as they stand in the frame; the third must be 0.
+    ids = sorted(struct.unpack(">H", struct.pack("<H", number))[0] for number in streams if number < 1 << 16)
+    made: list[Instruction] = [(_LOAD_X, 0, 0, 0)]
+    for _ in range(frames):
+        known = [(_EQUAL, len(ids) - place, 0, number) for place, number in enumerate(ids)]
+        refuse = len(known)
+        made += [
+            (_LOAD_BYTE, 0, 0, 0),
+            (_EQUAL, 0, refuse + 5, MARKER),
+            (_LOAD_BYTE, 0, 0, 2),  # incompatibility flags
+            (_EQUAL, 0, refuse + 3, 0),
+            (_LOAD_BYTE, 0, 0, 9),
+            (_EQUAL, 0, refuse + 1, 0),
+            (_LOAD_HALF, 0, 0, 7),
+            *known,
+            (_RETURN, 0, 0, _FIRST),
+            (_LOAD_BYTE, 0, 0, 1),
+            (_ADD, 0, 0, HEADER_BYTES + CHECKSUM_BYTES),
+            (_ADD_X, 0, 0, 0),
+            (_TO_X, 0, 0, 0),
+            (_LOAD_LENGTH, 0, 0, 0),
+            (_EQUAL_X, 0, 1, 0),
+            (_RETURN, 0, 0, _SECOND),
+        ]
+    return [*made, (_RETURN, 0, 0, _FIRST)]
+
+
+def beside(endpoint: Endpoint) -> socket.socket | None:
+    """Open the socket for telemetry beside a bound one; None where the kernel cannot, or must not.
+
+    The first has been bound without SO_REUSEPORT, so nobody else has the port: two daemons do not share one unawares.
+    """
+    code = array.array("B", b"".join(struct.pack("HBBI", *each) for each in program()))
+    address, _ = code.buffer_info()
+    option = struct.pack("HP", len(code) // 8, address)
+    made = socket.socket(endpoint.family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+    try:
+        made.settimeout(0.0)
+        made.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        made.bind(endpoint.getsockname())
+        made.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_REUSEPORT_CBPF, option)
+    except (OSError, AttributeError) as error:
+        logger.debug("mavlink: telemetry and questions share one socket: %s", error)
+        made.close()
+        return None
+    return made
+
+
+def drain(endpoint: socket.socket, now_s: float) -> list[tuple[bytes, Address, float]]:
+    """What has come: datagrams, who sent each, and when it came by the clock of `now_s`."""
+    found: list[tuple[bytes, Address, float]] = []
+    unix_s = time.time()
+    try:
+        while len(found) < MOST_AT_ONCE:
+            data, extra, _, peer = endpoint.recvmsg(MOST_BYTES, 64)
+            found.append((data, peer, now_s - _age_s(extra, unix_s)))
+    except BlockingIOError:
+        pass
+    except OSError as error:
+        logger.debug("mavlink: telemetry: %s", errno.errorcode.get(error.errno or 0, error))
+    return found
+
+
+def _age_s(extra: list[tuple[int, int, bytes]], unix_s: float) -> float:
+    for level, kind, data in extra:
+        if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS and len(data) in _TIMESTAMP:
+            seconds, nanoseconds = _TIMESTAMP[len(data)].unpack(data)
+            age_s: float = unix_s - seconds - nanoseconds * 1e-9
+            return age_s if 0.0 <= age_s <= OLDEST_S else 0.0
+    return 0.0

@@ -1,0 +1,215 @@
+"""The kernel tells telemetry from questions: on loopback with real sockets, its program in a machine of ours."""
+
+from __future__ import annotations
+
+import asyncio
+import select
+import socket
+import struct
+import time
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.links import telemetry_socket
+from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink_frames import may_wait
+from companion.links.mavlink_transport import run_transport
+from tests.unit.test_links_mavlink_transport import States, receive, udp_socket, until
+
+CODEC = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+HEARTBEAT: bytes = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(CODEC)
+TIMESYNC: bytes = mavlink.MAVLink_timesync_message(0, 77).pack(CODEC)
+ATTITUDE: bytes = mavlink.MAVLink_attitude_message(7, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0).pack(CODEC)
+IMU: bytes = mavlink.MAVLink_scaled_imu_message(1, 2, 3, -1000, 5, 6, 7, 8, 9, 10).pack(CODEC)
+ONE_CALL: bytes = mavlink.MAVLink_command_long_message(1, 191, 400, 0, *[0.0] * 7).pack(CODEC)
+CHUNKS = (HEARTBEAT, TIMESYNC, ATTITUDE, IMU, ONE_CALL, b"\xfd", b"", ATTITUDE[:9], bytes(20), b"\xfe" + ATTITUDE)
+
+
+@pytest.fixture
+def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
+    first = udp_socket()
+    second = telemetry_socket.beside(first)
+    if second is None:
+        pytest.skip("this kernel has no SO_ATTACH_REUSEPORT_CBPF")
+    yield first, second
+    first.close()
+    second.close()
+
+
+def run(program: list[telemetry_socket.Instruction], data: bytes) -> int:
+    """Classic BPF, by the kernel's Documentation/networking/filter.rst; beyond the end of the data it returns 0."""
+    a = x = 0
+    at = 0
+    while True:
+        code, true, false, k = program[at]
+        at += 1
+        try:
+            if code == 0x06:
+                return k
+            if code in (0x15, 0x1D):
+                at += true if a == (k if code == 0x15 else x) else false
+            elif code == 0x50:
+                a = data[x + k]
+            elif code == 0x48:
+                a = struct.unpack_from(">H", data, x + k)[0]
+            elif code == 0x80:
+                a = len(data)
+            elif code == 0x01:
+                x = k
+            elif code == 0x04:
+                a += k
+            elif code == 0x0C:
+                a += x
+            elif code == 0x07:
+                x = a
+            else:
+                raise AssertionError(code)
+        except (IndexError, struct.error):
+            return 0
+
+
+def test_every_jump_of_the_program_stays_in_it_and_fits_its_byte() -> None:
+    program = telemetry_socket.program()
+    assert len(program) <= 4096
+    for place, (code, true, false, _) in enumerate(program):
+        if code in (0x15, 0x1D):
+            assert max(true, false) < 256
+            assert place + 1 + max(true, false) < len(program)
+    assert program[-1][0] == 0x06
+
+
+@given(st.lists(st.sampled_from(CHUNKS), max_size=telemetry_socket.MOST_FRAMES).map(b"".join))
+def test_the_program_says_what_python_says(datagram: bytes) -> None:
+    assert run(telemetry_socket.program(), datagram) == may_wait(datagram)
+
+
+@given(st.binary(max_size=60), st.integers(0, len(ATTITUDE) - 1))
+def test_the_program_says_what_python_says_of_noise(noise: bytes, cut: int) -> None:
+    for datagram in (noise, ATTITUDE[:cut] + noise, ATTITUDE + noise):
+        assert run(telemetry_socket.program(), datagram) == may_wait(datagram)
+
+
+def test_more_frames_than_the_program_looks_at_are_no_telemetry() -> None:
+    most = telemetry_socket.MOST_FRAMES
+    assert run(telemetry_socket.program(), ATTITUDE * most) == 1
+    assert run(telemetry_socket.program(), ATTITUDE * (most + 1)) == 0
+
+
+@pytest.mark.parametrize(
+    ("datagram", "is_telemetry"),
+    [
+        (ATTITUDE, True),
+        (IMU + ATTITUDE, True),
+        (HEARTBEAT, False),
+        (TIMESYNC, False),
+        (ONE_CALL, False),
+        (ATTITUDE + ONE_CALL, False),
+        (ATTITUDE[:-1], False),
+        (b"", False),
+    ],
+)
+def test_the_kernel_gives_each_datagram_to_its_socket(
+    pair: tuple[socket.socket, socket.socket], datagram: bytes, is_telemetry: bool
+) -> None:
+    first, second = pair
+    with udp_socket() as peer:
+        peer.sendto(datagram, first.getsockname())
+        ready, _, _ = select.select(pair, [], [], 5.0)
+        assert ready == [second if is_telemetry else first]
+        if is_telemetry:
+            now_s = time.monotonic()
+            [(data, address, t_s)] = telemetry_socket.drain(second, now_s)
+            assert (data, address) == (datagram, peer.getsockname())
+            assert now_s - telemetry_socket.OLDEST_S <= t_s <= now_s
+            assert telemetry_socket.drain(second, now_s) == []
+
+
+def test_each_datagram_has_the_time_at_which_it_came(pair: tuple[socket.socket, socket.socket]) -> None:
+    first, second = pair
+    with udp_socket() as peer:
+        before_s = time.monotonic()
+        peer.sendto(ATTITUDE, first.getsockname())
+        select.select([second], [], [], 5.0)
+        after_s = time.monotonic()
+        while time.monotonic() < after_s + 0.02:
+            select.select([], [], [], 0.005)
+        [(_, _, t_s)] = telemetry_socket.drain(second, time.monotonic())
+        # The wall clock may be slewed a little meanwhile.
+        assert before_s - 1e-3 <= t_s <= after_s + 1e-3
+
+
+def test_a_wall_clock_that_was_set_meanwhile_dates_nothing(
+    pair: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = pair
+    for off_s in (-3600.0, 3600.0):
+        with udp_socket() as peer, monkeypatch.context() as patched:
+            peer.sendto(ATTITUDE, first.getsockname())
+            select.select([second], [], [], 5.0)
+            there_s = time.time() + off_s
+            patched.setattr(time, "time", lambda there_s=there_s: there_s)
+            assert [t_s for _, _, t_s in telemetry_socket.drain(second, 50.0)] == [50.0]
+
+
+def test_nobody_else_gets_the_port(pair: tuple[socket.socket, socket.socket]) -> None:
+    first, _ = pair
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other, pytest.raises(OSError, match="in use"):
+        other.bind(first.getsockname())
+
+
+def test_no_more_than_a_bounded_number_is_taken_at_once(
+    pair: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(telemetry_socket, "MOST_AT_ONCE", 3)
+    first, second = pair
+    with udp_socket() as peer:
+        for _ in range(4):
+            peer.sendto(ATTITUDE, first.getsockname())
+        select.select([second], [], [], 5.0)
+        assert [len(telemetry_socket.drain(second, 0.0)) for _ in range(3)] == [3, 1, 0]
+
+
+@pytest.mark.parametrize("kernel_can", [True, False])
+def test_a_listener_takes_telemetry_with_the_stream_and_questions_at_once(
+    monkeypatch: pytest.MonkeyPatch, kernel_can: bool
+) -> None:
+    if not kernel_can:
+        monkeypatch.setattr(telemetry_socket, "beside", lambda _: None)
+
+    async def main() -> None:
+        link, states = MavlinkLink(), States()
+        task = asyncio.create_task(run_transport(link, "udpin:127.0.0.1:0", on_state=states))
+        try:
+            await until(lambda: states.connected)
+            with udp_socket() as peer:
+                target = ("127.0.0.1", states.port)
+                peer.sendto(ATTITUDE, target)
+                await until(lambda: link.received["ATTITUDE"] == 1)
+                assert link.connected, "telemetry alone makes a peer known"
+                link.together.drive()
+                peer.sendto(ATTITUDE, target)
+                peer.sendto(HEARTBEAT, target)
+                await until(lambda: link.received["HEARTBEAT"] == 1)
+                assert link.received["ATTITUDE"] == 2, "what came before a question is taken before it"
+                peer.sendto(ATTITUDE, target)
+                await asyncio.sleep(0.05)
+                assert link.received["ATTITUDE"] == 2
+                link.together.rest()
+                assert link.received["ATTITUDE"] == 3
+                peer.sendto(ATTITUDE, target)
+                await until(lambda: link.received["ATTITUDE"] == 4)
+                assert link.send(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+                assert await receive(peer)
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+        with udp_socket(states.port):
+            pass  # both sockets are closed
+        link.together.drive()
+        link.together.take()
+
+    asyncio.run(main())
