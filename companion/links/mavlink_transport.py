@@ -208,9 +208,7 @@ class _Listener(_Udp):
 
     def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        endpoint = telemetry_socket.beside(transport.get_extra_info("socket"))
-        if endpoint is not None:
-            self._telemetry = _Telemetry(endpoint, self)
+        self._telemetry = _Telemetry(transport.get_extra_info("socket"), self)
 
     def connection_lost(self, exc: Exception | None) -> None:
         if self._telemetry is not None:
@@ -245,14 +243,18 @@ class _Listener(_Udp):
 
 
 class _Telemetry:
-    """The socket for telemetry beside a listener's own: read as it comes, or with a fast stream while there is one."""
+    """The socket for telemetry beside a listener's own, opened as soon as a fast stream drives: read with that."""
 
-    def __init__(self, endpoint: socket.socket, listener: _Listener) -> None:
-        self._endpoint, self._listener, self._link = endpoint, listener, listener.link
+    def __init__(self, beside: telemetry_socket.Endpoint, listener: _Listener) -> None:
+        self._beside, self._listener, self._link = beside, listener, listener.link
         self._loop = asyncio.get_running_loop()
+        self._endpoint: socket.socket | None = None
+        self._tried = False
         self._leave = self._link.together.join(self)
 
     def take(self) -> None:
+        if self._endpoint is None:
+            return
         heard: tuple[Any, ...] | None = None
         for data, peer, t_s in telemetry_socket.drain(self._endpoint, self._listener.now_s()):
             if peer != heard:
@@ -261,11 +263,18 @@ class _Telemetry:
             self._link.receive(data, t_s)
 
     def listen(self, *, at_once: bool) -> None:
+        if not at_once and not self._tried:
+            self._tried = True
+            self._endpoint = telemetry_socket.beside(self._beside)
+        if self._endpoint is None:
+            return
         if at_once:
             self._loop.add_reader(self._endpoint, self._link.together.take)
         else:
             self._loop.remove_reader(self._endpoint)
 
     def close(self) -> None:
+        self._tried = True
         self._leave()
-        self._endpoint.close()
+        if self._endpoint is not None:
+            self._endpoint.close()

@@ -177,8 +177,14 @@ def test_no_more_than_a_bounded_number_is_taken_at_once(
 def test_a_listener_takes_telemetry_with_the_stream_and_questions_at_once(
     monkeypatch: pytest.MonkeyPatch, kernel_can: bool
 ) -> None:
-    if not kernel_can:
-        monkeypatch.setattr(telemetry_socket, "beside", lambda _: None)
+    opened: list[socket.socket | None] = []
+
+    def beside(endpoint: socket.socket) -> socket.socket | None:
+        opened.append(real(endpoint) if kernel_can else None)
+        return opened[-1]
+
+    real = telemetry_socket.beside
+    monkeypatch.setattr(telemetry_socket, "beside", beside)
 
     async def main() -> None:
         link, states = MavlinkLink(), States()
@@ -189,8 +195,12 @@ def test_a_listener_takes_telemetry_with_the_stream_and_questions_at_once(
                 target = ("127.0.0.1", states.port)
                 peer.sendto(ATTITUDE, target)
                 await until(lambda: link.received["ATTITUDE"] == 1)
-                assert link.connected, "telemetry alone makes a peer known"
+                assert opened == [], "without a fast stream there is one socket"
                 link.together.drive()
+                link.together.rest()
+                link.together.drive()
+                assert len(opened) == 1
+                link.attach(None)
                 peer.sendto(ATTITUDE, target)
                 peer.sendto(HEARTBEAT, target)
                 await until(lambda: link.received["HEARTBEAT"] == 1)
@@ -200,6 +210,7 @@ def test_a_listener_takes_telemetry_with_the_stream_and_questions_at_once(
                 assert link.received["ATTITUDE"] == 2
                 link.together.rest()
                 assert link.received["ATTITUDE"] == 3
+                assert link.connected, "any datagram makes a peer known"
                 peer.sendto(ATTITUDE, target)
                 await until(lambda: link.received["ATTITUDE"] == 4)
                 assert link.send(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
