@@ -11,7 +11,6 @@ import asyncio
 import errno
 import logging
 import re
-import socket
 from collections.abc import Callable
 from typing import Any, Protocol, cast
 
@@ -243,20 +242,20 @@ class _Listener(_Udp):
 
 
 class _Telemetry:
-    """The socket for telemetry beside a listener's own, opened as soon as a fast stream drives: read with that."""
+    """The sockets beside a listener's own, opened as soon as a fast stream drives: telemetry is read with that."""
 
     def __init__(self, beside: telemetry_socket.Endpoint, listener: _Listener) -> None:
         self._beside, self._listener, self._link = beside, listener, listener.link
         self._loop = asyncio.get_running_loop()
-        self._endpoint: socket.socket | None = None
+        self._pair: telemetry_socket.Pair | None = None
         self._tried = False
         self._leave = self._link.together.join(self)
 
     def take(self) -> None:
-        if self._endpoint is None:
+        if self._pair is None:
             return
         heard: tuple[Any, ...] | None = None
-        for data, peer, t_s in telemetry_socket.drain(self._endpoint, self._listener.now_s()):
+        for data, peer, t_s in self._pair.drain(self._listener.now_s()):
             if peer != heard:
                 heard = peer
                 self._listener.hear(peer, t_s)
@@ -264,17 +263,25 @@ class _Telemetry:
 
     def listen(self, *, at_once: bool) -> None:
         if not at_once and not self._tried:
-            self._tried = True
-            self._endpoint = telemetry_socket.beside(self._beside)
-        if self._endpoint is None:
+            self._open()
+        if self._pair is None:
             return
         if at_once:
-            self._loop.add_reader(self._endpoint, self._link.together.take)
+            self._loop.add_reader(self._pair.telemetry, self._link.together.take)
         else:
-            self._loop.remove_reader(self._endpoint)
+            self._loop.remove_reader(self._pair.telemetry)
+
+    def _open(self) -> None:
+        self._tried = True
+        self._pair = telemetry_socket.beside(self._beside)
+        if self._pair is not None:
+            self._loop.add_reader(self._pair.questions, self._link.together.take)
+            for data, peer in telemetry_socket.left_in(self._beside):
+                self._listener.datagram_received(data, peer)
 
     def close(self) -> None:
         self._tried = True
         self._leave()
-        if self._endpoint is not None:
-            self._endpoint.close()
+        if self._pair is not None:
+            self._loop.remove_reader(self._pair.questions)
+            self._pair.close()

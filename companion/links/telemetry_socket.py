@@ -1,10 +1,11 @@
-"""A second socket on a UDP port, to which the kernel gives the autopilot's streams of telemetry and nothing else.
+"""Two more sockets on a UDP port: to one the kernel gives the autopilot's streams of telemetry, to one all else.
 
 Half of what an asyncio program spends on 200 small datagrams a second is waking up for each. Telemetry may wait for the
 next turn that has something to do anyway, a question may not; so the kernel tells them apart, before anybody wakes up:
-both sockets are bound to the port (SO_REUSEPORT), and a classic BPF program chooses one of them for each datagram
-(SO_ATTACH_REUSEPORT_CBPF, Linux 4.5; socket(7)). Each datagram of telemetry has the kernel's time of its arrival
-(SO_TIMESTAMPNS), so that it loses nothing by waiting.
+several sockets are bound to the port (SO_REUSEPORT), and a classic BPF program chooses one of them for each datagram
+(SO_ATTACH_REUSEPORT_CBPF, Linux 4.5; socket(7)). Each datagram has the kernel's time of its arrival (SO_TIMESTAMPNS),
+so that it loses nothing by waiting, and so that both sockets together are read in the order in which all came: who sees
+an autopilot's clock go back thinks that it has restarted.
 
 The program says "telemetry" of a datagram that holds one to `MOST_FRAMES` whole unsigned frames of MAVLink 2, all of
 them streams by their message id: the same as `mavlink_frames.may_wait`.
@@ -14,11 +15,14 @@ from __future__ import annotations
 
 import array
 import errno
+import heapq
 import logging
+import os
 import socket
 import struct
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from operator import itemgetter
 from typing import Any, Final, Protocol
 
 from companion.links.mavlink_frames import CHECKSUM_BYTES, HEADER_BYTES, MARKER, STREAMS
@@ -26,10 +30,12 @@ from companion.links.mavlink_frames import CHECKSUM_BYTES, HEADER_BYTES, MARKER,
 logger = logging.getLogger(__name__)
 
 MOST_FRAMES: Final = 4
-MOST_BYTES: Final = 2048
-"""Of a datagram of telemetry: a frame has 280 bytes at most."""
-MOST_AT_ONCE: Final = 256
-"""Datagrams that are taken in one turn; the rest waits in the kernel, which bounds it."""
+MOST_BYTES: Final = 65536
+"""UDP carries no more."""
+TELEMETRY_BYTES: Final = 2048
+"""`MOST_FRAMES` of 280 bytes at most have room in it; less is got from the kernel, and given back, for each."""
+MOST_AT_ONCE: Final = 2048
+"""Datagrams that are taken in one turn: several times what a socket has room for."""
 OLDEST_S: Final = 0.1
 """What seems to have waited longer, or not yet to have come, was stamped by a clock that has been set meanwhile."""
 
@@ -38,6 +44,7 @@ _SO_TIMESTAMPNS: Final = 35
 _SO_ATTACH_REUSEPORT_CBPF: Final = 51
 _TIMESTAMP: Final = {16: struct.Struct("qq"), 8: struct.Struct("ii")}
 """struct timespec by its length."""
+_EXTRA_BYTES: Final = 64
 
 # <linux/bpf_common.h>
 _LOAD_BYTE: Final = 0x50  # BPF_LD | BPF_B | BPF_IND: A = payload[X + k]
@@ -50,8 +57,8 @@ _ADD: Final = 0x04  # BPF_ALU | BPF_ADD | BPF_K
 _ADD_X: Final = 0x0C  # BPF_ALU | BPF_ADD | BPF_X
 _TO_X: Final = 0x07  # BPF_MISC | BPF_TAX: X = A
 _RETURN: Final = 0x06  # BPF_RET | BPF_K
-_FIRST, _SECOND = 0, 1
-"""Which socket of the port: in the order in which they were bound. Reading beyond the end returns 0 as well."""
+CUT_SHORT, QUESTIONS, TELEMETRY = 0, 1, 2
+"""Which socket of the port, in the order in which they were bound. Reading beyond a datagram's end returns 0."""
 
 Address = tuple[Any, ...]
 Instruction = tuple[int, int, int, int]
@@ -65,6 +72,9 @@ class Endpoint(Protocol):
     def family(self) -> int:
         """Of its addresses."""
 
+    def fileno(self) -> int:
+        """Its descriptor."""
+
     def getsockname(self) -> Any:
         """Its own address."""
 
@@ -73,7 +83,7 @@ class Endpoint(Protocol):
 
 
 def program(streams: Iterable[int] = STREAMS, frames: int = MOST_FRAMES) -> list[Instruction]:
-    """Classic BPF that returns 1 for a datagram of whole frames of these messages, and 0 for any other."""
+    """Classic BPF that says which socket gets a datagram; the first gets only what is cut short in a header."""
     # The two low bytes of the id, as they stand in the frame; the third must be 0.
     ids = sorted(struct.unpack(">H", struct.pack("<H", number))[0] for number in streams if number < 1 << 16)
     made: list[Instruction] = [(_LOAD_X, 0, 0, 0)]
@@ -89,60 +99,98 @@ def program(streams: Iterable[int] = STREAMS, frames: int = MOST_FRAMES) -> list
             (_EQUAL, 0, refuse + 1, 0),
             (_LOAD_HALF, 0, 0, 7),
             *known,
-            (_RETURN, 0, 0, _FIRST),
+            (_RETURN, 0, 0, QUESTIONS),
             (_LOAD_BYTE, 0, 0, 1),
             (_ADD, 0, 0, HEADER_BYTES + CHECKSUM_BYTES),
             (_ADD_X, 0, 0, 0),
             (_TO_X, 0, 0, 0),
             (_LOAD_LENGTH, 0, 0, 0),
             (_EQUAL_X, 0, 1, 0),
-            (_RETURN, 0, 0, _SECOND),
+            (_RETURN, 0, 0, TELEMETRY),
         ]
-    return [*made, (_RETURN, 0, 0, _FIRST)]
+    return [*made, (_RETURN, 0, 0, QUESTIONS)]
 
 
-def beside(endpoint: Endpoint) -> socket.socket | None:
-    """Open the socket for telemetry beside a bound one; None where the kernel cannot, or must not.
+def beside(endpoint: Endpoint) -> Pair | None:
+    """Open the two sockets beside a bound one; None where the kernel cannot.
 
     The first has been bound without SO_REUSEPORT, so nobody else has the port: two daemons do not share one unawares.
     """
     code = array.array("B", b"".join(struct.pack("HBBI", *each) for each in program()))
     address, _ = code.buffer_info()
     option = struct.pack("HP", len(code) // 8, address)
-    made = socket.socket(endpoint.family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+    made: list[socket.socket] = []
     try:
-        made.settimeout(0.0)
-        made.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-        made.bind(endpoint.getsockname())
-        made.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_REUSEPORT_CBPF, option)
+        for _ in (QUESTIONS, TELEMETRY):
+            made.append(socket.socket(endpoint.family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC))
+            made[-1].settimeout(0.0)
+            made[-1].setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            made[-1].setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+            made[-1].bind(endpoint.getsockname())
+        made[-1].setsockopt(socket.SOL_SOCKET, _SO_ATTACH_REUSEPORT_CBPF, option)
     except (OSError, AttributeError) as error:
         logger.debug("mavlink: telemetry and questions share one socket: %s", error)
-        made.close()
+        for each in made:
+            each.close()
         return None
-    return made
+    return Pair(*made)
 
 
-def drain(endpoint: socket.socket, now_s: float) -> list[tuple[bytes, Address, float]]:
-    """What has come: datagrams, who sent each, and when it came by the clock of `now_s`."""
-    found: list[tuple[bytes, Address, float]] = []
-    unix_s = time.time()
-    try:
-        while len(found) < MOST_AT_ONCE:
-            data, extra, _, peer = endpoint.recvmsg(MOST_BYTES, 64)
-            found.append((data, peer, now_s - _age_s(extra, unix_s)))
-    except BlockingIOError:
-        pass
-    except OSError as error:
-        logger.debug("mavlink: telemetry: %s", errno.errorcode.get(error.errno or 0, error))
+def left_in(endpoint: Endpoint) -> list[tuple[bytes, Address]]:
+    """What had come to a socket before there were others: a busy loop must not get to it behind what they bring."""
+    found: list[tuple[bytes, Address]] = []
+    with socket.socket(fileno=os.dup(endpoint.fileno())) as same:
+        try:
+            while len(found) < MOST_AT_ONCE:
+                found.append(same.recvfrom(MOST_BYTES))
+        except BlockingIOError:
+            pass
+        except OSError as error:
+            logger.debug("mavlink: %s", errno.errorcode.get(error.errno or 0, error))
     return found
 
 
-def _age_s(extra: list[tuple[int, int, bytes]], unix_s: float) -> float:
+class Pair:
+    """The two sockets, read in the order in which all their datagrams came."""
+
+    def __init__(self, questions: socket.socket, telemetry: socket.socket) -> None:
+        self.questions, self.telemetry = questions, telemetry
+
+    def drain(self, now_s: float) -> Iterator[tuple[bytes, Address, float]]:
+        """What has come: datagrams, who sent each, and when it came by the clock of `now_s`."""
+        unix_s = time.time()
+        # Telemetry last: what came before a question that is found is found as well.
+        questions = _waiting(self.questions, MOST_BYTES, unix_s)
+        telemetry = _waiting(self.telemetry, TELEMETRY_BYTES, unix_s)
+        for came_s, data, peer in heapq.merge(questions, telemetry, key=itemgetter(0)):
+            age_s = unix_s - came_s
+            yield data, peer, now_s - age_s if 0.0 <= age_s <= OLDEST_S else now_s
+
+    def close(self) -> None:
+        """Close both."""
+        self.questions.close()
+        self.telemetry.close()
+
+
+def _waiting(endpoint: socket.socket, room: int, unix_s: float) -> list[tuple[float, bytes, Address]]:
+    """Datagrams with the kernel's time of their arrival; `unix_s` where it has none."""
+    found: list[tuple[float, bytes, Address]] = []
+    try:
+        while len(found) < MOST_AT_ONCE:
+            data, extra, _, peer = endpoint.recvmsg(room, _EXTRA_BYTES)
+            found.append((_stamp_s(extra, unix_s), data, peer))
+    except BlockingIOError:
+        pass
+    except OSError as error:
+        logger.debug("mavlink: %s", errno.errorcode.get(error.errno or 0, error))
+    return found
+
+
+def _stamp_s(extra: list[tuple[int, int, bytes]], otherwise_s: float) -> float:
     for level, kind, data in extra:
         if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS and len(data) in _TIMESTAMP:
             seconds, nanoseconds = _TIMESTAMP[len(data)].unpack(data)
-            age_s: float = unix_s - seconds - nanoseconds * 1e-9
-            return age_s if 0.0 <= age_s <= OLDEST_S else 0.0
-    return 0.0
+            stamp_s: float = seconds + nanoseconds * 1e-9
+            return stamp_s
+    return otherwise_s
