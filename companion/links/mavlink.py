@@ -14,7 +14,7 @@ from typing import Literal, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.links.mavlink_frames import Codec, kind_at, may_wait, read
+from companion.links.mavlink_frames import Codec, goes_ahead, kind_at, may_wait, read
 from companion.links.mavlink_signing import Signing
 from companion.links.together import Together
 
@@ -120,14 +120,15 @@ class MavlinkLink:
     def arrived(self, datagram: bytes, t_s: float) -> None:
         """As `receive`, of a datagram; streams of telemetry are taken with the next read of a fast stream.
 
-        Whatever else comes is taken at once, behind what waits.
+        Whatever else comes is taken at once, behind what waits; some of what is asked of us ahead of it.
         """
         together = self.together
         if together.driven and may_wait(datagram):
             together.put(self.receive, datagram, t_s)
-        else:
+            return
+        if not (together.driven and goes_ahead(datagram)):
             together.take()
-            self.receive(datagram, t_s)
+        self.receive(datagram, t_s)
 
     def receive(self, data: bytes, t_s: float) -> None:
         """Take bytes that arrived at `t_s` (monotonic); never raises, whatever they are."""

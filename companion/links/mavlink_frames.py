@@ -69,6 +69,11 @@ STREAMS: Final = frozenset(
     }
 )
 """Sent again and again, each the successor of the one before: nobody asks something with them or waits for one."""
+AHEAD: Final = frozenset(
+    {mavlink.MAVLINK_MSG_ID_TIMESYNC, mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT}
+)
+"""Asked of us, and answered from what is known anyway, ahead of telemetry that waits. Not so parameters, heartbeats and
+answers: what was measured before them was measured under other offsets, or before arming."""
 _C_CRC: Final[Callable[[bytes, int], int] | None] = getattr(mavlink, "mcrf4xx", None)
 """"CRC-16/MCRF4XX" in C, where pymavlink has found it."""
 
@@ -79,11 +84,20 @@ def _crc(data: bytes) -> int:
 
 def may_wait(datagram: bytes) -> bool:
     """Whether there are whole unsigned frames of streams in it and nothing else; nobody has checked their sums."""
+    return _holds_only(datagram, STREAMS)
+
+
+def goes_ahead(datagram: bytes) -> bool:
+    """Whether there are such frames of `AHEAD` in it and nothing else."""
+    return _holds_only(datagram, AHEAD)
+
+
+def _holds_only(datagram: bytes, numbers: frozenset[int]) -> bool:
     at, size = 0, len(datagram)
     while size - at >= HEADER_BYTES + CHECKSUM_BYTES:
         if datagram[at] != MARKER or datagram[at + 2]:
             return False
-        if datagram[at + 7] | datagram[at + 8] << 8 | datagram[at + 9] << 16 not in STREAMS:
+        if datagram[at + 7] | datagram[at + 8] << 8 | datagram[at + 9] << 16 not in numbers:
             return False
         at += HEADER_BYTES + datagram[at + 1] + CHECKSUM_BYTES
     return 0 < at == size

@@ -11,7 +11,7 @@ import asyncio
 import errno
 import logging
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Protocol, cast
 
 from companion.errors import LinkError
@@ -252,10 +252,21 @@ class _Telemetry:
         self._leave = self._link.together.join(self)
 
     def take(self) -> None:
-        if self._pair is None:
-            return
+        if self._pair is not None:
+            self._receive(self._pair.drain(self._listener.now_s()))
+
+    def _asked(self) -> None:
+        """Questions have come: answer them ahead of telemetry where that may be, else behind it."""
+        assert self._pair is not None
+        together = self._link.together
+        if together.driven and (asked := self._pair.ahead(self._listener.now_s())):
+            self._receive(asked)
+        else:
+            together.take()
+
+    def _receive(self, datagrams: Iterable[tuple[bytes, tuple[Any, ...], float]]) -> None:
         heard: tuple[Any, ...] | None = None
-        for data, peer, t_s in self._pair.drain(self._listener.now_s()):
+        for data, peer, t_s in datagrams:
             if peer != heard:
                 heard = peer
                 self._listener.hear(peer, t_s)
@@ -275,7 +286,7 @@ class _Telemetry:
         self._tried = True
         self._pair = telemetry_socket.beside(self._beside)
         if self._pair is not None:
-            self._loop.add_reader(self._pair.questions, self._link.together.take)
+            self._loop.add_reader(self._pair.questions, self._asked)
             for data, peer in telemetry_socket.left_in(self._beside):
                 self._listener.datagram_received(data, peer)
 

@@ -25,7 +25,7 @@ from collections.abc import Iterable, Iterator
 from operator import itemgetter
 from typing import Any, Final, Protocol
 
-from companion.links.mavlink_frames import CHECKSUM_BYTES, HEADER_BYTES, MARKER, STREAMS
+from companion.links.mavlink_frames import CHECKSUM_BYTES, HEADER_BYTES, MARKER, STREAMS, goes_ahead
 
 logger = logging.getLogger(__name__)
 
@@ -61,6 +61,8 @@ CUT_SHORT, QUESTIONS, TELEMETRY = 0, 1, 2
 """Which socket of the port, in the order in which they were bound. Reading beyond a datagram's end returns 0."""
 
 Address = tuple[Any, ...]
+_Datagram = tuple[float, bytes, Address]
+"""With the time at which it came, by the wall clock."""
 Instruction = tuple[int, int, int, int]
 """Code, jump if true, jump if false, k (struct sock_filter)."""
 
@@ -156,16 +158,30 @@ class Pair:
 
     def __init__(self, questions: socket.socket, telemetry: socket.socket) -> None:
         self.questions, self.telemetry = questions, telemetry
+        self._asked: list[_Datagram] = []
+        """Questions that have been read and wait for what came before them."""
+
+    def ahead(self, now_s: float) -> list[tuple[bytes, Address, float]]:
+        """The questions that have come, where each of them may be answered ahead of telemetry; else nothing.
+
+        Those that may not come by `drain`.
+        """
+        unix_s = time.time()
+        self._asked += _waiting(self.questions, MOST_BYTES, unix_s)
+        if not all(goes_ahead(data) for _, data, _ in self._asked):
+            return []
+        asked, self._asked = self._asked, []
+        return [_dated(each, unix_s, now_s) for each in asked]
 
     def drain(self, now_s: float) -> Iterator[tuple[bytes, Address, float]]:
         """What has come: datagrams, who sent each, and when it came by the clock of `now_s`."""
         unix_s = time.time()
         # Telemetry last: what came before a question that is found is found as well.
-        questions = _waiting(self.questions, MOST_BYTES, unix_s)
+        questions = self._asked + _waiting(self.questions, MOST_BYTES, unix_s)
+        self._asked = []
         telemetry = _waiting(self.telemetry, TELEMETRY_BYTES, unix_s)
-        for came_s, data, peer in heapq.merge(questions, telemetry, key=itemgetter(0)):
-            age_s = unix_s - came_s
-            yield data, peer, now_s - age_s if 0.0 <= age_s <= OLDEST_S else now_s
+        for each in heapq.merge(questions, telemetry, key=itemgetter(0)):
+            yield _dated(each, unix_s, now_s)
 
     def close(self) -> None:
         """Close both."""
@@ -173,9 +189,15 @@ class Pair:
         self.telemetry.close()
 
 
-def _waiting(endpoint: socket.socket, room: int, unix_s: float) -> list[tuple[float, bytes, Address]]:
+def _dated(datagram: _Datagram, unix_s: float, now_s: float) -> tuple[bytes, Address, float]:
+    came_s, data, peer = datagram
+    age_s = unix_s - came_s
+    return data, peer, now_s - age_s if 0.0 <= age_s <= OLDEST_S else now_s
+
+
+def _waiting(endpoint: socket.socket, room: int, unix_s: float) -> list[_Datagram]:
     """Datagrams with the kernel's time of their arrival; `unix_s` where it has none."""
-    found: list[tuple[float, bytes, Address]] = []
+    found: list[_Datagram] = []
     try:
         while len(found) < MOST_AT_ONCE:
             data, extra, _, peer = endpoint.recvmsg(room, _EXTRA_BYTES)

@@ -173,6 +173,21 @@ def test_both_sockets_together_are_read_in_the_order_in_which_all_came(port: Por
         assert [data for data, _, _ in port.pair.drain(50.0)] == sent
 
 
+@pytest.mark.parametrize(("questions", "go_ahead"), [((TIMESYNC, ONE_CALL), True), ((TIMESYNC, HEARTBEAT), False)])
+def test_questions_go_ahead_of_telemetry_only_where_all_of_them_may(
+    port: Port, questions: tuple[bytes, bytes], go_ahead: bool
+) -> None:
+    first, second = questions
+    with udp_socket() as peer:
+        for datagram in (ATTITUDE, first, IMU, second):
+            peer.sendto(datagram, port.address)
+        port.wait(port.pair.questions)
+        assert [data for data, _, _ in port.pair.ahead(50.0)] == ([first, second] if go_ahead else [])
+        left = [ATTITUDE, IMU] if go_ahead else [ATTITUDE, first, IMU, second]
+        assert [data for data, _, _ in port.pair.drain(50.0)] == left
+        assert list(port.pair.drain(50.0)) == []
+
+
 def test_a_wall_clock_that_was_set_meanwhile_dates_nothing(port: Port, monkeypatch: pytest.MonkeyPatch) -> None:
     for off_s in (-3600.0, 3600.0):
         with udp_socket() as peer, monkeypatch.context() as patched:
@@ -242,6 +257,9 @@ def test_a_listener_takes_telemetry_with_the_stream_and_questions_at_once(
                 peer.sendto(ATTITUDE, target)
                 await asyncio.sleep(0.05)
                 assert link.received["ATTITUDE"] == 2
+                peer.sendto(TIMESYNC, target)
+                await until(lambda: link.received["TIMESYNC"] == 1)
+                assert link.received["ATTITUDE"] == 2, "answered ahead of what waits"
                 link.together.rest()
                 assert link.received["ATTITUDE"] == 3
                 assert link.connected, "any datagram makes a peer known"

@@ -242,7 +242,7 @@ class TestMavlink:
         got = self.heard(link)
         link.together.drive()
         link.arrived(attitude(1), 5.001)
-        question: bytes = mavlink.MAVLink_timesync_message(0, 77).pack(codec())
+        question = heartbeat()
         link.arrived(
             {"alone": b"", "before telemetry": b"", "behind telemetry": attitude(2)}[place]
             + question
@@ -250,7 +250,17 @@ class TestMavlink:
             5.002,
         )
         assert got[0] == ("ATTITUDE", 5.001)
-        assert ("TIMESYNC", 5.002) in got
+        assert ("HEARTBEAT", 5.002) in got
+
+    def test_what_is_asked_of_us_goes_ahead_of_telemetry_that_waits(self) -> None:
+        link = MavlinkLink()
+        got = self.heard(link)
+        link.together.drive()
+        link.arrived(attitude(1), 5.001)
+        link.arrived(mavlink.MAVLink_timesync_message(0, 77).pack(codec()), 5.002)
+        assert got == [("TIMESYNC", 5.002)]
+        link.together.take()
+        assert got == [("TIMESYNC", 5.002), ("ATTITUDE", 5.001)]
 
     @pytest.mark.parametrize("damage", ["cut", "noise behind", "signed", "version 1", "empty"])
     def test_what_is_not_whole_plain_frames_is_not_kept_waiting(self, damage: str) -> None:
