@@ -285,6 +285,19 @@ class AttitudeEstimator:
         innovation = innovation_of_field(field_frd, multiply(found, self._sensor_from_vehicle), declination_rad)
         return innovation is not None and self._turn(t_s, innovation, sigma_rad)
 
+    def kept_at(self, t_s: float) -> tuple[float, Quaternion] | None:
+        """What is remembered of the attitude then, body to NED, by the present opinion of level and north.
+
+        With the instant, up to a stretch before, of which it is; None when nothing of then is.
+        """
+        if not self.aligned:
+            return None
+        for then_s, orientation in reversed(self._history):
+            if then_s <= t_s:
+                turn = multiply(multiply(self._leveller.ned_from_e, orientation), self._sensor_from_vehicle)
+                return then_s, turn
+        return None
+
     def _sensor_to_ned_at(self, t_s: float) -> Quaternion | None:
         """The orientation then, by the leveller's present opinion; None when it is not remembered."""
         if not self.aligned:

@@ -136,8 +136,15 @@ class Uncertainty:
     def attitude_terms(self) -> tuple[float, float, float, float]:
         """Of `attitude`: about north, about east, the two together, about down."""
         if self._terms is None:
-            found = self.attitude
-            self._terms = (float(found[0, 0]), float(found[1, 1]), float(found[0, 1]), float(found[2, 2]))
+            value = self._covariance.item
+            level = self._levelled**2 * self._level_variance
+            about_north, about_east, about_down = (SCALE_SHARE * turned for turned in self._turned.tolist())
+            self._terms = (
+                value(0, 0) + level + about_north**2,
+                value(1, 1) + level + about_east**2,
+                value(0, 1),
+                value(2, 2) + about_down**2,
+            )
         return self._terms
 
     @property

@@ -15,6 +15,7 @@ from companion.daemon.serial_devices import Role, SerialDevice, parts_of
 from companion.links.budget import Budget
 from companion.links.bytestream import ByteLink, PortSettings
 from companion.links.ports import find_holders
+from companion.links.together import Together
 from companion.protocols.registry import Kind
 from companion.protocols.roles import Part
 from companion.protocols.stream_health import SILENT_AFTER_S
@@ -111,6 +112,7 @@ class SerialSensor:
         take: gets what each role takes of each sample.
         offload: runs a blocking call elsewhere.
         take_many: gets, instead, what an IMU's role takes of a read that brought nothing but readings of an IMU.
+        together: waits for the reads of an IMU that is read at intervals.
     """
 
     def __init__(
@@ -119,6 +121,7 @@ class SerialSensor:
         take: Callable[[Role, Part], None],
         offload: Offload = asyncio.to_thread,
         take_many: Callable[[Role, Sequence[ImuSample]], None] | None = None,
+        together: Together | None = None,
     ) -> None:
         settings = PortSettings(device.port, device.baud, device.parity)
         self.device = device
@@ -128,16 +131,21 @@ class SerialSensor:
         # Whoever is only read is not even thought about: without a dialogue there is nothing that could be sent.
         self.dialogue = None if device.read_only or device.info.dialogue is None else device.info.dialogue()
         name = ", ".join(role.name for role in device.roles)
-        self.link = ByteLink(settings, self.receive, name=name, on_state=self._on_state, budget=Budget())
-        self.link.on_gap = self._on_gap
         self.kinds = frozenset(role.kind for role in device.roles)
+        # Only an IMU: where none of our own is fast, the autopilot's may be what the attitude is carried with.
+        driven = together if "imu" in self.kinds else None
+        self.link = ByteLink(
+            settings, self._arrived, name=name, on_state=self._on_state, budget=Budget(), together=driven
+        )
+        self.link.on_gap = self._on_gap
+        self._together = Together() if together is None else together
         self.health = SensorHealth(
             self.link, device.roles[0].kind, self.protocol, self.decoder, polled=self.dialogue is not None
         )
         self.tap: Callable[[str, bytes | None, float], object] | None = None
         """Called with (name, bytes, time) before they are decoded; without bytes: some are missing."""
-        self.on_samples: Callable[[Sequence[Sample]], object] | None = None
-        """Called with all samples of a read before anybody else gets them: for what must not wait."""
+        self.on_samples: Callable[[Sequence[Sample], float], object] | None = None
+        """Called with all samples of a read, and its time, before anybody else gets them: for what must not wait."""
         self._take, self._offload, self._take_many = take, offload, take_many
         self._by_role = dict(zip(device.roles, self.roles, strict=True))
         self.other_north: str | None = None
@@ -162,6 +170,7 @@ class SerialSensor:
 
     def _on_state(self, connected: bool, reason: str) -> None:  # noqa: FBT001 - ByteLink's signature
         del reason
+        self._together.take()
         if connected:
             now_s = asyncio.get_running_loop().time()
             if self.tap is not None:
@@ -175,9 +184,24 @@ class SerialSensor:
 
     def _on_gap(self) -> None:
         """Bytes are missing from here on."""
+        self._together.take()
         if self.tap is not None:
             self.tap(self.name, None, asyncio.get_running_loop().time())
         self.decoder.interrupted()
+
+    def _arrived(self, data: bytes, t_s: float) -> None:
+        """Take bytes that were read at `t_s`: with the next read of a fast stream, unless it is this one's."""
+        if self.link.collecting:
+            self.receive(data, t_s)
+        elif self._is_lively(t_s):
+            self._together.take()
+            self.receive(data, t_s)
+        else:
+            self._together.put(self.receive, data, t_s)
+
+    def _is_lively(self, t_s: float) -> bool:
+        """Whether a conversation with it goes on, in which the answer to each word is waited for."""
+        return t_s - self._spoke_s < LIVELY_S
 
     def receive(self, data: bytes, t_s: float) -> None:
         """Take bytes that were read at `t_s`."""
@@ -185,7 +209,7 @@ class SerialSensor:
             self.tap(self.name, data, t_s)
         samples = self.decoder.receive(data, t_s)
         if samples and self.on_samples is not None:
-            self.on_samples(samples)
+            self.on_samples(samples, t_s)
         if (breaks := self.decoder.times.clock.breaks) != self._breaks:
             self._breaks = breaks
             logger.warning("%s: the device restarted, or its clock jumped; measuring afresh", self.link.name)
@@ -212,7 +236,10 @@ class SerialSensor:
         """Ask what is due: often while a conversation goes on, seldom otherwise, so that a stream costs no ticks."""
         loop = asyncio.get_running_loop()
         while True:
-            await asyncio.sleep(TICK_S if loop.time() - self._spoke_s < LIVELY_S else COARSE_S)
+            if self._is_lively(loop.time()):
+                await asyncio.sleep(TICK_S)
+            else:
+                await self._together.sleep(COARSE_S)
             if self.link.connected and loop.time() >= self._look_at_s:
                 await self._look_for_others()
             self._speak(loop.time())

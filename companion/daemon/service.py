@@ -108,7 +108,10 @@ class Service:
         self.slots = SlotMemory()
         self._imu_rate_hz = models.imu_rate_hz(config) if imu_rate_hz is None else imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
-        self.sensors = [SerialSensor(device, self._take, offload, self._take_many) for device in serial_devices(config)]
+        self.sensors = [
+            SerialSensor(device, self._take, offload, self._take_many, self.link.together)
+            for device in serial_devices(config)
+        ]
         self.sensor_watch = SensorWatch(self.sensors, self.collector, self._corrected, self._say)
         self.recorder = Recorder(
             config, self.collector, self.link, self.vehicle, self.imus.values(), self.sensors, offload
@@ -175,6 +178,7 @@ class Service:
         self.alignment.on_change = self.in_force.realigned
         self.readiness = Readiness(self.vehicle, self.collector, self.conductor, self.mender, self.in_force)
         self.readiness.reboot_owed = lambda: reboot.owed
+        self.readiness.pause = self.link.together.sleep
         self.automatic = Automatic(
             self.vehicle,
             self.collector,

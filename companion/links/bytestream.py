@@ -10,7 +10,6 @@ import asyncio
 import errno
 import logging
 import os
-import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -20,6 +19,8 @@ from companion.errors import LinkError
 from companion.links.backoff import Backoff
 from companion.links.budget import Budget
 from companion.links.serial_port import SerialOpener, close_serial
+from companion.links.tcp import connect_tcp, words_of
+from companion.links.together import Together
 
 logger = logging.getLogger(__name__)
 
@@ -40,8 +41,6 @@ FULLEST_LINE = 0.9
 """Of a line's time, where its stream may be collected."""
 OUT_BUFFER_BYTES = 16384
 """Over a second at 115200 baud; what waits longer than that is better dropped than sent."""
-CONNECT_DEADLINE_S = 2.0
-"""The kernel asks at once and after a second; a host that has come back is asked again within 2 s of that."""
 LONGEST_PAUSE_S = 1.0
 """Between two attempts: whatever has come back is open again within 3 s, the opening itself included."""
 BEAT_S = 1.0
@@ -108,11 +107,14 @@ class ByteLink:
         name: str,
         on_state: Callable[[bool, str], None] | None = None,
         budget: Budget | None = None,
+        together: Together | None = None,
     ) -> None:
         self.settings = settings
         self.name = name
         self.budget = budget
         """How much is taken in; None: whatever comes. What comes beyond it is thrown away unread."""
+        self.together = together
+        """What waits for the next read, whenever this stream is collected; None: nothing."""
         self.on_gap: Callable[[], None] = lambda: None
         """Called when bytes were thrown away between the last ones and the next ones."""
         self.last_error = ""
@@ -149,6 +151,11 @@ class ByteLink:
     def connected(self) -> bool:
         """Whether the port is open; says nothing of a device that keeps silent."""
         return self._descriptor is not None
+
+    @property
+    def collecting(self) -> bool:
+        """Whether it is read at intervals, since its every byte would wake the loop."""
+        return self._collecting is not None
 
     @property
     def latency_timer_ms(self) -> int | None:
@@ -208,7 +215,7 @@ class ByteLink:
 
     async def _open(self) -> int:
         if self.settings.is_tcp:
-            return await _connect_tcp(self.settings)
+            return await connect_tcp(self.settings.url, self.settings.address())
         return await self._opener.open()
 
     def _attach(self, loop: asyncio.AbstractEventLoop, descriptor: int) -> None:
@@ -232,25 +239,35 @@ class ByteLink:
         if self._reads == QUICK_READS:
             if now_s - self._reads_since[0] < QUICK_READS * QUICK_S and self._fits_the_line(now_s):
                 loop.remove_reader(self._descriptor)
-                self._collecting = loop.call_later(COLLECT_S, self._collected)
+                self._collecting = loop.call_at(now_s + COLLECT_S, self._collected)
+                if self.together is not None:
+                    self.together.drive()
             self._reads, self._turns, self._reads_since = 0, 0, (now_s, self.bytes_received)
 
     def _collected(self) -> None:
         """Read what has come in the meantime; where that is little, let the next byte wake the loop again."""
         loop = asyncio.get_running_loop()
         now_s = loop.time()
-        self._collecting = None
+        # First of all: whatever happens in this turn, there will be another.
+        self._collecting = loop.call_at(now_s + COLLECT_S, self._collected)
         self._turns += 1
+        if self.together is not None:
+            self.together.turn(now_s)  # what waits came before what is read now
         self._reads += self._read(now_s)
-        if self._descriptor is None or self._paused is not None:
+        if self._descriptor is None or self._paused is not None or now_s - self._reads_since[0] < JUDGED_S:
             return
-        if now_s - self._reads_since[0] >= JUDGED_S:
-            goes_on = 2 * self._reads > self._turns and self._fits_the_line(now_s)
-            self._reads, self._turns, self._reads_since = 0, 0, (now_s, self.bytes_received)
-            if not goes_on:
-                loop.add_reader(self._descriptor, self._readable)
-                return
-        self._collecting = loop.call_later(COLLECT_S, self._collected)
+        goes_on = 2 * self._reads > self._turns and self._fits_the_line(now_s)
+        self._reads, self._turns, self._reads_since = 0, 0, (now_s, self.bytes_received)
+        if not goes_on:
+            self._stop_collecting()
+            loop.add_reader(self._descriptor, self._readable)
+
+    def _stop_collecting(self) -> None:
+        if self._collecting is not None:
+            self._collecting.cancel()
+            self._collecting = None
+            if self.together is not None:
+                self.together.rest()
 
     def _fits_the_line(self, now_s: float) -> bool:
         """Whether the line, as it is set, could have carried what came since `_reads_since`.
@@ -287,6 +304,7 @@ class ByteLink:
         """Leave the port alone for a moment: whatever it sends, the others on this loop have their turn."""
         loop = asyncio.get_running_loop()
         assert self._descriptor is not None
+        self._stop_collecting()
         loop.remove_reader(self._descriptor)
         self._paused = loop.call_later(FLOOD_PAUSE_S, self._resume)
 
@@ -328,10 +346,10 @@ class ByteLink:
         """What a failed read or write means; None for a read that brought no bytes."""
         url = self.settings.url
         if self.settings.is_tcp:
-            return f"{url}: {'the other side closed the connection' if error is None else _words(error)}"
+            return f"{url}: {'the other side closed the connection' if error is None else words_of(error)}"
         if error is None or error.errno in (errno.EIO, errno.ENXIO, errno.ENODEV):
             return f"{url}: the device is gone; unplugged?"
-        return f"{url}: {_words(error)}"
+        return f"{url}: {words_of(error)}"
 
     def _lose(self, reason: str) -> None:
         # At once, not when `run` gets to it: while a dead descriptor is open, the device comes back under another name.
@@ -342,9 +360,7 @@ class ByteLink:
     def _close(self) -> None:
         descriptor, self._descriptor = self._descriptor, None
         self._out.clear()
-        if self._collecting is not None:
-            self._collecting.cancel()
-            self._collecting = None
+        self._stop_collecting()
         if descriptor is None:
             return
         loop = asyncio.get_running_loop()
@@ -365,53 +381,3 @@ class ByteLink:
         if self._on_state is not None and (connected, reason) != self._said:
             self._said = (connected, reason)
             self._on_state(connected, reason)
-
-
-def _words(error: OSError) -> str:
-    """The system's own words: asyncio puts "Connect call failed" and an address in their place."""
-    return os.strerror(error.errno) if error.errno else str(error)
-
-
-async def _connect_tcp(settings: PortSettings) -> int:
-    """Connect to the first address that answers; return the socket's descriptor.
-
-    Raises:
-        LinkError: one line that names the address and the cause.
-    """
-    host, port = settings.address()
-    loop = asyncio.get_running_loop()
-    reason = f"{settings.url}: the host has no address"
-    try:
-        async with asyncio.timeout(CONNECT_DEADLINE_S):
-            for family, kind, protocol, _, address in await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM):
-                try:
-                    return await _connect(loop, socket.socket(family, kind, protocol), address)
-                except OSError as error:
-                    reason = f"{settings.url}: {_words(error)}"
-    except TimeoutError:
-        reason = f"{settings.url}: no answer within {CONNECT_DEADLINE_S:g} s"
-    except (OSError, UnicodeError) as error:
-        reason = f"{settings.url}: host {host} is not known ({error})"
-    raise LinkError(reason)
-
-
-async def _connect(loop: asyncio.AbstractEventLoop, endpoint: socket.socket, address: tuple[object, ...]) -> int:
-    try:
-        endpoint.settimeout(0)
-        endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        # A peer that vanished without a word (power cut, Wi-Fi gone) is noticed within 5 + 3 * 2 s; and within 10 s
-        # while something that we sent is not acknowledged, when no keepalive is sent.
-        endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for option, value in (
-            ("TCP_KEEPIDLE", 5),
-            ("TCP_KEEPINTVL", 2),
-            ("TCP_KEEPCNT", 3),
-            ("TCP_USER_TIMEOUT", 10000),
-        ):
-            if hasattr(socket, option):
-                endpoint.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
-        await loop.sock_connect(endpoint, address)
-        return endpoint.detach()
-    except BaseException:
-        endpoint.close()
-        raise

@@ -14,8 +14,9 @@ from typing import Literal, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.links.mavlink_frames import Codec, kind_at, read
+from companion.links.mavlink_frames import Codec, goes_ahead, kind_at, may_wait, read
 from companion.links.mavlink_signing import Signing
+from companion.links.together import Together
 
 logger = logging.getLogger(__name__)
 
@@ -49,6 +50,8 @@ class MavlinkLink:
         """Called with (direction, bytes, time of arrival); without bytes: some are missing here."""
         self.signing: Signing | None = None
         """Signs what is sent and judges what comes; None: nobody does."""
+        self.together = Together()
+        """Where datagrams of telemetry wait for the next read of a fast stream, while there is one."""
         self._codec: Codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._codec.robust_parsing = True
         self._transmit: Callable[[bytes], object] | None = None
@@ -79,6 +82,7 @@ class MavlinkLink:
 
         A `transmit` that returns False has dropped the bytes because its buffer is full.
         """
+        self.together.take()  # what came over the transport before this one
         self._transmit = transmit
         self._attached += 1
         self._forget_received()
@@ -112,6 +116,19 @@ class MavlinkLink:
                 handlers.remove(handler)
 
         return unsubscribe
+
+    def arrived(self, datagram: bytes, t_s: float) -> None:
+        """As `receive`, of a datagram; streams of telemetry are taken with the next read of a fast stream.
+
+        Whatever else comes is taken at once, behind what waits; some of what is asked of us ahead of it.
+        """
+        together = self.together
+        if together.driven and may_wait(datagram):
+            together.put(self.receive, datagram, t_s)
+            return
+        if not (together.driven and goes_ahead(datagram)):
+            together.take()
+        self.receive(datagram, t_s)
 
     def receive(self, data: bytes, t_s: float) -> None:
         """Take bytes that arrived at `t_s` (monotonic); never raises, whatever they are."""

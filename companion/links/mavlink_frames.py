@@ -26,12 +26,81 @@ _EXTRA: Final[dict[Kind, bytes]] = {}
 _PLANS: Final[dict[Kind, tuple[struct.Struct, Callable[[Any], tuple[Any, ...]] | None] | None]] = {}
 """How the payload is unpacked and in which order its fields are given; None: it has text or arrays in it."""
 _ZEROS: Final = bytes(256)
+STREAMS: Final = frozenset(
+    {
+        mavlink.MAVLINK_MSG_ID_AHRS,
+        mavlink.MAVLINK_MSG_ID_AHRS2,
+        mavlink.MAVLINK_MSG_ID_AIRSPEED_AUTOCAL,
+        mavlink.MAVLINK_MSG_ID_ALTITUDE,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE_TARGET,
+        mavlink.MAVLINK_MSG_ID_BATTERY_STATUS,
+        mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
+        mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
+        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+        mavlink.MAVLINK_MSG_ID_GPS2_RAW,
+        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
+        mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
+        mavlink.MAVLINK_MSG_ID_HWSTATUS,
+        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+        mavlink.MAVLINK_MSG_ID_MEMINFO,
+        mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
+        mavlink.MAVLINK_MSG_ID_ODOMETRY,
+        mavlink.MAVLINK_MSG_ID_POSITION_TARGET_GLOBAL_INT,
+        mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED,
+        mavlink.MAVLINK_MSG_ID_POWER_STATUS,
+        mavlink.MAVLINK_MSG_ID_RANGEFINDER,
+        mavlink.MAVLINK_MSG_ID_RAW_IMU,
+        mavlink.MAVLINK_MSG_ID_RC_CHANNELS,
+        mavlink.MAVLINK_MSG_ID_RC_CHANNELS_RAW,
+        mavlink.MAVLINK_MSG_ID_SCALED_IMU,
+        mavlink.MAVLINK_MSG_ID_SCALED_IMU2,
+        mavlink.MAVLINK_MSG_ID_SCALED_IMU3,
+        mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,
+        mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE2,
+        mavlink.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW,
+        mavlink.MAVLINK_MSG_ID_SYS_STATUS,
+        mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT,
+        mavlink.MAVLINK_MSG_ID_VFR_HUD,
+        mavlink.MAVLINK_MSG_ID_VIBRATION,
+        mavlink.MAVLINK_MSG_ID_WIND,
+        mavlink.MAVLINK_MSG_ID_WIND_COV,
+    }
+)
+"""Sent again and again, each the successor of the one before: nobody asks something with them or waits for one."""
+AHEAD: Final = frozenset(
+    {mavlink.MAVLINK_MSG_ID_TIMESYNC, mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT}
+)
+"""Asked of us, and answered from what is known anyway, ahead of telemetry that waits. Not so parameters, heartbeats and
+answers: what was measured before them was measured under other offsets, or before arming."""
 _C_CRC: Final[Callable[[bytes, int], int] | None] = getattr(mavlink, "mcrf4xx", None)
 """"CRC-16/MCRF4XX" in C, where pymavlink has found it."""
 
 
 def _crc(data: bytes) -> int:
     return mavlink.x25crc(data).crc if _C_CRC is None else _C_CRC(data, 0xFFFF)
+
+
+def may_wait(datagram: bytes) -> bool:
+    """Whether there are whole unsigned frames of streams in it and nothing else; nobody has checked their sums."""
+    return _holds_only(datagram, STREAMS)
+
+
+def goes_ahead(datagram: bytes) -> bool:
+    """Whether there are such frames of `AHEAD` in it and nothing else."""
+    return _holds_only(datagram, AHEAD)
+
+
+def _holds_only(datagram: bytes, numbers: frozenset[int]) -> bool:
+    at, size = 0, len(datagram)
+    while size - at >= HEADER_BYTES + CHECKSUM_BYTES:
+        if datagram[at] != MARKER or datagram[at + 2]:
+            return False
+        if datagram[at + 7] | datagram[at + 8] << 8 | datagram[at + 9] << 16 not in numbers:
+            return False
+        at += HEADER_BYTES + datagram[at + 1] + CHECKSUM_BYTES
+    return 0 < at == size
 
 
 def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:

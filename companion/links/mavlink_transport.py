@@ -11,10 +11,11 @@ import asyncio
 import errno
 import logging
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Protocol, cast
 
 from companion.errors import LinkError
+from companion.links import telemetry_socket
 from companion.links.backoff import Backoff
 from companion.links.bytestream import ByteLink, PortSettings
 from companion.links.mavlink import MavlinkLink
@@ -193,7 +194,7 @@ class _Speaker(_Udp):
         self.link.attach(lambda data: self.send_to(data, None))
 
     def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
-        self.link.receive(data, self.now_s())
+        self.link.arrived(data, self.now_s())
 
 
 class _Listener(_Udp):
@@ -202,14 +203,28 @@ class _Listener(_Udp):
     def __init__(self, link: MavlinkLink) -> None:
         super().__init__(link)
         self._heard_s: dict[tuple[Any, ...], float] = {}
+        self._telemetry: _Telemetry | None = None
+
+    def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._telemetry = _Telemetry(transport.get_extra_info("socket"), self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._telemetry is not None:
+            self._telemetry.close()
+        super().connection_lost(exc)
 
     def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
         now_s = self.now_s()
-        if addr in self._heard_s or len(self._heard_s) < MAX_PEERS:
-            self._heard_s[addr] = now_s
+        self.hear(addr, now_s)
+        self.link.arrived(data, now_s)
+
+    def hear(self, peer: tuple[Any, ...], t_s: float) -> None:
+        """A peer spoke."""
+        if peer in self._heard_s or len(self._heard_s) < MAX_PEERS:
+            self._heard_s[peer] = t_s
             if not self.link.connected:
                 self.link.attach(self._send_to_all)
-        self.link.receive(data, now_s)
 
     def error_received(self, exc: Exception) -> None:
         # One peer that cannot be reached is its own trouble; it is forgotten once silent.
@@ -224,3 +239,60 @@ class _Listener(_Udp):
         self._heard_s = {peer: heard_s for peer, heard_s in self._heard_s.items() if now_s - heard_s <= PEER_SILENCE_S}
         if not self._heard_s:
             self.link.attach(None)
+
+
+class _Telemetry:
+    """The sockets beside a listener's own, opened as soon as a fast stream drives: telemetry is read with that."""
+
+    def __init__(self, beside: telemetry_socket.Endpoint, listener: _Listener) -> None:
+        self._beside, self._listener, self._link = beside, listener, listener.link
+        self._loop = asyncio.get_running_loop()
+        self._pair: telemetry_socket.Pair | None = None
+        self._tried = False
+        self._leave = self._link.together.join(self)
+
+    def take(self) -> None:
+        if self._pair is not None:
+            self._receive(self._pair.drain(self._listener.now_s()))
+
+    def _asked(self) -> None:
+        """Questions have come: answer them ahead of telemetry where that may be, else behind it."""
+        assert self._pair is not None
+        together = self._link.together
+        if together.driven and (asked := self._pair.ahead(self._listener.now_s())):
+            self._receive(asked)
+        else:
+            together.take()
+
+    def _receive(self, datagrams: Iterable[tuple[bytes, tuple[Any, ...], float]]) -> None:
+        heard: tuple[Any, ...] | None = None
+        for data, peer, t_s in datagrams:
+            if peer != heard:
+                heard = peer
+                self._listener.hear(peer, t_s)
+            self._link.receive(data, t_s)
+
+    def listen(self, *, at_once: bool) -> None:
+        if not at_once and not self._tried:
+            self._open()
+        if self._pair is None:
+            return
+        if at_once:
+            self._loop.add_reader(self._pair.telemetry, self._link.together.take)
+        else:
+            self._loop.remove_reader(self._pair.telemetry)
+
+    def _open(self) -> None:
+        self._tried = True
+        self._pair = telemetry_socket.beside(self._beside)
+        if self._pair is not None:
+            self._loop.add_reader(self._pair.questions, self._asked)
+            for data, peer in telemetry_socket.left_in(self._beside):
+                self._listener.datagram_received(data, peer)
+
+    def close(self) -> None:
+        self._tried = True
+        self._leave()
+        if self._pair is not None:
+            self._loop.remove_reader(self._pair.questions)
+            self._pair.close()

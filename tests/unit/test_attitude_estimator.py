@@ -399,3 +399,20 @@ def test_a_newer_calibration_keeps_the_attitude() -> None:
     assert after is not None
     assert after.quaternion == before.quaternion
     assert estimator.gyro_bias_rad_s == pytest.approx((0.001, 0.0, 0.0))
+
+
+def test_what_is_kept_of_an_instant_is_the_attitude_of_then() -> None:
+    estimator, found = aligned(), {}
+    for number in range(200):
+        turning = ImuSample(number / 100, (0.0, 0.0, 0.3 if number < 100 else -0.6), (0.0, 0.0, -9.8))
+        estimator.update([turning], phase="flight")
+        now = estimator.attitude()
+        assert now is not None
+        found[number] = now.quaternion
+    for number in (50, 100, 150, 199):
+        kept = estimator.kept_at(number / 100 + 1e-4)
+        assert kept is not None
+        assert 0.0 <= number / 100 + 1e-4 - kept[0] <= 0.021, "a stretch before at most"
+        then = found[round(kept[0] * 100)]
+        assert abs(sum(a * b for a, b in zip(kept[1], then, strict=True))) == pytest.approx(1.0, abs=1e-9)
+    assert estimator.kept_at(-1.0) is None

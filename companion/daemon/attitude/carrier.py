@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from companion.attitude.estimator import Attitude, AttitudeEstimator, Phase
-from companion.attitude.quaternion import conjugate, from_matrix, rotate
+from companion.attitude.quaternion import Quaternion, conjugate, from_matrix, rotate
 from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD
 from companion.autopilot.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.calibration.record import ImuRecord
@@ -169,6 +169,10 @@ class Carrier:
     def now(self) -> Attitude | None:
         """The attitude at the last sample; None while there is none."""
         return None if self.estimator is None else self.estimator.attitude()
+
+    def kept_at(self, t_s: float) -> tuple[float, Quaternion] | None:
+        """What is remembered of the attitude then: the instant and the turn from body to NED; None: nothing."""
+        return None if self.estimator is None else self.estimator.kept_at(t_s)
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event == "armed":

@@ -47,10 +47,17 @@ class Difference:
         link: the connection.
         vehicle: whose attitude counts; ours comes back from other stations under our own component's number.
         now: our attitude at the last sample.
+        kept_at: what is remembered of an instant before.
     """
 
-    def __init__(self, link: MavlinkLink, vehicle: Vehicle, now: Callable[[], Attitude | None]) -> None:
-        self._vehicle, self._now = vehicle, now
+    def __init__(
+        self,
+        link: MavlinkLink,
+        vehicle: Vehicle,
+        now: Callable[[], Attitude | None],
+        kept_at: Callable[[float], tuple[float, Quaternion] | None],
+    ) -> None:
+        self._vehicle, self._now, self._kept_at = vehicle, now, kept_at
         self._offset_s: float | None = None
         self._heard_s = -math.inf
         self._since_s = -math.inf
@@ -89,9 +96,11 @@ class Difference:
             return
         span_s = min(max(t_s - self._heard_s, 0.0), OLD_S)
         self._heard_s = t_s
-        since_s = ours.t_s - (t_s - late_s)
+        instant_s = t_s - late_s
+        kept_s, turn = self._kept_at(instant_s) or (ours.t_s, ours.quaternion)
+        since_s = kept_s - instant_s
         rx, ry, rz = ours.rate_rad_s
-        then = multiply(ours.quaternion, from_rotation_vector((-rx * since_s, -ry * since_s, -rz * since_s)))
+        then = multiply(turn, from_rotation_vector((-rx * since_s, -ry * since_s, -rz * since_s)))
         self._compare(then, from_roll_pitch_yaw(*angles), span_s, t_s)
 
     def _compare(self, ours: Quaternion, theirs: Quaternion, span_s: float, t_s: float) -> None:

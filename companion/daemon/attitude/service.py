@@ -76,8 +76,9 @@ class AttitudeService:
     ) -> None:
         self.on_beat: Callable[[], None] = lambda: None
         self._config, self._vehicle, self._say = config, vehicle, say
+        self._together = link.together
         self.carrier = Carrier(config, carrying_imu(config), vehicle, collector, in_force, offload)
-        self.difference = Difference(link, vehicle, self.carrier.now)
+        self.difference = Difference(link, vehicle, self.carrier.now, self.carrier.kept_at)
         self.health = Health(self.carrier, self.difference, vehicle)
         self.sender = Sender(link, models.attitude_rate_hz(config), full=config.push.attitude == "full")
         self.timesync = TimesyncResponder(link, vehicle)
@@ -102,21 +103,21 @@ class AttitudeService:
         self._autopilot_imu = imus.get(self.carrier.imu.name)
         if self._autopilot_imu is not None:
             take = self._guarded(self._on_autopilot_samples)
-            self._autopilot_imu.also = lambda sample: take((sample,))
+            self._autopilot_imu.also = lambda sample: take((sample,), sample.t_s)
         for sensor in sensors:
             if any(role.name == self.carrier.imu.name for role in sensor.roles):
                 sensor.on_samples = self._guarded(self._on_imu)
             elif "compass" in sensor.kinds:
-                sensor.on_samples = self._guarded(self.carrier.take_compass)
+                sensor.on_samples = self._guarded(lambda samples, _read_s: self.carrier.take_compass(samples))
 
     # --- what arrives
 
-    def _guarded(self, take: Callable[[Sequence[Sample]], None]) -> Callable[[Sequence[Sample]], None]:
+    def _guarded(self, take: Callable[[Sequence[Sample], float], None]) -> Callable[[Sequence[Sample], float], None]:
         """A fault in here must cost neither the calibration its samples nor the autopilot its truth."""
 
-        def guarded(samples: Sequence[Sample]) -> None:
+        def guarded(samples: Sequence[Sample], read_s: float) -> None:
             try:
-                take(samples)
+                take(samples, read_s)
             except Exception:
                 logger.exception("attitude met a fault of the program; it begins anew")
                 self.health.stop(INTERNAL)
@@ -124,32 +125,35 @@ class AttitudeService:
 
         return guarded
 
-    def _on_imu(self, samples: Sequence[Sample]) -> None:
+    def _on_imu(self, samples: Sequence[Sample], read_s: float) -> None:
         found = [sample for sample in samples if isinstance(sample, ImuSample)]
         if not found:
             return
         self.carrier.take(found)
-        self._push()
+        self._push(read_s)
 
-    def _on_autopilot_samples(self, samples: Sequence[Sample]) -> None:
+    def _on_autopilot_samples(self, samples: Sequence[Sample], read_s: float) -> None:
         step = self.carrier.gyro_step_rad_s
         found = [sample for sample in samples if isinstance(sample, ImuSample)]
         self.carrier.take([without_truncation(sample, step) for sample in found] if step else found)
-        self._push()
+        self._push(read_s)
 
-    def _push(self) -> None:
-        """Send what is due, in the turn of the loop that brought the samples."""
+    def _push(self, read_s: float) -> None:
+        """Send what is due, in the turn of the loop that brought the samples.
+
+        Its rhythm is that of the reads: by when each turn has got here, every other one would now and then come too
+        soon, and be left out.
+        """
         firmware = self._vehicle.firmware
         if not self.health.pushing or firmware is None:
             return
-        now_s = asyncio.get_running_loop().time()
-        if not self.sender.is_due(self.carrier.heard_s, now_s):
+        if not self.sender.is_due(self.carrier.heard_s, read_s):
             return
         attitude = self.carrier.now()
         if attitude is None or not is_sane(attitude):
             self.health.stop("attitude lost: samples were missing for too long")
             return
-        self.sender.send(firmware, attitude, self.carrier.reset_counter, now_s)
+        self.sender.send(firmware, attitude, self.carrier.reset_counter, read_s)
 
     def _on_attitude(self, message: mavlink.MAVLink_attitude_message, t_s: float) -> None:
         if self._vehicle.sent(message):
@@ -186,7 +190,7 @@ class AttitudeService:
                     logger.exception("attitude met a fault of the program")
                     self.health.stop(INTERNAL)
                     await asyncio.sleep(1.0)
-                await asyncio.sleep(TICK_S)
+                await self._together.sleep(TICK_S)
         finally:
             self._running = False
             self.health.stop("the companion ends")

@@ -1,0 +1,147 @@
+"""What may wait a moment is taken together with the next read of a fast stream: a wake-up costs more than its bytes.
+
+A stream that is read at short, fixed intervals (`bytestream.COLLECT_S`) drives; what others bring meanwhile and need
+not be looked at in that very moment waits for its next read, with the time at which it came, in the order in which it
+came. While nothing drives, nothing waits.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from typing import Final, Protocol
+
+logger = logging.getLogger(__name__)
+
+MOST_WAITING: Final = 64
+"""What comes beyond is not kept waiting: ten times what an autopilot sends between two reads."""
+
+TURNS: Final = 4
+"""What waits is taken at every so many reads of the stream ..."""
+SECOND_S: Final = 0.07
+"""... and at each within so much after a full second of the loop's clock: until the samples behind it have come,
+whoever works out a calibration waits for the second's last ones."""
+
+Take = Callable[[bytes, float], object]
+
+
+class Source(Protocol):
+    """Something that holds back bytes by itself, as the kernel does for a socket."""
+
+    def take(self) -> None:
+        """Take all that has come."""
+
+    def listen(self, *, at_once: bool) -> None:
+        """From here on take what comes as soon as it does, or leave it to `take`."""
+
+
+class Together:
+    """Chunks of bytes that wait, each with who takes it and when it came. All calls are made on the loop's thread."""
+
+    def __init__(self) -> None:
+        self._waiting: list[tuple[Take, bytes, float]] = []
+        self._sources: list[Source] = []
+        self._sleepers: list[tuple[float, asyncio.Future[None]]] = []
+        self._drivers = 0
+        self._turns = 0
+        """Of the drivers, since something was taken."""
+        self._taking = False
+
+    @property
+    def driven(self) -> bool:
+        """Whether what waits is taken again and again."""
+        return self._drivers > 0
+
+    @property
+    def waiting(self) -> int:
+        """Chunks that wait."""
+        return len(self._waiting)
+
+    def drive(self) -> None:
+        """From here on the caller calls `turn` at short intervals, until it says `rest`."""
+        self._drivers += 1
+        if self._drivers == 1:
+            for source in self._sources:
+                source.listen(at_once=False)
+
+    def rest(self) -> None:
+        """The caller drives no longer."""
+        self._drivers -= 1
+        if self._drivers == 0:
+            self.take()
+            for source in self._sources:
+                source.listen(at_once=True)
+            sleepers, self._sleepers = self._sleepers, []
+            for due_s, sleeper in sleepers:
+                sleeper.get_loop().call_at(due_s, _wake, sleeper)
+
+    def join(self, source: Source) -> Callable[[], None]:
+        """Let a source wait for the reads too; returns how it leaves."""
+        self._sources.append(source)
+        source.listen(at_once=not self.driven)
+
+        def leave() -> None:
+            if source in self._sources:
+                self._sources.remove(source)
+                source.listen(at_once=False)
+
+        return leave
+
+    def put(self, take: Take, data: bytes, t_s: float) -> None:
+        """Let bytes that came at `t_s` wait for the next `take`; where nothing drives they are taken now."""
+        self._waiting.append((take, data, t_s))
+        if self._drivers == 0 or len(self._waiting) >= MOST_WAITING:
+            self.take()
+
+    def turn(self, now_s: float) -> None:
+        """A driver is about to read: take what waits when it is time to, and wake who sleeps."""
+        self._turns += 1
+        if self._turns >= TURNS or now_s % 1.0 < SECOND_S:
+            self.take()
+        if self._sleepers:
+            self._wake_sleepers(now_s)
+
+    def take(self) -> None:
+        """Take all that waits, each source's in its order."""
+        if self._taking:
+            return  # by what was taken; the rest is about to be
+        self._taking, self._turns = True, 0
+        try:
+            for source in self._sources:
+                source.take()
+            while self._waiting:
+                waiting, self._waiting = self._waiting, []
+                for take, data, t_s in waiting:
+                    try:
+                        take(data, t_s)
+                    except Exception:
+                        # Of one, which must not cost the others theirs.
+                        logger.exception("taking what has waited failed")
+        finally:
+            self._taking = False
+
+    async def sleep(self, seconds: float) -> None:
+        """Sleep for so long; where something drives, until its turn after that, for what is not urgent."""
+        if not self.driven:
+            await asyncio.sleep(seconds)
+            return
+        loop = asyncio.get_running_loop()
+        entry = (loop.time() + seconds, loop.create_future())
+        self._sleepers.append(entry)
+        try:
+            await entry[1]
+        finally:
+            if entry in self._sleepers:
+                self._sleepers.remove(entry)
+
+    def _wake_sleepers(self, now_s: float) -> None:
+        due = [entry for entry in self._sleepers if entry[0] <= now_s]
+        for entry in due:
+            self._sleepers.remove(entry)
+            _wake(entry[1])
+
+
+def _wake(sleeper: asyncio.Future[None]) -> None:
+    if not sleeper.done():
+        sleeper.set_result(None)
