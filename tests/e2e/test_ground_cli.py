@@ -87,7 +87,7 @@ def test_cancelled_refused_and_set(tmp_path: Path) -> None:
 
 async def while_the_aircraft_is_handled(folder: Path) -> None:
     """It waits and says for what; cancelled by the time given, by Ctrl-C, and by somebody on board."""
-    async with ground_line(folder, "ardupilot", motions=[Handling(start_s=0.0, duration_s=600.0)]) as line:
+    async with ground_line(folder, "ardupilot", motions=[Handling(start_s=-200.0, duration_s=600.0)]) as line:
         late = await line.ground("calibrate", "--timeout", "2", "--json")
         assert late.code == FAILED, late
         assert late.json["state"] == "cancelled"
