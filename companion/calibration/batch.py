@@ -9,6 +9,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.calibration.robust import median
+
 Floats = NDArray[np.float64]
 
 MAX_LEVELS: Final = 1024
@@ -102,7 +104,7 @@ def missing_of(stamps: Floats) -> int:
     steps = steps[steps > 0]
     if len(steps) == 0 or steps.max() < EVEN * steps.min():
         return 0
-    usual = float(np.median(steps))
+    usual = float(median(steps))
     return int(np.maximum(np.rint(steps / usual) - 1.0, 0.0).sum())
 
 

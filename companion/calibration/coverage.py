@@ -17,6 +17,7 @@ from companion.calibration.allan import NoiseProfile, allan_variance
 from companion.calibration.batches import Batch
 from companion.calibration.profile_fit import LEAST_STILL_S, TRIADS, Triad, fit_profile
 from companion.calibration.rest import CHANNELS, MIN_SECONDS, Rest
+from companion.calibration.robust import median
 from companion.calibration.windows import ImuInput, estimates
 
 Floats = NDArray[np.float64]
@@ -195,8 +196,8 @@ def _summary(triad: Triad, columns: slice, mean_s: int, misses: _Misses) -> Kept
         windows=len(miss),
         minutes=misses.minutes,
         rms=float(np.sqrt(miss.mean())),
-        sigma_use=float(np.sqrt(np.median(use))),
-        sigma_other=float(np.sqrt(np.median(other))),
+        sigma_use=float(np.sqrt(median(np.ravel(use)))),
+        sigma_other=float(np.sqrt(median(np.ravel(other)))),
         share=share(use + seen),
         share_strict=share(use),
         share_other=share(other + seen),

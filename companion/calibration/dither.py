@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from companion.calibration.allan import NoiseProfile, floor_variance
 from companion.calibration.batches import Batch
+from companion.calibration.robust import median
 from companion.errors import CalibrationRefusedError
 
 Floats = NDArray[np.float64]
@@ -93,7 +94,7 @@ def why_void(steps: Sequence[Step], latest: Step, steps_lsb: Floats) -> str | No
             return "a reading too near to zero"
     if not steps:
         return None
-    before = np.median([_corrected(step, steps_lsb)[0] for step in steps], axis=0)
+    before = median([_corrected(step, steps_lsb)[0] for step in steps])
     allowed = _MOVED_LSB + _MOVED_SIGMAS * np.sqrt(scatter)
     off = np.abs(corrected - before) - allowed
     worst = int(off.argmax())

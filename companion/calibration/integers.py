@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from companion.calibration.batches import Batch
 from companion.calibration.quantised import MIN_BEYOND_TWO, Cells, Fit, fit, shape_variance, truncation_edges
 from companion.calibration.robust import HUBER_C as FLOAT_HUBER_C
+from companion.calibration.robust import median
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -148,7 +149,7 @@ def integer_means(
         found, values, scale = _linearised(bounds, grouped, sizes, weight, sigma, None)
         other = fit(Cells(bounds, grouped.sum(axis=0)), sigma * (1.0 + BORROWED_RMS))
         slope = np.where(found.identified & ~own, np.abs(other.mean - found.mean), 0.0)
-    outside = np.abs(values - np.median(values, axis=0)) > _OUTLIER * np.maximum(scale, _mad(values))
+    outside = np.abs(values - median(values)) > _OUTLIER * np.maximum(scale, _mad(values))
     outside &= found.identified
     if outside.any():
         weight = np.where(outside, 0.0, 1.0)
@@ -181,7 +182,7 @@ def _with_borrowed(found: Fit, counts: Floats, sigma: Floats | None) -> Floats |
         triad = slice(start, start + 3)
         known = found.identified[triad]
         if known.any() and not known.all():
-            usual = float(np.median(found.sigma[triad][known]))
+            usual = float(median(found.sigma[triad][known]))
             result[triad] = np.where(~known & enough[triad], usual, result[triad])
     return None if np.isnan(result).all() else result
 
@@ -199,7 +200,7 @@ def _linearised(
     inside = np.maximum(grouped.sum(axis=1), 1.0)
     values = found.mean + np.einsum("mkc,kc->mc", grouped, found.influence) / inside
     total = (weight * sizes[:, None]).sum(axis=0)
-    scale = np.sqrt(found.variance * total / np.median(sizes))
+    scale = np.sqrt(found.variance * total / median(sizes))
     return found, values, scale
 
 
@@ -208,8 +209,8 @@ def _aligned(batches: Sequence[Batch], plain: Floats, steps: Floats) -> tuple[In
 
     The grid reaches as far as noise does; a reading beyond is a fault of the line and is left out.
     """
-    centre = np.median(plain, axis=0)
-    noise = np.sqrt(np.median([batch.variance for batch in batches], axis=0)) / steps
+    centre = median(plain)
+    noise = np.sqrt(median([batch.variance for batch in batches])) / steps
     spread = np.maximum(np.maximum(noise, _LEAST_SPREAD), np.abs(plain - centre).max(axis=0) / _CORE_SIGMAS)
     reach = int(min(np.ceil(_CORE_SIGMAS * spread.max()) + _CORE_MARGIN, _MAX_REACH))
     start = np.rint(centre).astype(np.int64) - reach
@@ -277,7 +278,7 @@ def _share_of_zero(pooled: Floats, start: Integers) -> Floats:
 
 
 def _mad(values: Floats) -> Floats:
-    return np.asarray(_MAD_TO_SIGMA * np.median(np.abs(values - np.median(values, axis=0)), axis=0))
+    return np.asarray(_MAD_TO_SIGMA * median(np.abs(values - median(values))))
 
 
 def _dispersion(values: Floats, second: Floats) -> Floats:

@@ -28,7 +28,7 @@ from companion.calibration.integers import integer_columns
 from companion.calibration.pose_windows import FieldWindow, HeadingWindow, TiltWindow
 from companion.calibration.quantised import EDGE_RMS
 from companion.calibration.ramps import RAMP_BATCHES, is_ramp
-from companion.calibration.robust import huber_line, robust_mean
+from companion.calibration.robust import huber_line, median, robust_mean
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG_H, MG
 
@@ -340,7 +340,7 @@ def _refuse_broken(imu: ImuInput, batches: Sequence[Batch]) -> None:
 
 def _lost(batches: Sequence[Batch]) -> float:
     """Share of the samples that never came: by the device's counter, else against the usual number in a second."""
-    usual = float(np.median([batch.n for batch in batches]))
+    usual = float(median([batch.n for batch in batches]))
     missing = came = 0.0
     for batch in batches:
         came += batch.n
