@@ -200,7 +200,7 @@ class Answers:
             yield {
                 "kind": "progress",
                 "state": self._conductor.state.value,
-                "percent": job.progress_percent,
+                "percent": self._conductor.progress_percent,
                 "text": job.words,
             }
             await asyncio.wait([job.finished], timeout=PROGRESS_EVERY_S)
@@ -225,7 +225,7 @@ class Answers:
             "headline": _plain(self._headlines.now()),
             "state": conductor.state.value,
             "reason": job.words if busy and job is not None else conductor.reason,
-            "progress": job.progress_percent if busy and job is not None else None,
+            "progress": conductor.progress_percent if busy else None,
             "still_s": round(still.still_s, 1),
             "waiting_for": still.waiting_for,
             "vehicle": {

@@ -79,6 +79,13 @@ class Conductor:
     # --- what others ask of it (component.service.CalibrationService)
 
     @property
+    def progress_percent(self) -> int:
+        """Of the latest job; 100 from `done` on, though its record may still be on its way to the disk."""
+        if self.job is None or self._machine.state is State.DONE:
+            return 100
+        return self.job.progress_percent
+
+    @property
     def state(self) -> State:
         """Where the calibration stands."""
         return self._machine.state

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -214,5 +216,25 @@ def test_a_long_calibration_does_not_make_the_look_at_the_write_long(tmp_path: P
             assert result.outcome == "done", result
             assert {what.outcome for what in record.imus[0].written.values()} == {"verified"}
             assert record.duration_s < 70.0 + 30.0
+
+    run_virtual(main())
+
+
+def test_done_is_a_hundred_per_cent_while_the_record_is_on_its_way_to_the_disk(tmp_path: Path) -> None:
+    async def main() -> None:
+        rig = Rig(tmp_path, min_still_s=3.0, max_s=4.0)
+        seen: set[tuple[str, int | None]] = set()
+
+        async def looking(function: Callable[..., Any], *arguments: Any) -> Any:
+            if hasattr(rig, "service"):
+                status = rig.service.answers.status()
+                seen.add((status["state"], status["progress"]))
+            return function(*arguments)
+
+        rig.offload = looking
+        async with rig.running():
+            await calibrated(await rig.ready())
+        assert ("done", 100) in seen
+        assert all(progress == 100 for state, progress in seen if state == "done")
 
     run_virtual(main())

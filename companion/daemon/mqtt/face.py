@@ -198,7 +198,7 @@ class MqttFace:
                 "what": job.what.name.lower(),
                 "requester": job.requester,
                 "state": self._conductor.state.value,
-                "percent": job.progress_percent,
+                "percent": self._conductor.progress_percent,
                 "text": job.words if self._is_busy else self._conductor.reason,
             }
         )
