@@ -175,6 +175,10 @@ class MavlinkLink:
             at = end
         return data[at:] if at else data
 
+    def signed_on(self, message: Message) -> int | None:
+        """The sender's link id in a message that is signed with our key; None where it is not, or nobody judges."""
+        return None if self.signing is None else self.signing.link_id_of(message.get_msgbuf())
+
     def _next_message(self, data: bytes) -> mavlink.MAVLink_message | None:
         try:
             return self._codec.parse_char(data)

@@ -399,6 +399,30 @@ def _spoofed_commands(scene: Scene) -> None:
             one.say(command_message(command, 0.0, target=target))
 
 
+def _says_disarmed(scene: Scene) -> None:
+    stranger(scene, 1, 1).beat(autopilot=12 if scene.stage.variant.name == "PX4" else 3)
+
+
+_FORGES, _FORGES_NO_LONGER = every(0.02, _says_disarmed)
+
+
+async def forge_and_arm(scene: Scene) -> None:
+    """Somebody says "disarmed" all the time, and the pilot arms."""
+    await _FORGES(scene)
+    await asyncio.sleep(scene.chance.uniform(0.0, 2.0))
+    scene.stage.autopilot.arm()
+    scene.notes["armed_s"] = scene.stage.now_s
+
+
+async def no_longer_forged(scene: Scene) -> None:
+    armed_s = scene.notes["armed_s"]
+    # What left before the arming was known arrives within that.
+    written = [write.name for write in scene.stage.autopilot.writes if write.armed and write.t_s > armed_s + 0.05]
+    await disarm(scene)
+    await _FORGES_NO_LONGER(scene)
+    assert not written, f"written while the autopilot was armed: {written}"
+
+
 def _our_own_ids(scene: Scene) -> None:
     one = stranger(scene, 1, 191)
     one.beat(kind=18, autopilot=8)
@@ -494,6 +518,16 @@ def intruder_faults() -> list[Fault]:
             "intruder",
             "requests to others, and as if from ourselves",
             *every(0.3, _spoofed_commands),
+        ),
+        Fault(
+            "forged-disarmed",
+            "intruder",
+            "50 disarmed heartbeats a second under the autopilot's ids, and the pilot arms",
+            forge_and_arm,
+            no_longer_forged,
+            lasts_s=(6.0, 12.0),
+            names=r"two autopilots, or a forger",
+            excused=f"{LOST}|{ARMED}|{STILLNESS}",
         ),
         Fault(
             "our-own-ids", "intruder", "somebody beats under our own system and component id", *every(0.3, _our_own_ids)
