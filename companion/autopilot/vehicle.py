@@ -376,8 +376,8 @@ class Vehicle:
         self._conflict_s = now_s
 
     def _take(self, message: mavlink.MAVLink_heartbeat_message) -> None:
-        self.system_id = self._link.system_id = message.get_srcSystem()
-        self.component_id = message.get_srcComponent()
+        self.system_id, self.component_id = message.get_srcSystem(), message.get_srcComponent()
+        self._link.join((self.system_id, self.component_id))
         self.firmware = _FIRMWARES.get(message.autopilot, "other")
         self._wanted.add(mavlink.MAVLink_system_time_message, 1.0)
         self._wanted.add(mavlink.MAVLink_global_position_int_message, 1.0)
