@@ -91,11 +91,12 @@ class Course:
         self._late: Stage = "checking"
         """Of State.VERIFYING."""
         self._settled_by_s = 0.0
+        self._dithered = False
 
     @property
     def is_dithering(self) -> bool:
-        """Whether offsets are being stepped at this moment."""
-        return self._ditherer.active
+        """Whether offsets are being stepped, or were and what comes of it is being worked out."""
+        return self._ditherer.active or (self._dithered and self.machine.state is State.SOLVING)
 
     @property
     def stage(self) -> Stage | None:
@@ -153,6 +154,7 @@ class Course:
 
     async def _measure_and_push(self, job: Job, draft: Draft) -> None:
         self._collector.retarget(self._wanted(job.what))
+        self._dithered = False
         while True:
             self._collector.on_second = job.look_again
             try:
@@ -275,7 +277,9 @@ class Course:
         """The window with better means for IMUs whose integers do not tell, where that is allowed."""
         if not self._pusher.enabled:
             return window
-        return await self._ditherer.refine(window, job, draft, lambda words: job.progress(MEASURED_PERCENT, words))
+        refined = await self._ditherer.refine(window, job, draft, lambda words: job.progress(MEASURED_PERCENT, words))
+        self._dithered = any(imu.dithered for imu in refined.imus)
+        return refined
 
     def _wanted(self, what: What) -> Settings:
         """The targets of what was asked for; the rest may be as bad as it likes."""
