@@ -60,6 +60,7 @@ from companion.protocols.roles import Part
 from companion.recording.collector import RecordedCollector
 from companion.samples import ImuSample
 from companion.storage.changes import ChangeLog
+from companion.storage.lock import only_daemon
 from companion.storage.records import RecordStore
 
 if TYPE_CHECKING:
@@ -338,15 +339,16 @@ class Service:
         """Run until cancelled, reachable on the control socket.
 
         Raises:
-            CompanionError: it cannot start (another daemon runs).
+            CompanionError: it cannot start (another daemon runs, or works with the same storage).
         """
         for words in (*models.cannot_work(self.config), *models.doubtful(self.config)):
             logger.warning("%s", words)
         control = self.config.control
         async with ControlServer(control.path, self.answers.answer, group=control.group_name):
-            logger.info("ready: %s", control.path)
-            self.on_ready()
-            await self.serve()
+            with only_daemon(self.config.storage.path):
+                logger.info("ready: %s", control.path)
+                self.on_ready()
+                await self.serve()
 
     async def serve(self, *, mavlink: bool = True, ports: bool = True) -> None:
         """Do the work until cancelled, then leave the autopilot in order.
