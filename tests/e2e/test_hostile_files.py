@@ -85,9 +85,9 @@ def test_nothing_else_in_the_storage_ends_or_hangs_the_start(tmp_path: Path, nam
     run_virtual(main())
 
 
-@pytest.mark.parametrize(("firmware", "name"), [("ardupilot", "CAL_GYRO0_XOFF"), ("ardupilot", "INS5_GYROFFS_X")])
+@pytest.mark.parametrize(("version", "name"), [("4.6", "CAL_GYRO0_XOFF"), ("4.8", "INS5_GYROFFS_X")])
 def test_a_journal_of_parameters_that_this_autopilot_has_not_is_brought_to_an_end(
-    tmp_path: Path, firmware: Any, name: str, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, version: str, name: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Of another firmware, or of an IMU that is gone: nobody waits for it for ever, and what is there is put back."""
     there = "INS_GYROFFS_X" if name.startswith("INS") else name
@@ -95,7 +95,7 @@ def test_a_journal_of_parameters_that_this_autopilot_has_not_is_brought_to_an_en
     ChangeLog(tmp_path).journal.write(found)
 
     async def main() -> None:
-        async with Rig(tmp_path, firmware=firmware, parameters={"INS_GYROFFS_X": 0.001}).running() as rig:
+        async with Rig(tmp_path, version=version, parameters={"INS_GYROFFS_X": 0.001}).running() as rig:
             await rig.until(lambda: not rig.service.mender.pending, 20.0)
             ours = name.startswith("INS")
             assert rig.double.parameter("INS_GYROFFS_X") == pytest.approx(0.0 if ours else 0.001)

@@ -25,13 +25,15 @@ with only_daemon(Path(sys.argv[1])):
 def test_a_second_one_is_refused_by_name_until_the_first_has_ended_even_by_kill_9(tmp_path: Path) -> None:
     folder = tmp_path / "state"
     with subprocess.Popen([sys.executable, "-c", HOLDER, str(folder)], stdout=subprocess.PIPE, text=True) as holder:
-        assert holder.stdout is not None
-        assert holder.stdout.readline() == "held\n"
-        words = rf"state: another daemon \(process {holder.pid}\) works with this directory$"
-        for _ in range(2):
-            with pytest.raises(StorageError, match=words), only_daemon(folder):
-                pass
-        holder.kill()
+        try:
+            assert holder.stdout is not None
+            assert holder.stdout.readline() == "held\n"
+            words = rf"state: another daemon \(process {holder.pid}\) works with this directory$"
+            for _ in range(2):
+                with pytest.raises(StorageError, match=words), only_daemon(folder):
+                    pass
+        finally:
+            holder.kill()
     assert (folder / PID_FILE).exists()
     with only_daemon(folder):
         assert (folder / PID_FILE).read_text() == f"{os.getpid()}\n"

@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import signal
+import tracemalloc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -120,6 +121,45 @@ def test_others_that_are_read_are_refused_at_once(tmp_path: Path, what: str) -> 
             with pytest.raises(StorageError):
                 kept_token(tmp_path)
     assert os.path.lexists(record)  # of records, each is named and stays
+
+
+@pytest.mark.parametrize("what", ["a FIFO", "a device", "a folder"])
+def test_what_is_no_regular_file_is_not_even_opened(tmp_path: Path, what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "journal.json"
+    HOSTILE[what](path)
+
+    def opened(*_: object) -> int:
+        raise AssertionError("a device may do something when it is opened")
+
+    monkeypatch.setattr(os, "open", opened)
+    with pytest.raises(StorageError, match=r"journal\.json: cannot be read: not a regular file$"):
+        ChangeLog(tmp_path).journal.read()
+
+
+def test_a_file_that_becomes_a_fifo_just_then_hangs_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "journal.json"
+    path.write_bytes(b"{}")
+    real = os.open
+
+    def swapped(what: Any, *others: Any, **options: Any) -> int:
+        path.unlink()
+        os.mkfifo(path)
+        return real(what, *others, **options)
+
+    monkeypatch.setattr(os, "open", swapped)
+    with at_once(), pytest.raises(StorageError, match="not a regular file"):
+        ChangeLog(tmp_path).journal.read()
+
+
+def test_no_more_is_read_than_may_be_there(tmp_path: Path) -> None:
+    sparse(tmp_path / "journal.json")
+    tracemalloc.start()
+    try:
+        with pytest.raises(StorageError, match="more than 1000000 bytes"):
+            ChangeLog(tmp_path).journal.read()
+        assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_file_that_may_not_be_read_is_set_aside_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
