@@ -118,6 +118,8 @@ class Answers:
         """Whose noise figures the sigmas of each IMU are made of."""
         self.setup: Callable[[Object], Awaitable[Object]] | None = None
         """Sets the autopilot up for our heading."""
+        self.unusable: Callable[[], Sequence[str]] = tuple
+        """Files with old values that could not be used, each in a line."""
         self.mqtt: Callable[[], Object] = dict
         """How the broker is reached; empty where none is configured."""
 
@@ -245,7 +247,11 @@ class Answers:
             "pose": self._pose.now(),
             "readings": self._pose.readings(),
             "alignment": self._alignment.status(),
-            "warnings": [*self._rivalry.warnings, *(self._carried.warnings if self._carried is not None else ())],
+            "warnings": [
+                *self.unusable(),
+                *self._rivalry.warnings,
+                *(self._carried.warnings if self._carried is not None else ()),
+            ],
             "attitude": None if self._carried is None else self._carried.view(),
             "ground_stations": dict(zip(("good", "summary"), self._reach.words(), strict=True)),
             "fault": self._mender.fault,

@@ -18,6 +18,7 @@ from typing import Final
 
 from companion.errors import StorageError
 from companion.storage.atomic import write_atomically
+from companion.storage.state import read_regular
 
 TOKEN_HEADER: Final = "x-companion-token"  # noqa: S105 - a name
 TOKEN_FILE: Final = "web-token"  # noqa: S105 - a name
@@ -25,6 +26,7 @@ TOKEN_FILE: Final = "web-token"  # noqa: S105 - a name
 _ALPHABET: Final = "23456789abcdefghjkmnpqrstuvwxyz"
 _GROUPS, _GROUP = 3, 4
 _LEAST_TOKEN: Final = 8
+_MOST_TOKEN_BYTES: Final = 200
 _OWN_ENDINGS: Final = ("", ".local", ".lan", ".home.arpa", ".internal")
 """Of names that nobody can register: what a hotspot or a router makes of the board's name."""
 
@@ -60,7 +62,7 @@ def kept_token(directory: Path) -> str:
     """
     path = directory / TOKEN_FILE
     try:
-        token = path.read_text(encoding="ascii").strip()
+        token = read_regular(path, _MOST_TOKEN_BYTES).decode("ascii").strip()
     except FileNotFoundError:
         token = new_token()
         write_atomically(path, f"{token}\n".encode())  # a temporary file's mode is 0600, and stays
