@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
@@ -34,7 +35,7 @@ from companion.config.sections import (
     Storage,
     Vehicle,
 )
-from companion.config.words import explain, refuse_unknown_keys
+from companion.config.words import brief, explain, refuse_unknown_keys
 from companion.errors import ConfigError
 
 __all__ = [
@@ -63,6 +64,10 @@ __all__ = [
 ]
 
 DEFAULT_PATH = Path("/etc/companion/companion.toml")
+MOST_BYTES: Final = 64 * 1024
+"""Of the file; the sample, which says every key, has a ninth of that."""
+MOST_LINE: Final = 4096
+"""Characters of one line: what TOML takes to read a key grows with the square of its dots."""
 
 
 def load(path: Path, saved: Saved = none_saved) -> Config:
@@ -72,7 +77,8 @@ def load(path: Path, saved: Saved = none_saved) -> Config:
         ConfigError: one line that names the file, the key, what was found and what is allowed.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open("rb") as file:
+            text = file.read(MOST_BYTES + 1).decode()
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give another with -c FILE") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -86,10 +92,17 @@ def parse(text: str, name: str, saved: Saved = none_saved) -> Config:
     Raises:
         ConfigError: one line that names the file, the key, what was found and what is allowed.
     """
+    if len(text) > MOST_BYTES:
+        raise ConfigError(f"{name}: found more than {MOST_BYTES} bytes; allowed: a configuration file")
+    for number, line in enumerate(text.split("\n"), 1):
+        if len(line) > MOST_LINE:
+            raise ConfigError(f"{name}: line {number}: found {len(line)} characters; allowed: {MOST_LINE}")
     try:
         raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{name}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise ConfigError(f"{name}: not valid TOML: brackets within brackets, too deep") from None
+    except ValueError as error:  # TOML's own errors, and what Python says of a number with thousands of digits
+        raise ConfigError(f"{name}: not valid TOML: {brief(str(error))}") from None
     refuse_unknown_keys(raw, Config, "", name)
     try:
         config = msgspec.convert(raw, Config, strict=True)

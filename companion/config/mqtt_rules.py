@@ -21,8 +21,6 @@ def check_mqtt(mqtt: Mqtt, name: str) -> None:
         topic = getattr(mqtt, key)
         if topic is not None:
             _check_topic(topic, f"mqtt.{key}", name)
-    if mqtt.client_id is not None and not mqtt.client_id.isprintable():
-        raise ConfigError(f"{name}: 'mqtt.client_id': found {mqtt.client_id!r}; allowed: printable characters")
     if mqtt.password_file is not None and mqtt.username is None:
         raise ConfigError(f"{name}: 'mqtt.username' is missing; allowed: a text, not empty (needed by password_file)")
     if mqtt.password_file is not None and "/" in mqtt.password_file and not mqtt.password_file.startswith("/"):
@@ -43,8 +41,7 @@ def check_mqtt(mqtt: Mqtt, name: str) -> None:
 
 def _check_topic(topic: str, here: str, name: str) -> None:
     good = (
-        topic.isprintable()
-        and len(topic.encode()) <= MAX_TOPIC_BYTES
+        len(topic.encode()) <= MAX_TOPIC_BYTES
         and not any(character in topic for character in "+# ")
         and not topic.startswith(("/", "$"))
         and not topic.endswith("/")

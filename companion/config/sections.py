@@ -57,7 +57,8 @@ class Mavlink(Section, frozen=True):
     """How to reach the autopilot, and which component we are."""
 
     url: NonEmpty
-    component_id: Annotated[int, Meta(ge=1, le=255)] = 191
+    component_id: Annotated[int, Meta(ge=2, le=255)] = 191
+    """0 means everybody, and 1 is the autopilot."""
     allow: tuple[str, ...] = EVERYBODY
     """Who may calibrate, cancel, undo and set our parameters: as `config.senders` reads it."""
     signing: Signing | None = None

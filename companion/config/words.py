@@ -5,9 +5,10 @@ from __future__ import annotations
 import difflib
 import math
 import re
+import reprlib
 import types
 import typing
-from typing import Annotated, Any, Literal, Union
+from typing import Annotated, Any, Final, Literal, Union
 
 import msgspec
 from msgspec import Meta
@@ -15,9 +16,15 @@ from msgspec import Meta
 from companion.config.sections import Config
 from companion.errors import ConfigError
 
+_LONGEST: Final = 200
+"""Characters of what was found, in a message."""
+_INT_BITS: Final = 63
+_briefly: Final = reprlib.Repr()
+_briefly.maxstring = _briefly.maxother = _briefly.maxlong = 80
+
 
 def refuse_unknown_keys(raw: dict[str, Any], section: type[msgspec.Struct], path: str, name: str) -> None:
-    """Refuse the first key that no section knows, and numbers that are none.
+    """Refuse the first key that no section knows, and values that no key could have.
 
     Raises:
         ConfigError: names the key and the nearest known one, or what is allowed.
@@ -29,29 +36,40 @@ def refuse_unknown_keys(raw: dict[str, Any], section: type[msgspec.Struct], path
             kind = "section" if isinstance(value, dict) else "key"
             near = difflib.get_close_matches(key, known, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"allowed: {', '.join(sorted(known))}"
-            raise ConfigError(f"{name}: unknown {kind} {here!r}; {hint}")
-        _refuse_not_finite(value, here, name)
-        inner = _section_in(known[key])
-        if inner is None:
-            continue
-        if isinstance(value, dict):
-            refuse_unknown_keys(value, inner, here, name)
-        elif isinstance(value, list):
-            for index, item in enumerate(value):
-                if isinstance(item, dict):
-                    refuse_unknown_keys(item, inner, f"{here}[{index}]", name)
+            raise ConfigError(f"{name}: unknown {kind} {shown(here)}; {hint}")
+        inner, listed = _section_in(known[key]), isinstance(value, list)
+        for index, item in enumerate(value if listed else [value]):
+            if inner is not None and isinstance(item, dict):
+                refuse_unknown_keys(item, inner, f"{here}[{index}]" if listed else here, name)
+            else:
+                _refuse_unusable(item, here, name)
 
 
-def _refuse_not_finite(value: object, here: str, name: str) -> None:
-    """TOML can write nan and inf; no quantity here can be either."""
-    for item in value if isinstance(value, list) else [value]:
-        if isinstance(item, float) and not math.isfinite(item):
-            raise ConfigError(f"{name}: {here!r}: found {shown(value)}; allowed: {allowed(here)}, finite")
+def _refuse_unusable(value: object, here: str, name: str) -> None:
+    """What TOML can write and nothing here can be: nan and inf, endless integers, characters that nobody sees."""
+    within = [value]
+    while within:  # no recursion: dots in a key nest as deep as they like
+        item = within.pop()
+        if isinstance(item, dict):
+            within += [*item, *item.values()]
+        elif isinstance(item, list):
+            within += item
+        elif isinstance(item, float) and not math.isfinite(item):
+            raise ConfigError(f"{name}: {here!r}: found {shown(item)}; allowed: {allowed(here)}, finite")
+        elif isinstance(item, int) and item.bit_length() > _INT_BITS:
+            raise ConfigError(f"{name}: {here!r}: found a number of {item.bit_length()} bits; allowed: {allowed(here)}")
+        elif isinstance(item, str) and not item.isprintable():
+            raise ConfigError(f"{name}: {here!r}: found {shown(item)}; allowed: printable characters")
 
 
 def shown(value: object) -> str:
-    """A value as it stands in the file."""
-    return {True: "true", False: "false"}[value] if isinstance(value, bool) else repr(value)
+    """A value as it stands in the file; of a long one its ends."""
+    return {True: "true", False: "false"}[value] if isinstance(value, bool) else _briefly.repr(value)
+
+
+def brief(words: str) -> str:
+    """The beginning of what may be long."""
+    return words if len(words) <= _LONGEST else f"{words[:_LONGEST]}..."
 
 
 def _section_in(annotation: object) -> type[msgspec.Struct] | None:

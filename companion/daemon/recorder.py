@@ -32,7 +32,7 @@ from companion.errors import StorageError
 from companion.links.mavlink import Direction, MavlinkLink
 from companion.recording import topics
 from companion.recording.collector import RecordedCollector
-from companion.recording.files import RecordingFile, Ring, is_available, versions
+from companion.recording.files import FOLDER_MODE, RecordingFile, Ring, is_available, versions
 from companion.recording.journal import Beginning, Queue
 from companion.recording.redact import KeyFilter, without_key
 from companion.recording.state import freeze
@@ -382,7 +382,7 @@ class Recorder:
 def _kept(folder: Path) -> Path:
     """A name that the ring does not delete."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
         numbers = [int(path.stem[5:]) for path in folder.glob("kept-*.mcap") if path.stem[5:].isdecimal()]
     except OSError as error:
         raise StorageError(f"{folder}: {error.strerror or error}") from error

@@ -38,6 +38,8 @@ RESERVE_BYTES: Final = 32 * 1024 * 1024
 PARTS: Final = 8
 """A ring's files are at most this part of it, so that the oldest can go without taking much along."""
 
+FOLDER_MODE: Final = 0o700
+
 _NAME = re.compile(r"(\d{6,})\.mcap")
 
 Opener = Callable[[Path], IO[bytes]]
@@ -49,12 +51,12 @@ def _free_bytes(folder: Path) -> int:
 
 
 def open_new(path: Path) -> IO[bytes]:
-    """Create a file that does not exist yet.
+    """Create a file that does not exist yet, for its owner alone: positions and signatures are in it.
 
     Raises:
         OSError: it does, or it cannot be created.
     """
-    return path.open("xb")
+    return open(path, "xb", opener=lambda name, flags: os.open(name, flags, 0o600))
 
 
 def is_available() -> bool:
@@ -84,7 +86,7 @@ class RecordingFile:
         self._free_bytes = free_bytes
         self._file: IO[bytes] | None = None
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            path.parent.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
             self._file = opener(path)
         except FileExistsError:
             raise StorageError(f"{path}: exists already; nothing is overwritten") from None
@@ -278,7 +280,7 @@ class Ring:
 
     def _next(self) -> None:
         self.close()
-        self.folder.mkdir(parents=True, exist_ok=True)
+        self.folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
         self._make_room()
         numbers = [number for number, _, _ in self._files()]
         self._current = RecordingFile(

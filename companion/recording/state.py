@@ -104,6 +104,14 @@ _FORGOTTEN: Final[dict[tuple[str, str], Callable[[], Any]]] = {
     ("VectorNavDecoder", "_layouts"): dict,
 }
 _DEEPEST: Final = 40
+_MOST_VALUES: Final = 1_000_000
+"""An hour of three IMUs has 200 000."""
+_LEAST_ROW_BYTES: Final = 8
+"""Of a stack, each row of which becomes an array: without it, nothing at all would become a billion of them."""
+_LONGEST_TYPE: Final = 8
+_UNREADABLE: Final = (
+    msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError,
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -151,8 +159,10 @@ def from_json(data: bytes | str) -> Any:
         StorageError: it is nothing that this version could have written.
     """
     try:
+        if data.count("," if isinstance(data, str) else b",") >= _MOST_VALUES:  # type: ignore[arg-type]
+            raise ValueError(f"more than {_MOST_VALUES} values")
         return _made(msgspec.json.decode(data), _DEEPEST)
-    except (msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+    except _UNREADABLE as error:
         raise StorageError(f"the state in the recording is of another version or damaged ({error})") from None
 
 
@@ -179,7 +189,9 @@ def _plain_list(values: list[Any]) -> Any:
     kind = type(values[0]) if len(values) > 1 else None
     if kind is np.ndarray:
         first = values[0]
-        if all(type(v) is np.ndarray and v.shape == first.shape and v.dtype == first.dtype for v in values):
+        if first.nbytes >= _LEAST_ROW_BYTES and all(
+            type(v) is np.ndarray and v.shape == first.shape and v.dtype == first.dtype for v in values
+        ):
             return {"$": "stack", "of": _plain(np.stack(values))}
     if kind is not None and kind.__name__ in _VALUES and all(type(value) is kind for value in values):
         columns = {name: _plain_list([getattr(value, name) for value in values]) for name in _names(values[0])}
@@ -223,11 +235,18 @@ def _made(plain: Any, depth: int) -> Any:
     if name in _SIMPLE:
         return _SIMPLE[name](plain)
     if name in _MANY:
-        return _MANY[name](plain, _made(plain["of"], depth - 1), depth)
-    fields = {key: _made(item, depth - 1) for key, item in plain["is"].items()}
+        return _MANY[name](plain, _listed(plain["of"], depth - 1), depth)
     if name == "columns":
+        fields = {key: _listed(item, depth - 1) for key, item in plain["is"].items()}
         kind, rows = _VALUES[plain["name"]], zip(*fields.values(), strict=True)
         return [kind(**dict(zip(fields, row, strict=True))) for row in rows]
+    if name == "stack":
+        stack = _made(plain["of"], depth - 1)
+        if stack.nbytes < _LEAST_ROW_BYTES * len(stack):
+            raise ValueError("a stack of next to nothing")
+        # Copies: each is an array of its own.
+        return [each.copy() for each in stack]
+    fields = {key: _made(item, depth - 1) for key, item in plain["is"].items()}
     if name in _VALUES:
         return _VALUES[name](**fields)
     made: Any = object.__new__(_CHANGING[name])
@@ -240,7 +259,15 @@ def _made(plain: Any, depth: int) -> Any:
 
 
 def _pairs(plain: dict[str, Any], of: list[Any], depth: int) -> dict[Any, Any]:
-    return dict(zip(_made(plain["keys"], depth - 1), of, strict=True))
+    return dict(zip(_listed(plain["keys"], depth - 1), of, strict=True))
+
+
+def _listed(plain: Any, depth: int) -> list[Any]:
+    """What is many values: written one by one, as columns or as a stack."""
+    made = _made(plain, depth)
+    if not isinstance(made, list):
+        raise TypeError(f"a list was expected, not a {type(made).__name__}")
+    return made
 
 
 _MANY: Final[dict[str, Callable[[dict[str, Any], Any, int], Any]]] = {
@@ -248,8 +275,6 @@ _MANY: Final[dict[str, Callable[[dict[str, Any], Any, int], Any]]] = {
     "deque": lambda plain, of, depth: deque(of, plain["longest"]),
     "dict": _pairs,
     "counter": lambda plain, of, depth: Counter(_pairs(plain, of, depth)),
-    # Copies: each is an array of its own.
-    "stack": lambda plain, of, depth: [each.copy() for each in of],
 }
 
 
@@ -259,9 +284,9 @@ def _array(plain: dict[str, Any]) -> Any:
 
 
 def _numeric(name: str) -> Any:
-    kind: Any = np.dtype(name)
-    if kind.kind not in "biuf":
-        raise ValueError(f"no numbers: {name}")
+    kind: Any = np.dtype(name) if len(name) <= _LONGEST_TYPE else None
+    if kind is None or kind.kind not in "biuf":
+        raise ValueError(f"no numbers: {name[:_LONGEST_TYPE]}")
     return kind
 
 

@@ -6,6 +6,7 @@ hundred times faster than what it replays. The records are those of the MCAP spe
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 import struct
 import zlib
@@ -31,8 +32,11 @@ _LOG_TIME: Final = _HEAD.size + 6
 """Where in a message it stands: behind the numbers of its channel and its own."""
 _LENGTH: Final = struct.Struct("<I")
 _LONG: Final = struct.Struct("<Q")
-MOST_CHUNK_BYTES: Final = 64 * 1024 * 1024
-"""A chunk that claims more than this is damaged: ours have a state of some MB at most."""
+MOST_BYTES: Final = 16 * 1024 * 1024
+"""Of a record in the file, and of a chunk unpacked; ours have a state of some MB at most."""
+MOST_TIMES: Final = 100
+"""All chunks together unpack to so many times the file at most, and one chunk's worth; ours to four times."""
+MOST_TOPICS: Final = 1024
 
 AT_ONCE: Final = 8
 """Records that are given together to the thread that unpacks them: to hand one over costs half of unpacking it."""
@@ -100,6 +104,7 @@ class Recording:
         """After reading: why it ended before its end, in words; None when it is whole."""
         self.topics: list[str] = []
         """That were met so far."""
+        self._places: dict[str, int] = {}
         self._number_of = np.full(1 << 16, -1)
         """The number of a channel's topic; negative where it is not known or not wanted."""
         try:
@@ -137,6 +142,7 @@ class Recording:
     def _file(self, data: memoryview) -> Iterator[Messages | Metadata | Attachment]:
         """What is in a file; a thread unpacks the next chunks meanwhile, which needs no interpreter."""
         records, damage = _outermost(data), None
+        room = MOST_BYTES + MOST_TIMES * len(data)
         waiting: deque[tuple[list[_Record], Future[list[bytes | Exception | None]]]] = deque()
         with ThreadPoolExecutor(max_workers=1) as thread:
             while True:
@@ -150,11 +156,14 @@ class Recording:
                     if isinstance(chunk, Exception):
                         raise chunk
                     if chunk is not None:
+                        room -= len(chunk)
+                        if room < 0:
+                            raise _DamagedError(f"damaged: unpacks to more than {MOST_TIMES} times its size")
                         yield from self._chunk(chunk)
                     elif kind == _MESSAGE:
                         yield self._messages(bytes(data[at - _HEAD.size : end]), np.zeros(1, dtype=np.int64))
                     else:
-                        yield from self._other(data, kind, at)
+                        yield from self._other(kind, data[at:end])
         if isinstance(damage, _DamagedError):
             raise damage
 
@@ -170,21 +179,24 @@ class Recording:
             elif kind == _DATA_END:
                 return
             else:
-                yield from self._other(data, kind, at)
+                yield from self._other(kind, data[at:end])
             at = end
 
-    def _other(self, data: Any, kind: int, at: int) -> Iterator[Metadata | Attachment]:
+    def _other(self, kind: int, data: Any) -> Iterator[Metadata | Attachment]:
         """What a record that is neither message nor chunk has in it."""
         if kind == _CHANNEL:
-            number = int.from_bytes(data[at : at + 2], "little")
-            topic = _text(data, at + 4)[0]
-            if topic not in self.topics:
+            number = int.from_bytes(data[:2], "little")
+            topic = _text(data, 4)[0]
+            place = self._places.setdefault(topic, len(self.topics))
+            if place == len(self.topics):
+                if place == MOST_TOPICS:
+                    raise _DamagedError(f"damaged: more than {MOST_TOPICS} topics")
                 self.topics.append(topic)
-            self._number_of[number] = self.topics.index(topic) if self._wanted(topic) else -1
+            self._number_of[number] = place if self._wanted(topic) else -1
         elif kind == _METADATA:
-            yield _metadata(data, at)
+            yield _metadata(data)
         elif kind == _ATTACHMENT:
-            yield _attachment(data, at)
+            yield _attachment(data)
 
     def _messages(self, data: bytes, starts: NDArray[np.int64]) -> Messages:
         """Those of the messages that begin there whose topics are known and wanted."""
@@ -223,8 +235,14 @@ def _outermost(data: Any) -> Iterator[_Record]:
         kind, begin, at = _record(data, at)
         if kind == _DATA_END:
             return
+        if at - begin > MOST_BYTES:
+            raise _too_large(begin, at - begin)
         yield kind, begin, at
     raise _DamagedError(f"cut at byte {size}")
+
+
+def _too_large(at: int, size: int) -> _DamagedError:
+    return _DamagedError(f"damaged at byte {at}: found {size} bytes in one piece; allowed: {MOST_BYTES}")
 
 
 def _group(data: Any, records: Iterator[_Record]) -> tuple[list[_Record], Exception | None]:
@@ -260,10 +278,13 @@ def _decompressor() -> Callable[[Any, int], bytes] | None:
         import zstandard
     except ImportError:
         return None
-    unpack = zstandard.ZstdDecompressor().decompress
+    unpack = zstandard.ZstdDecompressor(max_window_size=MOST_BYTES).decompress
 
     def decompress(packed: Any, size: int) -> bytes:
         try:
+            # What a frame says of itself is made room for, whatever the limit is.
+            if zstandard.frame_content_size(packed) > size:
+                raise _DamagedError
             return unpack(packed, max_output_size=size)
         except zstandard.ZstdError as error:
             raise _DamagedError from error
@@ -283,18 +304,24 @@ def _chain(data: bytes, at: int) -> NDArray[np.int64]:
     Each says where the next one is; but what looks like the beginning of one nearly always is, and can be looked for
     everywhere at once.
     """
-    octets = np.frombuffer(data, np.uint8)
-    found: NDArray[np.int64] = at + np.flatnonzero(octets[at : len(data) - _WHOLE_HEAD + 1] == _MESSAGE)
-    heads = _anywhere(data, "<u8")[found + 1]
-    likely = (heads >= _MESSAGE_HEAD.size) & (heads < MOST_CHUNK_BYTES)
-    found, ends = found[likely], found[likely] + _HEAD.size + heads[likely].astype(np.int64)
-    if bool((ends[:-1] == found[1:]).all()) and ends[-1] <= len(data):
-        return found
-    following = dict(zip(found.tolist(), ends.tolist(), strict=True))
-    starts = [at]
-    while following.get(end := following[starts[-1]], len(data) + 1) <= len(data):
-        starts.append(end)
-    return np.array(starts, dtype=np.int64)
+    looks = np.frombuffer(data, np.uint8)[at : len(data) - _WHOLE_HEAD + 1] == _MESSAGE
+    # So many messages would not fit in: of what is all beginnings, nothing is gained by looking everywhere.
+    if np.count_nonzero(looks) <= len(data) // _WHOLE_HEAD:
+        found: NDArray[np.int64] = at + np.flatnonzero(looks)
+        heads = _anywhere(data, "<u8")[found + 1]
+        likely = (heads >= _MESSAGE_HEAD.size) & (heads < MOST_BYTES)
+        found, ends = found[likely], found[likely] + _HEAD.size + heads[likely].astype(np.int64)
+        if bool((ends[:-1] == found[1:]).all()) and ends[-1] <= len(data):
+            return found
+    return np.fromiter(_one_by_one(data, at), dtype=np.int64)
+
+
+def _one_by_one(data: Any, at: int) -> Iterator[int]:
+    """The same by going from each to the next."""
+    with contextlib.suppress(_DamagedError):
+        while _record(data, at)[0] == _MESSAGE:
+            yield at
+            at = _record(data, at)[2]
 
 
 def _chunk(data: Any, at: int, decompress: Callable[[Any, int], bytes] | None) -> bytes:
@@ -303,8 +330,8 @@ def _chunk(data: Any, at: int, decompress: Callable[[Any, int], bytes] | None) -
     compression, start = _text(data, _CHUNK_HEAD.size)
     (length,) = _LONG.unpack_from(data, start)
     packed = data[start + 8 : start + 8 + length]
-    if size > MOST_CHUNK_BYTES:
-        raise _DamagedError(f"damaged at byte {at}")
+    if size > MOST_BYTES:
+        raise _too_large(at, size)
     if compression == "zstd":
         if decompress is None:
             raise StorageError("a recording needs more than is installed: pip install 'companion[recording]'")
@@ -328,8 +355,8 @@ def _text(data: Any, at: int) -> tuple[str, int]:
     return str(bytes(data[at + 4 : end]), "utf-8"), end
 
 
-def _metadata(data: Any, at: int) -> Metadata:
-    name, at = _text(data, at)
+def _metadata(data: Any) -> Metadata:
+    name, at = _text(data, 0)
     (length,) = _LENGTH.unpack_from(data, at)
     at += 4
     end, table = at + length, {}
@@ -339,8 +366,8 @@ def _metadata(data: Any, at: int) -> Metadata:
     return Metadata(name, table)
 
 
-def _attachment(data: Any, at: int) -> Attachment:
-    name, at = _text(data, at + 16)
+def _attachment(data: Any) -> Attachment:
+    name, at = _text(data, 16)
     _, at = _text(data, at)
     (length,) = _LONG.unpack_from(data, at)
     return Attachment(name, bytes(data[at + 8 : at + 8 + length]))

@@ -34,7 +34,7 @@ ALLOWED: Final = (
 _AT_ONCE: Final = 1 << 20
 """Bytes that are read at once; where a line among them is no plain row of numbers, ever smaller parts are looked at."""
 _FEW: Final = 1 << 14
-"""So many are read line by line then."""
+"""So many are read line by line then, and no line has more: a hundred columns have a tenth of that."""
 
 _numbers: Final = msgspec.json.Decoder(list[float])
 
@@ -143,6 +143,8 @@ def read(path: Path, columns: str | None = None) -> Iterator[ImuBlock]:
                 end = data.rfind(b"\n") + 1
                 yield from log.blocks(data[:end])
                 data = data[end:]
+                if len(data) > _FEW:
+                    raise log.too_long()
             if log.empty:
                 yield from log.blocks(data)
             # Else the last line may be cut in the middle of a number, which then still looks like one.
@@ -204,10 +206,13 @@ class _Log:
             half = data.rfind(b"\n", 0, len(data) // 2) + 1 or data.find(b"\n") + 1 or len(data)
             first, rest = data[:half], data[half:]
             if not rest:
-                yield from _in_blocks(self._one_by_one(data))
-                return
+                raise self.too_long()
             yield from self.blocks(first)
             yield from self.blocks(rest)
+
+    def too_long(self) -> StorageError:
+        """Of the next line."""
+        return StorageError(f"{self._path}, line {self._lines + 1}: found no line end within {_FEW} bytes")
 
     def _one_by_one(self, data: bytes) -> Iterator[ImuSample]:
         text = data.decode("utf-8-sig" if self._lines == 0 else "utf-8")

@@ -40,6 +40,8 @@ __all__ = ["Replay", "Replayed", "Result"]
 
 AT_ONCE: Final = 16384
 """Messages that are gathered before they are replayed; half of them samples, they are some seconds of a 1 kHz IMU."""
+AT_ONCE_BYTES: Final = 16 * 1024 * 1024
+"""Of them; ours have a sixth of that."""
 _UNUSABLE: Final = (msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 """What a handler says of a message that nobody could have written."""
 _raw: Final = msgspec.json.Decoder(topics.RawBytes)
@@ -82,7 +84,7 @@ class Replay:
         self._recording = recording
         self._in_blocks = in_blocks
         self._gathered: list[Messages] = []
-        self._how_many = 0
+        self._how_many = self._bytes = 0
         self._config: Config | None = None
         self._versions: dict[str, str] = {}
         self._collector: RollingCollector | None = None
@@ -180,12 +182,13 @@ class Replay:
     def _gather(self, messages: Messages) -> None:
         self._gathered.append(messages)
         self._how_many += len(messages.data)
-        if self._how_many >= AT_ONCE:
+        self._bytes += sum(map(len, messages.data))
+        if self._how_many >= AT_ONCE or self._bytes >= AT_ONCE_BYTES:
             self._flush()
 
     def _flush(self) -> None:
         """Replay what has been gathered."""
-        gathered, self._gathered, self._how_many = self._gathered, [], 0
+        gathered, self._gathered, self._how_many, self._bytes = self._gathered, [], 0, 0
         if not gathered:
             return
         numbers = np.concatenate([each.numbers for each in gathered])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import stat
 from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any
@@ -94,6 +96,26 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="exists already"):
         RecordingFile(path)
     assert path.read_bytes() == b"precious"
+
+
+def test_a_recording_is_its_owners_alone_whatever_the_umask(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        ring = Ring(tmp_path / "ring", 8 * MB)
+        ring.write([beginning(), *raw(1, 10)])
+        ring.close()
+        asked_for = RecordingFile(tmp_path / "flights" / "mine.mcap")
+        asked_for.write([beginning()])
+        asked_for.close()
+    finally:
+        os.umask(before)
+    modes = {path.name: stat.filemode(path.stat().st_mode) for path in tmp_path.rglob("*")}
+    assert modes == {
+        "ring": "drwx------",
+        "000001.mcap": "-rw-------",
+        "flights": "drwx------",
+        "mine.mcap": "-rw-------",
+    }
 
 
 def full(path: Path) -> IO[bytes]:
