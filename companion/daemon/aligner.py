@@ -147,7 +147,8 @@ class Aligner:
             if moving:
                 moved, since_s = True, now_s
             still_s = min(status.still_s, now_s - since_s - SETTLE_S)
-            waiting_for = not_ready(self._vehicle, self._imus) or status.waiting_for
+            doubt = models.place_doubt(self._config, self._vehicle)
+            waiting_for = not_ready(self._vehicle, self._imus) or doubt or status.waiting_for
             share = min(max(still_s, 0.0) / self._stand_s, 1.0) if moved and waiting_for is None else 0.0
             if not moved:
                 words = f"{why or f'{number - 1} done. Now {wish}'}; waiting for it to move"

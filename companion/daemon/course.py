@@ -307,7 +307,8 @@ class Course:
                     raise AutopilotError(f"imu {name}: {imu.problem}")
             await estimating.catch_up(self._collector, self._offload)
             status = self._collector.status(now_s)
-            waiting_for = not_ready(self._vehicle, self._imus) or status.waiting_for
+            doubt = models.place_doubt(self._config, self._vehicle)
+            waiting_for = not_ready(self._vehicle, self._imus) or doubt or status.waiting_for
             if waiting_for is not None:
                 if self.machine.state is State.COLLECTING:
                     self.machine.on(Event.MOVED)
