@@ -177,7 +177,7 @@ class Aligner:
             self._machine.on(Event.MOVED)
 
     def _check(self, job: Job, taken: list[_Taken], now_s: float) -> None:
-        if self._vehicle.arm_state is ArmState.ARMED:
+        if job.armed or self._vehicle.arm_state is ArmState.ARMED:
             raise CalibrationRefusedError("armed during the alignment; the one before stays in force")
         if job.deadline_s is not None and now_s >= job.deadline_s:
             raise CalibrationRefusedError(f"not finished in the time given: {job.words}")

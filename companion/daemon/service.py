@@ -278,7 +278,7 @@ class Service:
         self.in_force.on_ended(job, result)
         if job.kind != ALIGNMENT:
             self.automatic.on_ended(job, result)
-        if job.record is not None:
+        if job.record is not None and job.record.is_worth_keeping:
             self.recorder.on_record(job.record)
 
     def _message_of(self, name: str) -> str | None:

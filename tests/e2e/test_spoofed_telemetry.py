@@ -104,3 +104,76 @@ def test_a_place_in_the_configuration_is_not_doubted(tmp_path: Path) -> None:
             assert job.record.site.source == "configuration"
 
     run_virtual(main())
+
+
+def announced() -> Message:
+    return mavlink.MAVLink_param_value_message(b"INS_GYROFFS_X", 0.3, 9, 1000, 65535)
+
+
+def beat(*, armed: bool) -> Callable[[], Message]:
+    return lambda: mavlink.MAVLink_heartbeat_message(2, 3, 128 if armed else 0, 0, 4, 3)
+
+
+def restarted() -> Message:
+    return mavlink.MAVLink_system_time_message(0, 5)
+
+
+def test_an_announced_offset_that_is_not_in_force_disturbs_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            async with spoofed(rig, 3.0, announced):
+                job = calibrate(rig)
+                async with asyncio.timeout(60.0):
+                    result = await job.finished
+            assert result.outcome == "done"
+            assert job.record is not None
+            found = np.array(job.record.imus[0].accel_bias_m_s2) / MG
+            assert np.abs(found - ACCEL_BIAS_MG).max() < 0.3
+
+    run_virtual(main())
+    assert "INS_GYROFFS_X = 0.3 was announced and is not in force" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("every_s", "what", "words"),
+    [
+        (0.05, (announced,), "pretend to be the autopilot"),
+        (5.0, (restarted,), "the autopilot rebooted, 5 times now"),
+        (0.5, (beat(armed=True), beat(armed=False)), "armed during the measurement"),
+    ],
+)
+def test_nothing_that_is_forged_again_and_again_holds_a_calibration_up_for_ever(
+    tmp_path: Path, every_s: float, what: tuple[Callable[[], Message], ...], words: str
+) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            async with spoofed(rig, every_s, *what):
+                job = calibrate(rig)
+                async with asyncio.timeout(60.0):
+                    result = await job.finished
+            assert result.outcome == "failed"
+            assert words in result.reason
+            await asyncio.sleep(2.0)
+            assert any("Calibration failed" in text for text in rig.ground.texts())
+
+    run_virtual(main())
+
+
+def test_an_arming_between_two_looks_ends_the_measurement(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            job = calibrate(rig)
+            await asyncio.sleep(3.05)
+            codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+            for armed in (True, False):
+                rig.link.receive(beat(armed=armed)().pack(codec), rig.now_s)
+            async with asyncio.timeout(5.0):
+                result = await job.finished
+            assert result.reason == "armed during the measurement; nothing was written"
+
+    run_virtual(main())
