@@ -8,7 +8,6 @@ armed heartbeat has come under the vehicle's ids for 3 s, from whomever (`arming
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import enum
 import logging
 import math
@@ -22,7 +21,9 @@ from companion.autopilot.boot_clock import BootClock
 from companion.autopilot.commands import Commands
 from companion.autopilot.latch import Latch, is_aircraft
 from companion.autopilot.standing_requests import StandingRequests
+from companion.autopilot.whereabouts import Position, TimeAndPlace
 from companion.links.mavlink import MavlinkLink, Message, Unsubscribe
+from companion.links.mavlink_signing import EARLIEST_S
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +45,6 @@ _CONFLICT_S: Final = 5.0
 """So long after the last sign of a second autopilot under our vehicle's ids nothing is believed of either."""
 _RESTARTS_S: Final = 1.0
 """No autopilot restarts twice in that time: two whose times since boot alternate do."""
-_EARLIEST_UNIX_TIME_S: Final = 1577836800.0  # 2020: a clock before that has not been set
 
 Firmware = Literal["ardupilot", "px4", "other"]
 VehicleEvent = Literal["armed", "disarmed", "lost", "found", "rebooted"]
@@ -65,16 +65,6 @@ class ArmState(enum.Enum):
     DISARMED = "disarmed"
     ARMED = "armed"
     UNKNOWN = "unknown"
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Position:
-    """Where the autopilot believes to be; the height is above mean sea level."""
-
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float
-    source: str
 
 
 class Vehicle:
@@ -103,7 +93,8 @@ class Vehicle:
         """Whether its last heartbeat was signed (MAVLink 2)."""
         self.boots = 0
         """How many restarts were seen."""
-        self.position: Position | None = None
+        self.place = TimeAndPlace()
+        """What it says of time and place."""
         self.commands = Commands(link, self._target)
         self._link = link
         self._latch = Latch(system_id)
@@ -116,7 +107,6 @@ class Vehicle:
         self._lost = True
         self._trusted_from_s = -math.inf
         self._boot_clock = BootClock()
-        self._unix_minus_loop_s: float | None = None
         self._watchers: list[Callable[[VehicleEvent], None]] = []
         self._found = asyncio.Event()
         self._heartbeat_waiters: list[asyncio.Event] = []
@@ -183,9 +173,12 @@ class Vehicle:
     @property
     def unix_time_s(self) -> float | None:
         """UTC as the autopilot has it (from its GNSS), carried on by the loop's clock; None when it has none."""
-        if self._unix_minus_loop_s is None:
-            return None
-        return self._unix_minus_loop_s + asyncio.get_running_loop().time()
+        return self.place.unix_time_s
+
+    @property
+    def position(self) -> Position | None:
+        """Where it stands, as far as the autopilot can be believed; None when it says no place."""
+        return self.place.position
 
     @property
     def name(self) -> str:
@@ -446,8 +439,7 @@ class Vehicle:
         self.boots += 1
         self._arming.restarted()
         self._armed_told = None
-        self.position = None
-        self._unix_minus_loop_s = None
+        self.place.restarted()
         self.version = self.capabilities = None
         self._version_asked_s, self._version_pause_s = -math.inf, 2.0
         self._ask_soon()
@@ -468,7 +460,7 @@ class Vehicle:
         self, message: mavlink.MAVLink_raw_imu_message | mavlink.MAVLink_highres_imu_message, t_s: float
     ) -> None:
         # The field may carry UTC instead; no autopilot has been up since the nineteen-seventies.
-        if self.sent(message) and message.time_usec * 1e-6 < _EARLIEST_UNIX_TIME_S:
+        if self.sent(message) and message.time_usec * 1e-6 < EARLIEST_S:
             self._boot_time(message.time_usec * 1e-6, t_s)
 
     def _on_system_time(self, message: mavlink.MAVLink_system_time_message, t_s: float) -> None:
@@ -476,8 +468,7 @@ class Vehicle:
             return
         self._wanted.heard(message, t_s)
         self._boot_time(message.time_boot_ms * 1e-3, t_s)
-        unix_s = message.time_unix_usec * 1e-6
-        self._unix_minus_loop_s = unix_s - t_s if unix_s > _EARLIEST_UNIX_TIME_S else None
+        self.place.hear_time(message, t_s)
 
     def _on_version(self, message: mavlink.MAVLink_autopilot_version_message, _t_s: float) -> None:
         if self.sent(message):
@@ -489,21 +480,11 @@ class Vehicle:
             return
         self._wanted.heard(message, t_s)
         self._boot_time(message.time_boot_ms * 1e-3, t_s)
-        position = _position(message.lat, message.lon, message.alt, "autopilot GLOBAL_POSITION_INT")
-        if position is not None:
-            self.position = position
+        self.place.hear_estimate(message, t_s)
 
-    def _on_gps(self, message: mavlink.MAVLink_gps_raw_int_message, _t_s: float) -> None:
-        estimated = self.position is not None and "GLOBAL_POSITION" in self.position.source
-        if self.sent(message) and message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX and not estimated:
-            self.position = _position(message.lat, message.lon, message.alt, "autopilot GPS_RAW_INT") or self.position
-
-
-def _position(latitude_1e7: int, longitude_1e7: int, height_mm: int, source: str) -> Position | None:
-    # (0, 0) is what ArduPilot sends while it knows no position.
-    if (latitude_1e7, longitude_1e7) == (0, 0) or abs(latitude_1e7) > 900000000 or abs(longitude_1e7) > 1800000000:
-        return None
-    return Position(latitude_1e7 * 1e-7, longitude_1e7 * 1e-7, height_mm * 1e-3, source)
+    def _on_gps(self, message: mavlink.MAVLink_gps_raw_int_message, t_s: float) -> None:
+        if self.sent(message):
+            self.place.hear_receiver(message, t_s)
 
 
 def _version_text(packed: int) -> str:

@@ -53,6 +53,8 @@ POLL_S: Final = 0.2
 SAY_WAITING_EVERY_S: Final = 10.0
 READ_ATTEMPTS: Final = 2
 """So often, within one calibration, the autopilot's offsets may fail to be read."""
+MOST_UPSETS: Final = 5
+"""So often, within one calibration, other offsets may come into force, or the autopilot restart."""
 WRONG_IMU_ATTEMPTS: Final = 3
 """Of three IMUs two may have been taken for the one that is meant."""
 SETTLING_PERCENT: Final = 95.0
@@ -92,6 +94,8 @@ class Course:
         """Of State.VERIFYING."""
         self._settled_by_s = 0.0
         self._dithered = False
+        self._upsets: dict[str, int] = {}
+        """By IMU, how many there had been before this calibration."""
 
     @property
     def is_dithering(self) -> bool:
@@ -126,6 +130,7 @@ class Course:
         """
         if not job.automatic:
             self._say(Severity.NOTICE, "Calibration started: keep the aircraft still", Weight.NEWS)
+        self._upsets = {name: imu.upsets for name, imu in self._imus.items()}
         for _ in range(WRONG_IMU_ATTEMPTS - 1):
             try:
                 await self._measure_and_push(job, draft)
@@ -302,16 +307,21 @@ class Course:
         failures = {name: imu.failures for name, imu in self._imus.items()}
         while True:
             now_s = loop.time()
-            if self._vehicle.arm_state is ArmState.ARMED:
+            if job.armed or self._vehicle.arm_state is ArmState.ARMED:
                 raise CalibrationRefusedError("armed during the measurement; nothing was written")
             for name, imu in self._imus.items():
                 failures[name] = min(failures[name], imu.failures)
                 if imu.failures - failures[name] >= READ_ATTEMPTS:
                     # Patience is for what can change by itself; an autopilot that does not answer is a fault.
                     raise AutopilotError(f"imu {name}: {imu.problem}")
+                if (upsets := imu.upsets - self._upsets.get(name, 0)) >= MOST_UPSETS:
+                    raise AutopilotError(
+                        f"{imu.upset}, {upsets} times now: does something else write, or pretend to be the autopilot?"
+                    )
             await estimating.catch_up(self._collector, self._offload)
             status = self._collector.status(now_s)
-            waiting_for = not_ready(self._vehicle, self._imus) or status.waiting_for
+            doubt = models.place_doubt(self._config, self._vehicle)
+            waiting_for = not_ready(self._vehicle, self._imus) or doubt or status.waiting_for
             if waiting_for is not None:
                 if self.machine.state is State.COLLECTING:
                     self.machine.on(Event.MOVED)

@@ -13,7 +13,7 @@ from companion.autopilot.imu_calibration import accel_taken_off
 from companion.autopilot.imu_stream import StreamKind
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.px4_slots import SlotMemory
-from companion.autopilot.vehicle import Vehicle
+from companion.autopilot.vehicle import ArmState, Vehicle
 from companion.autopilot.writer import ParameterWriter
 from companion.component.component import Component
 from companion.component.service import JobResult
@@ -107,6 +107,7 @@ class Service:
             field_by=models.field_by(config),
             message_of=self._message_of,
         )
+        self.vehicle.place.is_carried = self._is_carried
         self.slots = SlotMemory()
         self._imu_rate_hz = models.imu_rate_hz(config) if imu_rate_hz is None else imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
@@ -280,12 +281,17 @@ class Service:
         self.in_force.on_ended(job, result)
         if job.kind != ALIGNMENT:
             self.automatic.on_ended(job, result)
-        if job.record is not None:
+        if job.record is not None and job.record.is_worth_keeping:
             self.recorder.on_record(job.record)
 
     def _message_of(self, name: str) -> str | None:
         imu = self.imus.get(name)
         return imu.stream.kind.message if imu is not None and imu.stream.kind is not None else None
+
+    def _is_carried(self) -> bool:
+        if self.vehicle.arm_state is ArmState.ARMED:
+            return True
+        return self.collector.glance(asyncio.get_running_loop().time()).moving
 
     def _corrected(self, name: str) -> Corrected | None:
         imu = self.imus.get(name)

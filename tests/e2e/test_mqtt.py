@@ -64,7 +64,7 @@ def test_a_calibration_is_asked_for_watched_and_answered(tmp_path: Path) -> None
                 last = await watcher.until("companion/1/calibration/progress", says("done"))
                 assert last.json["percent"] == 100
                 await _the_pose(rig, watcher.heard)
-                assert len(rig.service.store.history()) == 1
+                assert rig.service.store.history() == []  # nothing had been measured
 
                 watcher.forget()
                 await watcher.publish("companion/1/request/undo", {"transaction": 3})

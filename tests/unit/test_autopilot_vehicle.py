@@ -8,7 +8,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.boot_clock import BootClock
-from companion.autopilot.vehicle import ArmState, Position, Vehicle
+from companion.autopilot.vehicle import ArmState, Vehicle
+from companion.autopilot.whereabouts import Position
 from companion.links.mavlink import MavlinkLink
 from tests.support.scripted_autopilot import ScriptedAutopilot, flying_on
 from tests.support.virtual_time import run_virtual
@@ -260,7 +261,7 @@ def test_asks_for_what_it_needs_and_learns_version_time_and_place() -> None:
     async def main() -> None:
         autopilot = ScriptedAutopilot()
         async with aboard(autopilot) as (vehicle, _):
-            await asyncio.sleep(2.0)
+            await asyncio.sleep(5.0)
             assert autopilot.intervals[mavlink.MAVLINK_MSG_ID_HEARTBEAT] == pytest.approx(0.2)
             assert vehicle.version == "4.8.0-dev"
             assert vehicle.name == "ArduPilot 4.8.0-dev, system 1"
@@ -301,9 +302,10 @@ def test_position_zero_zero_is_no_position_and_gps_serves_instead() -> None:
         ):
             link.receive(message.pack(codec), 1000.0)
         assert position(vehicle) is None
-        link.receive(
-            mavlink.MAVLink_gps_raw_int_message(1000, 3, 100000000, 200000000, 1000, 0, 0, 0, 0, 9).pack(codec), 1000.0
-        )
+        for t_s in range(1000, 1004):
+            link.receive(
+                mavlink.MAVLink_gps_raw_int_message(1000, 3, 100000000, 200000000, 1000, 0, 0, 0, 0, 9).pack(codec), t_s
+            )
         assert vehicle.position is not None
         assert vehicle.position.source == "autopilot GPS_RAW_INT"
         assert vehicle.position.longitude_deg == pytest.approx(20.0)
