@@ -18,7 +18,6 @@ from companion.component.statustext import Severity, Weight
 from companion.daemon.ledger import Offload
 from companion.daemon.readiness import Readiness
 from companion.errors import StorageError
-from companion.links.budget import Budget
 from companion.storage.bounded import BoundedList
 
 logger = logging.getLogger(__name__)
@@ -26,9 +25,6 @@ logger = logging.getLogger(__name__)
 KEEP: Final = 200
 """Some 400 bytes each: below 100 kB, a season of flying."""
 QUEUE: Final = 16
-KEPT_PER_S: Final = 0.1
-BURST: Final = 10.0
-"""Whoever flies arms less often; what only flickers must not wash out the season."""
 
 Say = Callable[[Severity, str, Weight], object]
 
@@ -40,7 +36,6 @@ class Armings:
         self._readiness, self._say, self._offload = readiness, say, offload
         self._file = BoundedList(directory / "armings.json", Arming, KEEP)
         self._queue: asyncio.Queue[Arming] = asyncio.Queue(QUEUE)
-        self._budget = Budget(KEPT_PER_S, BURST)
         self.last: Arming | None = None
         self._unsubscribe = vehicle.watch(self._on_event)
 
@@ -79,9 +74,6 @@ class Armings:
             gyro_sigma_use_rad_s=in_force.sigma("gyro"),
             accel_sigma_use_m_s2=in_force.sigma("accel"),
         )
-        if self._budget.left(now_s) < 1.0:
-            return
-        self._budget.take(1, now_s)
         with contextlib.suppress(asyncio.QueueFull):
             self._queue.put_nowait(self.last)
         if readiness.at_arm != "off":
