@@ -445,6 +445,18 @@ def _spoofed_values(scene: Scene) -> None:
     stranger(scene, 1, 1).say(mavlink.MAVLink_command_ack_message(31010, 4, 0, 0, 1, 191))
 
 
+def _forged_dates_and_places(scene: Scene) -> None:
+    """Under the autopilot's own ids, beside what it says itself: a year that no calendar has, the equator, 20 km up."""
+    one, boot_ms = stranger(scene, 1, 1), round((scene.stage.service.vehicle.boot_s or 0.0) * 1e3)
+    one.say(mavlink.MAVLink_system_time_message(2**63, boot_ms))
+    for lat, alt in ((1000, 50_000), (400_000_000, 20_000_000)):
+        one.say(mavlink.MAVLink_global_position_int_message(boot_ms, lat, 1_160_000_000, alt, 0, 0, 0, 0, 0))
+
+
+def _announced_offset(scene: Scene) -> None:
+    stranger(scene, 1, 1).say(mavlink.MAVLink_param_value_message(_gyro_x(scene).encode(), 0.3, 9, 1000, 65535))
+
+
 def _asks_to_arm(scene: Scene) -> None:
     one = stranger(scene, 1, 1)
     for _ in range(20):
@@ -543,6 +555,20 @@ def intruder_faults() -> list[Fault]:
             "intruder",
             "values, telemetry and acknowledgements of another component",
             *every(0.1, _spoofed_values),
+        ),
+        Fault(
+            "forged-places",
+            "intruder",
+            "dates and places that cannot be, under the autopilot's ids",
+            *every(0.2, _forged_dates_and_places),
+            excused=r"position|height",
+        ),
+        Fault(
+            "announced-offset",
+            "intruder",
+            "an offset that is not in force is announced under the autopilot's ids",
+            *every(2.5, _announced_offset),
+            excused=r"OFF|somebody|changed",
         ),
         Fault(
             "arm-question-flood",
