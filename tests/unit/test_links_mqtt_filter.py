@@ -15,7 +15,7 @@ import pytest
 import trustme
 
 from companion.config.sections import Mqtt
-from companion.links import mqtt_filter
+from companion.links import mqtt, mqtt_filter
 from companion.links.mqtt import Incoming, MqttLink
 from companion.links.mqtt_filter import BrokerFaultError, MqttFilter, NoGreetingError
 from tests.support.hostile_broker import Attack, HostileBroker, huge, packet, publish, variable
@@ -146,7 +146,7 @@ def test_another_program_that_finds_the_address_gets_nothing() -> None:
         writer.close()
 
     async def main() -> bytes:
-        async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
+        async with asyncio.timeout(30.0), await asyncio.start_server(serve, "127.0.0.1", 0) as server:
             async with MqttFilter("127.0.0.1", server.sockets[0].getsockname()[1], None, 5) as broker:
                 name = broker.address.removeprefix("\0")
                 child = await asyncio.create_subprocess_exec(
@@ -218,6 +218,7 @@ def test_the_worst_broker_is_named_and_costs_next_to_nothing(
     broker: HostileBroker, words: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(mqtt_filter, "FLOOD_S", 1.0)
+    monkeypatch.setattr(mqtt, "MANY", 1)
     said, allocated = until_words(broker, words)
     assert allocated < MOST_ALLOCATED_BYTES
     assert said.startswith(f"127.0.0.1:{broker.port}: the broker ")
