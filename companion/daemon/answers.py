@@ -10,7 +10,7 @@ import msgspec
 
 from companion.autopilot.vehicle import Vehicle
 from companion.calibration.record import Record
-from companion.calibration.request import What
+from companion.calibration.request import What, is_time_limit
 from companion.calibration.rolling import RollingCollector
 from companion.component.permission import Permission
 from companion.component.service import Refusal
@@ -189,10 +189,13 @@ class Answers:
     async def _answer_calibrate(self, request: Object, face: str) -> AsyncIterator[Object]:
         try:
             what = What[str(request.get("what", "both")).upper()]
-            timeout_s = request.get("timeout_s")
-            timeout_s = None if timeout_s is None else float(timeout_s)
-        except (KeyError, TypeError, ValueError) as error:
+        except KeyError as error:
             raise CalibrationRefusedError(f"calibrate: {error} is not understood") from None
+        timeout_s = request.get("timeout_s")
+        if timeout_s is not None and not is_time_limit(timeout_s):
+            raise CalibrationRefusedError(
+                f"calibrate: 'timeout_s': found {timeout_s!r}; allowed: a number of seconds above 0"
+            )
         reboot = request.get("reboot") is True
         job = _accepted(self._conductor.start_calibration(what, f"{face} calibrate", timeout_s, reboot=reboot))
         if not request.get("wait"):
