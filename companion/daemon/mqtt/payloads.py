@@ -10,6 +10,7 @@ from typing import Any, Final
 import msgspec
 
 from companion.calibration.request import What
+from companion.printable import printable
 
 Object = dict[str, Any]
 Transaction = str | int | None
@@ -98,7 +99,7 @@ def _shown(value: object) -> str:
         text = msgspec.json.encode(value).decode()
     except (OverflowError, RecursionError):
         return "what is too large"
-    text = text if text.isprintable() else ascii(text)[1:-1]
+    text = printable(text)
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
 
 
