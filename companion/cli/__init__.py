@@ -10,14 +10,17 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import logging
 import sys
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from companion import __version__, config
+from companion.cli import logs
 from companion.config.profiles import SavedProfiles
 from companion.errors import CompanionError, ConfigError, DaemonUnreachableError, NobodyHeardError
+from companion.printable import printable
 
 DONE: Final = 0
 FAILED: Final = 1
@@ -29,11 +32,13 @@ Command = Callable[[argparse.Namespace], Awaitable[int]]
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(logs.OneLineFormatter())
     options = _parser().parse_args(arguments)
     try:
         return asyncio.run(_dispatch(options))
     except ConfigError as error:
-        print(error, file=sys.stderr)
+        print_lines(error, error=True)
         return USAGE
     except (DaemonUnreachableError, NobodyHeardError) as error:
         _fail(options, "unreachable", str(error))
@@ -54,10 +59,24 @@ async def _dispatch(options: argparse.Namespace) -> int:
     return await command(options)
 
 
+def print_lines(*lines: object, error: bool = False, end: str = "\n") -> None:
+    """Print lines for people, or JSON: the one door to the terminal, by which nothing goes that it would obey.
+
+    Args:
+        lines: each is one, whatever is in it.
+        error: to stderr.
+        end: of each.
+    """
+    stream = sys.stderr if error else sys.stdout
+    for line in lines:
+        stream.write(printable(str(line)) + end)
+    stream.flush()
+
+
 def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
-    print(f"companion: {reason}", file=sys.stderr)
+    print_lines(f"companion: {reason}", error=True)
     if getattr(options, "json", False):
-        print(json.dumps({"state": state, "reason": reason}))
+        print_json({"state": state, "reason": reason})
 
 
 def load_config(options: argparse.Namespace, *, profiles: bool = False, forgiving: bool = False) -> config.Config:
@@ -103,7 +122,8 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Say a usage error in one line."""
-        self.exit(USAGE, f"{self.prog}: {message} (see {self.prog} --help)\n")
+        print_lines(f"{self.prog}: {message} (see {self.prog} --help)", error=True)
+        self.exit(USAGE)
 
 
 def _parser() -> Parser:
@@ -198,4 +218,4 @@ def _count(text: str) -> int:
 
 def print_json(value: Any) -> None:
     """Print the one JSON object of a command."""
-    print(json.dumps(value))
+    print_lines(json.dumps(value))

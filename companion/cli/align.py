@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 import asyncio
 import math
-import sys
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from companion.cli import DONE, FAILED, load_config, print_json, seconds
+from companion.cli import DONE, FAILED, load_config, print_json, print_lines, seconds
 from companion.daemon.control import ask
 
 Object = dict[str, Any]
@@ -52,7 +51,7 @@ async def align(options: argparse.Namespace) -> int:
                 running = True
                 if reply["text"] != shown:
                     shown = reply["text"]
-                    print(f"[{reply['percent']:3d} %] {shown}", file=sys.stderr, flush=True)
+                    print_lines(f"[{reply['percent']:3d} %] {shown}", error=True)
     except asyncio.CancelledError:
         if not running:
             raise
@@ -69,16 +68,15 @@ async def _cancel(path: Any) -> Object:
 def _finish(options: argparse.Namespace, action: str, reply: Object) -> int:
     if reply["kind"] == "error":
         answer: Object = {"state": "refused", "reason": reply["reason"]}
-        print(f"companion: {reply['reason']}", file=sys.stderr)
+        print_lines(f"companion: {reply['reason']}", error=True)
     else:
         answer = {key: value for key, value in reply.items() if key != "kind"}
     good = answer["state"] in ("done", "in force") or (action == "show" and answer["state"] != "refused")
     if getattr(options, "json", False):
         print_json(answer)
     elif reply["kind"] != "error":
-        print(f"{answer['state'].upper()}: {answer['reason']}" if answer["reason"] else answer["state"].upper())
-        for line in alignment_lines(answer["alignment"]) if answer.get("alignment") else ():
-            print(line)
+        print_lines(f"{answer['state'].upper()}: {answer['reason']}" if answer["reason"] else answer["state"].upper())
+        print_lines(*(alignment_lines(answer["alignment"]) if answer.get("alignment") else ()))
     return DONE if good else FAILED
 
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import Any
 
-from companion.cli import DONE, FAILED, load_config, print_json, show
+from companion.cli import DONE, FAILED, load_config, print_json, print_lines, show
 from companion.daemon.control import ask
 
 Object = dict[str, Any]
@@ -19,7 +18,7 @@ async def _request(options: argparse.Namespace, request: Object) -> Object:
     async for reply in ask(load_config(options).control.path, request):
         if reply["kind"] == "progress" and reply["text"] != shown:
             shown = reply["text"]
-            print(f"[{reply['percent']:3d} %] {reply['state']}: {shown}", file=sys.stderr, flush=True)
+            print_lines(f"[{reply['percent']:3d} %] {reply['state']}: {shown}", error=True)
     return reply
 
 
@@ -27,12 +26,11 @@ def _finish(options: argparse.Namespace, reply: Object, answer: Object, lines: l
     """Print an answer, as JSON or as lines for people, and give the exit code."""
     if reply["kind"] == "error":
         answer, lines, good = {"state": "refused", "reason": reply["reason"]}, [], False
-        print(f"companion: {reply['reason']}", file=sys.stderr)
+        print_lines(f"companion: {reply['reason']}", error=True)
     if getattr(options, "json", False):
         print_json(answer)
     else:
-        for line in lines:
-            print(line)
+        print_lines(*lines)
     return DONE if good else FAILED
 
 

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from companion.cli import DONE, FAILED, Parser, print_json, seconds
+from companion.cli import DONE, FAILED, Parser, print_json, print_lines, seconds
 from companion.errors import ConfigError, LinkError, NobodyHeardError
 
 if TYPE_CHECKING:
@@ -111,8 +111,7 @@ async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Aw
     if getattr(options, "json", False):
         print_json(outcome.answer)
     else:
-        for line in outcome.lines:
-            print(line)
+        print_lines(*outcome.lines)
     return DONE if outcome.good else FAILED
 
 

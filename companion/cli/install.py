@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from companion.cli import DONE, FAILED, Command, print_json
+from companion.cli import DONE, FAILED, Command, print_json, print_lines
 
 if TYPE_CHECKING:
     from companion.installation.install import Step, Target
@@ -57,11 +56,11 @@ async def udev_rule(options: argparse.Namespace) -> int:
     if getattr(options, "json", False):
         print_json({"rule": rule, "recognised_by": words, "file": udev.FILE})
         return DONE
-    print(rule)
-    print(f"recognised by {words}", file=sys.stderr)
-    print(f"to use it: add the line to {udev.FILE}, then", file=sys.stderr)
-    print("  sudo udevadm control --reload && sudo udevadm trigger --subsystem-match=tty", file=sys.stderr)
-    print(f"and name the port /dev/companion-{options.name} in the configuration", file=sys.stderr)
+    print_lines(rule)
+    print_lines(f"recognised by {words}", error=True)
+    print_lines(f"to use it: add the line to {udev.FILE}, then", error=True)
+    print_lines("  sudo udevadm control --reload && sudo udevadm trigger --subsystem-match=tty", error=True)
+    print_lines(f"and name the port /dev/companion-{options.name} in the configuration", error=True)
     return DONE
 
 
@@ -77,12 +76,12 @@ def _tell(options: argparse.Namespace, steps: Iterable[Step]) -> int:
     for step in steps:
         done.append(step)
         line = f"{step.outcome:9}  {step.what}" + (f": {step.words}" if step.words else "")
-        print(line, file=sys.stderr if as_json else sys.stdout, flush=True)
+        print_lines(line, error=as_json)
     failed = [step for step in done if step.outcome == "failed"]
     if as_json:
         reason = "; ".join(f"{step.what}: {step.words}" for step in failed)
         state = "failed" if failed else "would be done" if options.dry_run else "done"
         print_json({"state": state, "reason": reason, "steps": [dataclasses.asdict(step) for step in done]})
     elif options.dry_run:
-        print("this was a dry run: nothing was changed", file=sys.stderr)
+        print_lines("this was a dry run: nothing was changed", error=True)
     return FAILED if failed else DONE

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from companion.cli import DONE, FAILED, config_path, load_config, logs, print_json, show
+from companion.cli import DONE, FAILED, config_path, load_config, logs, print_json, print_lines, show
 from companion.errors import CompanionError, LinkError
 
 if TYPE_CHECKING:
@@ -45,10 +45,10 @@ async def ports(options: argparse.Namespace) -> int:
             answer["heard"] = {port: _heard(heard) for port, heard in listened.items()}
         print_json(answer)
         return DONE
-    for line in () if options.listen else show.port_lines(found):
-        print(line)
+    if not options.listen:
+        print_lines(*show.port_lines(found))
     for port, heard in (listened or {}).items():
-        print("\n".join(show.heard_lines(port, heard)))
+        print_lines(*show.heard_lines(port, heard))
     return DONE
 
 
@@ -65,7 +65,7 @@ async def _listen(wanted: Sequence[str], found: Sequence[SerialPort]) -> dict[st
     # What is said to a console's port is a login, and what comes from it is no sensor.
     names = list(wanted) or [port.stable_name or port.device for port in found if not port.is_console]
     if names:
-        print(f"listening to {', '.join(names)}: up to half a minute", file=sys.stderr, flush=True)
+        print_lines(f"listening to {', '.join(names)}: up to half a minute", error=True)
     return dict(zip(names, await asyncio.gather(*map(one, names)), strict=True))
 
 
@@ -93,9 +93,9 @@ async def lua(options: argparse.Namespace) -> int:
     if getattr(options, "json", False):
         print_json({"name": ARMING_SCRIPT.name, "script": script, "installation": list(INSTALLATION)})
         return DONE
-    print(script, end="")
+    sys.stdout.write(script)
     for number, step in enumerate(INSTALLATION, 1):
-        print(f"{number}. {step}", file=sys.stderr)
+        print_lines(f"{number}. {step}", error=True)
     return DONE
 
 
@@ -112,10 +112,10 @@ async def web_token(options: argparse.Namespace) -> int:
     if getattr(options, "json", False):
         print_json({"url": url, "token": token})
     elif token is None:
-        print(f"{url} needs no token: only this board can reach it")
+        print_lines(f"{url} needs no token: only this board can reach it")
     else:
-        print(f"token: {token}")
-        print(f"open once on the phone: {url}#token={token}")
+        print_lines(f"token: {token}")
+        print_lines(f"open once on the phone: {url}#token={token}")
     return DONE
 
 
@@ -138,5 +138,5 @@ async def check(options: argparse.Namespace) -> int:
     else:
         width = max(len(finding.name) for finding in findings)
         for finding in findings:
-            print(f"{'ok ' if finding.good else 'BAD'}  {finding.name:{width}}  {finding.words}")
+            print_lines(f"{'ok ' if finding.good else 'BAD'}  {finding.name:{width}}  {finding.words}")
     return DONE if good else FAILED

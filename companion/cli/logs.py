@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import Final, TextIO
 
 from companion.links.budget import Budget
+from companion.printable import printable
 
 # The journal reads the level from "<N>" at the beginning of a line, so that `journalctl -p warning` finds it.
 _PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
@@ -84,7 +85,17 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
         super().emit(record)
 
 
-class JournalFormatter(logging.Formatter):
+class OneLineFormatter(logging.Formatter):
+    """A message is one line, whatever has come over a wire into it; only a traceback has more."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Whoever reads the log on a terminal sees what it would obey."""
+        said = copy.copy(record)
+        said.msg, said.args = printable(record.getMessage()), None
+        return "\n".join(map(printable, super().format(said).splitlines()))
+
+
+class JournalFormatter(OneLineFormatter):
     """Lines as journald wants them; it stamps the time itself."""
 
     def format(self, record: logging.LogRecord) -> str:
@@ -103,7 +114,7 @@ def set_up(level: str) -> None:
     if goes_to_journal(sys.stderr):
         handler.setFormatter(JournalFormatter("%(levelname)s %(message)s"))
     else:
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+        handler.setFormatter(OneLineFormatter("%(asctime)s %(levelname)s %(message)s"))
     logging.basicConfig(level=level.upper(), handlers=[handler])
 
 

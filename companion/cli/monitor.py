@@ -17,9 +17,10 @@ import textwrap
 import time
 from typing import Any, Final, Protocol
 
-from companion.cli import DONE, load_config, print_json, show
+from companion.cli import DONE, load_config, print_json, print_lines, show
 from companion.daemon.control import ask
 from companion.errors import DaemonUnreachableError
+from companion.printable import printable
 
 Object = dict[str, Any]
 
@@ -115,7 +116,7 @@ class _Lines:
     def _print(self, lines: list[str]) -> None:
         now = time.strftime("%H:%M:%S")
         for line in lines:
-            print(f"{now} {line}", flush=True)
+            print_lines(f"{now} {line}")
 
     def close(self) -> None:
         pass
@@ -140,7 +141,7 @@ class _Screen:
     def _draw(self, tone: str, word: str, reason: str, status: Object | None) -> None:
         width, height = shutil.get_terminal_size()
         look = _COLOURS[tone] if self._colours else "1;7"
-        head = [" ", f"  {_SIGNS[tone]}  {' '.join(word)}", " "]
+        head = [" ", f"  {_SIGNS[tone]}  {' '.join(printable(word))}", " "]
         lines = [f"\x1b[{look}m{line[:width].ljust(width)}\x1b[0m" for line in head]
         lines += [f"\x1b[1m{part}\x1b[0m" for part in _wrapped(reason, width)]
         if status is not None:
@@ -157,8 +158,7 @@ class _Screen:
 
 def _wrapped(line: str, width: int) -> list[str]:
     """A line as the terminal holds it; what a wire may have slipped into it moves no cursor."""
-    line = "".join(letter if letter.isprintable() else "?" for letter in line)
-    return textwrap.wrap(line, max(width, 20), subsequent_indent="    ", drop_whitespace=False) or [""]
+    return textwrap.wrap(printable(line), max(width, 20), subsequent_indent="    ", drop_whitespace=False) or [""]
 
 
 def _without_figures(line: str) -> str:

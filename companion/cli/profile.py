@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 import datetime
 import math
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
-from companion.cli import DONE, FAILED, Command, load_config, print_json, seconds, storage_path
+from companion.cli import DONE, FAILED, Command, load_config, print_json, print_lines, seconds, storage_path
 from companion.errors import CalibrationRefusedError, ConfigError, StorageError
 from companion.physics.units import DEG_H, MG
 
@@ -88,7 +87,7 @@ async def profile(options: argparse.Namespace) -> int:
         except CalibrationRefusedError as error:
             refused.append(f"imu {imu}: {error}")
     for words in refused:
-        print(f"companion: {words}", file=sys.stderr)
+        print_lines(f"companion: {words}", error=True)
     saved = None
     reason = "; ".join(refused)
     state = "done" if results and not refused else "failed"
@@ -105,11 +104,11 @@ async def profile(options: argparse.Namespace) -> int:
         print_json({**answer, "imus": [_object(result) for result in results]})
     else:
         for result in results:
-            print("\n".join(_lines(result)))
+            print_lines(*_lines(result))
         if saved is not None:
-            print(f'saved: {saved}; profile = "{options.save}" in [[imu]] takes it, after a restart')
+            print_lines(f'saved: {saved}; profile = "{options.save}" in [[imu]] takes it, after a restart')
     if state == "refused":
-        print(f"companion: {reason}", file=sys.stderr)
+        print_lines(f"companion: {reason}", error=True)
     return DONE if state == "done" else FAILED
 
 

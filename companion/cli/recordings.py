@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from companion.cli import DONE, FAILED, load_config, print_json, seconds, show, storage_path
+from companion.cli import DONE, FAILED, load_config, print_json, print_lines, seconds, show, storage_path
 from companion.daemon.control import ask
 from companion.errors import ConfigError
 
@@ -78,11 +78,12 @@ async def record(options: argparse.Namespace) -> int:
     try:
         async for reply in ask(path, {"command": "record", "file": file, "seconds": options.seconds}):
             if reply["kind"] == "progress":
-                print(f"\r{reply['text']}", end="", file=sys.stderr, flush=True)
+                sys.stderr.write("\r")
+                print_lines(reply["text"], end="", error=True)
     except asyncio.CancelledError:  # Ctrl-C
-        print(file=sys.stderr)
+        print_lines("", error=True)
         return await _end(options, {})
-    print(file=sys.stderr)
+    print_lines("", error=True)
     return await _end(options, reply)
 
 
@@ -93,13 +94,15 @@ async def _end(options: argparse.Namespace, reply: Object) -> int:
             reply = answer
     if reply["kind"] == "error":
         reply = {"state": "refused", "reason": reply["reason"]}
-        print(f"companion: {reply['reason']}", file=sys.stderr)
+        print_lines(f"companion: {reply['reason']}", error=True)
     answer = {key: item for key, item in reply.items() if key != "kind"}
     if getattr(options, "json", False):
         print_json(answer)
     elif "file" in answer:
         lost = f", {answer['lost']} messages lost" if answer["lost"] else ""
-        print(f"{answer['file']}: {answer['seconds']:.0f} s, {answer['bytes'] / 1e6:.1f} MB{lost}; {answer['reason']}")
+        print_lines(
+            f"{answer['file']}: {answer['seconds']:.0f} s, {answer['bytes'] / 1e6:.1f} MB{lost}; {answer['reason']}"
+        )
     return DONE if answer["state"] == "done" else FAILED
 
 
@@ -129,18 +132,17 @@ def _replay_recording(options: argparse.Namespace) -> int:
     reason = lines[-1]
     good = not different and (result.estimate is None or result.estimate.state == "done")
     state = "different" if different else "done" if good else "failed"
-    print(
+    print_lines(
         f"replayed {result.seconds:.0f} s in {took_s:.1f} s"
         + (f"; the recording ends early: {result.cut_short}" if result.cut_short else ""),
-        file=sys.stderr,
+        error=True,
     )
     for note in result.notes:
-        print(f"note: {note}", file=sys.stderr)
+        print_lines(f"note: {note}", error=True)
     if getattr(options, "json", False):
         print_json({"state": state, "reason": reason, **msgspec.to_builtins(result)})
     else:
-        for line in lines:
-            print(line)
+        print_lines(*lines)
     return DONE if good else FAILED
 
 
@@ -195,6 +197,5 @@ def _replay_csv(options: argparse.Namespace) -> int:
     if getattr(options, "json", False):
         print_json(msgspec.to_builtins(found))
     else:
-        for line in show.record_lines(msgspec.to_builtins(found)):
-            print(line)
+        print_lines(*show.record_lines(msgspec.to_builtins(found)))
     return DONE if found.state == "done" else FAILED

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from companion.cli import DONE, FAILED, USAGE, Command, load_config, print_json
+from companion.cli import DONE, FAILED, USAGE, Command, load_config, print_json, print_lines
 from companion.errors import CompanionError, ConfigError, StorageError
 
 if TYPE_CHECKING:
@@ -35,26 +35,26 @@ async def report(options: argparse.Namespace) -> int:
     """`companion report`."""
     as_json = getattr(options, "json", False)
     if options.history and options.record is not None:
-        print("companion report: RECORD and --history exclude one another", file=sys.stderr)
+        print_lines("companion report: RECORD and --history exclude one another", error=True)
         return USAGE
     if options.output == "-" and as_json:
-        print("companion report: -o - and --json both want stdout", file=sys.stderr)
+        print_lines("companion report: -o - and --json both want stdout", error=True)
         return USAGE
     directory, profiles = _where(options)
     try:
         path, damaged = _make(options, directory, profiles)
     except CompanionError as error:
-        print(f"companion: {error}", file=sys.stderr)
+        print_lines(f"companion: {error}", error=True)
         if as_json:
             print_json({"state": "failed", "reason": str(error), "file": None})
         return FAILED
     skipped = f"skipped: {'; '.join(damaged)}" if damaged else ""
     if skipped:
-        print(f"companion: {skipped}", file=sys.stderr)
+        print_lines(f"companion: {skipped}", error=True)
     if as_json:
         print_json({"state": "done", "reason": skipped, "file": str(path)})
     elif path is not None:
-        print(path)
+        print_lines(path)
     return DONE
 
 

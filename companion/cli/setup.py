@@ -6,7 +6,7 @@ import argparse
 import sys
 from typing import Any
 
-from companion.cli import DONE, FAILED, load_config, print_json
+from companion.cli import DONE, FAILED, load_config, print_json, print_lines
 from companion.daemon.control import ask
 
 Object = dict[str, Any]
@@ -22,7 +22,7 @@ async def setup(options: argparse.Namespace) -> int:
     if options.apply:
         shown = await _request(options, {"action": "show"})
         for risk in shown.get("risks", []):
-            print(f"risk: {risk}", file=sys.stderr)
+            print_lines(f"risk: {risk}", error=True)
         if shown["kind"] != "error" and shown["state"] != "applied" and not _agreed(options):
             return _finish(options, {"kind": "error", "reason": "not applied: say --yes, or answer on a terminal"})
         return _finish(options, await _request(options, {"action": "apply"}))
@@ -37,21 +37,20 @@ def _agreed(options: argparse.Namespace) -> bool:
         return True
     if not sys.stdin.isatty():
         return False
-    print("type yes to go on: ", end="", file=sys.stderr, flush=True)
+    print_lines("type yes to go on: ", end="", error=True)
     return sys.stdin.readline().strip().lower() == "yes"
 
 
 def _finish(options: argparse.Namespace, reply: Object) -> int:
     if reply["kind"] == "error":
         answer: Object = {"state": "refused", "reason": reply["reason"]}
-        print(f"companion: {reply['reason']}", file=sys.stderr)
+        print_lines(f"companion: {reply['reason']}", error=True)
     else:
         answer = {key: value for key, value in reply.items() if key != "kind"}
     if getattr(options, "json", False):
         print_json(answer)
     elif reply["kind"] != "error":
-        for line in setup_lines(answer):
-            print(line)
+        print_lines(*setup_lines(answer))
     return FAILED if reply["kind"] == "error" else DONE
 
 

@@ -7,6 +7,7 @@ from typing import Any, Self
 
 from companion.errors import ConfigError
 from companion.ground.link import INSTALL
+from companion.printable import printable
 
 
 class Display:
@@ -38,6 +39,7 @@ class Display:
 
     def progress(self, percent: int, text: str) -> None:
         """How far it is."""
+        text = printable(text)
         if self._console.is_terminal:
             if self._task is None:
                 self._task = self._bar.add_task(text, total=100)
@@ -49,4 +51,4 @@ class Display:
 
     def text(self, text: str, *, urgent: bool) -> None:
         """What the companion says."""
-        self._console.print(text, style="bold yellow" if urgent else "")
+        self._console.print(printable(text), style="bold yellow" if urgent else "")

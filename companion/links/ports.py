@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from companion.printable import printable
+
 ROOT = Path("/")
 _TEXT_LIMIT = 80
 _PASSING_NAME = re.compile(r"/dev/tty(?:USB|ACM)\d+$")
@@ -226,8 +228,7 @@ def _read(path: Path, limit: int = _TEXT_LIMIT) -> str | None:
         raw = path.read_bytes()[:limit]
     except OSError:
         return None
-    text = "".join(letter if letter.isprintable() else "?" for letter in raw.decode("utf-8", "replace").strip())
-    return text or None
+    return printable(raw.decode("utf-8", "replace").strip()) or None
 
 
 def _number(path: Path, base: int) -> int | None:

@@ -28,7 +28,7 @@ NOT_FOR_PEOPLE = {
     # Command lines that cannot be read are answered at once, with what is allowed.
     "ArgumentTypeError",
     # Expressions and templates of other tools.
-    "compile", "Formatter", "JournalFormatter",
+    "compile", "Formatter", "JournalFormatter", "OneLineFormatter",
     # Names of tasks.
     "create_task", "Thread",
 }  # fmt: skip

@@ -177,7 +177,7 @@ def test_what_a_device_says_of_itself_is_cut_and_cleaned(machine: Machine) -> No
     (machine.root / place / "idProduct").write_text("zz\n")
     port = ports_of(machine)["/dev/ttyACM0"]
     assert port.description.isprintable()
-    assert port.description.startswith("?[2JBad?")
+    assert port.description.startswith(r"\x1b[2JBad\x00")
     assert len(port.description) < 200
     assert port.product_id is None
 

@@ -9,6 +9,7 @@ from typing import Any, Final
 import msgspec
 
 from companion.calibration.request import What, is_time_limit
+from companion.printable import printable
 
 Object = dict[str, Any]
 Transaction = str | int | None
@@ -93,7 +94,7 @@ def _shown(value: object) -> str:
         text = msgspec.json.encode(value).decode()
     except (OverflowError, RecursionError):
         return "what is too large"
-    text = text if text.isprintable() else ascii(text)[1:-1]
+    text = printable(text)
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
 
 
