@@ -380,7 +380,7 @@ def test_armed_between_the_two_steps_nothing_more_is_written_until_it_is_disarme
             with pytest.raises(NotDisarmedError):
                 await stage.writer.restore(changes)
             stage.px4.armed = False
-            await asyncio.sleep(2.0)
+            await asyncio.sleep(4.5)  # 3 s after the last armed heartbeat it counts as disarmed
             await stage.writer.restore(changes)
             await asyncio.sleep(1.5)
             assert in_use(stage.px4, "GYRO") == [0.0, 0.0, 0.0]
