@@ -32,7 +32,7 @@ PACKET_COST_BYTES: Final = 256
 """What a packet counts beyond its length: even the shortest is work."""
 FLOOD_S: Final = 4.0
 """A flood that lasts so long ends the connection, before the answer that is lost behind it is missed."""
-QUIET_S: Final = 1.0
+QUIET_S: Final = 2.0
 """So long within bounds, and a flood is over."""
 
 CONNACK: Final = 0x20
@@ -125,6 +125,8 @@ class MqttFilter:
         tasks: list[asyncio.Task[None]] = []
         try:
             from_library, library = await asyncio.open_connection(sock=await self._accepted())
+            # It connects in a thread, which is done with its socket when it has spoken: nothing is said to it before.
+            writer.write(await from_library.read(MAX_PACKET_BYTES))
             tasks += [
                 asyncio.create_task(self._inwards(reader, library, writer), name="mqtt in"),
                 asyncio.create_task(_outwards(from_library, writer), name="mqtt out"),

@@ -44,6 +44,7 @@ async def passed(sent: bytes, protocol: int = 5) -> tuple[bytes, BaseException |
     async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
         async with MqttFilter("127.0.0.1", server.sockets[0].getsockname()[1], None, protocol) as broker:
             reader, writer = await asyncio.open_unix_connection(broker.address)
+            writer.write(packet(0x10))
             got = await reader.read()
             writer.close()
         return got, broker.fault
@@ -154,6 +155,7 @@ def test_another_program_that_finds_the_address_gets_nothing() -> None:
                 )
                 seen, _ = await child.communicate()
                 reader, writer = await asyncio.open_unix_connection(broker.address)
+                writer.write(packet(0x10))
                 assert await reader.read(len(CONNACK)) == CONNACK
                 writer.close()
             return seen
@@ -210,9 +212,21 @@ def until_words(brokers: HostileBroker, words: str, *, tls: str | None = None) -
         (HostileBroker(forever(publish(STATUS.encode(), b"x"))), "the broker floods"),
         (HostileBroker(forever(publish(REQUEST, qos=1)), reads=False), "the broker floods"),
         (HostileBroker(forever(packet(0x90, b"\x12\x34\0\1"))), "the broker floods"),
+        (HostileBroker(lambda: itertools.repeat(publish(b"a" * 65000))), "the broker floods"),
         (HostileBroker(forever(publish(REQUEST, properties=USER_PROPERTY * 90))), "the broker floods"),
     ],
-    ids=["250 MB", "250 MB in 3.1.1", "greeting", "QoS 2", "topic", "flood", "deaf flood", "SUBACKs", "properties"],
+    ids=[
+        "250 MB",
+        "250 MB in 3.1.1",
+        "greeting",
+        "QoS 2",
+        "topic",
+        "flood",
+        "deaf flood",
+        "SUBACKs",
+        "long topics",
+        "properties",
+    ],
 )
 def test_the_worst_broker_is_named_and_costs_next_to_nothing(
     broker: HostileBroker, words: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
