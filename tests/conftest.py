@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import gc
+import signal
 
 import pytest
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # So it is under `nohup` and in the background of a script, and every command that a test starts would inherit it:
+    # what is told to stop by Ctrl-C would never stop.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(trylast=True)

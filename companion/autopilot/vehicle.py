@@ -1,13 +1,13 @@
 """The autopilot as seen from outside: which one it is, whether it is armed, whether it restarted, where it stands.
 
 Whoever writes to it asks `arm_state` immediately before every message that leaves. A heartbeat tells the past: the
-state is UNKNOWN as soon as the last one is 2 s old, and after a restart until the next one.
+state is UNKNOWN as soon as the last one is 2 s old, and after a restart until the next one. It is DISARMED only when no
+armed heartbeat has come under the vehicle's ids for 3 s, from whomever (`arming_watch`).
 """
 
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import enum
 import logging
 import math
@@ -16,11 +16,14 @@ from typing import Final, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.autopilot.arming_watch import ArmingWatch
 from companion.autopilot.boot_clock import BootClock
 from companion.autopilot.commands import Commands
 from companion.autopilot.latch import Latch, is_aircraft
 from companion.autopilot.standing_requests import StandingRequests
+from companion.autopilot.whereabouts import Position, TimeAndPlace
 from companion.links.mavlink import MavlinkLink, Message, Unsubscribe
+from companion.links.mavlink_signing import EARLIEST_S
 
 logger = logging.getLogger(__name__)
 
@@ -33,6 +36,8 @@ HEARTBEAT_RATE_HZ: Final = 5.0
 FRESH_WITHIN_S: Final = 0.3
 """An autopilot that sends heartbeats on request does so within 20 ms of it; slow radios need more."""
 
+_BEHIND_ANSWER_S: Final = 0.03
+"""How long after its answer to the request a heartbeat may leave ArduPilot (20 ms); PX4 sends it before the answer."""
 _OVERDUE_S: Final = 1.1
 _TICK_S: Final = 0.5
 _STALL_S: Final = 1.0
@@ -40,12 +45,12 @@ _CONFLICT_S: Final = 5.0
 """So long after the last sign of a second autopilot under our vehicle's ids nothing is believed of either."""
 _RESTARTS_S: Final = 1.0
 """No autopilot restarts twice in that time: two whose times since boot alternate do."""
-_EARLIEST_UNIX_TIME_S: Final = 1577836800.0  # 2020: a clock before that has not been set
 
 Firmware = Literal["ardupilot", "px4", "other"]
 VehicleEvent = Literal["armed", "disarmed", "lost", "found", "rebooted"]
 """What `Vehicle.watch` tells. "found": latched, or heard again after "lost". "armed" and "disarmed": the heartbeat
-says so and the one before, if any, said otherwise; so the first heartbeat of all brings "found" and one of them."""
+says so and the one before, if any, said otherwise; so the first heartbeat of all brings "found" and one of them.
+"disarmed" comes when that is believed: 3 s after the last armed heartbeat."""
 
 
 _FIRMWARES: Final[dict[int, Firmware]] = {
@@ -60,16 +65,6 @@ class ArmState(enum.Enum):
     DISARMED = "disarmed"
     ARMED = "armed"
     UNKNOWN = "unknown"
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Position:
-    """Where the autopilot believes to be; the height is above mean sea level."""
-
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float
-    source: str
 
 
 class Vehicle:
@@ -98,17 +93,20 @@ class Vehicle:
         """Whether its last heartbeat was signed (MAVLink 2)."""
         self.boots = 0
         """How many restarts were seen."""
-        self.position: Position | None = None
+        self.place = TimeAndPlace()
+        """What it says of time and place."""
         self.commands = Commands(link, self._target)
         self._link = link
         self._latch = Latch(system_id)
         self._heartbeat_s: float | None = None
-        self._armed: bool | None = None
+        self._heartbeat_link_id: int | None = None
+        self._arming = ArmingWatch()
+        self._armed_told: bool | None = None
+        self._contradiction_logged = False
         self._conflict_s = self._restarted_s = -math.inf
         self._lost = True
         self._trusted_from_s = -math.inf
         self._boot_clock = BootClock()
-        self._unix_minus_loop_s: float | None = None
         self._watchers: list[Callable[[VehicleEvent], None]] = []
         self._found = asyncio.Event()
         self._heartbeat_waiters: list[asyncio.Event] = []
@@ -135,22 +133,29 @@ class Vehicle:
 
     @property
     def arm_state(self) -> ArmState:
-        """ARMED or DISARMED by a heartbeat of the latched autopilot younger than 2 s, else UNKNOWN."""
-        if self._lost or self._armed is None or self._heartbeat_s is None or self.conflict is not None:
-            return ArmState.UNKNOWN
+        """ARMED or DISARMED while the latched autopilot's last heartbeat is younger than 2 s, else UNKNOWN.
+
+        ARMED for 3 s after any armed heartbeat; UNKNOWN while there is a `conflict`.
+        """
         now_s = asyncio.get_running_loop().time()
+        armed = self._arming.armed(now_s)
+        if self._lost or armed is None or self._heartbeat_s is None or self.conflict is not None:
+            return ArmState.UNKNOWN
         # After a stall of our own loop the next heartbeats read are old ones that waited in a buffer.
         stalled = now_s - self._tick_due_s > _STALL_S or self._heartbeat_s < self._trusted_from_s
         if stalled or now_s - self._heartbeat_s >= HEARTBEAT_TIMEOUT_S:
             return ArmState.UNKNOWN
-        return ArmState.ARMED if self._armed else ArmState.DISARMED
+        return ArmState.ARMED if armed else ArmState.DISARMED
 
     @property
     def conflict(self) -> str | None:
         """What is wrong when two autopilots speak under the ids of one; then the arm state is UNKNOWN."""
-        if asyncio.get_running_loop().time() - self._conflict_s >= _CONFLICT_S:
-            return None
-        return f"two autopilots have system id {self.system_id}"
+        now_s = asyncio.get_running_loop().time()
+        if self._arming.contradicts_itself(now_s):
+            return f"system id {self.system_id} says armed and disarmed by turns: two autopilots, or a forger"
+        if now_s - self._conflict_s < _CONFLICT_S:
+            return f"two autopilots have system id {self.system_id}"
+        return None
 
     @property
     def alive(self) -> bool:
@@ -168,9 +173,12 @@ class Vehicle:
     @property
     def unix_time_s(self) -> float | None:
         """UTC as the autopilot has it (from its GNSS), carried on by the loop's clock; None when it has none."""
-        if self._unix_minus_loop_s is None:
-            return None
-        return self._unix_minus_loop_s + asyncio.get_running_loop().time()
+        return self.place.unix_time_s
+
+    @property
+    def position(self) -> Position | None:
+        """Where it stands, as far as the autopilot can be believed; None when it says no place."""
+        return self.place.position
 
     @property
     def name(self) -> str:
@@ -242,6 +250,9 @@ class Vehicle:
     async def fresh_heartbeat(self, within_s: float = FRESH_WITHIN_S) -> bool:
         """Ask for a heartbeat and wait for it, so that an arming is known at once and not at the next beat.
 
+        The heartbeat that comes first may be another's than the one asked for: waited for is the autopilot's answer to
+        the request too, and the time that the heartbeat may be behind it.
+
         False when none came in time (old firmware, a lossy link): then what `arm_state` says is all there is.
         """
         heard = asyncio.Event()
@@ -250,6 +261,8 @@ class Vehicle:
         request = self.commands.request_message(heartbeat_id)
         try:
             async with asyncio.timeout(within_s):
+                await request
+                await asyncio.sleep(_BEHIND_ANSWER_S)
                 await heard.wait()
         except TimeoutError:
             return False
@@ -288,11 +301,18 @@ class Vehicle:
             return
         if self.system_id is None and self._latch.takes(message, t_s):
             self._take(message)
-        if not self.sent(message) or not self._is_ours(message):
+        if not self.sent(message):
             return
-        was_lost, was_armed = self._lost, self._armed
-        self._heartbeat_s = asyncio.get_running_loop().time()
-        self._armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        now_s = asyncio.get_running_loop().time()
+        armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        ours = self._is_ours(message) and self._is_on_our_link(message)
+        if ours or armed:
+            self._arming.heard(now_s, armed=armed)
+            self._log_contradiction(now_s)
+        if not ours:
+            return
+        was_lost = self._lost
+        self._heartbeat_s = now_s
         self.system_status = message.system_status
         self.signs = bool(message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
         self._lost = False
@@ -303,8 +323,11 @@ class Vehicle:
         if was_lost:
             self._ask_soon()
             self._tell("found")
-        if self._armed != was_armed:
-            self._tell("armed" if self._armed else "disarmed")
+        # A disarmed heartbeat within 3 s of an armed one is neither news yet.
+        believed = armed == self._arming.armed(now_s) and not self._arming.contradicts_itself(now_s)
+        if believed and armed is not self._armed_told:
+            self._armed_told = armed
+            self._tell("armed" if armed else "disarmed")
 
     def _is_ours(self, message: mavlink.MAVLink_heartbeat_message) -> bool:
         """Whether a heartbeat under our ids is our vehicle's; ArduPilot and PX4 both are system 1 out of the box."""
@@ -322,6 +345,23 @@ class Vehicle:
         self._restarted()
         return True
 
+    def _is_on_our_link(self, message: mavlink.MAVLink_heartbeat_message) -> bool:
+        """Whether a heartbeat was signed on the link on which we hear the autopilot.
+
+        It signs each of its links apart: what was held back on another one is not news here. Unsigned heartbeats
+        (None) count until the first signed one.
+        """
+        link_id = self._link.signed_on(message)
+        if self._lost or self._heartbeat_link_id is None:
+            self._heartbeat_link_id = link_id
+        return link_id == self._heartbeat_link_id
+
+    def _log_contradiction(self, now_s: float) -> None:
+        contradicts = self._arming.contradicts_itself(now_s)
+        if contradicts and not self._contradiction_logged:
+            logger.error("%s: %s; nothing is written", self.name, self.conflict)
+        self._contradiction_logged = contradicts
+
     def _notice_conflict(self) -> None:
         now_s = asyncio.get_running_loop().time()
         if now_s - self._conflict_s > _CONFLICT_S:
@@ -329,8 +369,8 @@ class Vehicle:
         self._conflict_s = now_s
 
     def _take(self, message: mavlink.MAVLink_heartbeat_message) -> None:
-        self.system_id = self._link.system_id = message.get_srcSystem()
-        self.component_id = message.get_srcComponent()
+        self.system_id, self.component_id = message.get_srcSystem(), message.get_srcComponent()
+        self._link.join((self.system_id, self.component_id))
         self.firmware = _FIRMWARES.get(message.autopilot, "other")
         self._wanted.add(mavlink.MAVLink_system_time_message, 1.0)
         self._wanted.add(mavlink.MAVLink_global_position_int_message, 1.0)
@@ -397,9 +437,9 @@ class Vehicle:
 
     def _restarted(self) -> None:
         self.boots += 1
-        self._armed = None  # the last heartbeat was of the time before
-        self.position = None
-        self._unix_minus_loop_s = None
+        self._arming.restarted()
+        self._armed_told = None
+        self.place.restarted()
         self.version = self.capabilities = None
         self._version_asked_s, self._version_pause_s = -math.inf, 2.0
         self._ask_soon()
@@ -420,7 +460,7 @@ class Vehicle:
         self, message: mavlink.MAVLink_raw_imu_message | mavlink.MAVLink_highres_imu_message, t_s: float
     ) -> None:
         # The field may carry UTC instead; no autopilot has been up since the nineteen-seventies.
-        if self.sent(message) and message.time_usec * 1e-6 < _EARLIEST_UNIX_TIME_S:
+        if self.sent(message) and message.time_usec * 1e-6 < EARLIEST_S:
             self._boot_time(message.time_usec * 1e-6, t_s)
 
     def _on_system_time(self, message: mavlink.MAVLink_system_time_message, t_s: float) -> None:
@@ -428,8 +468,7 @@ class Vehicle:
             return
         self._wanted.heard(message, t_s)
         self._boot_time(message.time_boot_ms * 1e-3, t_s)
-        unix_s = message.time_unix_usec * 1e-6
-        self._unix_minus_loop_s = unix_s - t_s if unix_s > _EARLIEST_UNIX_TIME_S else None
+        self.place.hear_time(message, t_s)
 
     def _on_version(self, message: mavlink.MAVLink_autopilot_version_message, _t_s: float) -> None:
         if self.sent(message):
@@ -441,21 +480,11 @@ class Vehicle:
             return
         self._wanted.heard(message, t_s)
         self._boot_time(message.time_boot_ms * 1e-3, t_s)
-        position = _position(message.lat, message.lon, message.alt, "autopilot GLOBAL_POSITION_INT")
-        if position is not None:
-            self.position = position
+        self.place.hear_estimate(message, t_s)
 
-    def _on_gps(self, message: mavlink.MAVLink_gps_raw_int_message, _t_s: float) -> None:
-        estimated = self.position is not None and "GLOBAL_POSITION" in self.position.source
-        if self.sent(message) and message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX and not estimated:
-            self.position = _position(message.lat, message.lon, message.alt, "autopilot GPS_RAW_INT") or self.position
-
-
-def _position(latitude_1e7: int, longitude_1e7: int, height_mm: int, source: str) -> Position | None:
-    # (0, 0) is what ArduPilot sends while it knows no position.
-    if (latitude_1e7, longitude_1e7) == (0, 0) or abs(latitude_1e7) > 900000000 or abs(longitude_1e7) > 1800000000:
-        return None
-    return Position(latitude_1e7 * 1e-7, longitude_1e7 * 1e-7, height_mm * 1e-3, source)
+    def _on_gps(self, message: mavlink.MAVLink_gps_raw_int_message, t_s: float) -> None:
+        if self.sent(message):
+            self.place.hear_receiver(message, t_s)
 
 
 def _version_text(packed: int) -> str:

@@ -16,6 +16,8 @@ from companion.physics.frames import roll_pitch_from_up
 from companion.physics.units import DEG, DEG_H, MG
 
 FORMAT_VERSION = 1
+MOST_DEG = 90.0
+"""Of a gradienter's zero and of its sigma."""
 
 Axes = tuple[float, float, float]
 Pair = tuple[float, float]
@@ -104,24 +106,17 @@ class AlignmentRecord(msgspec.Struct, frozen=True, kw_only=True):
         return configured[0] + self.offset_deg[0], configured[1] + self.offset_deg[1]
 
 
-def to_json(record: AlignmentRecord) -> bytes:
-    """The record as JSON."""
-    return msgspec.json.encode(record)
-
-
-def from_json(data: bytes) -> AlignmentRecord:
-    """Read a record back.
+def check(record: AlignmentRecord) -> None:
+    """Whether a record can be used.
 
     Raises:
-        msgspec.MsgspecError: not a record of this format.
+        msgspec.ValidationError: of another format, or figures that no gradienter has.
     """
-    record = msgspec.json.decode(data, type=AlignmentRecord)
     if record.format_version != FORMAT_VERSION:
         raise msgspec.ValidationError(f"format {record.format_version}, known is {FORMAT_VERSION}")
     figures = [*record.offset_deg, record.sigma_deg]
-    if not np.isfinite(figures).all() or record.sigma_deg <= 0.0:
+    if not np.abs(figures).max() < MOST_DEG or record.sigma_deg <= 0.0:
         raise msgspec.ValidationError(f"offset and sigma {figures} cannot be")
-    return record
 
 
 def stand_record(stand: Stand, result: Alignment, number: int, seconds: float, configured: Pair) -> StandRecord:

@@ -15,6 +15,9 @@ import msgspec
 Axes = tuple[float, float, float]
 Triad = Literal["gyro", "accel"]
 
+MOST_RAD_S: Final = 10.0
+MOST_M_S2: Final = 100.0
+"""Of a whole bias and of its sigmas: beyond what the worst IMU could have, one with a wrong scale included."""
 NEW_AFTER: Final = 3
 """So many power-ups in a row that contradict what was before are no outliers: the sensor is another one now."""
 SAME_START_S: Final = 60.0
@@ -83,6 +86,22 @@ class Point(msgspec.Struct, frozen=True, kw_only=True):
     def as_chosen(self) -> Point:
         """The same, of a calibration that somebody has asked for and that is in force now."""
         return msgspec.structs.replace(self, gyro=_as_chosen(self.gyro), accel=_as_chosen(self.accel))
+
+
+def check(point: Point) -> None:
+    """Whether a point can be one of an IMU.
+
+    Raises:
+        msgspec.ValidationError: figures that no IMU has.
+    """
+    for found, most in ((point.gyro, MOST_RAD_S), (point.accel, MOST_M_S2)):
+        if found is None:
+            continue
+        sigmas = (*found.sigma_stat, *found.sigma_use, *found.sigma_shared)
+        if not max(map(abs, (*found.bias, *sigmas))) <= most or min(sigmas) < 0.0:
+            raise msgspec.ValidationError(
+                f"found a bias of {found.bias} with sigmas of {sigmas}; allowed: up to {most:g}, none below 0"
+            )
 
 
 def _as_chosen(found: Measured | None) -> Measured | None:

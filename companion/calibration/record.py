@@ -245,6 +245,11 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     armings: tuple[Arming, ...] = ()
     """Armings while this calibration was in force; empty in the file, filled in by the history."""
 
+    @property
+    def is_worth_keeping(self) -> bool:
+        """Whether there is something to remember: no, where it was cancelled before anything was measured."""
+        return self.state != "cancelled" or bool(self.imus or self.warnings)
+
 
 def to_json(record: Record) -> bytes:
     """The record as JSON, every key present."""

@@ -79,19 +79,20 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
         print_json({"state": state, "reason": reason})
 
 
-def load_config(options: argparse.Namespace, *, profiles: bool = False) -> config.Config:
+def load_config(options: argparse.Namespace, *, profiles: bool = False, forgiving: bool = False) -> config.Config:
     """The configuration that -c names, or the default one.
 
     Args:
         options: of the command line.
         profiles: read the saved noise profiles that it names too; who only asks the daemon may not be allowed to, and
             leaves them be.
+        forgiving: one of them that is damaged is no reason to refuse the configuration.
     """
 
     def saved(directory: Path) -> SavedProfiles | None:
         from companion.storage.profiles import ProfileStore
 
-        return ProfileStore(directory) if profiles else None
+        return ProfileStore(directory, forgiving=forgiving) if profiles else None
 
     return config.load(config_path(options), saved)
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 async def run(options: argparse.Namespace) -> int:
     """`companion run`."""
-    config = load_config(options, profiles=True)
+    config = load_config(options, profiles=True, forgiving=True)
     # Where the whole process stands still the watchdog's SIGABRT is the only witness: let it say where that was.
     faulthandler.enable()
     logs.set_up("debug" if options.verbose else config.log.level)

@@ -30,6 +30,9 @@ class SavedProfiles(Protocol):
             StorageError: it cannot be read, in one line.
         """
 
+    def instead(self, name: str, error: StorageError) -> Noise | None:
+        """What to take where one cannot be read; None: the configuration that names it is refused."""
+
 
 Saved = Callable[[Path], SavedProfiles | None]
 """The saved profiles of a storage directory; None: they are not to be looked for, and a name stays a name."""
@@ -41,6 +44,9 @@ class _NoneSaved:
 
     def noise(self, name: str) -> Noise:
         raise StorageError(f"no profile {name!r}")
+
+    def instead(self, name: str, error: StorageError) -> Noise | None:
+        return None
 
 
 def none_saved(_directory: Path) -> SavedProfiles:
@@ -78,6 +84,8 @@ def _found(store: SavedProfiles, wanted: str, key: str) -> Noise:
         if wanted in names:
             return store.noise(wanted)
     except StorageError as error:
+        if (instead := store.instead(wanted, error)) is not None:
+            return instead
         raise ConfigError(f"{key} {wanted!r}, a saved profile: {error}") from None
     near = difflib.get_close_matches(wanted, [*CATALOGUE, *names], n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""

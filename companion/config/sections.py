@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import msgspec
 from msgspec import Meta
@@ -24,9 +24,13 @@ AtArm = Literal["gate", "warn", "off"]
 LogLevel = Literal["debug", "info", "warning", "error"]
 Signing = Literal["off", "sign", "require"]
 
-Latitude = Annotated[float, Meta(ge=-90, le=90)]
-Longitude = Annotated[float, Meta(ge=-180, le=180)]
-Height = Annotated[float, Meta(ge=-500, le=9000)]
+LATITUDE_DEG: Final = (-90.0, 90.0)
+LONGITUDE_DEG: Final = (-180.0, 180.0)
+HEIGHT_M: Final = (-500.0, 9000.0)
+"""Where an aircraft can stand, whoever says where it does."""
+Latitude = Annotated[float, Meta(ge=LATITUDE_DEG[0], le=LATITUDE_DEG[1])]
+Longitude = Annotated[float, Meta(ge=LONGITUDE_DEG[0], le=LONGITUDE_DEG[1])]
+Height = Annotated[float, Meta(ge=HEIGHT_M[0], le=HEIGHT_M[1])]
 Baud = Annotated[int, Meta(ge=300, le=4_000_000)]
 PositiveFloat = Annotated[float, Meta(gt=0)]
 NonEmpty = Annotated[str, Meta(min_length=1)]

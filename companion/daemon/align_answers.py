@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import math
 from collections.abc import AsyncIterator
 from typing import Final
 
 import msgspec
 
+from companion.calibration.request import is_time_limit
 from companion.component.service import Refusal
 from companion.daemon.align_steps import HEADINGS, Plan
 from companion.daemon.alignment import AlignmentInForce
@@ -60,8 +60,7 @@ async def _measure(conductor: Conductor, request: Object, face: str) -> AsyncIte
     action, headings = request.get("action"), request.get("headings", 2)
     timeout_s = request.get("timeout_s")
     timeout_s = TIMEOUT_S if timeout_s is None else timeout_s
-    sound = isinstance(timeout_s, int | float) and 0.0 < timeout_s < math.inf
-    if action not in ("zero", "tilts") or headings not in (2, HEADINGS) or not sound:
+    if action not in ("zero", "tilts") or headings not in (2, HEADINGS) or not is_time_limit(timeout_s):
         raise CalibrationRefusedError(f"align: {request} is not understood")
     plan = Plan(action, headings, quick=request.get("quick") is True)
     job = conductor.start_alignment(plan, f"{face} align", float(timeout_s))

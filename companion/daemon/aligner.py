@@ -147,7 +147,8 @@ class Aligner:
             if moving:
                 moved, since_s = True, now_s
             still_s = min(status.still_s, now_s - since_s - SETTLE_S)
-            waiting_for = not_ready(self._vehicle, self._imus) or status.waiting_for
+            doubt = models.place_doubt(self._config, self._vehicle)
+            waiting_for = not_ready(self._vehicle, self._imus) or doubt or status.waiting_for
             share = min(max(still_s, 0.0) / self._stand_s, 1.0) if moved and waiting_for is None else 0.0
             if not moved:
                 words = f"{why or f'{number - 1} done. Now {wish}'}; waiting for it to move"
@@ -176,7 +177,7 @@ class Aligner:
             self._machine.on(Event.MOVED)
 
     def _check(self, job: Job, taken: list[_Taken], now_s: float) -> None:
-        if self._vehicle.arm_state is ArmState.ARMED:
+        if job.armed or self._vehicle.arm_state is ArmState.ARMED:
             raise CalibrationRefusedError("armed during the alignment; the one before stays in force")
         if job.deadline_s is not None and now_s >= job.deadline_s:
             raise CalibrationRefusedError(f"not finished in the time given: {job.words}")

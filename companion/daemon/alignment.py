@@ -12,7 +12,6 @@ from companion.calibration.solve import GradienterModel
 from companion.config import Config
 from companion.daemon import models
 from companion.daemon.ledger import Offload
-from companion.errors import StorageError
 from companion.storage.alignment import AlignmentStore
 
 logger = logging.getLogger(__name__)
@@ -32,12 +31,11 @@ class AlignmentInForce:
         """Told when another zero is in force."""
 
     def load(self) -> None:
-        """Read what was kept before this start; blocking. What cannot be read is said and not used."""
-        try:
-            self._take(self._store.read())
-        except StorageError as error:
-            self.record, self.unused = None, str(error)
-        if self.unused is not None:
+        """Read what was kept before this start; blocking. What cannot be used is set aside and said."""
+        self._take(self._store.take())
+        if self._store.unusable is not None:
+            self.unused = self._store.unusable
+        elif self.unused is not None:
             logger.warning("alignment not used: %s", self.unused)
 
     async def keep(self, record: AlignmentRecord) -> None:

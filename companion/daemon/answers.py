@@ -10,7 +10,7 @@ import msgspec
 
 from companion.autopilot.vehicle import Vehicle
 from companion.calibration.record import Record
-from companion.calibration.request import What
+from companion.calibration.request import What, is_time_limit
 from companion.calibration.rolling import RollingCollector
 from companion.component.permission import Permission
 from companion.component.service import Refusal
@@ -118,6 +118,8 @@ class Answers:
         """Whose noise figures the sigmas of each IMU are made of."""
         self.setup: Callable[[Object], Awaitable[Object]] | None = None
         """Sets the autopilot up for our heading."""
+        self.unusable: Callable[[], Sequence[str]] = tuple
+        """Files with old values that could not be used, each in a line."""
         self.mqtt: Callable[[], Object] = dict
         """How the broker is reached; empty where none is configured."""
 
@@ -187,10 +189,13 @@ class Answers:
     async def _answer_calibrate(self, request: Object, face: str) -> AsyncIterator[Object]:
         try:
             what = What[str(request.get("what", "both")).upper()]
-            timeout_s = request.get("timeout_s")
-            timeout_s = None if timeout_s is None else float(timeout_s)
-        except (KeyError, TypeError, ValueError) as error:
+        except KeyError as error:
             raise CalibrationRefusedError(f"calibrate: {error} is not understood") from None
+        timeout_s = request.get("timeout_s")
+        if timeout_s is not None and not is_time_limit(timeout_s):
+            raise CalibrationRefusedError(
+                f"calibrate: 'timeout_s': found {timeout_s!r}; allowed: a number of seconds above 0"
+            )
         reboot = request.get("reboot") is True
         job = _accepted(self._conductor.start_calibration(what, f"{face} calibrate", timeout_s, reboot=reboot))
         if not request.get("wait"):
@@ -245,7 +250,11 @@ class Answers:
             "pose": self._pose.now(),
             "readings": self._pose.readings(),
             "alignment": self._alignment.status(),
-            "warnings": [*self._rivalry.warnings, *(self._carried.warnings if self._carried is not None else ())],
+            "warnings": [
+                *self.unusable(),
+                *self._rivalry.warnings,
+                *(self._carried.warnings if self._carried is not None else ()),
+            ],
             "attitude": None if self._carried is None else self._carried.view(),
             "ground_stations": dict(zip(("good", "summary"), self._reach.words(), strict=True)),
             "fault": self._mender.fault,

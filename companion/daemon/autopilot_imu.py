@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,18 @@ from companion.samples import ImuSample
 logger = logging.getLogger(__name__)
 
 RETRY_S: Final = 3.0
+REREAD_EVERY_S: Final = 0.5
+"""What is announced again and again must not fill the line with our questions."""
+CONFIRMED_WITHIN_S: Final = 3.0
+"""A reading that comes later does not tell what was in force in between."""
+
+
+class _Announced(NamedTuple):
+    """A value that is not the one in force as far as we know; who says so is not known."""
+
+    name: str
+    value: float
+    t_s: float
 
 
 class AutopilotImu:
@@ -65,6 +77,10 @@ class AutopilotImu:
         """Why the offsets are not known, in one line."""
         self.failures = 0
         """How often reading the offsets has failed in a row."""
+        self.upsets = 0
+        """How often the autopilot has restarted or other offsets have come into force, not by us."""
+        self.upset = ""
+        """The latest of these, in a few words."""
         self.tap: Callable[[ImuSample], None] | None = None
         """Gets every sample, whatever the offsets behind it."""
         self.also: Callable[[ImuSample], None] | None = None
@@ -77,6 +93,8 @@ class AutopilotImu:
         self._known: ImuCalibration | None = None
         """What was read last, unless we have written since."""
         self._ours = 0
+        self._announced: _Announced | None = None
+        self._pause_s = 0.0
         self._stale = asyncio.Event()
         self._stale.set()
         self._kind_changed, self._grid = kind_changed, (0.0, 0.0)
@@ -128,7 +146,14 @@ class AutopilotImu:
         Raises:
             AutopilotError: they cannot be read, or this IMU cannot be calibrated.
         """
-        assumed, fresh = self.calibration, await self._read()
+        assumed, announced, self._announced = self.calibration, self._announced, None
+        why = "the autopilot's offsets were read anew" if announced is None else f"{announced.name} was changed"
+        try:
+            fresh = await self._read()
+        except AutopilotError:
+            if announced is not None and not self._ours:
+                self._upset(why)
+            raise
         if self._ours:
             return False  # we have begun to write meanwhile: nobody knows which of them this still is
         known, self._known = self._known, fresh
@@ -137,10 +162,20 @@ class AutopilotImu:
             self._grid = grid
             self._kind_changed(self.stream.kind, grid)
         self.on_read(known, fresh)
-        if assumed is None or not _same(assumed, fresh):
-            self._void("the autopilot's offsets were read anew")
-            return False
-        return True
+        now_s = asyncio.get_running_loop().time()
+        holds = assumed is not None and _same(assumed, fresh)
+        if announced is not None and holds:
+            logger.warning(
+                "%s: %s = %.6g was announced and is not in force", self.name, announced.name, announced.value
+            )
+            holds = now_s - announced.t_s <= CONFIRMED_WITHIN_S
+        elif announced is not None:
+            logger.warning("%s: somebody set %s to %.6g; measuring afresh", self.name, announced.name, announced.value)
+        if not holds:
+            if assumed is not None:
+                self.upsets, self.upset = self.upsets + 1, why
+            self._void(why)
+        return holds
 
     async def _read(self) -> ImuCalibration:
         return await read_calibration(self._parameters, self.instance, self._memory)
@@ -159,12 +194,21 @@ class AutopilotImu:
         self._void(why)
         self._stale.set()
 
+    def _upset(self, why: str) -> None:
+        self.upsets, self.upset = self.upsets + 1, why
+        self._invalidate(why)
+
     def _on_parameter(self, name: str, value: float) -> None:
-        if self.calibration is not None and not self._ours and self.calibration.contradicts({name: value}):
-            logger.warning("%s: somebody set %s to %.6g; measuring afresh", self.name, name, value)
-            self._invalidate(f"{name} was changed")
-        elif self.calibration is not None and self._rival_changed(self.calibration, name, value):
-            self._stale.set()  # what is in force is the same, but not what will become of it
+        known = self.calibration
+        if known is None or self._ours:
+            return
+        if known.contradicts({name: value}):
+            # Anybody can say so; `refresh` asks the autopilot, and voids what was collected if it is true.
+            self._announced = self._announced or _Announced(name, value, asyncio.get_running_loop().time())
+        elif not self._rival_changed(known, name, value):
+            return  # else what is in force is the same, but not what will become of it
+        self._pause_s = REREAD_EVERY_S
+        self._stale.set()
 
     def _rival_changed(self, calibration: ImuCalibration, name: str, value: float) -> bool:
         known = {rival.parameter: rival.value for rival in calibration.rivals}
@@ -172,7 +216,7 @@ class AutopilotImu:
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event == "rebooted":
-            self._invalidate("the autopilot rebooted")
+            self._upset("the autopilot rebooted")
         elif event == "found":
             # Somebody may have changed them while we heard nothing; if so, `refresh` voids what was collected.
             self._stale.set()
@@ -192,6 +236,9 @@ class AutopilotImu:
                 logger.warning("%s: %s", self.name, error)
                 self._stale.set()
                 await asyncio.sleep(RETRY_S)
+            else:
+                pause_s, self._pause_s = self._pause_s, 0.0
+                await asyncio.sleep(pause_s)
 
     def status(self) -> dict[str, object]:
         """For `companion status` and `check`."""

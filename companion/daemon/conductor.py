@@ -33,6 +33,7 @@ from companion.daemon.ledger import Offload
 from companion.daemon.mend import Mender
 from companion.daemon.push import Pusher
 from companion.daemon.report import Draft
+from companion.daemon.start_limit import StartLimit
 from companion.errors import CompanionError, StorageError
 from companion.storage.records import RecordStore
 
@@ -62,6 +63,7 @@ class Conductor:
         self._pusher, self._mender, self._store = pusher, mender, store
         self._say, self._offload = say, offload
         self._machine = course.machine
+        self._starts = StartLimit()
         self._task: asyncio.Task[None] | None = None
         self.job: Job | None = None
         self.last: Record | None = None
@@ -156,6 +158,8 @@ class Conductor:
         if what is What.ACCELEROMETERS and self._config.gradienter is None:
             return Refusal("other", "accelerometers need a gradienter: none is configured")
         kind = "auto calibration" if automatic else "calibration"
+        if (refusal := self._starts.refuses(requester)) is not None:
+            return refusal
         job = Job(kind, what, requester, deadline_s, reboot=reboot)
         job.automatic = automatic
         return self._start(job, Event.REQUEST, self._calibrate(job))
@@ -167,6 +171,8 @@ class Conductor:
             return refusal
         if self._config.gradienter is None:
             return Refusal("other", "there is no gradienter to align: none is configured")
+        if (refusal := self._starts.refuses(requester)) is not None:
+            return refusal
         job = Job(ALIGNMENT, What.BOTH, requester, asyncio.get_running_loop().time() + timeout_s)
         return self._start(job, Event.REQUEST, self._align(job, plan))
 
@@ -175,6 +181,8 @@ class Conductor:
         running = self._by_itself()
         if running is not None and self._task is not None:
             # Somebody who wants old values back must not wait for new ones that nobody asked for.
+            if (refusal := self._starts.refuses(requester)) is not None:
+                return refusal
             running.cancel(requester)
             self.job = Job("undo", What.BOTH, requester, None)
             work = self._undo_instead(self._task, running, self.job, force=force)
@@ -186,6 +194,8 @@ class Conductor:
         why = self._mender.why_no_undo()
         if why is not None:
             return Refusal("nothing_to_undo", why)
+        if (refusal := self._starts.refuses(requester)) is not None:
+            return refusal
         job = Job("undo", What.BOTH, requester, None)
         return self._start(job, Event.UNDO, self._undo(job, force=force))
 
@@ -273,6 +283,8 @@ class Conductor:
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event == "armed":
+            if self.job is not None:
+                self.job.armed = True
             self._collector.reset("armed")
         elif event == "disarmed":
             self._collector.reset("just disarmed")
@@ -306,7 +318,8 @@ class Conductor:
         job.record = self.last = record
         self.on_result(record)
         try:
-            await self._offload(self._keep, record, seen)
+            if record.is_worth_keeping:
+                await self._offload(self._keep, record, seen)
         except StorageError as error:
             logger.error("%s", error)  # noqa: TRY400 - the traceback tells nothing more
             self._say(Severity.WARNING, f"Record not kept: {error}", Weight.NEWS)

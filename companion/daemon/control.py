@@ -18,6 +18,7 @@ import os
 import socket
 import stat
 import struct
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any, Final, Self
@@ -25,6 +26,7 @@ from typing import Any, Final, Self
 import msgspec
 
 from companion.errors import CompanionError, DaemonDeniedError, DaemonUnreachableError, LinkError
+from companion.links.request import parse_request
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +37,13 @@ Handler = Callable[[Object], AsyncIterator[Object]]
 REQUEST_LIMIT: Final = 64 * 1024
 ANSWER_LIMIT: Final = 32 * 1024 * 1024
 REQUEST_TIMEOUT_S: Final = 5.0
+ANSWER_TIMEOUT_S: Final = 10.0
+"""So long a client may take to read before it is given up."""
+KERNEL_BYTES: Final = 16 * 1024
 MAX_CLIENTS: Final = 16
+"""Of each kind: those that have not asked yet, those with urgent commands, and all others."""
+URGENT: Final = ("cancel", "status")
+"""Commands that no crowd of others keeps out."""
 
 
 class ControlServer:
@@ -46,6 +54,10 @@ class ControlServer:
         self._handler = handler
         self._server: asyncio.Server | None = None
         self._clients: set[asyncio.Task[None]] = set()
+        self._silent: dict[asyncio.Task[None], None] = {}
+        """Clients that have not asked yet, the oldest first."""
+        self._served: Counter[bool] = Counter()
+        """How many are served, urgent or not."""
 
     async def __aenter__(self) -> Self:
         """Bind the socket, replacing a stale one.
@@ -69,32 +81,65 @@ class ControlServer:
             self._path.unlink()
 
     def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if len(self._clients) >= MAX_CLIENTS:
-            writer.write(b'{"kind": "error", "reason": "the daemon has too many clients at once; try again"}\n')
-            writer.close()
-            return
+        if len(self._silent) >= MAX_CLIENTS:
+            # A client of ours asks at once: the oldest one that has not makes way.
+            oldest = next(iter(self._silent))
+            oldest.cancel()
+            del self._silent[oldest]
+        # One that does not read is soon noticed.
+        writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, KERNEL_BYTES)
+        writer.transport.set_write_buffer_limits(0)
         client = asyncio.get_running_loop().create_task(self._serve(reader, writer), name="control client")
         self._clients.add(client)
-        client.add_done_callback(self._clients.discard)
+        self._silent[client] = None
+        client.add_done_callback(self._forget)
+
+    def _forget(self, client: asyncio.Task[None]) -> None:
+        self._clients.discard(client)
+        self._silent.pop(client, None)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
-            await self._answer(reader, writer)
+            request = await self._request(reader, writer)
+            if request is not None:
+                await self._take(request, writer)
         except (ConnectionError, TimeoutError):
-            pass  # the client went away; what it asked for goes on
+            pass  # the client went away, or is deaf; what it asked for goes on
         finally:
-            writer.close()
-            with contextlib.suppress(ConnectionError):
-                await writer.wait_closed()
+            writer.transport.abort()
 
-    async def _answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _request(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Object | None:
+        """What a client asks; None: nothing that can be understood, which it has been told.
+
+        Raises:
+            TimeoutError: it does not ask in time.
+        """
         try:
             async with asyncio.timeout(REQUEST_TIMEOUT_S):
                 line = await reader.readline()
-            request = msgspec.json.decode(line, type=Object)
-        except (ValueError, msgspec.MsgspecError) as error:
+            return parse_request(line)
+        except ValueError as error:
             await _write(writer, {"kind": "error", "reason": f"request not understood: {error}"})
+            await _finish(writer)
+            return None
+
+    async def _take(self, request: Object, writer: asyncio.StreamWriter) -> None:
+        """Answer a request if there is a place for one of its kind."""
+        if (client := asyncio.current_task()) is not None:
+            self._silent.pop(client, None)
+        urgent = request.get("command") in URGENT
+        if self._served[urgent] >= MAX_CLIENTS:
+            await _write(writer, {"kind": "error", "reason": "the daemon has too many clients at once; try again"})
+            await _finish(writer)
             return
+        self._served[urgent] += 1
+        try:
+            await self._answer(request, writer)
+            await _finish(writer)
+        finally:
+            self._served[urgent] -= 1
+
+    async def _answer(self, request: Object, writer: asyncio.StreamWriter) -> None:
         try:
             async for reply in self._handler(request):
                 await _write(writer, reply)
@@ -108,8 +153,28 @@ class ControlServer:
 
 
 async def _write(writer: asyncio.StreamWriter, reply: Object) -> None:
+    """Send one line.
+
+    Raises:
+        ConnectionError: the other side is gone, or does not read.
+    """
     writer.write(msgspec.json.encode(reply) + b"\n")
-    await writer.drain()
+    try:
+        async with asyncio.timeout(ANSWER_TIMEOUT_S):
+            await writer.drain()
+    except TimeoutError:
+        raise ConnectionAbortedError from None
+
+
+async def _finish(writer: asyncio.StreamWriter) -> None:
+    """Close when the other side has everything.
+
+    Raises:
+        OSError: it is gone, or does not read; of which a `TimeoutError` is one.
+    """
+    writer.close()
+    async with asyncio.timeout(ANSWER_TIMEOUT_S):
+        await writer.wait_closed()
 
 
 def _bind(path: Path) -> socket.socket:

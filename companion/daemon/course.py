@@ -53,6 +53,8 @@ POLL_S: Final = 0.2
 SAY_WAITING_EVERY_S: Final = 10.0
 READ_ATTEMPTS: Final = 2
 """So often, within one calibration, the autopilot's offsets may fail to be read."""
+MOST_UPSETS: Final = 5
+"""So often, within one calibration, other offsets may come into force, or the autopilot restart."""
 WRONG_IMU_ATTEMPTS: Final = 3
 """Of three IMUs two may have been taken for the one that is meant."""
 SETTLING_PERCENT: Final = 95.0
@@ -91,11 +93,14 @@ class Course:
         self._late: Stage = "checking"
         """Of State.VERIFYING."""
         self._settled_by_s = 0.0
+        self._dithered = False
+        self._upsets: dict[str, int] = {}
+        """By IMU, how many there had been before this calibration."""
 
     @property
     def is_dithering(self) -> bool:
-        """Whether offsets are being stepped at this moment."""
-        return self._ditherer.active
+        """Whether offsets are being stepped, or were and what comes of it is being worked out."""
+        return self._ditherer.active or (self._dithered and self.machine.state is State.SOLVING)
 
     @property
     def stage(self) -> Stage | None:
@@ -125,6 +130,7 @@ class Course:
         """
         if not job.automatic:
             self._say(Severity.NOTICE, "Calibration started: keep the aircraft still", Weight.NEWS)
+        self._upsets = {name: imu.upsets for name, imu in self._imus.items()}
         for _ in range(WRONG_IMU_ATTEMPTS - 1):
             try:
                 await self._measure_and_push(job, draft)
@@ -153,6 +159,7 @@ class Course:
 
     async def _measure_and_push(self, job: Job, draft: Draft) -> None:
         self._collector.retarget(self._wanted(job.what))
+        self._dithered = False
         while True:
             self._collector.on_second = job.look_again
             try:
@@ -275,7 +282,9 @@ class Course:
         """The window with better means for IMUs whose integers do not tell, where that is allowed."""
         if not self._pusher.enabled:
             return window
-        return await self._ditherer.refine(window, job, draft, lambda words: job.progress(MEASURED_PERCENT, words))
+        refined = await self._ditherer.refine(window, job, draft, lambda words: job.progress(MEASURED_PERCENT, words))
+        self._dithered = any(imu.dithered for imu in refined.imus)
+        return refined
 
     def _wanted(self, what: What) -> Settings:
         """The targets of what was asked for; the rest may be as bad as it likes."""
@@ -298,16 +307,21 @@ class Course:
         failures = {name: imu.failures for name, imu in self._imus.items()}
         while True:
             now_s = loop.time()
-            if self._vehicle.arm_state is ArmState.ARMED:
+            if job.armed or self._vehicle.arm_state is ArmState.ARMED:
                 raise CalibrationRefusedError("armed during the measurement; nothing was written")
             for name, imu in self._imus.items():
                 failures[name] = min(failures[name], imu.failures)
                 if imu.failures - failures[name] >= READ_ATTEMPTS:
                     # Patience is for what can change by itself; an autopilot that does not answer is a fault.
                     raise AutopilotError(f"imu {name}: {imu.problem}")
+                if (upsets := imu.upsets - self._upsets.get(name, 0)) >= MOST_UPSETS:
+                    raise AutopilotError(
+                        f"{imu.upset}, {upsets} times now: does something else write, or pretend to be the autopilot?"
+                    )
             await estimating.catch_up(self._collector, self._offload)
             status = self._collector.status(now_s)
-            waiting_for = not_ready(self._vehicle, self._imus) or status.waiting_for
+            doubt = models.place_doubt(self._config, self._vehicle)
+            waiting_for = not_ready(self._vehicle, self._imus) or doubt or status.waiting_for
             if waiting_for is not None:
                 if self.machine.state is State.COLLECTING:
                     self.machine.on(Event.MOVED)

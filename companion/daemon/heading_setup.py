@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.vehicle import Vehicle
 from companion.autopilot.writer import ParameterWriter
+from companion.autopilot.written import HEADING_SETUP
 from companion.config import Config
 from companion.daemon.conductor import Conductor
 from companion.daemon.control import Object
@@ -36,7 +37,7 @@ class HeadingSetup:
         offload: Offload,
     ) -> None:
         self._folder = config.storage.path / "setup"
-        self.ledger = Ledger(ChangeLog(self._folder), offload)
+        self.ledger = Ledger(ChangeLog(self._folder, HEADING_SETUP), offload)
         command = "companion autopilot-setup --undo"
         self.mender = Mender(vehicle, parameters, writer, self.ledger, say, contextlib.nullcontext, command=command)
         self._parts = (config, vehicle, parameters, writer, self.ledger, self.mender, conductor, say)

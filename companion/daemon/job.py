@@ -31,6 +31,8 @@ class Job:
         """Whether the autopilot is to be restarted once the result is stored."""
         self.automatic = False
         """Whether nobody asked for it."""
+        self.armed = False
+        """Whether the aircraft was armed since, be it for a moment."""
         self.deadline_s = deadline_s
         """Loop time until which measuring may take; None: no limit."""
         self.finished: asyncio.Future[JobResult] = asyncio.get_running_loop().create_future()

@@ -11,6 +11,7 @@ import contextlib
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+from companion.autopilot.vehicle import Firmware
 from companion.errors import StorageError
 from companion.storage.changes import ChangeLog, ChangeSet
 
@@ -28,21 +29,24 @@ class Ledger:
         self.open: ChangeSet | None = None
         self.undoable: dict[int, ChangeSet] = {}
         """By vehicle's system id."""
+        self.unusable: tuple[str, ...] = ()
+        """Files that were there and were set aside, each in a line; none of it was written anywhere."""
+        self.lost_write = False
+        """One of them was the journal: an interrupted write stays as it is."""
         self.orphaned = asyncio.Event()
 
     def load(self) -> None:
-        """Read the files at start, and find out whether they can be written."""
+        """Read the files at start, and find out whether they can be written; what cannot be used is set aside."""
         try:
             self._log.check_writable()
         except StorageError as error:
             self.fault = f"{error}; nothing can be kept, so nothing is written; mend it and restart the companion"
-        try:
-            self.open = self._log.journal.read()
-            self.undoable = self._log.undos()
-        except StorageError as error:
-            self.fault = self.fault or (
-                f"{error}; compare the autopilot's parameters with your notes, then remove the file"
-            )
+        journal, undos = self._log.journal, self._log.undos()
+        self.open = journal.take()
+        kept = [file.take() for file in undos]
+        self.undoable = {each.system_id: each for each in kept if each is not None}
+        self.unusable += tuple(file.unusable for file in (journal, *undos) if file.unusable is not None)
+        self.lost_write |= journal.unusable is not None
         if self.open is not None:
             self.orphaned.set()
 
@@ -50,7 +54,7 @@ class Ledger:
         """Keep the old values before the first of them is overwritten.
 
         Raises:
-            StorageError: they could not be kept; do not write.
+            StorageError: they could not be kept, or a name or a value is none that the companion writes; do not write.
         """
         await self._offload(self._log.journal.write, changes)
         self.open = changes
@@ -82,6 +86,10 @@ class Ledger:
         await self._offload(self._log.journal.clear)
         self.open = None
         self.orphaned.clear()
+
+    def strange_to(self, firmware: Firmware | None, changes: ChangeSet) -> list[str]:
+        """The parameters among them that we never write on this firmware."""
+        return self._log.strange_to(firmware, changes)
 
     async def forget_undo(self, system_id: int) -> None:
         """What could be undone on a vehicle has been.

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from typing import Final
 
 from companion.autopilot.float32 import same_float32
@@ -16,7 +16,7 @@ from companion.autopilot.writer import Change, ParameterWriter, WriteFailedError
 from companion.calibration.record import WrittenParameter
 from companion.component.statustext import Severity, Weight
 from companion.daemon.ledger import Ledger
-from companion.errors import AutopilotError, StorageError
+from companion.errors import AutopilotError, ParameterRefusedError, StorageError
 from companion.storage.changes import Changed, ChangeSet
 
 logger = logging.getLogger(__name__)
@@ -37,7 +37,7 @@ class Mender:
         writer: ParameterWriter,
         ledger: Ledger,
         say: Say,
-        changing: Callable[[], AbstractContextManager[None]],
+        changing: Callable[[], contextlib.AbstractContextManager[None]],
         *,
         command: str = "companion undo",
     ) -> None:
@@ -62,13 +62,15 @@ class Mender:
         """Why there is nothing to undo, or None when there is."""
         undoable = self._ledger.undoable
         if not undoable:
-            return "nothing to undo"
+            return "nothing to undo" + ("; what was kept could not be used" if self._ledger.unusable else "")
         if self._vehicle.system_id not in undoable:
             return f"nothing to undo here, only on system {', '.join(map(str, sorted(undoable)))}"
         return None
 
     async def run(self) -> None:
         """Bring interrupted writes to an end, whenever there is one, until cancelled."""
+        if self._ledger.lost_write:
+            self._say(Severity.WARNING, "Interrupted write, file damaged: calibrate", Weight.RESULT)
         while True:
             await self._ledger.orphaned.wait()
             try:
@@ -83,8 +85,9 @@ class Mender:
             self._ledger.orphaned.clear()
             return
         await self._vehicle.wait_found()
-        if open_set.system_id != self._vehicle.system_id:
-            names = ", ".join(changed.parameter for changed in open_set.changes)
+        strange = self._ledger.strange_to(self._vehicle.firmware, open_set)
+        if strange or open_set.system_id != self._vehicle.system_id:
+            names = ", ".join(open_set.names)
             words = f"An interrupted write on system {open_set.system_id} is not this aircraft's; there check: {names}"
             logger.warning("%s", words)
             self._say(Severity.WARNING, words, Weight.REFUSAL)
@@ -162,9 +165,12 @@ class Mender:
         """Which changes are still as we made them, and what others have put in their place."""
         ours: list[Change] = []
         foreign: list[str] = []
-        found = await self._parameters.read_many(changed.parameter for changed in changes.changes)
+        found = await self._read(changes.names)
         for changed in changes.changes:
-            now, change = found[changed.parameter], _change(changed)
+            now, change = found.get(changed.parameter), _change(changed)
+            if now is None:
+                foreign.append(f"{changed.parameter} cannot be read any more (before: {changed.before:.6g})")
+                continue
             if changed.after is None:
                 if not same_float32(now, changed.before):
                     ours.append(Change(changed.parameter, changed.before, now))
@@ -177,6 +183,16 @@ class Mender:
                     f"{changed.parameter} is {now:.6g}, we had set {changed.after:.6g} (before: {changed.before:.6g})"
                 )
         return ours, foreign
+
+    async def _read(self, names: Sequence[str]) -> dict[str, float]:
+        """Those that the autopilot does not refuse; silence is no refusal, and is waited for."""
+        with contextlib.suppress(ParameterRefusedError):
+            return await self._parameters.read_many(names)
+        found: dict[str, float] = {}
+        for name in names:
+            with contextlib.suppress(ParameterRefusedError):
+                found[name] = await self._parameters.read(name)
+        return found
 
 
 def _change(changed: Changed) -> Change:

@@ -226,3 +226,9 @@ def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:
         source = position.source if place.height_m is None else f"{position.source}; height: configuration"
         return Whereabouts(position.latitude_deg, position.longitude_deg, height_m, source, date)
     return Whereabouts(height_m=place.height_m, source=None, date=date)
+
+
+def place_doubt(config: Config, vehicle: Vehicle) -> str | None:
+    """What a calibration waits for: the autopilot contradicts itself about what the configuration leaves open."""
+    place = config.vehicle
+    return None if place.latitude_deg is not None and place.height_m is not None else vehicle.place.doubt

@@ -19,7 +19,7 @@ import msgspec
 from companion.autopilot.vehicle import Vehicle
 from companion.calibration.prior import Expectation
 from companion.calibration.record import AlignmentUsed, Record
-from companion.calibration.request import What
+from companion.calibration.request import What, is_time_limit
 from companion.calibration.rolling import RollingCollector, Window
 from companion.calibration.site import Whereabouts
 from companion.config import Config
@@ -291,7 +291,7 @@ class Recorder:
             yield {"kind": "result", **await self._stop(self._on_request, "stopped")}
             return
         seconds, name = request.get("seconds"), request.get("file")
-        if not (seconds is None or isinstance(seconds, int | float)) or not (name is None or isinstance(name, str)):
+        if not (seconds is None or is_time_limit(seconds)) or not (name is None or isinstance(name, str)):
             raise StorageError(f"record: not understood: {request}")
         recording = await self._start(name, seconds)
         while not recording.ended.done():

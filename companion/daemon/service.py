@@ -13,7 +13,7 @@ from companion.autopilot.imu_calibration import accel_taken_off
 from companion.autopilot.imu_stream import StreamKind
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.px4_slots import SlotMemory
-from companion.autopilot.vehicle import Vehicle
+from companion.autopilot.vehicle import ArmState, Vehicle
 from companion.autopilot.writer import ParameterWriter
 from companion.component.component import Component
 from companion.component.service import JobResult
@@ -53,12 +53,14 @@ from companion.daemon.sensor_watch import UNTOUCHED, Corrected, SensorWatch
 from companion.daemon.sensors import SerialSensor
 from companion.daemon.serial_devices import Role, collect, serial_devices
 from companion.daemon.signing import LinkSigning
+from companion.errors import StorageError
 from companion.links.mavlink import MavlinkLink
 from companion.links.mavlink_transport import run_transport
 from companion.protocols.roles import Part
 from companion.recording.collector import RecordedCollector
 from companion.samples import ImuSample
 from companion.storage.changes import ChangeLog
+from companion.storage.lock import only_daemon
 from companion.storage.records import RecordStore
 
 if TYPE_CHECKING:
@@ -105,6 +107,7 @@ class Service:
             field_by=models.field_by(config),
             message_of=self._message_of,
         )
+        self.vehicle.place.is_carried = self._is_carried
         self.slots = SlotMemory()
         self._imu_rate_hz = models.imu_rate_hz(config) if imu_rate_hz is None else imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
@@ -227,6 +230,7 @@ class Service:
         self.answers.carry(self.attitude)
         self.answers.setup = self.setup.answer
         self.answers.profiles = models.profiles(config)
+        self.answers.unusable = lambda: (*self.ledger.unusable, *self.setup.ledger.unusable)
         self.answers.watch_access(self.signing, self.component.permission)
         self.mqtt = self._mqtt_face(offload)
         self.page = self._page(offload)
@@ -277,12 +281,17 @@ class Service:
         self.in_force.on_ended(job, result)
         if job.kind != ALIGNMENT:
             self.automatic.on_ended(job, result)
-        if job.record is not None:
+        if job.record is not None and job.record.is_worth_keeping:
             self.recorder.on_record(job.record)
 
     def _message_of(self, name: str) -> str | None:
         imu = self.imus.get(name)
         return imu.stream.kind.message if imu is not None and imu.stream.kind is not None else None
+
+    def _is_carried(self) -> bool:
+        if self.vehicle.arm_state is ArmState.ARMED:
+            return True
+        return self.collector.glance(asyncio.get_running_loop().time()).moving
 
     def _corrected(self, name: str) -> Corrected | None:
         imu = self.imus.get(name)
@@ -336,15 +345,16 @@ class Service:
         """Run until cancelled, reachable on the control socket.
 
         Raises:
-            CompanionError: it cannot start (another daemon runs, the storage cannot be read).
+            CompanionError: it cannot start (another daemon runs, or works with the same storage).
         """
         for words in (*models.cannot_work(self.config), *models.doubtful(self.config)):
             logger.warning("%s", words)
         control = self.config.control
         async with ControlServer(control.path, self.answers.answer, group=control.group_name):
-            logger.info("ready: %s", control.path)
-            self.on_ready()
-            await self.serve()
+            with only_daemon(self.config.storage.path):
+                logger.info("ready: %s", control.path)
+                self.on_ready()
+                await self.serve()
 
     async def serve(self, *, mavlink: bool = True, ports: bool = True) -> None:
         """Do the work until cancelled, then leave the autopilot in order.
@@ -360,8 +370,10 @@ class Service:
         if self.ledger.fault is not None:
             # Stay and say so: a daemon that is gone is harder to understand from the field.
             logger.error("%s", self.ledger.fault)
-        else:
+        try:
             self.conductor.last = next(iter(self.store.history(limit=1)), None)
+        except StorageError as error:
+            logger.warning("%s; the daemon goes on without earlier records", error)
         try:
             async with asyncio.TaskGroup() as group:
                 try:

@@ -26,10 +26,14 @@ class Budget:
         self.discarded = 0
         """Bytes that were thrown away for it."""
 
+    def left(self, now_s: float) -> float:
+        """How many may be taken."""
+        gained = max(now_s - self._t_s, 0.0) * self._bytes_per_s
+        return min(self._left + gained, self._burst_bytes)
+
     def take(self, count: int, now_s: float) -> bool:
         """Take so many; False when there were not so many, which leaves a bucket that is empty and no more."""
-        gained = max(now_s - self._t_s, 0.0) * self._bytes_per_s
-        self._left, self._t_s = min(self._left + gained, self._burst_bytes) - count, now_s
+        self._left, self._t_s = self.left(now_s) - count, now_s
         if self._left >= 0.0:
             return True
         self._left, self.exceeded_s = 0.0, now_s

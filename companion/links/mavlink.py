@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Literal, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.links.mavlink_frames import Codec, goes_ahead, kind_at, may_wait, read
-from companion.links.mavlink_signing import Signing
-from companion.links.together import Together
+from companion.links.mavlink_signing import NEVER_SIGNED, Signing
+from companion.links.together import Take, Together
 
 logger = logging.getLogger(__name__)
 
@@ -25,8 +25,11 @@ M = TypeVar("M", bound=mavlink.MAVLink_message)
 Handler = Callable[[M, float], None]
 Unsubscribe = Callable[[], None]
 Direction = Literal["in", "out"]
+Sender = tuple[int, int]
+"""System and component."""
 
 _COMPACT_BYTES = 4096
+_ANYBODYS = frozenset(mavlink.mavlink_map[number].msgname for number in NEVER_SIGNED)
 
 
 class MavlinkLink:
@@ -52,6 +55,8 @@ class MavlinkLink:
         """Signs what is sent and judges what comes; None: nobody does."""
         self.together = Together()
         """Where datagrams of telemetry wait for the next read of a fast stream, while there is one."""
+        self.autopilot: Sender | None = None
+        """The autopilot that this link is for; None while it is not known."""
         self._codec: Codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._codec.robust_parsing = True
         self._transmit: Callable[[bytes], object] | None = None
@@ -66,6 +71,11 @@ class MavlinkLink:
     @system_id.setter
     def system_id(self, value: int) -> None:
         self._codec.srcSystem = value
+
+    def join(self, autopilot: Sender) -> None:
+        """Belong to this autopilot's vehicle from here on: we send under its system id."""
+        self.autopilot = autopilot
+        self.system_id = autopilot[0]
 
     @property
     def half_received(self) -> bytes:
@@ -117,63 +127,94 @@ class MavlinkLink:
 
         return unsubscribe
 
-    def arrived(self, datagram: bytes, t_s: float) -> None:
-        """As `receive`, of a datagram; streams of telemetry are taken with the next read of a fast stream.
+    def arrived(self, datagram: bytes, t_s: float, take: Take) -> None:
+        """Have a datagram taken by `take(datagram, t_s)`: streams of telemetry with the next read of a fast stream.
 
         Whatever else comes is taken at once, behind what waits; some of what is asked of us ahead of it.
         """
         together = self.together
         if together.driven and may_wait(datagram):
-            together.put(self.receive, datagram, t_s)
+            together.put(take, datagram, t_s)
             return
         if not (together.driven and goes_ahead(datagram)):
             together.take()
-        self.receive(datagram, t_s)
+        take(datagram, t_s)
 
     def receive(self, data: bytes, t_s: float) -> None:
-        """Take bytes that arrived at `t_s` (monotonic); never raises, whatever they are."""
+        """Take bytes of a stream that arrived at `t_s` (monotonic); never raises, whatever they are."""
         if self.tap is not None:
             self.tap("in", data, t_s)
-        if self._codec.buf:
-            data = self.half_received + data
-            self._forget_received()
-        data = self._take_whole(data, t_s)
-        if not data:
-            return
-        message = self._next_message(data)
-        while message is not None:
-            self._dispatch(message, t_s)
-            message = self._next_message(b"")
+        attached = self._attached
+        for name, _, message in self._frames(data):
+            self._dispatch(name, message, t_s)
+            if self._attached != attached:
+                return  # what came over another transport ends here
         # The codec frees its buffer only when a read happens to end on a frame's end; a busy serial link may not
         # do that for hours.
         if self._codec.buf_index > _COMPACT_BYTES:
             del self._codec.buf[: self._codec.buf_index]
             self._codec.buf_index = 0
 
-    def _take_whole(self, data: bytes, t_s: float) -> bytes:
-        """Take the good frames at the front, without looking into those that nobody wants; what is left of the bytes.
+    def receive_datagram(self, datagram: bytes, t_s: float, admit: Callable[[Sender], None]) -> None:
+        """Take a datagram, which holds whole messages: of one that is cut off nothing is carried into the next.
 
-        The codec, which knows everything and takes several times as long, gets the rest from the first frame on that is
-        anything special: signed, of version 1, with text or arrays in it for somebody, damaged, cut off.
+        `admit` is told who sent each message that may have an effect, before it has any; not of a radio's own, which
+        anybody may send without a signature.
         """
-        if self.signing is not None:
-            return data
-        at, attached = 0, self._attached
-        while (found := kind_at(data, at)) is not None:
+        if self.tap is not None:
+            self.tap("in", datagram, t_s)
+        frames = list(self._frames(datagram))
+        if self.half_received:
+            self.received["bad"] += 1
+            if self.tap is not None:
+                self.tap("in", None, None)
+        self._forget_received()
+        for name, sender, message in frames:
+            if name not in _ANYBODYS:
+                admit(sender)
+            self._dispatch(name, message, t_s)
+
+    def _frames(self, data: bytes) -> Iterator[tuple[str, Sender, Message | None]]:
+        """Name, sender and message of what is whole and admitted; no message where nobody wants it.
+
+        The good frames at the front are read here. The codec, which knows everything and takes several times as long,
+        gets the rest from the first frame on that is anything special: signed, of version 1, with text or arrays in it
+        for somebody, damaged, cut off.
+        """
+        if self._codec.buf:
+            data = self.half_received + data
+            self._forget_received()
+        at = 0
+        while self.signing is None and (found := kind_at(data, at)) is not None:
             kind, end = found
-            name = kind.msgname
-            if self._handlers.get(name):
+            message = None
+            if self._handlers.get(kind.msgname):
                 message = read(kind, data, at, end)
                 if message is None:
                     break
-                self._dispatch(message, t_s)
-                if self._attached != attached:
-                    return b""  # what came over another transport ends here
-            else:
-                self.received[name] += 1
-                self.last_received_s = t_s
+            yield kind.msgname, (data[at + 5], data[at + 6]), message
             at = end
-        return data[at:] if at else data
+        if at == len(data):
+            return
+        message = self._next_message(data[at:])
+        while message is not None:
+            if self._admits(message):
+                yield message.get_type(), (message.get_srcSystem(), message.get_srcComponent()), message
+            message = self._next_message(b"")
+
+    def _admits(self, message: Message) -> bool:
+        if message.get_type() == "BAD_DATA":
+            self.received["bad"] += 1
+            return False
+        if isinstance(message, mavlink.MAVLink_unknown):
+            # One counter for all: noise can look like any of 16 million message ids.
+            self.received["unknown"] += 1
+            return False
+        return self.signing is None or self.signing.admits(message.get_msgbuf())
+
+    def signed_on(self, message: Message) -> int | None:
+        """The sender's link id in a message that is signed with our key; None where it is not, or nobody judges."""
+        return None if self.signing is None else self.signing.link_id_of(message.get_msgbuf())
 
     def _next_message(self, data: bytes) -> mavlink.MAVLink_message | None:
         try:
@@ -187,19 +228,11 @@ class MavlinkLink:
         self._codec.buf = bytearray()
         self._codec.buf_index = 0
 
-    def _dispatch(self, message: mavlink.MAVLink_message, t_s: float) -> None:
-        name = message.get_type()
-        if name == "BAD_DATA":
-            self.received["bad"] += 1
-            return
-        if isinstance(message, mavlink.MAVLink_unknown):
-            # One counter for all: noise can look like any of 16 million message ids.
-            self.received["unknown"] += 1
-            return
-        if self.signing is not None and not self.signing.admits(message.get_msgbuf()):
-            return
+    def _dispatch(self, name: str, message: Message | None, t_s: float) -> None:
         self.received[name] += 1
         self.last_received_s = t_s
+        if message is None:
+            return
         for handler in tuple(self._handlers.get(name, ())):
             try:
                 handler(message, t_s)

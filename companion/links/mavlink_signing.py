@@ -23,7 +23,9 @@ EPOCH_S: Final = 1420070400
 TICKS_PER_S: Final = 100_000
 LAST: Final = 2**48 - 1
 LATE_TICKS: Final = 60 * TICKS_PER_S
-"""So far behind our own time may a sender be that is heard for the first time (the specification's minute)."""
+"""How far behind our own time a sender may be (the specification's minute for one that is heard for the first time)."""
+BEHIND_ITSELF_TICKS: Final = 5 * TICKS_PER_S
+"""How far a sender may be behind the newest time heard from it on any of its links: more has been held back."""
 MAX_STREAMS: Final = 64
 """Senders with the key that are remembered, by system, component and link; newcomers beyond are not believed."""
 MAX_STRANGERS: Final = 16
@@ -38,7 +40,7 @@ _TAIL: Final = mavlink.MAVLINK_SIGNATURE_BLOCK_LEN
 _HASH: Final = 6
 
 Reason = Literal["unsigned", "other key", "old", "no key"]
-"""Why a message is not believed. "old": it, or a later one of the same sender, has been heard before."""
+"""Why a message is not believed. "old": it, or a much later one of the same sender, has been heard before."""
 
 
 def uptime_s() -> float:
@@ -137,6 +139,7 @@ class Signing:
         self.believed: Counter[tuple[int, int]] = Counter()
         """What was signed with our key, by system and component."""
         self._streams: dict[tuple[int, int, int], int] = {}
+        self._newest: dict[tuple[int, int], int] = {}
 
     def __repr__(self) -> str:
         """Without the key."""
@@ -169,19 +172,31 @@ class Signing:
             return "no key"
         if first or not frame[2] & _SIGNED:
             return "unsigned"
-        if not hmac.compare_digest(_digest(self.key, frame[:-_HASH]), bytes(frame[-_HASH:])):
+        if not self._is_ours(frame):
             return "other key"
         # Only who has the key comes as far as this.
         ticks = int.from_bytes(frame[1 - _TAIL : -_HASH], "little")
-        stream = (frame[5], frame[6], frame[-_TAIL])
+        sender, stream = (frame[5], frame[6]), (frame[5], frame[6], frame[-_TAIL])
+        newest = self._newest.get(sender, 0)
+        if ticks + LATE_TICKS < self.clock.now() or ticks + BEHIND_ITSELF_TICKS < newest:
+            return "old"
         before = self._streams.get(stream)
-        if before is None:
-            if ticks + LATE_TICKS < self.clock.now() or len(self._streams) >= MAX_STREAMS:
-                return "old"
-        elif ticks <= before:
+        if (before is None and len(self._streams) >= MAX_STREAMS) or (before is not None and ticks <= before):
             return "old"
         self._streams[stream] = ticks
+        self._newest[sender] = max(ticks, newest)
         self.clock.heard(ticks)
         self.verified += 1
-        self.believed[frame[5], frame[6]] += 1
+        self.believed[sender] += 1
         return None
+
+    def link_id_of(self, frame: bytes | bytearray) -> int | None:
+        """On which of its links the sender has signed a whole packet with our key; None: it has not."""
+        signed = frame[0] != _MARKER_1 and frame[2] & _SIGNED
+        return frame[-_TAIL] if signed and self._is_ours(frame) else None
+
+    def _is_ours(self, frame: bytes | bytearray) -> bool:
+        """Whether a signed packet was signed with our key."""
+        if self.key is None:
+            return False
+        return hmac.compare_digest(_digest(self.key, frame[:-_HASH]), bytes(frame[-_HASH:]))

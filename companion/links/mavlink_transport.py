@@ -9,22 +9,22 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import functools
 import logging
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, Protocol, cast
 
 from companion.errors import LinkError
-from companion.links import telemetry_socket
 from companion.links.backoff import Backoff
 from companion.links.bytestream import ByteLink, PortSettings
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink import MavlinkLink, Sender
 
 logger = logging.getLogger(__name__)
 
 PEER_SILENCE_S = 10.0
 MAX_PEERS = 8
-"""Newcomers beyond these are heard but not answered: a scan of our port must not push out the autopilot."""
+"""Newcomers beyond these are heard but not answered; only the autopilot's own address gets the place of another."""
 OUT_BUFFER_BYTES = 65536
 MOST_DATAGRAM_BYTES = 65536
 """UDP carries no more; asyncio makes room for four times that, afresh for every datagram, which costs more than all the
@@ -37,6 +37,8 @@ _URL = re.compile(r"(?P<kind>udpin|udpout|tcp|serial):(?P<where>.+):(?P<number>\
 _PASSING_ERRORS = frozenset({errno.ECONNREFUSED, errno.ENOBUFS, errno.EAGAIN})
 
 OnState = Callable[[bool, str], None]
+Peer = tuple[Any, ...]
+"""An address as the socket gives it."""
 
 
 async def run_transport(link: MavlinkLink, url: str, *, on_state: OnState | None = None) -> None:
@@ -173,7 +175,7 @@ class _Udp(asyncio.DatagramProtocol):
         if not (isinstance(exc, OSError) and exc.errno in _PASSING_ERRORS):
             self._fail(exc)
 
-    def send_to(self, data: bytes, peer: tuple[Any, ...] | None) -> bool:
+    def send_to(self, data: bytes, peer: Peer | None) -> bool:
         """Send one datagram; False when the socket is gone or its buffer full (then the newest is what is dropped)."""
         transport = self._transport
         if transport is None or transport.get_write_buffer_size() + len(data) > OUT_BUFFER_BYTES:
@@ -194,37 +196,47 @@ class _Speaker(_Udp):
         self.link.attach(lambda data: self.send_to(data, None))
 
     def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
-        self.link.arrived(data, self.now_s())
+        self.link.arrived(data, self.now_s(), self._take)
+
+    def _take(self, datagram: bytes, t_s: float) -> None:
+        self.link.receive_datagram(datagram, t_s, lambda sender: None)
 
 
 class _Listener(_Udp):
-    """udpin: sends to every peer heard lately; with no such peer the link counts as not connected."""
+    """udpin: sends to every peer that has a place; with no such peer the link counts as not connected.
+
+    A place is for who has sent a message that may have an effect, not for any bytes.
+    """
 
     def __init__(self, link: MavlinkLink) -> None:
         super().__init__(link)
-        self._heard_s: dict[tuple[Any, ...], float] = {}
-        self._telemetry: _Telemetry | None = None
+        self._heard_s: dict[Peer, float] = {}
+        self._autopilots: set[Peer] = set()
+        """Those of them that have spoken for the autopilot."""
 
-    def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
-        self._telemetry = _Telemetry(transport.get_extra_info("socket"), self)
+    def datagram_received(self, data: bytes, addr: Peer) -> None:
+        self.link.arrived(data, self.now_s(), functools.partial(self._take, addr))
 
-    def connection_lost(self, exc: Exception | None) -> None:
-        if self._telemetry is not None:
-            self._telemetry.close()
-        super().connection_lost(exc)
+    def _take(self, peer: Peer, datagram: bytes, t_s: float) -> None:
+        self.link.receive_datagram(datagram, t_s, lambda sender: self._hear(peer, sender, t_s))
 
-    def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
-        now_s = self.now_s()
-        self.hear(addr, now_s)
-        self.link.arrived(data, now_s)
+    def _hear(self, peer: Peer, sender: Sender, t_s: float) -> None:
+        autopilot = sender == self.link.autopilot
+        if peer not in self._heard_s and len(self._heard_s) >= MAX_PEERS and not (autopilot and self._make_room()):
+            return
+        if autopilot:
+            self._autopilots.add(peer)
+        self._heard_s[peer] = t_s
+        if not self.link.connected:
+            self.link.attach(self._send_to_all)
 
-    def hear(self, peer: tuple[Any, ...], t_s: float) -> None:
-        """A peer spoke."""
-        if peer in self._heard_s or len(self._heard_s) < MAX_PEERS:
-            self._heard_s[peer] = t_s
-            if not self.link.connected:
-                self.link.attach(self._send_to_all)
+    def _make_room(self) -> bool:
+        """Let the autopilot's own address have the place of somebody else, the one who has been silent for longest."""
+        others = self._heard_s.keys() - self._autopilots
+        if not others:
+            return False
+        del self._heard_s[min(others, key=self._heard_s.__getitem__)]
+        return True
 
     def error_received(self, exc: Exception) -> None:
         # One peer that cannot be reached is its own trouble; it is forgotten once silent.
@@ -237,62 +249,6 @@ class _Listener(_Udp):
     def _turn(self) -> None:
         now_s = self.now_s()
         self._heard_s = {peer: heard_s for peer, heard_s in self._heard_s.items() if now_s - heard_s <= PEER_SILENCE_S}
+        self._autopilots &= self._heard_s.keys()
         if not self._heard_s:
             self.link.attach(None)
-
-
-class _Telemetry:
-    """The sockets beside a listener's own, opened as soon as a fast stream drives: telemetry is read with that."""
-
-    def __init__(self, beside: telemetry_socket.Endpoint, listener: _Listener) -> None:
-        self._beside, self._listener, self._link = beside, listener, listener.link
-        self._loop = asyncio.get_running_loop()
-        self._pair: telemetry_socket.Pair | None = None
-        self._tried = False
-        self._leave = self._link.together.join(self)
-
-    def take(self) -> None:
-        if self._pair is not None:
-            self._receive(self._pair.drain(self._listener.now_s()))
-
-    def _asked(self) -> None:
-        """Questions have come: answer them ahead of telemetry where that may be, else behind it."""
-        assert self._pair is not None
-        together = self._link.together
-        if together.driven and (asked := self._pair.ahead(self._listener.now_s())):
-            self._receive(asked)
-        else:
-            together.take()
-
-    def _receive(self, datagrams: Iterable[tuple[bytes, tuple[Any, ...], float]]) -> None:
-        heard: tuple[Any, ...] | None = None
-        for data, peer, t_s in datagrams:
-            if peer != heard:
-                heard = peer
-                self._listener.hear(peer, t_s)
-            self._link.receive(data, t_s)
-
-    def listen(self, *, at_once: bool) -> None:
-        if not at_once and not self._tried:
-            self._open()
-        if self._pair is None:
-            return
-        if at_once:
-            self._loop.add_reader(self._pair.telemetry, self._link.together.take)
-        else:
-            self._loop.remove_reader(self._pair.telemetry)
-
-    def _open(self) -> None:
-        self._tried = True
-        self._pair = telemetry_socket.beside(self._beside)
-        if self._pair is not None:
-            self._loop.add_reader(self._pair.questions, self._asked)
-            for data, peer in telemetry_socket.left_in(self._beside):
-                self._listener.datagram_received(data, peer)
-
-    def close(self) -> None:
-        self._tried = True
-        self._leave()
-        if self._pair is not None:
-            self._loop.remove_reader(self._pair.questions)
-            self._pair.close()

@@ -1,8 +1,9 @@
 """The connection to an MQTT broker, for as long as it takes.
 
-aiomqtt carries it (paho below): asyncio without a thread of ours, typed, and its version 2 speaks MQTT 3.1.1 and 5.
-All that knows aiomqtt is in this module, as its version 3 will be another library. MQTT 5 is tried first: only there
-can a message say that it was published to be retained, and only there is the broker told how large a message may be.
+aiomqtt speaks MQTT (paho below): asyncio without a thread of ours, typed, and its version 2 speaks MQTT 3.1.1 and 5.
+All that knows aiomqtt is in this module, as its version 3 will be another library; what it gets of the broker has
+passed `mqtt_filter`. MQTT 5 is tried first: only there can a message say that it was published to be retained, and
+only there is the broker told how large a message may be.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from companion.config import Mqtt
 from companion.links.backoff import Backoff
+from companion.links.mqtt_filter import LEAVE_DEADLINE_S, MAX_PACKET_BYTES, BrokerFaultError, MqttFilter
 from companion.links.mqtt_outbox import Outbox
 from companion.links.mqtt_secrets import is_open_to_all, read_password, tls_context
-from companion.links.mqtt_words import ClosedEarlyError, explain, is_of_protocol
+from companion.links.mqtt_words import causes, explain, is_of_protocol
 
 if TYPE_CHECKING:
     import aiomqtt
@@ -31,24 +33,19 @@ _quiet = logging.getLogger(f"{__name__}.aiomqtt")
 _quiet.setLevel(logging.CRITICAL)
 
 INSTALL: Final = "pip install 'aiomqtt>=2.5,<3' where the companion is installed"
-CONNECT_DEADLINE_S: Final = 4.0
 GREETING_DEADLINE_S: Final = 5.0
 """For the broker's first words; until then MQTT 3.1.1 is not tried on one that is silent to MQTT 5."""
 ANSWER_DEADLINE_S: Final = 5.0
-LEAVE_DEADLINE_S: Final = 1.0
 FIRST_WAIT_S: Final = 0.5
 LONGEST_WAIT_S: Final = 30.0
 WORTH_S: Final = 10.0
 """A connection that lasted so long was worth one: the next attempts begin with short waits again."""
 MANY: Final = 3
 """So many connections in a row that were not worth one are more than bad luck."""
-MAX_PACKET_BYTES: Final = 64 * 1024
-"""That the broker may send us; told to it where it speaks MQTT 5."""
 MQTT_3_1_1: Final = 4
 MQTT_5: Final = 5
 """The numbers of the two protocols on the wire."""
 _REFUSED: Final = 128
-_MOMENT_S: Final = 0.05
 
 Offload = Callable[..., Awaitable[Any]]
 
@@ -173,7 +170,9 @@ class MqttLink:
             if self._protocol == MQTT_3_1_1:
                 return
         why = explain(error, self.settings, self.client_id, reached=reached)
-        is_short = reached and asyncio.get_running_loop().time() - began_s < WORTH_S
+        # Who was thrown out by another client did nothing wrong before.
+        is_fault = isinstance(causes(error)[0], BrokerFaultError)
+        is_short = reached and not is_fault and asyncio.get_running_loop().time() - began_s < WORTH_S
         self._short = self._short + 1 if is_short else 0
         if self._short >= MANY:
             # Two clients of one name throw each other out for ever, and few brokers say so.
@@ -188,26 +187,14 @@ class MqttLink:
                     await self.outbox.empty()
 
     async def _serve(self) -> None:
-        client = await self._connect()
-        try:
-            await self._subscribe(client)
-            self._up()
-            await _both(self._send(client), self._receive(client))
-        finally:
-            self._connected_s = None
-            self.outbox.closed()
-            await _leave(client)
-
-    async def _connect(self) -> aiomqtt.Client:
-        """Reach the broker.
+        """One connection, to its end.
 
         Raises:
-            LinkError: password or certificates cannot be used.
-            aiomqtt.MqttError: no broker, or it refuses.
+            LinkError: password or certificates cannot be used, or the broker sends what is not taken.
+            OSError: no broker is reached.
+            aiomqtt.MqttError: it refuses, or the connection is lost.
         """
         import aiomqtt
-        from paho.mqtt.packettypes import PacketTypes
-        from paho.mqtt.properties import Properties
 
         password = await self._offload(read_password, self.settings)
         if not self._warned_open and is_open_to_all(self.settings):
@@ -215,13 +202,38 @@ class MqttLink:
             path = self.settings.password_path
             logger.warning("mqtt: password file %s: everybody on this computer can read it (chmod o-r)", path)
         context = await self._offload(tls_context, self.settings)
+        lost: Exception | None = None
+        async with MqttFilter(self.settings.host, self.settings.broker_port, context, self._protocol) as broker:
+            try:
+                await self._talk(broker, password)
+            except aiomqtt.MqttError as error:
+                lost = error
+        # What is wrong with the broker is the better reason: the library knows only that the connection is gone.
+        if (reason := broker.fault or lost) is not None:
+            raise reason
+
+    async def _talk(self, broker: MqttFilter, password: str | None) -> None:
+        client = self._client(broker.address, password)
+        await _enter(client, broker)
+        try:
+            await _both(self._speak(client), self._receive(client))
+        finally:
+            self._connected_s = None
+            self.outbox.closed()
+            await _leave(client)
+
+    def _client(self, address: str, password: str | None) -> aiomqtt.Client:
+        import aiomqtt
+        from paho.mqtt.packettypes import PacketTypes
+        from paho.mqtt.properties import Properties
+
         properties = None
         if self._protocol == MQTT_5:
             properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
             properties.MaximumPacketSize = MAX_PACKET_BYTES
-        client = aiomqtt.Client(
-            self.settings.host,
-            self.settings.broker_port,
+        return aiomqtt.Client(
+            address,
+            transport="unix",
             username=self.settings.username,
             password=password,
             identifier=self.client_id,
@@ -230,22 +242,15 @@ class MqttLink:
             clean_session=True if properties is None else None,
             keepalive=self.settings.keepalive_s,
             properties=properties,
-            tls_context=context,
             timeout=GREETING_DEADLINE_S,
             queue_type=_inbox(self._take),
             logger=_quiet,
         )
-        _paho(client).connect_timeout = CONNECT_DEADLINE_S
-        entering = asyncio.get_running_loop().create_task(client.__aenter__(), name="mqtt connect")
-        try:
-            await _entered(client, entering)
-        except BaseException:
-            # Left alone, a connection that came about half way would live on without us.
-            await _close(client)
-            entering.cancel()
-            await asyncio.wait([entering], timeout=LEAVE_DEADLINE_S)
-            raise
-        return client
+
+    async def _speak(self, client: aiomqtt.Client) -> None:
+        await self._subscribe(client)
+        self._up()
+        await self._send(client)
 
     async def _subscribe(self, client: aiomqtt.Client) -> None:
         from paho.mqtt.subscribeoptions import SubscribeOptions
@@ -348,69 +353,28 @@ def _inbox(take: Callable[[aiomqtt.Message], None]) -> type[asyncio.Queue[aiomqt
     return Inbox
 
 
-def _paho(client: aiomqtt.Client) -> Any:
-    """What aiomqtt is built on: only there a connection that came about half way can be closed."""
-    return client._client  # noqa: SLF001
-
-
-async def _entered(client: aiomqtt.Client, entering: asyncio.Task[aiomqtt.Client]) -> None:
-    """Wait until the broker has accepted or refused the connection.
-
-    aiomqtt would wait to its deadline for a broker that closes the connection instead, and its thread that connects
-    cannot be stopped.
+async def _enter(client: aiomqtt.Client, broker: MqttFilter) -> None:
+    """Wait until the broker has accepted or refused us.
 
     Raises:
-        ClosedEarlyError: the broker has closed the connection.
-        aiomqtt.MqttError: it refuses, or cannot be reached.
+        aiomqtt.MqttError: it refuses.
     """
-    closed = _closing(client)
-    either: list[asyncio.Future[Any]] = [entering, closed]
+    entering = asyncio.get_running_loop().create_task(client.__aenter__(), name="mqtt connect")
     try:
-        await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
-        # A refusal closes the connection too, and `entering` learns of it a moment later.
-        await asyncio.wait([entering], timeout=_MOMENT_S)
-        if not entering.done():
-            raise ClosedEarlyError("the broker closes the connection without a word")
+        await asyncio.shield(entering)
     except asyncio.CancelledError:
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(CONNECT_DEADLINE_S):
-                while not entering.done() and _paho(client).socket() is None and not closed.done():
-                    await asyncio.sleep(_MOMENT_S)
+        # Left alone half way, it would live on without us: without the broker it ends by itself.
+        broker.hang_up()
+        await asyncio.wait([entering], timeout=LEAVE_DEADLINE_S)
+        entering.cancel()
+        await asyncio.gather(entering, return_exceptions=True)
         raise
-    await entering
-
-
-def _closing(client: aiomqtt.Client) -> asyncio.Future[None]:
-    """Done when the client's socket is closed."""
-    loop = asyncio.get_running_loop()
-    closed: asyncio.Future[None] = loop.create_future()
-    paho = _paho(client)
-    of_aiomqtt = paho.on_socket_close
-
-    def on_close(*arguments: Any) -> None:
-        of_aiomqtt(*arguments)
-        if not loop.is_closed():
-            loop.call_soon_threadsafe(lambda: None if closed.done() else closed.set_result(None))
-
-    paho.on_socket_close = on_close
-    return closed
 
 
 async def _leave(client: aiomqtt.Client) -> None:
-    """Say goodbye if that is still possible; the socket is closed in any case."""
+    """Say goodbye if that is still possible."""
     import aiomqtt
 
     with contextlib.suppress(aiomqtt.MqttError, OSError, TimeoutError):
         async with asyncio.timeout(LEAVE_DEADLINE_S):
             await client.__aexit__(None, None, None)
-    await _close(client)
-
-
-async def _close(client: aiomqtt.Client) -> None:
-    """Close the socket, and wait until the loop has done so."""
-    paho = _paho(client)
-    paho.disconnect()
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(LEAVE_DEADLINE_S):
-            while paho.socket() is not None:
-                await asyncio.sleep(0.01)

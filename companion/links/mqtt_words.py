@@ -9,6 +9,7 @@ from typing import Final
 
 from companion.config import Mqtt
 from companion.errors import LinkError
+from companion.links.mqtt_filter import NoGreetingError
 
 UNSUPPORTED_PROTOCOL: Final = 132
 """Reason codes of MQTT 5 (its section 2.4); paho turns those of MQTT 3.1.1 into the same."""
@@ -21,10 +22,6 @@ _LOST: Final = (7, 128)
 """paho's own number, and what it makes of it for MQTT 5."""
 _SILENT: Final = (16, 141)
 """Likewise: nothing was heard for twice the keepalive."""
-
-
-class ClosedEarlyError(LinkError):
-    """What listens there took the connection and closed it before it said anything."""
 
 
 def causes(error: BaseException) -> list[BaseException]:
@@ -51,7 +48,7 @@ def reason_code(error: BaseException) -> int | None:
 
 def is_of_protocol(error: BaseException) -> bool:
     """Whether the broker may not speak the version of MQTT that it was spoken to in."""
-    closed = any(isinstance(cause, ClosedEarlyError) for cause in causes(error))
+    closed = any(isinstance(cause, NoGreetingError) for cause in causes(error))
     return closed or reason_code(error) == UNSUPPORTED_PROTOCOL or _is_unanswered(error)
 
 
@@ -71,7 +68,7 @@ def explain(error: BaseException, settings: Mqtt, client_id: str, *, reached: bo
     if _is_unanswered(error):
         return "the broker does not answer any more" if reached else f"what listens there says nothing{hint}"
     for cause in causes(error):
-        if isinstance(cause, ClosedEarlyError):
+        if isinstance(cause, NoGreetingError):
             return f"{cause}{hint}"
         if isinstance(cause, LinkError):
             return str(cause)

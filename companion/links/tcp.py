@@ -29,20 +29,33 @@ async def connect_tcp(url: str, address: tuple[str, int]) -> int:
         LinkError: one line that names the address and the cause.
     """
     host, port = address
-    loop = asyncio.get_running_loop()
-    reason = f"{url}: the host has no address"
     try:
         async with asyncio.timeout(CONNECT_DEADLINE_S):
-            for family, kind, protocol, _, found in await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM):
-                try:
-                    return await _connect(loop, socket.socket(family, kind, protocol), found)
-                except OSError as error:
-                    reason = f"{url}: {words_of(error)}"
+            return await connect(host, port)
     except TimeoutError:
         reason = f"{url}: no answer within {CONNECT_DEADLINE_S:g} s"
-    except (OSError, UnicodeError) as error:
+    except (socket.gaierror, UnicodeError) as error:
         reason = f"{url}: host {host} is not known ({error})"
+    except OSError as error:
+        reason = f"{url}: {words_of(error)}"
     raise LinkError(reason)
+
+
+async def connect(host: str, port: int) -> int:
+    """Connect to the first address of a host that answers, for as long as the system tries; return the descriptor.
+
+    Raises:
+        OSError: none does; of a host that is not known, `socket.gaierror`.
+        UnicodeError: the host cannot be a name.
+    """
+    loop = asyncio.get_running_loop()
+    failed = OSError("the host has no address")
+    for family, kind, protocol, _, found in await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+        try:
+            return await _connect(loop, socket.socket(family, kind, protocol), found)
+        except OSError as error:
+            failed = error
+    raise failed
 
 
 async def _connect(loop: asyncio.AbstractEventLoop, endpoint: socket.socket, address: tuple[object, ...]) -> int:

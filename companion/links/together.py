@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Final
 
 logger = logging.getLogger(__name__)
 
@@ -26,22 +26,11 @@ whoever works out a calibration waits for the second's last ones."""
 Take = Callable[[bytes, float], object]
 
 
-class Source(Protocol):
-    """Something that holds back bytes by itself, as the kernel does for a socket."""
-
-    def take(self) -> None:
-        """Take all that has come."""
-
-    def listen(self, *, at_once: bool) -> None:
-        """From here on take what comes as soon as it does, or leave it to `take`."""
-
-
 class Together:
     """Chunks of bytes that wait, each with who takes it and when it came. All calls are made on the loop's thread."""
 
     def __init__(self) -> None:
         self._waiting: list[tuple[Take, bytes, float]] = []
-        self._sources: list[Source] = []
         self._sleepers: list[tuple[float, asyncio.Future[None]]] = []
         self._drivers = 0
         self._turns = 0
@@ -61,32 +50,15 @@ class Together:
     def drive(self) -> None:
         """From here on the caller calls `turn` at short intervals, until it says `rest`."""
         self._drivers += 1
-        if self._drivers == 1:
-            for source in self._sources:
-                source.listen(at_once=False)
 
     def rest(self) -> None:
         """The caller drives no longer."""
         self._drivers -= 1
         if self._drivers == 0:
             self.take()
-            for source in self._sources:
-                source.listen(at_once=True)
             sleepers, self._sleepers = self._sleepers, []
             for due_s, sleeper in sleepers:
                 sleeper.get_loop().call_at(due_s, _wake, sleeper)
-
-    def join(self, source: Source) -> Callable[[], None]:
-        """Let a source wait for the reads too; returns how it leaves."""
-        self._sources.append(source)
-        source.listen(at_once=not self.driven)
-
-        def leave() -> None:
-            if source in self._sources:
-                self._sources.remove(source)
-                source.listen(at_once=False)
-
-        return leave
 
     def put(self, take: Take, data: bytes, t_s: float) -> None:
         """Let bytes that came at `t_s` wait for the next `take`; where nothing drives they are taken now."""
@@ -103,13 +75,11 @@ class Together:
             self._wake_sleepers(now_s)
 
     def take(self) -> None:
-        """Take all that waits, each source's in its order."""
+        """Take all that waits, in its order."""
         if self._taking:
             return  # by what was taken; the rest is about to be
         self._taking, self._turns = True, 0
         try:
-            for source in self._sources:
-                source.take()
             while self._waiting:
                 waiting, self._waiting = self._waiting, []
                 for take, data, t_s in waiting:

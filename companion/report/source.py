@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-import msgspec
-
 from companion.calibration.record import Arming, Record
 from companion.errors import StorageError
 from companion.report import calibration_page, history_page
 from companion.report.page import Profiles
+from companion.storage.bounded import BoundedList
 from companion.storage.records import Entry, RecordStore
 
 MAX_EARLIER: Final = 60
@@ -45,16 +44,11 @@ class Storage:
             raise StorageError(f"no calibration yet: {records} is empty")
         if not any(entry.record for entry in self.entries):
             raise StorageError(f"no calibration can be read: {'; '.join(self.damaged[:3])}")
-        self._armings = self._read_armings(directory / "armings.json")
-
-    def _read_armings(self, path: Path) -> list[Arming]:
+        self._armings: list[Arming] = []
         try:
-            return msgspec.json.decode(path.read_bytes(), type=list[Arming])
-        except FileNotFoundError:
-            return []
-        except (OSError, ValueError, msgspec.MsgspecError) as error:
-            self.damaged.append(f"{path.name}: {error}")
-            return []
+            self._armings = BoundedList(directory / "armings.json", Arming, keep=0).all()
+        except StorageError as error:
+            self.damaged.append(str(error))
 
     def calibration(self, wanted: str | None, profiles: Profiles) -> calibration_page.Material:
         """One calibration.

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Final
 
 import msgspec
 
-from companion.calibration.history import Point
-from companion.errors import StorageError
-from companion.storage.atomic import write_atomically
-
-logger = logging.getLogger(__name__)
+from companion.calibration.history import Point, check
+from companion.storage.state import StateFile
 
 FORMAT_VERSION: Final = 1
 KEEP_POINTS: Final = 40
@@ -36,25 +32,12 @@ class BiasStore:
     """`biases.json` in the storage directory."""
 
     def __init__(self, directory: Path) -> None:
-        self._path = directory / "biases.json"
+        self._file: StateFile[_File] = StateFile(directory / "biases.json", _File, _check)
 
     def read(self) -> dict[str, KnownImu]:
-        """By IMU, what is kept; what cannot be read is logged in one line and begun anew, since nothing hangs on it."""
-        try:
-            found = msgspec.json.decode(self._path.read_bytes(), type=_File)
-            if found.format_version != FORMAT_VERSION:
-                raise msgspec.ValidationError(f"format {found.format_version}, known is {FORMAT_VERSION}")
-        except FileNotFoundError:
-            return {}
-        except OSError as error:
-            logger.warning(
-                "%s: cannot be read: %s; goes on without earlier biases", self._path, error.strerror or error
-            )
-            return {}
-        except (ValueError, msgspec.MsgspecError) as error:
-            logger.warning("%s: not readable: %s; goes on without earlier biases", self._path, error)
-            return {}
-        return found.imus
+        """By IMU, what is kept; what cannot be used is set aside and begun anew, since nothing hangs on it."""
+        found = self._file.take()
+        return {} if found is None else found.imus
 
     def write(self, imus: dict[str, KnownImu]) -> None:
         """Keep the latest points of the latest IMUs.
@@ -67,8 +50,12 @@ class BiasStore:
             name: msgspec.structs.replace(imus[name], points=imus[name].points[-KEEP_POINTS:])
             for name in latest[-KEEP_IMUS:]
         }
-        try:
-            data = msgspec.json.encode(_File(imus=kept))
-        except (ValueError, msgspec.MsgspecError) as error:
-            raise StorageError(f"{self._path}: cannot be written: {error}") from error
-        write_atomically(self._path, data + b"\n")
+        self._file.write(_File(imus=kept))
+
+
+def _check(found: _File) -> None:
+    if found.format_version != FORMAT_VERSION:
+        raise msgspec.ValidationError(f"format {found.format_version}, known is {FORMAT_VERSION}")
+    for known in found.imus.values():
+        for point in known.points:
+            check(point)

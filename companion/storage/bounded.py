@@ -2,35 +2,39 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Generic, TypeVar
 
 import msgspec
 
-from companion.storage.atomic import write_atomically
-
-logger = logging.getLogger(__name__)
+from companion.storage.state import StateFile
 
 T = TypeVar("T")
 
 
+class _Entries(msgspec.Struct, Generic[T], frozen=True):
+    entries: list[T]
+
+
 class BoundedList(Generic[T]):
-    """The latest `keep` entries, oldest first; one that cannot be read begins anew, since nothing hangs on it."""
+    """The latest `keep` entries, oldest first; one that cannot be used is set aside, since nothing hangs on it."""
 
     def __init__(self, path: Path, kind: type[T], keep: int) -> None:
-        self._path, self._kind, self._keep = path, kind, keep
+        # Before there were checksums, the list was all there was.
+        self._file: StateFile[_Entries[T] | list[T]] = StateFile(path, _Entries[kind] | list[kind])  # type: ignore[valid-type]
+        self._keep = keep
 
     def read(self) -> list[T]:
-        """All entries; an unreadable file is logged and counts as empty."""
-        try:
-            entries: list[T] = msgspec.json.decode(self._path.read_bytes(), type=list[self._kind])  # type: ignore[name-defined]
-        except FileNotFoundError:
-            return []
-        except (OSError, msgspec.MsgspecError) as error:
-            logger.warning("%s: cannot be read, begun anew: %s", self._path, error)
-            return []
-        return entries[-self._keep :]
+        """The latest entries, for the daemon; a file that cannot be used counts as empty."""
+        return _listed(self._file.take())[-self._keep :]
+
+    def all(self) -> list[T]:
+        """All entries, for whoever changes nothing.
+
+        Raises:
+            StorageError: the file cannot be used.
+        """
+        return _listed(self._file.read())
 
     def append(self, entry: T) -> None:
         """Add an entry.
@@ -39,4 +43,8 @@ class BoundedList(Generic[T]):
             StorageError: it could not be written.
         """
         entries = [*self.read(), entry][-self._keep :]
-        write_atomically(self._path, msgspec.json.encode(entries) + b"\n")
+        self._file.write(_Entries(entries))
+
+
+def _listed(found: _Entries[T] | list[T] | None) -> list[T]:
+    return found.entries if isinstance(found, _Entries) else found or []

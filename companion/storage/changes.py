@@ -1,20 +1,30 @@
 """What we changed in an autopilot: kept before the first write, so that it can be put back after any interruption.
 
 `journal.json` exists only while a write is under way (found at start, it means that the daemon died in the middle);
-`undo-N.json` holds the values before the last finished write on the vehicle with system id N.
+`undo-N.json` holds the values before the last finished write on the vehicle with system id N. What they say is written
+to an autopilot, so that they may name nothing else than what the companion writes, with values that can be.
 """
 
 from __future__ import annotations
 
+import functools
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
-from companion.errors import StorageError
+from companion.autopilot.vehicle import Firmware
+from companion.autopilot.written import CALIBRATION, Ranges
 from companion.storage.atomic import remove_durably, write_atomically
+from companion.storage.state import StateFile
+
+_UNDO: Final = re.compile(r"undo-(\d{1,3})\.json")
+_SYSTEM_IDS: Final = range(1, 256)
 
 
-class Changed(msgspec.Struct, frozen=True):
+class Changed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One parameter: the value before, the one we set, and the one that is set on the way between them, if any."""
 
     parameter: str
@@ -27,73 +37,50 @@ class Changed(msgspec.Struct, frozen=True):
     """Other values that may stand there by our doing, while several are set one after the other."""
 
 
-class ChangeSet(msgspec.Struct, frozen=True):
+class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The changes of one calibration on one vehicle."""
 
     system_id: int
     changes: tuple[Changed, ...]
 
+    @property
+    def names(self) -> list[str]:
+        """Of the parameters."""
+        return [changed.parameter for changed in self.changes]
 
-class ChangeFile:
-    """One change set on disk, or none."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def read(self) -> ChangeSet | None:
-        """What is kept, if anything.
-
-        Raises:
-            StorageError: the file is there and cannot be understood.
-        """
-        try:
-            return msgspec.json.decode(self._path.read_bytes(), type=ChangeSet)
-        except FileNotFoundError:
-            return None
-        except (OSError, msgspec.MsgspecError) as error:
-            raise StorageError(f"{self._path}: cannot be read: {error}") from error
-
-    def write(self, changes: ChangeSet) -> None:
-        """Keep a change set.
-
-        Raises:
-            StorageError: it could not be written.
-        """
-        write_atomically(self._path, msgspec.json.encode(changes) + b"\n")
-
-    def clear(self) -> None:
-        """Keep nothing any more.
-
-        Raises:
-            StorageError: the file could not be removed.
-        """
-        remove_durably(self._path)
+ChangeFile = StateFile[ChangeSet]
+"""One change set on disk, or none."""
 
 
 class ChangeLog:
-    """The change files of one storage folder."""
+    """The change files of one storage folder.
 
-    def __init__(self, directory: Path) -> None:
-        self._directory = directory
+    Args:
+        directory: where.
+        ranges: all that these changes may be, by firmware.
+    """
+
+    def __init__(self, directory: Path, ranges: Mapping[Firmware, Ranges] = CALIBRATION) -> None:
+        self._directory, self._ranges = directory, ranges
+        self._allowed = {name: one for each in ranges.values() for name, one in each.items()}
         self._probe = directory / "probe"
-        self.journal = ChangeFile(directory / "journal.json")
+        self.journal: ChangeFile = StateFile(directory / "journal.json", ChangeSet, self._check)
 
     def undo_of(self, system_id: int) -> ChangeFile:
         """The values from before the last finished write on one vehicle."""
-        return ChangeFile(self._directory / f"undo-{system_id}.json")
+        check = functools.partial(self._check, system_id=system_id)
+        return StateFile(self._directory / f"undo-{system_id}.json", ChangeSet, check)
 
-    def undos(self) -> dict[int, ChangeSet]:
-        """By system id, what can be undone.
+    def undos(self) -> list[ChangeFile]:
+        """Of all vehicles of which there is one."""
+        numbers = [match[1] for match in map(_UNDO.fullmatch, self._names()) if match]
+        return [self.undo_of(int(number)) for number in sorted(numbers) if number == str(int(number))]
 
-        Raises:
-            StorageError: a file is there and cannot be understood.
-        """
-        found: dict[int, ChangeSet] = {}
-        for path in sorted(self._directory.glob("undo-*.json")):
-            kept = ChangeFile(path).read()
-            if kept is not None:
-                found[kept.system_id] = kept
-        return found
+    def strange_to(self, firmware: Firmware | None, changes: ChangeSet) -> list[str]:
+        """The parameters that we never write on this firmware."""
+        known = self._ranges.get(firmware or "other", {})
+        return [name for name in changes.names if name not in known]
 
     def check_writable(self) -> None:
         """Find out now, not at the first write, whether anything can be kept here.
@@ -103,3 +90,22 @@ class ChangeLog:
         """
         write_atomically(self._probe, b"")
         remove_durably(self._probe)
+
+    def _names(self) -> Iterator[str]:
+        try:
+            yield from (path.name for path in self._directory.iterdir())
+        except OSError:
+            return  # there is none, or `check_writable` has said so
+
+    def _check(self, found: ChangeSet, system_id: int | None = None) -> None:
+        if found.system_id not in _SYSTEM_IDS or found.system_id != (system_id or found.system_id):
+            raise msgspec.ValidationError(f"found system_id {found.system_id}; allowed: {system_id or '1 to 255'}")
+        names = found.names
+        for changed in found.changes:
+            name = changed.parameter
+            if name not in self._allowed or names.count(name) > 1:
+                why = "named twice" if name in self._allowed else "not a parameter that the companion writes"
+                raise msgspec.ValidationError(f"found {name[:40]!r}: {why}")
+            for value in (changed.before, changed.after, changed.via, *changed.also):
+                if value is not None and not self._allowed[name].holds(value):
+                    raise msgspec.ValidationError(f"found {name} = {value:.9g}; allowed: {self._allowed[name]}")

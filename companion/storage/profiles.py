@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import logging
 import math
 import re
 from collections.abc import Callable
@@ -11,14 +12,16 @@ from typing import Any, Final
 
 import msgspec
 
-from companion.calibration.allan import AllanModel, NoiseProfile
+from companion.calibration.allan import PROFILES, AllanModel, NoiseProfile
 from companion.config import Noise
 from companion.config.profiles import CATALOGUE
 from companion.errors import ConfigError, StorageError
 from companion.storage.atomic import write_atomically
+from companion.storage.state import UNREADABLE, read_regular, sealed, unsealed
+
+logger = logging.getLogger(__name__)
 
 FORMAT_VERSION: Final = 1
-MOST_BYTES: Final = 1_000_000
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]{0,39}")
 
 
@@ -93,10 +96,15 @@ def check_name(name: str) -> None:
 
 
 class ProfileStore:
-    """The folder `profiles` of a storage directory."""
+    """The folder `profiles` of a storage directory.
 
-    def __init__(self, directory: Path) -> None:
-        self._folder = directory / "profiles"
+    Args:
+        directory: that.
+        forgiving: for the daemon, which no damaged file may end: the figures of the worst common parts, and a word.
+    """
+
+    def __init__(self, directory: Path, *, forgiving: bool = False) -> None:
+        self._folder, self._forgiving = directory / "profiles", forgiving
 
     def path(self, name: str) -> Path:
         """The file of a profile."""
@@ -136,6 +144,19 @@ class ProfileStore:
         """
         return self.read(name).noise
 
+    def instead(self, name: str, error: StorageError) -> Noise | None:
+        """The figures of the worst common parts, said once, where the daemon starts; else None."""
+        if not self._forgiving:
+            return None
+        logger.warning("%s; its sigmas are those of the worst common parts", error)
+        worst = PROFILES["unknown"]
+        return Noise(
+            name=name,
+            gyro=msgspec.structs.astuple(worst.gyro),
+            accel=msgspec.structs.astuple(worst.accel),
+            origin="which cannot be used: sigmas are those of the worst common parts",
+        )
+
     def write(self, profile: SavedProfile) -> Path:
         """Keep a profile, in the place of one of that name; returns its file.
 
@@ -145,7 +166,8 @@ class ProfileStore:
         check_name(profile.name)
         path = self.path(profile.name)
         # Nothing in it is secret, and whoever may enter the folder may run `check` on what it says.
-        write_atomically(path, msgspec.json.format(msgspec.json.encode(profile), indent=2) + b"\n", mode=0o644)
+        data = sealed(msgspec.json.format(msgspec.json.encode(profile), indent=2))
+        write_atomically(path, data, mode=0o644)
         return path
 
 
@@ -156,13 +178,10 @@ def read_profile(path: Path) -> SavedProfile:
         StorageError: one line: it cannot be read, is damaged, or of a newer version.
     """
     try:
-        with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
+        return _from_json(unsealed(read_regular(path)))
     except OSError as error:
         raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from error
-    try:
-        return _from_json(data)
-    except (ValueError, msgspec.MsgspecError) as error:
+    except UNREADABLE as error:
         raise StorageError(f"{path}: not a readable profile: {error}") from error
 
 
@@ -195,8 +214,6 @@ def given_profile(wanted: str, directory: Callable[[], Path]) -> str | Noise:
 
 
 def _from_json(data: bytes) -> SavedProfile:
-    if len(data) > MOST_BYTES:
-        raise ValueError(f"more than {MOST_BYTES} bytes")
     raw: Any = msgspec.json.decode(data)
     version = raw.get("format_version") if isinstance(raw, dict) else None
     if isinstance(version, int) and version > FORMAT_VERSION:

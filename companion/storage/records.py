@@ -16,6 +16,7 @@ from companion.calibration.record import Record, from_json, to_json
 from companion.calibration.trace import Trace
 from companion.errors import StorageError
 from companion.storage.atomic import remove_durably, write_atomically
+from companion.storage.state import UNREADABLE, read_regular, sealed, unsealed
 
 logger = logging.getLogger(__name__)
 
@@ -28,8 +29,8 @@ KEEP_TRACES = 200
 MAX_TRACE_BYTES: Final = 4_000_000
 """Unpacked: more is none of ours."""
 
-_NAME = re.compile(r"(\d{6})\.json")
-_TRACE = re.compile(r"(\d{6})\.trace\.json\.gz")
+_NAME = re.compile(r"(\d{6,})\.json")
+_TRACE = re.compile(r"(\d{6,})\.trace\.json\.gz")
 _GZIP: Final = 16 + zlib.MAX_WBITS
 
 
@@ -68,15 +69,15 @@ class RecordStore:
                 remove_durably(trace_path)
         except StorageError as error:
             logger.warning("%s; the record is kept without it", error)
-        write_atomically(path, to_json(record) + b"\n")
+        write_atomically(path, sealed(to_json(record)))
         kept = [*numbers, number][-KEEP:]
         for old in numbers:
             if old < kept[0]:
-                self._path(old).unlink(missing_ok=True)
+                self._remove(self._path(old))
         with_trace = set(kept[-KEEP_TRACES:])
         for old in self._numbers(_TRACE):
             if old not in with_trace:
-                self._trace_path(old).unlink(missing_ok=True)
+                self._remove(self._trace_path(old))
         return path
 
     def entries(self) -> Iterator[Entry]:
@@ -88,10 +89,10 @@ class RecordStore:
         for number in reversed(self._numbers()):
             path = self._path(number)
             try:
-                yield Entry(number, path, from_json(path.read_bytes()))
+                yield Entry(number, path, from_json(unsealed(read_regular(path))))
             except OSError as error:
                 yield Entry(number, path, None, error.strerror or str(error))
-            except (ValueError, msgspec.MsgspecError) as error:
+            except UNREADABLE as error:
                 yield Entry(number, path, None, f"not a readable record: {error}")
 
     def history(self, limit: int | None = None) -> list[Record]:
@@ -117,12 +118,12 @@ class RecordStore:
         """
         path = self._trace_path(entry.number)
         try:
-            trace = traces.from_json(_unpacked(path.read_bytes()))
+            trace = traces.from_json(_unpacked(read_regular(path, MAX_TRACE_BYTES)))
         except FileNotFoundError:
             return None
         except OSError as error:
             raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from error
-        except (ValueError, zlib.error, msgspec.MsgspecError) as error:
+        except (*UNREADABLE, zlib.error) as error:
             raise StorageError(f"{path}: not a readable trace: {error}") from error
         if entry.record is None or trace.started_at != entry.record.started_at:
             raise StorageError(f"{path}: belongs to the calibration of {trace.started_at}")
@@ -140,8 +141,16 @@ class RecordStore:
                 continue
             wrote = record.state == "done" and any(imu.written for imu in record.imus)
             if wrote and record.system_id == system_id:
-                write_atomically(entry.path, to_json(msgspec.structs.replace(record, undone_at=undone_at)) + b"\n")
+                write_atomically(entry.path, sealed(to_json(msgspec.structs.replace(record, undone_at=undone_at))))
                 return
+
+    @staticmethod
+    def _remove(path: Path) -> None:
+        """To make room; that it cannot be is logged: the new record matters more."""
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            logger.warning("%s: cannot be removed: %s", path, error.strerror or error)
 
     def _path(self, number: int) -> Path:
         return self._folder / f"{number:06d}.json"

@@ -8,9 +8,11 @@ from typing import Final
 
 import msgspec
 
-from companion.storage.atomic import write_atomically
+from companion.storage.state import StateFile
 
 FILE: Final = "mavlink-signing-time.json"
+MOST_UPTIME_S: Final = 3.2e9
+"""A century."""
 _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 
 
@@ -39,12 +41,8 @@ def this_boot() -> str:
 
 
 def load(directory: Path) -> SigningTime | None:
-    """What was kept; None where nothing is, or nothing that can be read."""
-    try:
-        found = msgspec.json.decode((directory / FILE).read_bytes(), type=SigningTime)
-    except (OSError, msgspec.MsgspecError):
-        return None
-    return found if 0 <= found.ticks <= found.reserved < 2**48 else None
+    """What was kept; None where nothing is, or nothing that can be used: that is set aside."""
+    return _file(directory).take()
 
 
 def save(directory: Path, time: SigningTime) -> None:
@@ -53,4 +51,13 @@ def save(directory: Path, time: SigningTime) -> None:
     Raises:
         StorageError: it cannot be written.
     """
-    write_atomically(directory / FILE, msgspec.json.encode(time))
+    _file(directory).write(time)
+
+
+def _file(directory: Path) -> StateFile[SigningTime]:
+    return StateFile(directory / FILE, SigningTime, _check)
+
+
+def _check(found: SigningTime) -> None:
+    if not 0 <= found.ticks <= found.reserved < 2**48 or not 0.0 <= found.uptime_s < MOST_UPTIME_S:
+        raise msgspec.ValidationError(f"ticks {found.ticks} to {found.reserved} at {found.uptime_s:g} s cannot be")

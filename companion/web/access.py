@@ -19,6 +19,7 @@ from typing import Final
 
 from companion.errors import StorageError
 from companion.storage.atomic import write_atomically
+from companion.storage.state import read_regular
 
 logger = logging.getLogger(__name__)
 
@@ -32,6 +33,7 @@ _LEAST_TOKEN: Final = _GROUPS * _GROUP
 FIRST_DELAY_S: Final = 0.25
 MOST_DELAY_S: Final = 5.0
 MOST_PEERS: Final = 256
+_MOST_TOKEN_BYTES: Final = 200
 _OWN_ENDINGS: Final = ("", ".local", ".lan", ".home.arpa", ".internal")
 """Of names that nobody can register: what a hotspot or a router makes of the board's name."""
 
@@ -67,7 +69,7 @@ def kept_token(directory: Path) -> str:
     """
     path = directory / TOKEN_FILE
     try:
-        token = path.read_text(encoding="ascii").strip()
+        token = read_regular(path, _MOST_TOKEN_BYTES).decode("ascii").strip()
     except FileNotFoundError:
         token = new_token()
         write_atomically(path, f"{token}\n".encode())  # a temporary file's mode is 0600, and stays

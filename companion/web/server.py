@@ -22,6 +22,7 @@ import msgspec
 from companion import __version__
 from companion.errors import CompanionError
 from companion.links.backoff import Backoff
+from companion.links.request import parse_request
 from companion.web.access import (
     TOKEN_HEADER,
     Access,
@@ -84,6 +85,8 @@ class Page:
         self._html, self._tag = html, hashlib.sha256(html).hexdigest()[:16]
         self._always = _security_headers(html)
         self._clients: set[asyncio.Task[None]] = set()
+        self._brief: dict[asyncio.Task[None], None] = {}
+        """Those of them that do not look on, the oldest first."""
         self._viewers: set[Exchange] = set()
         self._guesses, self._waiting = Guesses(), 0
         self._wake = asyncio.Event()
@@ -144,11 +147,21 @@ class Page:
 
     def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if len(self._clients) >= MAX_CONNECTIONS:
-            writer.transport.abort()
-            return
+            # Whoever presses a button is done in a moment; who is here for longest says nothing, or hears nothing.
+            oldest = next(iter(self._brief), None)
+            if oldest is None:
+                writer.transport.abort()
+                return
+            oldest.cancel()
+            self._forget(oldest)
         client = asyncio.get_running_loop().create_task(self._connection(reader, writer), name="page client")
         self._clients.add(client)
-        client.add_done_callback(self._clients.discard)
+        self._brief[client] = None
+        client.add_done_callback(self._forget)
+
+    def _forget(self, client: asyncio.Task[None]) -> None:
+        self._clients.discard(client)
+        self._brief.pop(client, None)
 
     async def _connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         connection = writer.get_extra_info("socket")
@@ -217,9 +230,9 @@ class Page:
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             return _refusal(415, "an action is asked for in application/json")
         try:
-            wanted = msgspec.json.decode(request.body or b"{}", type=Object)
-        except (msgspec.MsgspecError, ValueError):
-            return _refusal(400, "not a JSON object")
+            wanted = parse_request(request.body or b"{}")
+        except ValueError as error:
+            return _refusal(400, f"not a JSON object: {error}")
         asked: Object = {"command": request.path.removeprefix("/")}
         asked |= {key: wanted[key] for key in _ACTIONS[request.path] if key in wanted}
         try:
@@ -274,6 +287,8 @@ class Page:
         if not self._viewers:
             self._wake.set()
         self._viewers.add(exchange)
+        if (client := asyncio.current_task()) is not None:
+            self._brief.pop(client, None)
         try:
             await exchange.left()
         finally:

@@ -13,6 +13,7 @@ from tests.campaign.disk import Refusal
 from tests.campaign.fault import Act, Fault, Scene
 from tests.campaign.faults_devices import STILLNESS
 from tests.campaign.faults_mavlink import LOST, every
+from tests.campaign.witness import vectors
 
 DISK = r"cannot be (written|removed)|not kept|No space|read-only|Read-only|Input/output"
 
@@ -158,15 +159,6 @@ def spoils(name: str, how: Harm) -> Act:
     return strike
 
 
-async def remove_spoilt(scene: Scene) -> None:
-    """What the companion asks for: look, remove the file, restart."""
-    stage = scene.stage
-    await stage.kill()
-    for name in scene.spoilt:
-        (stage.store / name).unlink(missing_ok=True)
-    await begin_again(scene)
-
-
 async def spoil_record(scene: Scene) -> None:
     await spoils("records/??????.json", scene.chance.choice(("cut", "zeros", "empty")))(scene)
 
@@ -183,6 +175,26 @@ async def spoil_journal(scene: Scene) -> None:
     # With it goes the knowledge of what an interrupted write had overwritten.
     await spoils("journal.json", scene.chance.choice(("cut", "zeros", "empty")))(scene)
     scene.notes["somebody else"] = "journal"
+
+
+async def tamper_journal(scene: Scene) -> None:
+    """Under the old checksum, or without one: some values are no IMU's."""
+    stage = scene.stage
+    await stage.kill()
+    path = stage.store / "journal.json"
+    names = list(vectors(stage))
+    if path.exists():
+        whole = json.loads(path.read_bytes())
+    else:
+        now = {name: stage.autopilot.parameter(name) for name in names}
+        whole = {"system_id": 1, "changes": [{"parameter": n, "before": v, "after": v} for n, v in now.items()]}
+    for change in whole["changes"]:
+        change["before"] = scene.chance.choice((9.5, 1e30, change["before"] + 0.01))
+    if "sha256" not in whole:
+        whole["changes"][0]["before"] = 9.5
+    path.write_text(json.dumps(whole))
+    scene.notes["somebody else"] = "journal"
+    await begin_again(scene)
 
 
 # --- the broker
@@ -411,8 +423,7 @@ def faults() -> list[Fault]:
             "files",
             "the values for undo are damaged",
             spoil_undo,
-            remove_spoilt,
-            names=r"cannot be read",
+            names=r"cannot be used",
             **back,
         ),
         Fault(
@@ -420,8 +431,15 @@ def faults() -> list[Fault]:
             "files",
             "the journal of a write is damaged",
             spoil_journal,
-            remove_spoilt,
-            names=r"cannot be read",
+            names=r"cannot be used",
+            **back,
+        ),
+        Fault(
+            "journal-tampered",
+            "files",
+            "the journal of a write names values that no IMU has",
+            tamper_journal,
+            names=r"cannot be used",
             **back,
         ),
         Fault(
@@ -429,8 +447,7 @@ def faults() -> list[Fault]:
             "files",
             "the gradienter's alignment is damaged",
             spoils("alignment.json", "cut"),
-            remove_spoilt,
-            names=r"not a readable alignment",
+            names=r"cannot be used",
             **back,
         ),
         Fault(

@@ -399,6 +399,30 @@ def _spoofed_commands(scene: Scene) -> None:
             one.say(command_message(command, 0.0, target=target))
 
 
+def _says_disarmed(scene: Scene) -> None:
+    stranger(scene, 1, 1).beat(autopilot=12 if scene.stage.variant.name == "PX4" else 3)
+
+
+_FORGES, _FORGES_NO_LONGER = every(0.02, _says_disarmed)
+
+
+async def forge_and_arm(scene: Scene) -> None:
+    """Somebody says "disarmed" all the time, and the pilot arms."""
+    await _FORGES(scene)
+    await asyncio.sleep(scene.chance.uniform(0.0, 2.0))
+    scene.stage.autopilot.arm()
+    scene.notes["armed_s"] = scene.stage.now_s
+
+
+async def no_longer_forged(scene: Scene) -> None:
+    armed_s = scene.notes["armed_s"]
+    # What left before the arming was known arrives within that.
+    written = [write.name for write in scene.stage.autopilot.writes if write.armed and write.t_s > armed_s + 0.05]
+    await disarm(scene)
+    await _FORGES_NO_LONGER(scene)
+    assert not written, f"written while the autopilot was armed: {written}"
+
+
 def _our_own_ids(scene: Scene) -> None:
     one = stranger(scene, 1, 191)
     one.beat(kind=18, autopilot=8)
@@ -419,6 +443,18 @@ def _spoofed_values(scene: Scene) -> None:
     one.say(mavlink.MAVLink_raw_imu_message(1000, 0, 0, 0, 900, 900, 900, 0, 0, 0, 0, 3000))
     one.say(mavlink.MAVLink_command_ack_message(31010, 0, 0, 0, 1, 191))
     stranger(scene, 1, 1).say(mavlink.MAVLink_command_ack_message(31010, 4, 0, 0, 1, 191))
+
+
+def _forged_dates_and_places(scene: Scene) -> None:
+    """Under the autopilot's own ids, beside what it says itself: a year that no calendar has, the equator, 20 km up."""
+    one, boot_ms = stranger(scene, 1, 1), round((scene.stage.service.vehicle.boot_s or 0.0) * 1e3)
+    one.say(mavlink.MAVLink_system_time_message(2**63, boot_ms))
+    for lat, alt in ((1000, 50_000), (400_000_000, 20_000_000)):
+        one.say(mavlink.MAVLink_global_position_int_message(boot_ms, lat, 1_160_000_000, alt, 0, 0, 0, 0, 0))
+
+
+def _announced_offset(scene: Scene) -> None:
+    stranger(scene, 1, 1).say(mavlink.MAVLink_param_value_message(_gyro_x(scene).encode(), 0.3, 9, 1000, 65535))
 
 
 def _asks_to_arm(scene: Scene) -> None:
@@ -496,6 +532,16 @@ def intruder_faults() -> list[Fault]:
             *every(0.3, _spoofed_commands),
         ),
         Fault(
+            "forged-disarmed",
+            "intruder",
+            "50 disarmed heartbeats a second under the autopilot's ids, and the pilot arms",
+            forge_and_arm,
+            no_longer_forged,
+            lasts_s=(6.0, 12.0),
+            names=r"two autopilots, or a forger",
+            excused=f"{LOST}|{ARMED}|{STILLNESS}",
+        ),
+        Fault(
             "our-own-ids", "intruder", "somebody beats under our own system and component id", *every(0.3, _our_own_ids)
         ),
         Fault(
@@ -509,6 +555,20 @@ def intruder_faults() -> list[Fault]:
             "intruder",
             "values, telemetry and acknowledgements of another component",
             *every(0.1, _spoofed_values),
+        ),
+        Fault(
+            "forged-places",
+            "intruder",
+            "dates and places that cannot be, under the autopilot's ids",
+            *every(0.2, _forged_dates_and_places),
+            excused=r"position|height",
+        ),
+        Fault(
+            "announced-offset",
+            "intruder",
+            "an offset that is not in force is announced under the autopilot's ids",
+            *every(2.5, _announced_offset),
+            excused=r"OFF|somebody|changed",
         ),
         Fault(
             "arm-question-flood",

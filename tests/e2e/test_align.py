@@ -258,7 +258,7 @@ def test_a_file_that_cannot_be_read_is_said_and_not_used(tmp_path: Path) -> None
             await made.ready()
             status = made.service.status()["alignment"]
             assert status["in_force"] is False
-            assert "not a readable alignment" in status["unused_because"]
+            assert "alignment.json: cannot be used: " in status["unused_because"]
 
     run_virtual(main())
 

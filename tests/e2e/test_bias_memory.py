@@ -237,5 +237,5 @@ def test_a_damaged_file_costs_one_line_and_what_is_undone_is_forgotten(
 
     run_virtual(main())
     (line,) = [each.message for each in caplog.records if "biases.json" in each.message]
-    assert line.startswith(f"{tmp_path}/biases.json: not readable: ")
-    assert line.endswith("goes on without earlier biases")
+    assert line.startswith(f"{tmp_path}/biases.json: cannot be used: ")
+    assert line.endswith("; set aside as biases.json.unusable")

@@ -51,8 +51,13 @@ class FlightLine(NamedTuple):
 
 
 @contextlib.asynccontextmanager
-async def flight_line(folder: Path, *, daemon: bool = True, more: str = "") -> AsyncIterator[FlightLine]:
-    """A virtual aircraft on ptys and UDP, its configuration (and `more` of it), and the daemon as a process."""
+async def flight_line(
+    folder: Path, *, daemon: bool = True, more: str = "", still_s: tuple[float, float] = (3.0, 4.0)
+) -> AsyncIterator[FlightLine]:
+    """A virtual aircraft on ptys and UDP, its configuration (and `more` of it), and the daemon as a process.
+
+    A calibration takes `still_s` of stillness, at least and at most.
+    """
     scenario = demo(seed=25)
     async with contextlib.AsyncExitStack() as stack:
         scenario.aircraft.begin(asyncio.get_running_loop().time())
@@ -64,7 +69,7 @@ async def flight_line(folder: Path, *, daemon: bool = True, more: str = "") -> A
         autopilot = asyncio.create_task(scenario.autopilot.run())
         stack.callback(autopilot.cancel)
         text = configuration(scenario, directory=folder, udp=link.local).replace("udpin:", "udpout:")
-        text += '[calibration]\nmin_still_s = 3\nmax_s = 4\nat_arm = "off"\n' + more
+        text += f'[calibration]\nmin_still_s = {still_s[0]}\nmax_s = {still_s[1]}\nat_arm = "off"\n{more}'
         config = folder / "companion.toml"
         config.write_text(text)
         process = None

@@ -162,7 +162,7 @@ def test_a_write_interrupted_by_a_power_cut_is_mended_at_the_next_start(tmp_path
 
 def test_values_that_somebody_else_has_set_since_are_left_alone(tmp_path: Path) -> None:
     names = offset_names(1, "gyro")
-    changes = tuple(Changed(name, before=0.0, after=0.5) for name in names)
+    changes = tuple(Changed(name, before=0.0, after=0.25) for name in names)
     ChangeLog(tmp_path).journal.write(ChangeSet(1, changes))
 
     async def main() -> None:

@@ -88,7 +88,7 @@ class Witness:
             self.last_final_s[message.command] = now_s
 
 
-async def _people(rig: Rig, chance: random.Random) -> None:
+async def people(rig: Rig, chance: random.Random) -> None:
     """A ground station whose operator is in a hurry: requests, repeats, cancels and undoes."""
     for _ in range(chance.randint(2, 5)):
         await asyncio.sleep(chance.uniform(0.2, ACTS_S / 3))
@@ -169,7 +169,7 @@ async def _one(folder: Path, seed: int) -> tuple[int, int, int]:
     start = {name: rig.double.parameter(name) for name in FC_PARAMETERS}
     async with rig.running():
         await rig.ready()
-        await asyncio.gather(_people(rig, chance), _fate(rig, chance), _fate(rig, chance))
+        await asyncio.gather(people(rig, chance), _fate(rig, chance), _fate(rig, chance))
         # Now let everything come to rest.
         double, conductor = rig.double, rig.service.conductor
         faults = double.faults

@@ -246,8 +246,6 @@ def test_a_password_file_that_is_missing_is_one_line(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-# paho leaves the socket of a failed handshake to the garbage collector.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("kind", KINDS)
 def test_tls_by_an_authority_of_ones_own(tmp_path: Path, kind: Kind, monkeypatch: pytest.MonkeyPatch) -> None:
     hurry(monkeypatch, kind)
@@ -267,7 +265,6 @@ def test_tls_by_an_authority_of_ones_own(tmp_path: Path, kind: Kind, monkeypatch
 
 
 @mosquitto_only
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_broker_that_asks_for_certificates(tmp_path: Path) -> None:
     async def main() -> None:
         one = Broker(tmp_path, tls=True)

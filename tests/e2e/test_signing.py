@@ -16,12 +16,15 @@ from typing import Any, Literal
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.links.mavlink_signing import ticks_of
+from companion.autopilot.vehicle import ArmState
+from companion.daemon import signing as daemon_signing
+from companion.links.mavlink_signing import SigningClock, ticks_of
 from tests.support.component import ACCEPTED, CALIBRATE, CANCEL, DENIED, Ground, command_message
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
 KEY, OTHER = bytes(range(100, 132)), bytes(range(32))
+START_S = 1.8e9
 GYRO = {"ardupilot": "INS_GYROFFS_X", "px4": "CAL_GYRO0_XOFF"}
 Firmware = Literal["ardupilot", "px4"]
 
@@ -36,6 +39,15 @@ def signed_rig(folder: Path, *, mode: str = "require", key: bytes = KEY, **more:
 
 def now() -> int:
     return ticks_of(time.time())
+
+
+def virtual_clock(start: int) -> SigningClock:
+    """The daemon's clock for signatures, going with the loop's."""
+
+    def seconds() -> float:
+        return asyncio.get_running_loop().time()
+
+    return SigningClock(start, wall_s=lambda: START_S + seconds(), uptime=seconds)
 
 
 def words_of(rig: Rig) -> str:
@@ -359,5 +371,34 @@ def test_forged_packets_between_good_ones_are_no_reason_to_change_keys(
                 await asyncio.sleep(0.1)
             assert rig.service.status()["vehicle"]["signing"]["good"]
             assert lines(caplog, "give both the same one") == 0
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("mode", ["require", "sign"])
+def test_heartbeats_held_back_on_another_link_do_not_disarm(
+    tmp_path: Path, mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The autopilot signs each of its links apart; those of the telemetry radio are played on ours 75 s later."""
+    monkeypatch.setattr(daemon_signing, "SigningClock", virtual_clock)
+
+    async def main() -> None:
+        rig = signed_rig(tmp_path, mode=mode, imu_rate_hz=10.0)
+        rig.autopilot.require_signatures(KEY, ticks_of(START_S))
+        rig.ground.sign(KEY, ticks_of(START_S))
+        async with rig.running():
+            await rig.ready()
+            vehicle = rig.service.vehicle
+            await asyncio.sleep(10.0)
+            held_back = [data for data in rig.ground.raw if data[5:10] == bytes((1, 1, 0, 0, 0))]
+            assert len(held_back) >= 10
+            rig.autopilot.arm()
+            await asyncio.sleep(75.0)
+            assert vehicle.arm_state is ArmState.ARMED
+            for data in held_back:
+                rig.wire.carry_from_other(data)
+                await asyncio.sleep(0.5)
+                assert vehicle.arm_state is ArmState.ARMED
+            assert vehicle.conflict is None
 
     run_virtual(main())

@@ -8,7 +8,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.boot_clock import BootClock
-from companion.autopilot.vehicle import ArmState, Position, Vehicle
+from companion.autopilot.vehicle import ArmState, Vehicle
+from companion.autopilot.whereabouts import Position
 from companion.links.mavlink import MavlinkLink
 from tests.support.scripted_autopilot import ScriptedAutopilot, flying_on
 from tests.support.virtual_time import run_virtual
@@ -71,6 +72,87 @@ def test_state_is_unknown_before_the_first_heartbeat() -> None:
     run_virtual(main())
 
 
+def test_disarmed_is_believed_once_no_armed_heartbeat_has_come_for_three_seconds() -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        events: list[tuple[float, str]] = []
+        loop = asyncio.get_running_loop()
+        vehicle.watch(lambda event: events.append((round(loop.time() - 1000.0, 3), event)))
+        heartbeat(link, armed=True)
+        for _ in range(4):
+            await asyncio.sleep(0.9)
+            assert state(vehicle) is (ArmState.ARMED if loop.time() < 1003.0 else ArmState.DISARMED)
+            heartbeat(link)
+        assert state(vehicle) is ArmState.DISARMED
+        assert events == [(0, "found"), (0, "armed"), (3.6, "disarmed")]
+        vehicle.close()
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("forger_hz", [1.0, 5.0, 50.0, 1000.0, 5000.0])
+@pytest.mark.parametrize("own_hz", [1.0, 5.0])
+def test_disarmed_heartbeats_of_a_forger_are_not_believed_and_named(forger_hz: float, own_hz: float) -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+
+        async def beat(rate_hz: float, *, armed: bool, late_s: float) -> None:
+            await asyncio.sleep(late_s)
+            while True:
+                heartbeat(link, armed=armed)
+                await asyncio.sleep(1.0 / rate_hz)
+
+        heartbeat(link, armed=True)
+        both = [
+            asyncio.create_task(beat(own_hz, armed=True, late_s=0.2)),
+            asyncio.create_task(beat(forger_hz, armed=False, late_s=0.5)),
+        ]
+        for _ in range(1200):
+            await asyncio.sleep(0.01)
+            assert state(vehicle) is not ArmState.DISARMED
+        assert state(vehicle) is ArmState.UNKNOWN
+        assert vehicle.conflict == "system id 1 says armed and disarmed by turns: two autopilots, or a forger"
+        for task in both:
+            task.cancel()
+        vehicle.close()
+
+    run_virtual(main())
+
+
+def test_an_armed_heartbeat_of_another_firmware_under_the_same_ids_counts() -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        heartbeat(link)
+        assert state(vehicle) is ArmState.DISARMED
+        heartbeat(link, autopilot=mavlink.MAV_AUTOPILOT_GENERIC, armed=True)
+        heartbeat(link)
+        assert state(vehicle) is ArmState.ARMED
+        vehicle.close()
+
+    run_virtual(main())
+
+
+def test_a_restart_that_somebody_pretends_does_not_make_it_disarmed() -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+        events: list[str] = []
+        vehicle.watch(events.append)
+        heartbeat(link, armed=True)
+        for boot_ms in (60_000, 100):
+            link.receive(mavlink.MAVLink_system_time_message(0, boot_ms).pack(codec), asyncio.get_running_loop().time())
+        heartbeat(link)
+        assert events == ["found", "armed", "rebooted"]
+        assert state(vehicle) is ArmState.ARMED
+        vehicle.close()
+
+    run_virtual(main())
+
+
 def test_state_follows_heartbeats_and_is_unknown_two_seconds_after_the_last() -> None:
     async def main() -> None:
         link = MavlinkLink()
@@ -89,8 +171,7 @@ def test_state_follows_heartbeats_and_is_unknown_two_seconds_after_the_last() ->
         assert state(vehicle) is ArmState.UNKNOWN
         assert vehicle.heartbeat_age_s == pytest.approx(2.1)
         heartbeat(link, armed=True)
-        heartbeat(link, armed=False)
-        assert events == [(0, "found"), (0, "disarmed"), (1, "armed"), (3, "lost"), (3.1, "found"), (3.1, "disarmed")]
+        assert events == [(0, "found"), (0, "disarmed"), (1, "armed"), (3, "lost"), (3.1, "found")]
         vehicle.close()
         assert state(vehicle) is ArmState.UNKNOWN
 
@@ -180,7 +261,7 @@ def test_asks_for_what_it_needs_and_learns_version_time_and_place() -> None:
     async def main() -> None:
         autopilot = ScriptedAutopilot()
         async with aboard(autopilot) as (vehicle, _):
-            await asyncio.sleep(2.0)
+            await asyncio.sleep(5.0)
             assert autopilot.intervals[mavlink.MAVLINK_MSG_ID_HEARTBEAT] == pytest.approx(0.2)
             assert vehicle.version == "4.8.0-dev"
             assert vehicle.name == "ArduPilot 4.8.0-dev, system 1"
@@ -221,9 +302,10 @@ def test_position_zero_zero_is_no_position_and_gps_serves_instead() -> None:
         ):
             link.receive(message.pack(codec), 1000.0)
         assert position(vehicle) is None
-        link.receive(
-            mavlink.MAVLink_gps_raw_int_message(1000, 3, 100000000, 200000000, 1000, 0, 0, 0, 0, 9).pack(codec), 1000.0
-        )
+        for t_s in range(1000, 1004):
+            link.receive(
+                mavlink.MAVLink_gps_raw_int_message(1000, 3, 100000000, 200000000, 1000, 0, 0, 0, 0, 9).pack(codec), t_s
+            )
         assert vehicle.position is not None
         assert vehicle.position.source == "autopilot GPS_RAW_INT"
         assert vehicle.position.longitude_deg == pytest.approx(20.0)

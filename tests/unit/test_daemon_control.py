@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from companion.config import Control
+from companion.daemon import control
 from companion.daemon.control import ControlServer, Object, ask
 from companion.errors import CalibrationRefusedError, DaemonUnreachableError, LinkError
 
@@ -110,8 +111,22 @@ def test_a_file_in_the_way_is_not_removed(tmp_path: Path) -> None:
     assert path.read_text() == "precious"
 
 
-@pytest.mark.parametrize("line", [b"\n", b"{\n", b"[1]\n", b"\xff\xfe\n", b"x" * 70000 + b"\n"])
-def test_garbage_is_answered_with_one_error_line(tmp_path: Path, line: bytes) -> None:
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"\n",
+        b"{\n",
+        b"[1]\n",
+        b"\xff\xfe\n",
+        b"x" * 70000 + b"\n",
+        b"[" * 30000 + b"\n",
+        b'{"command": ' + b"[" * 30000 + b"\n",
+        b'{"command": "calibrate", "what": {"both": 1}}\n',
+        b'{"command": "calibrate", "timeout_s": NaN}\n',
+        b'{"command": "record", "file": "a\\u0000b"}\n',
+    ],
+)
+def test_garbage_is_answered_with_one_error_line(tmp_path: Path, line: bytes, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "control.sock"
 
     async def main() -> bytes:
@@ -122,7 +137,11 @@ def test_garbage_is_answered_with_one_error_line(tmp_path: Path, line: bytes) ->
             writer.close()
             return answer
 
-    assert b"request not understood" in asyncio.run(main())
+    answer = asyncio.run(main())
+    assert b"request not understood" in answer
+    assert answer.count(b"\n") == 1
+    assert len(answer) < 300
+    assert not caplog.records
 
 
 def test_no_daemon_is_said_in_one_line(tmp_path: Path) -> None:
@@ -152,3 +171,64 @@ def test_a_client_that_leaves_in_the_middle_disturbs_nobody(tmp_path: Path) -> N
 
     asyncio.run(main())
     assert not os.path.exists(path)
+
+
+async def monitoring(request: Object) -> AsyncIterator[Object]:
+    if request.get("command") != "monitor":
+        yield {"kind": "result", "command": request["command"]}
+    while request.get("command") == "monitor":
+        yield {"kind": "progress", "pad": "x" * 4000}
+        await asyncio.sleep(0)
+
+
+async def _connected(path: Path, line: bytes = b"") -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    reader, writer = await asyncio.open_unix_connection(str(path), limit=16)
+    writer.write(line)
+    return reader, writer
+
+
+@pytest.mark.parametrize("command", control.URGENT)
+def test_no_crowd_keeps_cancel_and_status_out(tmp_path: Path, command: str) -> None:
+    path = tmp_path / "control.sock"
+
+    async def main() -> None:
+        async with ControlServer(path, monitoring), asyncio.timeout(30.0):
+            deaf = [await _connected(path, b'{"command": "monitor"}\n') for _ in range(control.MAX_CLIENTS)]
+            for reader, _ in deaf:
+                await reader.readexactly(1)
+            silent = [await _connected(path) for _ in range(3 * control.MAX_CLIENTS)]
+            assert await _all(path, {"command": command}) == [{"kind": "result", "command": command}]
+            (full,) = await _all(path, {"command": "monitor"})
+            assert full == {"kind": "error", "reason": "the daemon has too many clients at once; try again"}
+            for _, writer in deaf + silent:
+                writer.transport.abort()
+
+    asyncio.run(main())
+
+
+def test_who_does_not_read_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(control, "ANSWER_TIMEOUT_S", 0.2)
+    path = tmp_path / "control.sock"
+
+    async def main() -> None:
+        async with ControlServer(path, monitoring), asyncio.timeout(30.0):
+            deaf = [await _connected(path, b'{"command": "monitor"}\n') for _ in range(control.MAX_CLIENTS)]
+            while "too many clients" in str(await anext(ask(path, {"command": "monitor"}))):
+                await asyncio.sleep(0.05)
+            for _, writer in deaf:
+                writer.transport.abort()
+
+    asyncio.run(main())
+
+
+def test_a_long_answer_reaches_who_reads_it(tmp_path: Path) -> None:
+    path = tmp_path / "control.sock"
+
+    async def long(request: Object) -> AsyncIterator[Object]:
+        yield {"kind": "result", "records": ["x" * 1000] * 5000}
+
+    async def main() -> list[Object]:
+        async with ControlServer(path, long):
+            return await _all(path, {"command": "history"})
+
+    assert asyncio.run(main())[0]["records"] == ["x" * 1000] * 5000

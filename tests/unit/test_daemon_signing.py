@@ -152,8 +152,8 @@ def test_a_disk_that_cannot_be_written_is_said_once_and_costs_nothing_else(
         def full(*_: Any) -> None:
             raise StorageError("disk full")
 
+        signing_time.save(tmp_path, signing_time.SigningTime(0, 0, 0.0, ""))
         monkeypatch.setattr(signing_time, "save", full)
-        (tmp_path / FILE).write_bytes(b"")
         async with board.daemon() as one:
             await asyncio.sleep(200.0)
             assert one.signing is not None

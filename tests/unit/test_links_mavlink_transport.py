@@ -17,14 +17,15 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.errors import LinkError
 from companion.links import mavlink_transport
 from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink_signing import Signing
 from companion.links.mavlink_transport import MAX_PEERS, run_transport
 
 HEARTBEAT = mavlink.MAVLink_heartbeat_message
 DEADLINE_S = 5.0
 
 
-def packet(mode: int = 0) -> bytes:
-    return HEARTBEAT(2, 3, 0, mode, 4, 3).pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
+def packet(mode: int = 0, *, system: int = 1, component: int = 1) -> bytes:
+    return HEARTBEAT(2, 3, 0, mode, 4, 3).pack(mavlink.MAVLink(None, srcSystem=system, srcComponent=component))
 
 
 async def until(condition: Callable[[], bool]) -> None:
@@ -139,7 +140,7 @@ class TestUdpIn:
                 await until(lambda: link.connected)
                 scanners = [udp_socket() for _ in range(3 * MAX_PEERS)]
                 for scanner in scanners:
-                    scanner.sendto(packet(), ("127.0.0.1", states.port))
+                    scanner.sendto(packet(system=200), ("127.0.0.1", states.port))
                 await until(lambda: link.received["HEARTBEAT"] == 1 + len(scanners))
                 link.send(HEARTBEAT(18, 8, 0, 0, 4, 3))
                 await receive(peer)
@@ -151,6 +152,99 @@ class TestUdpIn:
                         answered += 1
                     scanner.close()
                 assert answered == MAX_PEERS - 1
+
+        asyncio.run(main())
+
+    def test_bytes_that_are_no_message_get_no_place(self, peer: socket.socket) -> None:
+        async def main() -> None:
+            link = MavlinkLink()
+            async with transport(link, "udpin:127.0.0.1:0") as states:
+                await until(lambda: states.connected)
+                strangers = [udp_socket() for _ in range(MAX_PEERS)]
+                radio = mavlink.MAVLink_radio_status_message(7, 0, 0, 0, 0, 0, 0).pack(mavlink.MAVLink(None))
+                for stranger in strangers:
+                    for data in (b"x", packet()[:-1], packet()[:-1] + b"\0", radio):
+                        stranger.sendto(data, ("127.0.0.1", states.port))
+                await until(lambda: link.received["RADIO_STATUS"] == MAX_PEERS)
+                assert not link.connected
+                peer.sendto(packet(), ("127.0.0.1", states.port))
+                await until(lambda: link.connected)
+                assert link.send(HEARTBEAT(18, 8, 0, 0, 4, 3))
+                await receive(peer)
+                for stranger in strangers:
+                    stranger.close()
+
+        asyncio.run(main())
+
+    def test_who_is_not_believed_gets_no_place(self, peer: socket.socket) -> None:
+        async def main() -> None:
+            link = MavlinkLink()
+            link.signing = Signing(required=True)
+            link.signing.key = bytes(32)
+            async with transport(link, "udpin:127.0.0.1:0") as states:
+                await until(lambda: states.connected)
+                peer.sendto(packet(), ("127.0.0.1", states.port))
+                await until(lambda: link.signing is not None and link.signing.doubted["unsigned"] == 1)
+                assert not link.connected
+
+        asyncio.run(main())
+
+    def test_the_autopilot_has_a_place_whoever_else_speaks_and_keeps_it_when_its_port_changes(
+        self, peer: socket.socket
+    ) -> None:
+        async def main() -> None:
+            link = MavlinkLink()
+            link.join((1, 1))
+            async with transport(link, "udpin:127.0.0.1:0") as states:
+                await until(lambda: states.connected)
+                stations = [udp_socket() for _ in range(MAX_PEERS)]
+                for number, station in enumerate(stations):
+                    station.sendto(packet(system=100 + number, component=190), ("127.0.0.1", states.port))
+                    await until(lambda number=number: link.received["HEARTBEAT"] == number + 1)  # type: ignore[misc]
+                moved = udp_socket()
+                for autopilot in (peer, moved):
+                    autopilot.sendto(packet(), ("127.0.0.1", states.port))
+                await until(lambda: link.received["HEARTBEAT"] == MAX_PEERS + 2)
+                link.send(HEARTBEAT(18, 8, 0, 0, 4, 3))
+                for reached in (peer, moved, *stations[2:]):
+                    await receive(reached)
+                for silent_for_longest in stations[:2]:
+                    with pytest.raises(BlockingIOError):
+                        silent_for_longest.recv(2048)
+                for endpoint in (moved, *stations):
+                    endpoint.close()
+
+        asyncio.run(main())
+
+    @pytest.mark.parametrize(
+        "cut_off", [b"\xfd\xff", b"\xfe\xff", packet()[:-1], bytes(range(1, 50)) + b"\xfd\xff\x00"]
+    )
+    def test_a_datagram_is_whole_whoever_sent_the_one_before(self, peer: socket.socket, cut_off: bytes) -> None:
+        async def main() -> None:
+            link = MavlinkLink()
+            async with transport(link, "udpin:127.0.0.1:0") as states:
+                await until(lambda: states.connected)
+                stranger = udp_socket()
+                for number in range(20):
+                    stranger.sendto(cut_off, ("127.0.0.1", states.port))
+                    peer.sendto(packet(), ("127.0.0.1", states.port))
+                    await until(lambda number=number: link.received["HEARTBEAT"] == number + 1)  # type: ignore[misc]
+                assert link.half_received == b""
+                stranger.close()
+
+        asyncio.run(main())
+
+    def test_a_whole_datagram_is_taken_whoever_becomes_connected_by_it(self, peer: socket.socket) -> None:
+        async def main() -> None:
+            link = MavlinkLink()
+            texts: list[str] = []
+            link.subscribe(mavlink.MAVLink_statustext_message, lambda message, _t_s: texts.append(message.text))
+            text = mavlink.MAVLink_statustext_message(6, b"hello").pack(mavlink.MAVLink(None, srcSystem=1))
+            async with transport(link, "udpin:127.0.0.1:0") as states:
+                await until(lambda: states.connected)
+                peer.sendto(packet() + text + packet() + text, ("127.0.0.1", states.port))
+                await until(lambda: link.received["HEARTBEAT"] == 2)
+                assert texts == ["hello", "hello"]
 
         asyncio.run(main())
 

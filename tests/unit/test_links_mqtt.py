@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import pytest
 
@@ -25,7 +25,7 @@ class Breaking(MqttLink):
         super().__init__(Mqtt(host="broker"), client_id="me", offload=at_once)
         self.serving, self.loss = asyncio.Event(), asyncio.Event()
 
-    async def _connect(self) -> Any:
+    def _client(self, address: str, password: str | None) -> Any:
         return None
 
     async def _subscribe(self, client: Any) -> None:
@@ -40,14 +40,35 @@ class Breaking(MqttLink):
         raise OSError("thrown out")
 
 
-async def nothing(client: Any) -> None:
+class NoFilter:
+    """Nobody is there, and nobody finds fault."""
+
+    address, fault = "", None
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        pass
+
+
+async def nothing(*_: object) -> None:
     pass
 
 
-@pytest.mark.parametrize("turns", range(4))
-def test_stopping_at_the_moment_of_a_loss_stops(turns: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two clients of one name throw each other out again and again; whoever is stopped just then must end."""
+@pytest.fixture(autouse=True)
+def _without_a_broker(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mqtt, "MqttFilter", NoFilter)
+    monkeypatch.setattr(mqtt, "_enter", nothing)
     monkeypatch.setattr(mqtt, "_leave", nothing)
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_stopping_at_the_moment_of_a_loss_stops(turns: int) -> None:
+    """Two clients of one name throw each other out again and again; whoever is stopped just then must end."""
 
     async def main() -> None:
         link = Breaking()
@@ -64,8 +85,7 @@ def test_stopping_at_the_moment_of_a_loss_stops(turns: int, monkeypatch: pytest.
     run_virtual(main())
 
 
-def test_after_a_loss_it_connects_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mqtt, "_leave", nothing)
+def test_after_a_loss_it_connects_again() -> None:
 
     async def main() -> None:
         link = Breaking()

@@ -17,20 +17,6 @@ START_S = 1000.2
 """Away from the full second."""
 
 
-class Pile:
-    """A source that has something whenever it is asked."""
-
-    def __init__(self) -> None:
-        self.taken = 0
-        self.at_once: list[bool] = []
-
-    def take(self) -> None:
-        self.taken += 1
-
-    def listen(self, *, at_once: bool) -> None:
-        self.at_once.append(at_once)
-
-
 class Taker:
     def __init__(self) -> None:
         self.got: list[tuple[bytes, float]] = []
@@ -137,28 +123,6 @@ class TestWaiting:
         assert [data for data, _ in taker.got] == [b"first", b"second", b"late"]
 
 
-class TestSources:
-    def test_a_source_is_heard_at_once_only_while_nothing_drives(self) -> None:
-        together, pile = Together(), Pile()
-        leave = together.join(pile)
-        together.drive()
-        together.take()
-        assert pile.taken == 1
-        together.rest()
-        assert pile.at_once == [True, False, True]
-        assert pile.taken == 2, "what it held back is taken before"
-        leave()
-        leave()
-        together.take()
-        assert (pile.taken, pile.at_once[-1]) == (2, False)
-
-    def test_one_that_joins_later_waits_at_once(self) -> None:
-        together, pile = Together(), Pile()
-        together.drive()
-        together.join(pile)
-        assert pile.at_once == [False]
-
-
 class TestSleep:
     def test_without_a_stream_it_is_an_ordinary_sleep(self) -> None:
         async def main() -> float:
@@ -230,8 +194,8 @@ class TestMavlink:
         link = MavlinkLink()
         got = self.heard(link)
         link.together.drive()
-        link.arrived(attitude(1), 5.001)
-        link.arrived(attitude(2) + attitude(3), 5.002)
+        link.arrived(attitude(1), 5.001, link.receive)
+        link.arrived(attitude(2) + attitude(3), 5.002, link.receive)
         assert got == []
         link.together.take()
         assert got == [("ATTITUDE", 5.001), ("ATTITUDE", 5.002), ("ATTITUDE", 5.002)]
@@ -241,13 +205,14 @@ class TestMavlink:
         link = MavlinkLink()
         got = self.heard(link)
         link.together.drive()
-        link.arrived(attitude(1), 5.001)
+        link.arrived(attitude(1), 5.001, link.receive)
         question = heartbeat()
         link.arrived(
             {"alone": b"", "before telemetry": b"", "behind telemetry": attitude(2)}[place]
             + question
             + (attitude(2) if place == "before telemetry" else b""),
             5.002,
+            link.receive,
         )
         assert got[0] == ("ATTITUDE", 5.001)
         assert ("HEARTBEAT", 5.002) in got
@@ -256,8 +221,8 @@ class TestMavlink:
         link = MavlinkLink()
         got = self.heard(link)
         link.together.drive()
-        link.arrived(attitude(1), 5.001)
-        link.arrived(mavlink.MAVLink_timesync_message(0, 77).pack(codec()), 5.002)
+        link.arrived(attitude(1), 5.001, link.receive)
+        link.arrived(mavlink.MAVLink_timesync_message(0, 77).pack(codec()), 5.002, link.receive)
         assert got == [("TIMESYNC", 5.002)]
         link.together.take()
         assert got == [("TIMESYNC", 5.002), ("ATTITUDE", 5.001)]
@@ -276,19 +241,19 @@ class TestMavlink:
         }[damage]
         link = MavlinkLink()
         link.together.drive()
-        link.arrived(data, 5.0)
+        link.arrived(data, 5.0, link.receive)
         assert link.together.waiting == 0
 
     def test_without_a_fast_stream_nothing_waits(self) -> None:
         link = MavlinkLink()
         got = self.heard(link)
-        link.arrived(attitude(1), 5.0)
+        link.arrived(attitude(1), 5.0, link.receive)
         assert got == [("ATTITUDE", 5.0)]
 
     def test_what_came_over_the_transport_before_is_taken_before_another_is_attached(self) -> None:
         link = MavlinkLink()
         got = self.heard(link)
         link.together.drive()
-        link.arrived(attitude(1), 5.0)
+        link.arrived(attitude(1), 5.0, link.receive)
         link.attach(None)
         assert got == [("ATTITUDE", 5.0)]

@@ -156,6 +156,44 @@ def test_who_is_heard_first_may_be_a_minute_behind(late_s: float, believed: bool
     assert judge.admits(MESSAGE.pack(peer(KEY, NOW - int(late_s * TICKS_PER_S)))) is believed
 
 
+def test_what_was_held_back_on_another_link_of_the_sender_is_old() -> None:
+    """Each link id has a time of its own; that of the sender goes on with the newest of them."""
+    clocks = Clocks()
+    link = MavlinkLink()
+    link.signing = signing(clocks=clocks)
+    heard = hears(link)
+    held_back = [HEARTBEAT(2, 3, 0, 100 + n, 4, 3).pack(peer(ticks=NOW + n, link_id=4)) for n in range(480)]
+    for second in range(8):
+        link.receive(HEARTBEAT(2, 3, 0, second, 4, 3).pack(peer(ticks=NOW + second * 100_000)), 0.0)
+        clocks.pass_(1.0)
+    for data in held_back:
+        link.receive(data, 0.0)
+    assert heard == list(range(8))
+    assert link.signing.doubted == {"old": 480}
+
+
+def test_what_was_held_back_for_more_than_a_minute_is_old_though_nothing_came_since() -> None:
+    clocks = Clocks()
+    link = MavlinkLink()
+    link.signing = signing(clocks=clocks)
+    heard = hears(link)
+    link.receive(HEARTBEAT(2, 3, 0, 1, 4, 3).pack(peer(ticks=NOW)), 0.0)
+    held_back = HEARTBEAT(2, 3, 0, 2, 4, 3).pack(peer(ticks=NOW + 100_000))
+    clocks.pass_(62.0)
+    link.receive(held_back, 0.0)
+    assert heard == [1]
+
+
+@pytest.mark.parametrize("required", [True, False])
+def test_a_link_id_is_that_of_a_signature_with_our_key(required: bool) -> None:
+    link, found = MavlinkLink(), list[int | None]()
+    link.signing = signing(required=required)
+    link.subscribe(HEARTBEAT, lambda message, _t: found.append(link.signed_on(message)))
+    for codec in (peer(link_id=7), peer(None), peer(OTHER, link_id=7)):
+        link.receive(HEARTBEAT(2, 3, 0, 0, 4, 3).pack(codec), 0.0)
+    assert found == ([7] if required else [7, None, None])
+
+
 def test_a_forged_time_shuts_nobody_out() -> None:
     judge = signing()
     assert judge.admits(MESSAGE.pack(peer(KEY, NOW)))

@@ -22,6 +22,7 @@ from companion.recording.journal import Beginning, Entry
 from companion.replay.still_log import read_logs
 from companion.samples import ImuSample
 from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, check_name
+from companion.storage.state import sealed, unsealed
 from sim.__main__ import main as simulator
 from tests.support.made_noise import DEG_H, adis16405, write_csv
 
@@ -54,7 +55,8 @@ def test_a_profile_comes_back_as_it_was(tmp_path: Path) -> None:
 
 
 def changed(**changes: Any) -> Callable[[bytes], bytes]:
-    return lambda data: json.dumps(json.loads(data) | changes).encode()
+    """As another version, or somebody by hand, would have it."""
+    return lambda data: sealed(json.dumps(json.loads(unsealed(data)) | changes).encode())
 
 
 @pytest.mark.parametrize(
@@ -64,6 +66,7 @@ def changed(**changes: Any) -> Callable[[bytes], bytes]:
         (lambda _: b"", "truncated"),
         (lambda _: b"\x00\xff" * 40, "not a readable profile"),
         (lambda _: b"[1, 2]", "not a readable profile"),
+        (lambda data: data.replace(b'"mine"', b'"nine"'), "its checksum does not fit: damaged, or changed by hand"),
         (lambda data: data + b" " * 1_000_000, "more than 1000000 bytes"),
         (changed(format_version=2), "found format 2; allowed: up to 1 (a newer companion has saved it)"),
         (changed(name="other"), "it is of 'other'"),
@@ -74,7 +77,7 @@ def changed(**changes: Any) -> Callable[[bytes], bytes]:
     ],
 )
 def test_a_damaged_or_newer_one_is_refused_in_one_line(
-    tmp_path: Path, damage: Callable[[bytes], bytes], words: str
+    tmp_path: Path, damage: Callable[[bytes], bytes], words: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     store = ProfileStore(tmp_path)
     path = store.write(saved())
@@ -89,6 +92,13 @@ def test_a_damaged_or_newer_one_is_refused_in_one_line(
         parse(SMALLEST.format("mine"), "x.toml", lambda _: store)
     assert str(refused.value).startswith("x.toml: 'imu[0].profile': found 'mine', a saved profile: ")
     assert words in str(refused.value)
+    # All but the daemon's own start, which no file may prevent: then with the figures of the worst parts, and a word.
+    config = parse(SMALLEST.format("mine"), "x.toml", lambda folder: ProfileStore(tmp_path, forgiving=True))
+    assert models.profile_in_words(config.imu[0].profile).startswith("mine, which cannot be used")
+    instead, worst = noise_profile(config.imu[0].profile), noise_profile(None)
+    assert (instead.gyro, instead.accel) == (worst.gyro, worst.accel)
+    (said,) = caplog.messages
+    assert words in said
 
 
 @pytest.mark.parametrize("name", ["own", "my-imu_2.b", "a" * 40])

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from companion.calibration.record import ImuRecord, Record, WrittenParameter
+from companion.calibration.record import ImuRecord, Record, WrittenParameter, to_json
 from companion.calibration.trace import Trace
 from companion.errors import StorageError
 from companion.storage import records as records_module
@@ -131,6 +131,37 @@ def test_a_damaged_record_is_passed_over_and_said(tmp_path: Path, caplog: pytest
     assert "000002.json: not a readable record" in caplog.text
 
 
+def test_a_record_that_was_changed_is_passed_over_and_one_from_before_there_were_checksums_is_not(
+    tmp_path: Path,
+) -> None:
+    store = RecordStore(tmp_path)
+    store.save(_record("of before")).write_bytes(to_json(_record("of before")) + b"\n")
+    path = store.save(_record("changed"))
+    path.write_bytes(path.read_bytes().replace(b'"duration_s":12.0', b'"duration_s":19.0'))
+    assert [record.reason for record in store.history()] == ["of before"]
+    assert next(store.entries()).problem.endswith("damaged, or changed by hand")
+
+
+def test_numbers_of_records_go_on_beyond_six_digits(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path)
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records" / "999999.json").write_bytes(b"")
+    for reason in ("first", "second"):
+        store.save(_record(reason))
+    assert [record.reason for record in store.history()] == ["second", "first"]
+
+
+def test_a_folder_in_the_place_of_an_old_record_costs_no_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(records_module, "KEEP", 1)
+    (tmp_path / "records" / "000001.json").mkdir(parents=True)
+    store = RecordStore(tmp_path)
+    store.save(_record("new"))
+    assert [record.reason for record in store.history()] == ["new"]
+    assert "000001.json: cannot be removed: " in caplog.text
+
+
 def test_old_records_make_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(records_module, "KEEP", 3)
     store = RecordStore(tmp_path)
@@ -222,7 +253,7 @@ def test_journal_and_undo_outlive_the_process(tmp_path: Path) -> None:
 
 def test_a_journal_that_cannot_be_understood_is_an_error_not_an_empty_one(tmp_path: Path) -> None:
     (tmp_path / "journal.json").write_text("{")
-    with pytest.raises(StorageError, match=r"journal\.json: cannot be read"):
+    with pytest.raises(StorageError, match=r"journal\.json: cannot be used"):
         ChangeLog(tmp_path).journal.read()
 
 

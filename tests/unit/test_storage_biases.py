@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -55,8 +56,21 @@ def test_what_cannot_be_read_is_one_line(tmp_path: Path, content: bytes, caplog:
     assert BiasStore(tmp_path).read() == {}
     (record,) = caplog.records
     assert record.levelno == logging.WARNING
-    assert record.getMessage().startswith(f"{path}: not readable: ")
+    assert record.getMessage().startswith(f"{path}: cannot be used: ")
+    assert record.getMessage().endswith("; set aside as biases.json.unusable")
     assert "\n" not in record.getMessage()
+
+
+@pytest.mark.parametrize(
+    "changes", [{"bias": (11.0, 0.0, 0.0)}, {"sigma_use": (-1.0, 0.0, 0.0)}, {"sigma_stat": (1e30, 0.0, 0.0)}]
+)
+def test_figures_that_no_gyro_has_are_neither_kept_nor_believed(tmp_path: Path, changes: dict[str, Any]) -> None:
+    wrong = msgspec.structs.replace(point(1), gyro=msgspec.structs.replace(ONE, **changes))
+    with pytest.raises(StorageError, match="not written: found a bias of"):
+        BiasStore(tmp_path).write({"fc": KnownImu(identity={}, points=(point(0), wrong))})
+    whole = {"format_version": 1, "imus": {"fc": {"identity": {}, "points": [msgspec.to_builtins(wrong)]}}}
+    (tmp_path / "biases.json").write_text(json.dumps(whole))
+    assert BiasStore(tmp_path).read() == {}
 
 
 def test_any_cut_of_it_is_no_loss(tmp_path: Path) -> None:

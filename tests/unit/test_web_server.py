@@ -329,22 +329,48 @@ def test_who_sends_byte_by_byte_is_not_waited_for(tmp_path: Path, monkeypatch: p
     run(tmp_path, visit)
 
 
-def test_more_connections_than_allowed_are_closed_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_whoever_says_nothing_for_longest_makes_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "MAX_CONNECTIONS", 3)
 
     async def visit(served: Page, daemon: Daemon) -> None:
-        idle = [await connect(served) for _ in range(3)]
-        with contextlib.suppress(ConnectionError):
-            assert await raw(served, b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n") == b""
-        for _, writer in idle:
-            writer.close()
+        silent = [await connect(served) for _ in range(3)]
+        assert (await ask(served, "GET", "/")).status == 200
         async with asyncio.timeout(3.0):
-            while True:
-                with contextlib.suppress(ConnectionError, IndexError):
-                    if (await ask(served, "GET", "/")).status == 200:
-                        return
+            with contextlib.suppress(ConnectionError):
+                assert await silent[0][0].read() == b""
+        for _, writer in silent:
+            writer.close()
 
     run(tmp_path, visit)
+
+
+def test_whoever_looks_on_does_not_make_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "MAX_CONNECTIONS", 2)
+
+    async def visit(served: Page, daemon: Daemon) -> None:
+        viewer = await Viewer.at(served)
+        await viewer.head()
+        await viewer.event()
+        silent = [await connect(served) for _ in range(4)]
+        assert (await ask(served, "POST", "/cancel", b"{}", **good_headers(served))).status == 200
+        assert served.status()["viewers"] == 1
+        for _ in range(3):
+            await viewer.event()
+        for _, writer in [*silent, (None, viewer.writer)]:
+            writer.close()
+
+    run(tmp_path, visit)
+
+
+@pytest.mark.parametrize("body", [b'{"what":' + b"[" * 4000, b'{"what": "\\u0000"}', b'{"force": {"a": 1}}', b"[1]"])
+def test_a_body_that_is_no_request_is_refused_in_one_line(
+    tmp_path: Path, body: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def visit(served: Page, daemon: Daemon) -> None:
+        assert (await ask(served, "POST", "/undo", body, **good_headers(served))).status == 400
+
+    run(tmp_path, visit)
+    assert not [record for record in caplog.records if record.exc_info]
 
 
 class Viewer:

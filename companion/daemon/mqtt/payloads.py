@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Callable
 from typing import Any, Final
 
 import msgspec
 
-from companion.calibration.request import What
+from companion.calibration.request import What, is_time_limit
 from companion.printable import printable
 
 Object = dict[str, Any]
@@ -89,10 +88,6 @@ def _is_what(value: object) -> bool:
     return value in _WHAT
 
 
-def _is_time(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e6 and math.isfinite(value)
-
-
 def _shown(value: object) -> str:
     """A value as JSON, short enough for one line."""
     try:
@@ -109,7 +104,7 @@ _FLAG: Final = (_is_flag, "true or false")
 KEYS: Final[dict[str, dict[str, tuple[Callable[[object], bool], str]]]] = {
     "calibrate": {
         "what": (_is_what, ", ".join(f'"{what}"' for what in _WHAT)),
-        "timeout_s": (_is_time, "a number of seconds above 0"),
+        "timeout_s": (is_time_limit, "a number of seconds above 0"),
         "reboot": _FLAG,
     },
     "cancel": {},

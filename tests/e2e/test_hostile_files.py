@@ -1,0 +1,125 @@
+"""Files of state that somebody or a worn-out card has made: the daemon starts, says so, and writes nothing of them."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from companion.component.service import Refusal
+from companion.storage.changes import Changed, ChangeLog, ChangeSet
+from companion.storage.state import StateFile, sealed
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+CHECK = "ARMING_CHECK"
+
+
+def changes(name: str, before: float, *more: str) -> bytes:
+    found = tuple(Changed(each, before=before, after=0.001) for each in (name, *more))
+    return sealed(msgspec.json.encode(ChangeSet(1, found)))
+
+
+CONTENTS: dict[str, Any] = {
+    "no value of an IMU": changes("INS_GYROFFS_X", 9.5),
+    "no value at all": changes("INS_GYROFFS_X", 1e30),
+    "another parameter": changes(CHECK, 0.0),
+    "no name of a parameter": changes("A" * 40, 0.0),
+    "a name twice": changes("INS_GYROFFS_X", 0.0, "INS_GYROFFS_X"),
+    "too deep": b"[" * 100_000,
+    "a FIFO": os.mkfifo,
+}
+
+
+@pytest.mark.parametrize("what", CONTENTS)
+@pytest.mark.parametrize("name", ["journal.json", "undo-1.json", "setup/journal.json"])
+def test_it_starts_says_so_and_writes_nothing(
+    tmp_path: Path, name: str, what: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    content = CONTENTS[what]
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        content(path)
+
+    async def main() -> None:
+        rig = Rig(tmp_path, version="4.6", parameters={"INS_GYROFFS_X": 0.001, CHECK: 0.001})
+        async with rig.running():
+            await rig.ready()
+            await asyncio.sleep(10.0)
+            (said,) = [words for words in caplog.messages if path.name in words]
+            assert said in rig.service.status()["warnings"]
+            assert said.startswith(f"{path}: cannot be {'read' if what == 'a FIFO' else 'used'}: ")
+            assert rig.service.mender.fault is None
+            assert not rig.service.mender.pending
+            assert not rig.service.setup.mender.pending
+            if name == "undo-1.json":
+                answer = rig.service.conductor.start_undo("test")
+                assert isinstance(answer, Refusal)
+                assert answer.reason == "nothing to undo; what was kept could not be used"
+            else:
+                assert "Interrupted write, file damaged: calibrate" in rig.ground.texts()
+            assert rig.double.writes == []
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize(
+    "name", ["alignment.json", "biases.json", "automatic.json", "armings.json", "records", "records/000001.json"]
+)
+def test_nothing_else_in_the_storage_ends_or_hangs_the_start(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    os.mkfifo(tmp_path / name)
+
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            assert rig.service.mender.fault is None
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize(("version", "name"), [("4.6", "CAL_GYRO0_XOFF"), ("4.8", "INS5_GYROFFS_X")])
+def test_a_journal_of_parameters_that_this_autopilot_has_not_is_brought_to_an_end(
+    tmp_path: Path, version: str, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of another firmware, or of an IMU that is gone: nobody waits for it for ever, and what is there is put back."""
+    there = "INS_GYROFFS_X" if name.startswith("INS") else name
+    found = ChangeSet(1, tuple(Changed(each, before=0.0, after=0.001) for each in dict.fromkeys((name, there))))
+    ChangeLog(tmp_path).journal.write(found)
+
+    async def main() -> None:
+        async with Rig(tmp_path, version=version, parameters={"INS_GYROFFS_X": 0.001}).running() as rig:
+            await rig.until(lambda: not rig.service.mender.pending, 20.0)
+            ours = name.startswith("INS")
+            assert rig.double.parameter("INS_GYROFFS_X") == pytest.approx(0.0 if ours else 0.001)
+            assert len(rig.double.writes) == int(ours)
+            assert any(name in words for words in caplog.messages)
+
+    run_virtual(main())
+
+
+def test_whatever_the_fault_no_other_name_and_no_other_value_is_written(tmp_path: Path) -> None:
+    """At the door of the ledger, which every write goes through."""
+
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            undo = rig.service.ledger
+            undo.undoable[1] = ChangeSet(1, (Changed("INS_GYROFFS_X", before=9.5, after=0.0),))
+            rig.double.set_parameter("INS_GYROFFS_X", 0.0)
+            answer = rig.service.conductor.start_undo("test")
+            assert not isinstance(answer, Refusal)
+            result = await answer.finished
+            assert result.outcome == "failed"
+            assert "INS_GYROFFS_X = 9.5; allowed: -0.486 to 0.486 rad/s" in result.reason
+            assert rig.double.writes == []
+            assert StateFile(tmp_path / "journal.json", ChangeSet).read() is None
+
+    run_virtual(main())

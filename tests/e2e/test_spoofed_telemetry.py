@@ -1,0 +1,179 @@
+"""Somebody who speaks under the autopilot's ids: what a calibration makes of it, and what the pilot is told."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.calibration.request import What
+from companion.component.service import Refusal
+from companion.daemon.job import Job
+from sim.imu_model import MG
+from tests.support.rig import ACCEL_BIAS_MG, Rig
+from tests.support.virtual_time import run_virtual
+
+Message = mavlink.MAVLink_message
+
+
+@contextlib.asynccontextmanager
+async def spoofed(rig: Rig, every_s: float, *messages: Callable[[], Message]) -> AsyncIterator[None]:
+    """Messages under the autopilot's ids, in turn, beside its own."""
+    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+
+    async def say() -> None:
+        while True:
+            for message in messages:
+                await asyncio.sleep(every_s)
+                rig.wire.carry_from_other(message().pack(codec))
+                codec.seq = (codec.seq + 1) % 256
+
+    task = asyncio.create_task(say())
+    try:
+        yield
+    finally:
+        task.cancel()
+
+
+def calibrate(rig: Rig) -> Job:
+    answer = rig.service.conductor.start_calibration(What.BOTH, "a pilot")
+    assert not isinstance(answer, Refusal), answer.reason
+    return answer
+
+
+def place(rig: Rig, latitude_deg: float, height_m: float) -> Callable[[], Message]:
+    def message() -> Message:
+        boot_ms = round((rig.service.vehicle.boot_s or 0.0) * 1e3)
+        lat, lon, alt = round(latitude_deg * 1e7), round(rig.site.longitude_deg * 1e7), round(height_m * 1e3)
+        return mavlink.MAVLink_global_position_int_message(boot_ms, lat, lon, alt, 0, 0, 0, 0, 0)
+
+    return message
+
+
+@pytest.mark.parametrize(
+    ("latitude_deg", "height_m", "words"),
+    [(40.0, 20000.0, "impossible"), (40.0, 8000.0, "height jumped 7950 m"), (0.001, 50.0, "position jumped 4448 km")],
+)
+def test_a_calibration_waits_while_the_place_jumps_and_says_why(
+    tmp_path: Path, latitude_deg: float, height_m: float, words: str
+) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            await asyncio.sleep(8.0)
+            async with spoofed(rig, 0.1, place(rig, latitude_deg, height_m)):
+                await asyncio.sleep(1.0)
+                job = calibrate(rig)
+                for _ in range(100):
+                    await asyncio.sleep(0.5)
+                    assert not job.finished.done()
+                assert words in job.words
+                assert "set vehicle.latitude_deg" in job.words
+                assert any(words in text for text in rig.ground.texts())
+            # The autopilot alone is heard again.
+            async with asyncio.timeout(30.0):
+                result = await job.finished
+            assert result.outcome == "done"
+            assert job.record is not None
+            assert job.record.site is not None
+            assert job.record.site.height_m == pytest.approx(50.0)
+            found = np.array(job.record.imus[0].accel_bias_m_s2) / MG
+            assert np.abs(found - ACCEL_BIAS_MG).max() < 0.3
+
+    run_virtual(main())
+
+
+def test_a_place_in_the_configuration_is_not_doubted(tmp_path: Path) -> None:
+    place_known = "[vehicle]\nlatitude_deg = 40.0\nlongitude_deg = 116.0\nheight_m = 50.0"
+
+    async def main() -> None:
+        async with Rig(tmp_path, more=place_known).running() as rig:
+            await rig.ready()
+            async with spoofed(rig, 0.1, place(rig, 0.001, 8000.0)):
+                job = calibrate(rig)
+                async with asyncio.timeout(60.0):
+                    result = await job.finished
+            assert result.outcome == "done"
+            assert job.record is not None
+            assert job.record.site is not None
+            assert job.record.site.source == "configuration"
+
+    run_virtual(main())
+
+
+def announced() -> Message:
+    return mavlink.MAVLink_param_value_message(b"INS_GYROFFS_X", 0.3, 9, 1000, 65535)
+
+
+def beat(*, armed: bool) -> Callable[[], Message]:
+    return lambda: mavlink.MAVLink_heartbeat_message(2, 3, 128 if armed else 0, 0, 4, 3)
+
+
+def restarted() -> Message:
+    return mavlink.MAVLink_system_time_message(0, 5)
+
+
+def test_an_announced_offset_that_is_not_in_force_disturbs_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            async with spoofed(rig, 3.0, announced):
+                job = calibrate(rig)
+                async with asyncio.timeout(60.0):
+                    result = await job.finished
+            assert result.outcome == "done"
+            assert job.record is not None
+            found = np.array(job.record.imus[0].accel_bias_m_s2) / MG
+            assert np.abs(found - ACCEL_BIAS_MG).max() < 0.3
+
+    run_virtual(main())
+    assert "INS_GYROFFS_X = 0.3 was announced and is not in force" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("every_s", "what", "words"),
+    [
+        (0.05, (announced,), "pretend to be the autopilot"),
+        (5.0, (restarted,), "the autopilot rebooted, 5 times now"),
+        (0.5, (beat(armed=True), beat(armed=False)), "armed during the measurement"),
+    ],
+)
+def test_nothing_that_is_forged_again_and_again_holds_a_calibration_up_for_ever(
+    tmp_path: Path, every_s: float, what: tuple[Callable[[], Message], ...], words: str
+) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            async with spoofed(rig, every_s, *what):
+                job = calibrate(rig)
+                async with asyncio.timeout(60.0):
+                    result = await job.finished
+            assert result.outcome == "failed"
+            assert words in result.reason
+            await asyncio.sleep(2.0)
+            assert any("Calibration failed" in text for text in rig.ground.texts())
+
+    run_virtual(main())
+
+
+def test_an_arming_between_two_looks_ends_the_measurement(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            job = calibrate(rig)
+            await asyncio.sleep(3.05)
+            codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+            for armed in (True, False):
+                rig.link.receive(beat(armed=armed)().pack(codec), rig.now_s)
+            async with asyncio.timeout(5.0):
+                result = await job.finished
+            assert result.reason == "armed during the measurement; nothing was written"
+
+    run_virtual(main())

@@ -1,0 +1,130 @@
+"""Somebody who asks and cancels, or arms and disarms, in a loop: what is kept stays, and people are still served."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.calibration.request import What
+from companion.component.service import Refusal
+from companion.daemon.align_steps import Plan
+from companion.daemon.job import Job
+from companion.daemon.start_limit import MOST_REQUESTERS, StartLimit
+from tests.support.component import ACCEPTED, CALIBRATE, CANCEL, TEMPORARILY_REJECTED
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+
+def ask(rig: Rig, requester: str) -> Job | Refusal:
+    return rig.service.conductor.start_calibration(What.BOTH, requester)
+
+
+async def done(rig: Rig) -> None:
+    job = ask(rig, "a pilot")
+    assert isinstance(job, Job), job
+    async with asyncio.timeout(120.0):
+        assert (await job.finished).outcome == "done"
+
+
+def test_requests_and_cancels_in_a_loop_leave_the_history_as_it_was(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            await done(rig)
+            before = [entry.path.read_bytes() for entry in rig.service.store.entries()]
+            for _ in range(1000):
+                rig.ground.command(CALIBRATE)
+                await asyncio.sleep(0.005)
+                rig.ground.command(CANCEL)
+                await asyncio.sleep(0.005)
+            await rig.until(lambda: not rig.service.conductor.state.busy, 30.0)
+            assert [entry.path.read_bytes() for entry in rig.service.store.entries()] == before
+            assert len(before) == 1
+            assert TEMPORARILY_REJECTED in rig.ground.finals(CALIBRATE)
+            assert set(rig.ground.finals(CANCEL)) == {ACCEPTED}
+            assert any("too many requests, wait" in text for text in rig.ground.texts())
+            await done(rig)  # somebody else is not held up
+
+    run_virtual(main())
+
+
+def test_what_was_measured_before_the_cancel_is_a_record(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            job = ask(rig, "a pilot")
+            assert isinstance(job, Job)
+            await rig.until(lambda: rig.service.conductor.is_writing, 60.0)
+            rig.service.conductor.cancel("a pilot")
+            assert (await job.finished).outcome == "cancelled"
+            assert [record.state for record in rig.service.store.history()] == ["cancelled"]
+
+    run_virtual(main())
+
+
+def test_a_person_who_presses_once_a_second_is_never_refused_and_a_script_soon_is() -> None:
+    async def main() -> None:
+        limit = StartLimit()
+        for _ in range(1000):
+            assert limit.refuses("a pilot") is None
+            await asyncio.sleep(1.0)
+        started = 0
+        for _ in range(1000):
+            started += limit.refuses("a script") is None
+            await asyncio.sleep(0.01)
+        assert 10 <= started <= 10 + 10
+        refusal = limit.refuses("a script")
+        assert refusal is not None
+        assert refusal.kind == "busy"
+        await asyncio.sleep(1.0)
+        assert limit.refuses("a script") is None
+
+    run_virtual(main())
+
+
+def test_made_up_names_do_not_get_a_budget_each_and_nobody_known_pays_for_them() -> None:
+    async def main() -> None:
+        limit = StartLimit()
+        assert limit.refuses("a pilot") is None
+        started = sum(limit.refuses(f"mavlink {number // 250}/{number % 250}") is None for number in range(60000))
+        assert started <= MOST_REQUESTERS + 10
+        assert limit.refuses("a pilot") is None
+        await asyncio.sleep(20.0)
+        assert limit.refuses("somebody new") is None
+
+    run_virtual(main())
+
+
+def test_an_arming_that_flickers_does_not_wash_out_the_armings(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+            for k in range(1200):
+                beat = mavlink.MAVLink_heartbeat_message(2, 3, 128 if k % 2 else 0, 0, 4, 3)
+                rig.wire.carry_from_other(beat.pack(codec))
+                codec.seq = (codec.seq + 1) % 256
+                await asyncio.sleep(0.05)
+            await asyncio.sleep(1.0)
+            assert len(rig.service.armings.history()) == 1
+
+    run_virtual(main())
+
+
+def test_alignments_have_the_same_limit(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path).running() as rig:
+            await rig.ready()
+            answers = []
+            for _ in range(30):
+                answers.append(rig.service.conductor.start_alignment(Plan("zero", 2), "a script", 60.0))
+                rig.service.conductor.cancel("a script")
+                if isinstance(job := answers[-1], Job):
+                    await job.finished
+            reasons = [answer.reason for answer in answers if isinstance(answer, Refusal)]
+            assert len(reasons) in range(19, 21)
+            assert all(reason.startswith("too many requests") for reason in reasons)
+
+    run_virtual(main())
