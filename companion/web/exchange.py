@@ -28,6 +28,8 @@ class Request:
     path: str
     headers: Mapping[str, str]
     body: bytes = b""
+    peer: str = ""
+    """The address that it came from."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -100,7 +102,8 @@ class Exchange:
             elif isinstance(event, h11.EndOfMessage) and head is not None:
                 headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in head.headers}
                 path = head.target.decode("latin-1").partition("?")[0]
-                return Request(head.method.decode("latin-1"), path, headers, body)
+                peer = str((self.writer.get_extra_info("peername") or ("nobody",))[0])
+                return Request(head.method.decode("latin-1"), path, headers, body, peer)
             else:
                 return None
 

@@ -23,7 +23,16 @@ from companion import __version__
 from companion.errors import CompanionError
 from companion.links.backoff import Backoff
 from companion.links.request import parse_request
-from companion.web.access import Access, is_loopback, kept_token, new_token, page_url, split_address
+from companion.web.access import (
+    TOKEN_HEADER,
+    Access,
+    Guesses,
+    is_loopback,
+    kept_token,
+    new_token,
+    page_url,
+    split_address,
+)
 from companion.web.exchange import BadRequestError, Exchange, Request, Response
 
 logger = logging.getLogger(__name__)
@@ -39,6 +48,8 @@ LEAST_S: Final = 0.1
 """Between two events, whatever wakes them."""
 MAX_CONNECTIONS: Final = 48
 MAX_VIEWERS: Final = 16
+MAX_WAITING: Final = 16
+"""Answers to wrong tokens that are held back at a time."""
 MAX_WAITING_BYTES: Final = 128 * 1024
 """For one viewer, beyond what the kernel holds: ten seconds of events. Who is further behind begins anew."""
 KERNEL_BYTES: Final = 64 * 1024
@@ -77,6 +88,7 @@ class Page:
         self._brief: dict[asyncio.Task[None], None] = {}
         """Those of them that do not look on, the oldest first."""
         self._viewers: set[Exchange] = set()
+        self._guesses, self._waiting = Guesses(), 0
         self._wake = asyncio.Event()
 
     # --- open, and open again
@@ -128,6 +140,7 @@ class Page:
             "summary": self.problem or self.url + ("" if self.local else " (buttons: companion web-token)"),
             "url": None if self.problem else self.url,
             "viewers": len(self._viewers),
+            "wrong_tokens": self._guesses.in_all,
         }
 
     # --- one connection
@@ -207,9 +220,13 @@ class Page:
         return _refusal(404, "nothing is here")
 
     async def _act(self, request: Request) -> Response:
-        why = self.access.refuses_stranger(request.headers) or self.access.refuses_token(request.headers)
-        if why is not None:
+        if (why := self.access.refuses_stranger(request.headers)) is not None:
             return _refusal(403, why)
+        if (why := self.access.refuses_token(request.headers)) is not None:
+            if not self.local and request.headers.get(TOKEN_HEADER):
+                await self._wait_after_guess(request.peer)
+            return _refusal(403, why)
+        self._guesses.right(request.peer)
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             return _refusal(415, "an action is asked for in application/json")
         try:
@@ -227,6 +244,16 @@ class Page:
         if reply.get("kind") == "error":
             return _refusal(409, str(reply["reason"]))
         return _json(200, {key: value for key, value in reply.items() if key != "kind"})
+
+    async def _wait_after_guess(self, peer: str) -> None:
+        """Answers that wait hold connections: beyond some, the others are not to suffer for it."""
+        delay_s = self._guesses.wrong(peer)
+        if self._waiting < MAX_WAITING:
+            self._waiting += 1
+            try:
+                await asyncio.sleep(delay_s)
+            finally:
+                self._waiting -= 1
 
     async def _result(self, asked: Object) -> Object:
         """The last reply; an action that takes longer than a person waits goes on, and the events tell of it."""

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from companion.cli import main as companion
 from companion.errors import CalibrationRefusedError, StorageError
 from companion.web import access, exchange, server
 from companion.web.server import Page
@@ -591,6 +592,89 @@ def test_the_kept_token_stays_and_a_useless_one_is_refused(tmp_path: Path) -> No
         (tmp_path / "web-token").write_bytes(useless)
         with pytest.raises(StorageError, match="web-token"):
             access.kept_token(tmp_path)
+
+
+def test_a_token_that_somebody_chose_has_twelve_characters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, toml = tmp_path / "web-token", tmp_path / "c.toml"
+    toml.write_text(
+        '[mavlink]\nurl = "udpout:127.0.0.1:9"\n[[imu]]\nname = "fc"\nsource = "autopilot"\n'
+        f'[web]\nbind = "192.168.4.1:8191"\n[storage]\ndirectory = "{tmp_path}"\n'
+    )
+    path.write_text("eleven - chars\n")
+    assert companion(["web-token", "-c", str(toml)]) == 1
+    assert capsys.readouterr().err == (
+        f"companion: {path}: found a token of 11 characters; allowed: at least 12; remove the file, and a good one is"
+        " made\n"
+    )
+    path.write_text("twelve - chars!\n")
+    assert companion(["web-token", "-c", str(toml)]) == 0
+    assert capsys.readouterr().out.startswith("token: twelve - chars!\n")
+
+
+def test_a_wrong_token_is_answered_later_each_time_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    guesses = access.Guesses()
+    delays = [guesses.wrong("10.0.0.7") for _ in range(7)]
+    assert delays == [0.25, 0.5, 1.0, 2.0, 4.0, 5.0, 5.0]
+    assert guesses.wrong("10.0.0.8") == 0.25, "the others do not wait for it"
+    guesses.right("10.0.0.7")
+    assert guesses.wrong("10.0.0.7") == 0.25
+    assert guesses.in_all == 9
+    said = [record.getMessage() for record in caplog.records]
+    assert said == [f"page: wrong token from 10.0.0.{k}; more of them are only counted" for k in (7, 8)]
+
+
+def test_strangers_fill_neither_the_memory_nor_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    guesses = access.Guesses()
+    for number in range(5000):
+        guesses.wrong(f"2001:db8::{number:x}")
+    assert guesses.in_all == 5000
+    assert len(guesses._by_peer) == len(caplog.records) == access.MOST_PEERS
+
+
+def test_who_has_the_token_is_let_in_whoever_guesses_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(access, "FIRST_DELAY_S", 3600.0)
+    monkeypatch.setattr(access, "MOST_DELAY_S", 7200.0)
+
+    async def visit(served: Page, daemon: Daemon) -> None:
+        def guess() -> asyncio.Task[Said]:
+            headers = good_headers(served) | {"X_Companion_Token": "2" * 12}
+            return asyncio.create_task(ask(served, "POST", "/cancel", b"{}", **headers))
+
+        # From one after the other that waits, so many are held back; the next is answered at once.
+        waiting = []
+        for held in range(1, server.MAX_WAITING + 1):
+            waiting.append(guess())
+            while served.status()["wrong_tokens"] < held:
+                await asyncio.sleep(0)
+        beyond = await guess()
+        assert beyond.status == 403
+        assert not any(task.done() for task in waiting)
+        assert (await ask(served, "GET", "/records.json")).status == 200
+        right = await ask(served, "POST", "/cancel", b"{}", **good_headers(served))
+        assert right.status == 200
+        assert daemon.asked[-1][0] == {"command": "cancel"}
+        assert served._guesses.wrong("127.0.0.1") == access.FIRST_DELAY_S, "and what was mistyped before is forgotten"
+        assert served.status()["wrong_tokens"] == server.MAX_WAITING + 2
+        for task in waiting:
+            task.cancel()
+        await asyncio.gather(*waiting, return_exceptions=True)
+
+    run(tmp_path, visit, bind="0.0.0.0:0")
+    assert caplog.text.count("wrong token from 127.0.0.1") == 1
+    assert "2" * 12 not in caplog.text
+
+
+def test_on_the_board_itself_an_old_token_is_no_guess(tmp_path: Path) -> None:
+    async def visit(served: Page, _daemon: Daemon) -> None:
+        old = await ask(served, "POST", "/cancel", b"{}", **good_headers(served) | {"X_Companion_Token": "2" * 12})
+        assert (old.status, old.json["reason"]) == (403, "the companion was restarted: try again")
+        none = await ask(served, "POST", "/cancel", b"{}", **good_headers(served) | {"X_Companion_Token": None})
+        assert none.status == 403
+        assert served.status()["wrong_tokens"] == 0
+
+    run(tmp_path, visit)
 
 
 @pytest.mark.parametrize(
