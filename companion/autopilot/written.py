@@ -9,7 +9,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Final
 
-from companion.autopilot import ardupilot, attitude_setup, px4
+from companion.autopilot import ardupilot, heading_parameters, px4
 from companion.autopilot.imu_calibration import (
     MAX_ACCEL_OFFSET_M_S2,
     MAX_ACCEL_RESIDUAL_M_S2,
@@ -81,6 +81,6 @@ CALIBRATION: Final[Mapping[Firmware, Ranges]] = {
 
 HEADING_SETUP: Final[Mapping[Firmware, Ranges]] = {
     firmware: {one.parameter: Range(0.0, one.most, whole=one.whole) for one in wanted}
-    for firmware, wanted in attitude_setup.WANTED.items()
+    for firmware, wanted in heading_parameters.WANTED.items()
 }
 """By `companion autopilot-setup` and its undo."""

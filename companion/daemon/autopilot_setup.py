@@ -10,8 +10,8 @@ from typing import Final
 
 import msgspec
 
-from companion.autopilot.attitude_setup import RISKS, changes_for, wanted_for
 from companion.autopilot.float32 import same_float32
+from companion.autopilot.heading_parameters import RISKS, changes_for, wanted_for
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.vehicle import Vehicle
 from companion.autopilot.writer import Change, ParameterWriter, WriteFailedError

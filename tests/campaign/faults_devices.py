@@ -128,11 +128,14 @@ def repeats_last(scene: Scene) -> Mangle:
 
 
 async def stick_and_tilt(scene: Scene) -> None:
-    """The gradienter hangs, and then somebody sets the aircraft down differently."""
+    """The gradienter hangs, and then somebody sets the aircraft down differently.
+
+    In between lie whole seconds of the IMUs: without one nobody could know that it was tilted since.
+    """
     stage = scene.stage
     stage.mangle[TILT] = repeats_last(scene)
     now_s = stage.aircraft.time_at(stage.now_s)
-    stage.aircraft.add(Turn(start_s=now_s + 0.5, duration_s=1.0, roll_deg=7.0, pitch_deg=-4.0))
+    stage.aircraft.add(Turn(start_s=now_s + 2.5, duration_s=1.0, roll_deg=7.0, pitch_deg=-4.0))
 
 
 async def unstick(scene: Scene) -> None:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from companion.attitude.estimator import Attitude
 from companion.attitude.quaternion import Quaternion
 from companion.autopilot.attitude_messages import attitude_messages, vision_position_estimate
-from companion.autopilot.attitude_setup import changes_for
+from companion.autopilot.heading_parameters import changes_for
 from companion.calibration.record import ImuRecord, Outcome, WrittenParameter
 from companion.calibration.site import Whereabouts, local_earth
 from companion.config import Imu, parse
