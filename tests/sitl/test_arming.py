@@ -66,6 +66,40 @@ def test_it_arms_when_asked_and_disarms(autopilot: Autopilot) -> None:
     autopilot.run(main)
 
 
+def test_a_heartbeat_that_is_asked_for_is_there_30_ms_after_the_answer(autopilot: Autopilot) -> None:
+    """What the companion waits for before each write, so that nobody else's heartbeat stands for the autopilot's."""
+
+    async def main(craft: Craft) -> None:
+        loop, ground = asyncio.get_running_loop(), craft.ground
+        late_s = []
+        for _ in range(40):
+            asked_s = loop.time()
+            ground.send(
+                mavlink.MAVLink_command_long_message(
+                    ground.vehicle, 1, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, mavlink.MAVLINK_MSG_ID_HEARTBEAT, *[0.0] * 6
+                )
+            )
+            await asyncio.sleep(0.3)
+            answers = [
+                t_s
+                for t_s, answer in ground.timed(mavlink.MAVLink_command_ack_message, since_s=asked_s)
+                if answer.command == mavlink.MAV_CMD_REQUEST_MESSAGE
+            ]
+            beats = [
+                t_s
+                for t_s, beat in ground.timed(mavlink.MAVLink_heartbeat_message, since_s=asked_s)
+                if beat.get_srcComponent() == 1
+            ]
+            assert answers
+            assert beats
+            late_s.append(beats[0] - answers[0])
+        print(f"heartbeat behind the answer: {sorted(round(1e3 * each, 1) for each in late_s)} ms")
+        # A busy machine may hold a process up now and then, which holds up its answer as well.
+        assert sorted(late_s)[-4] <= 0.03
+
+    autopilot.run(main)
+
+
 def test_a_write_is_accepted_and_works_while_armed(autopilot: Autopilot) -> None:
     async def main(craft: Craft) -> None:
         name = ACCEL[craft.firmware]
