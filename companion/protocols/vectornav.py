@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import binascii
 import re
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from companion.protocols.base import (
     CHECKSUM,
@@ -35,9 +35,6 @@ from companion.protocols.framing import WAIT, FrameDecoder
 from companion.protocols.vectornav_binary import Layout, header_bytes, layout_of
 from companion.samples import AttitudeSample, ImuSample, MagSample, Sample
 
-if TYPE_CHECKING:
-    from companion.protocols.bulk import Frames
-
 SENTENCE_LIMIT = 250
 """Bytes of a sentence after its "$"; the longest asynchronous one has some 200."""
 LAYOUTS_KEPT = 16
@@ -57,7 +54,6 @@ class VectorNavDecoder(FrameDecoder):
     """VectorNav outputs; gives `ImuSample`, `AttitudeSample` and `MagSample` as far as a frame has them."""
 
     device_clock_wraps_s: ClassVar[float | None] = 2**64 / 1e9
-    many = "imu"
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)
@@ -113,19 +109,6 @@ class VectorNavDecoder(FrameDecoder):
         except RejectedError as error:
             self.rejected[error.reason] += 1
         return end
-
-    def _frames(self, buffer: bytes) -> Frames | None:
-        header = self._header
-        if not header or not buffer.startswith(header):
-            return None
-        layout = self._layouts.get(header) or layout_of(header)
-        whole = len(buffer) // layout.frame_bytes * layout.frame_bytes
-        if not buffer.startswith(header[: len(buffer) - whole], whole):
-            return None
-        return layout.frames(header, buffer, whole)
-
-    def _took(self, frames: Frames) -> None:
-        self._layouts[frames.header] = layout_of(frames.header)
 
     def _run(self, buffer: bytes, at: int, origin: int, samples: list[Sample], layout: Layout) -> int:
         """Take plain frames with the last good one's header, one behind the other, as long as they are whole and good.
