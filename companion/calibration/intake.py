@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -76,21 +75,6 @@ class Intake(ABC):
         row = sample.gyro_rad_s + sample.accel_m_s2
         if source.batches.add(sample.t_s, row, sample.temperature_degc, stamp):
             self._evaluate()
-
-    def add_many(self, name: str, samples: Sequence[ImuSample]) -> None:
-        """Take samples of the IMU of that name, one after the other."""
-        source = self._imus.get(name)
-        if source is None:
-            self.unknown_samples += len(samples)
-            return
-        add, breaks = source.batches.add, self._breaks.get(name, 0)
-        for sample in samples:
-            if sample.breaks != breaks:
-                breaks = self._breaks[name] = sample.breaks
-                self._forget(f"imu {name} restarted", name)
-            stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
-            if add(sample.t_s, sample.gyro_rad_s + sample.accel_m_s2, sample.temperature_degc, stamp):
-                self._evaluate()
 
     def add_tilt(self, sample: TiltSample) -> None:
         """Take one reading of the gradienter; dropped when none is expected."""

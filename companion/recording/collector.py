@@ -74,13 +74,6 @@ class RecordedCollector(RollingCollector):
             self.journal.imu(name, sample, self._message_of(name), sample.t_s)
         super().add_imu(name, sample)
 
-    def add_many(self, name: str, samples: Sequence[ImuSample]) -> None:  # noqa: D102
-        if self.journal.queues:
-            message = self._message_of(name)
-            for sample in samples:
-                self.journal.imu(name, sample, message, sample.t_s)
-        super().add_many(name, samples)
-
     def add_tilt(self, sample: TiltSample) -> None:  # noqa: D102
         self.journal.tilt(sample)
         super().add_tilt(sample)
