@@ -44,8 +44,7 @@ class FrameDecoder(Decoder):
             if end == WAIT:
                 break
             if self.accepted != accepted:
-                # Where it took several, they were alike.
-                self.frame_bytes = (end - at) // (self.accepted - accepted)
+                self.frame_bytes = end - at
             at = end
         self._buffer = buffer[at:]
         while self._chunks and self._chunks[0][0] <= origin + at:
@@ -63,7 +62,6 @@ class FrameDecoder(Decoder):
         """Read what begins at `at`, of which `origin` is the buffer's place in the stream.
 
         Returns where to go on, always further on, or `WAIT`. How much of it has arrived must not change the outcome.
-        Several frames of one length may be taken at once where all of them are accepted.
         """
 
     def _skip_to(self, start: bytes, buffer: bytes, at: int) -> int:

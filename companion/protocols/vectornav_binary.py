@@ -95,11 +95,6 @@ class Layout:
     attitude: int | None
     mag: int | None
 
-    @property
-    def is_plain(self) -> bool:
-        """Whether it holds one reading of an IMU and nothing else that is used here."""
-        return self.imu is not None and self.attitude is None and self.mag is None
-
     def samples(self, frame: bytes, start: int, t_s: float) -> list[Sample]:
         """The samples in a frame that begins at `start` and has passed its CRC.
 
