@@ -189,38 +189,24 @@ class SentenceDecoder(Decoder):
         text = self._partial + data.replace(b"\r", b"\n")
         lines = text.split(b"\n")
         remaining, partial = len(text), lines.pop()
-        seconds_per_byte, limit, read = self.seconds_per_byte, self.LIMIT, self._read
         samples: list[Sample] = []
-        accepted, latest = 0, b""
         for line in lines:
             if not line:
                 remaining -= 1
                 continue
             remaining -= len(line) + 1
+            sentence = self._last_sentence(line)
+            if not sentence:
+                continue
             try:
-                # Nearly every line is one whole sentence with two digits; only the others need a closer look.
-                if line.rfind(b"$") == 0 and len(line) <= limit:
-                    digits = _HEXADECIMAL.get(line[-2:])
-                    if digits is not None and line[-3] == _STAR:
-                        body = line[1:-3]
-                        if xor_checksum(body) != digits:
-                            raise RejectedError(CHECKSUM)
-                    else:
-                        body = body_of_sentence(line)
-                elif sentence := self._last_sentence(line):
-                    body = body_of_sentence(sentence)
-                else:
-                    continue
-                read(body, t_s - seconds_per_byte * remaining, samples)
-                accepted += 1
-                latest = line
+                self._read(body_of_sentence(sentence), t_s - self.seconds_per_byte * remaining, samples)
             except RejectedError as error:
                 self.rejected[error.reason] += 1
             except ValueError:
                 self.rejected[NOT_A_NUMBER] += 1
-        if accepted:
-            self.accepted += accepted
-            self.frame_bytes = len(latest) + 1
+            else:
+                self.accepted += 1
+                self.frame_bytes = len(line) + 1
         if partial or self._partial:
             self._partial = self._last_sentence(partial)
         return samples
@@ -264,36 +250,18 @@ _HEXADECIMAL: Final = {
     (high + low).encode(): int(high + low, 16) for high in "0123456789abcdefABCDEF" for low in "0123456789abcdefABCDEF"
 }
 """Every way to write a byte; a look-up is quicker than `int` and takes no "+5"."""
-_STAR: Final = ord("*")
-_from_bytes: Final = int.from_bytes
 
 
 def xor_checksum(body: bytes) -> int:
     """The checksum of NMEA 0183 and of its imitators: all bytes between "$" and "*" exclusive-ored."""
-    folded, size = _from_bytes(body, "little"), len(body)
-    # Fold halves onto each other: a loop over the bytes of a longer sentence takes several times as long.
-    if size > 32:
-        if size > 64:
-            if size > 128:
-                folded = _fold_long(folded, size)
-            folded ^= folded >> 512
-        folded ^= folded >> 256
-    folded ^= folded >> 128
-    folded ^= folded >> 64
-    folded ^= folded >> 32
-    folded ^= folded >> 16
-    return (folded ^ folded >> 8) & 0xFF
-
-
-def _fold_long(folded: int, size: int) -> int:
-    """Fold all that lies beyond 128 bytes onto them."""
-    shift = 1024
-    while shift * 2 < size * 8:
+    folded, shift = int.from_bytes(body, "little"), 8
+    while shift < 8 * len(body):
         shift *= 2
-    while shift >= 1024:
+    # Halves folded onto each other: a loop over the bytes takes several times as long.
+    while shift >= 8:
         folded ^= folded >> shift
         shift //= 2
-    return folded
+    return folded & 0xFF
 
 
 def body_of_sentence(sentence: bytes) -> bytes:
@@ -305,7 +273,7 @@ def body_of_sentence(sentence: bytes) -> bytes:
         RejectedError: there is no checksum, or it is wrong.
     """
     expected = _HEXADECIMAL.get(sentence[-2:])
-    if expected is not None and sentence[-3] == _STAR:
+    if expected is not None and sentence[-3:-2] == b"*":
         body = sentence[1:-3]
         if xor_checksum(body) != expected:
             raise RejectedError(CHECKSUM)

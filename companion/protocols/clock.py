@@ -189,11 +189,7 @@ class SampleTimes:
                 if t_s is None:
                     self.dropped[LATE] += 1
                     continue
-                # `_in_order`, written out.
-                if t_s < self._newest_s <= read_s:
-                    t_s = self._newest_s
-                else:
-                    self._newest_s = t_s
+                t_s = self._in_order(t_s, read_s)
                 gyro, accel, warm = sample.gyro_rad_s, sample.accel_m_s2, sample.temperature_degc
                 placed.append(ImuSample(t_s, gyro, accel, warm, sequence, device_s, breaks))
                 # Whatever else the same frame brought was taken at the same time.
