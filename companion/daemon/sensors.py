@@ -222,10 +222,7 @@ class SerialSensor:
         """Ask what is due: often while a conversation goes on, seldom otherwise, so that a stream costs no ticks."""
         loop = asyncio.get_running_loop()
         while True:
-            if self._is_lively(loop.time()):
-                await asyncio.sleep(TICK_S)
-            else:
-                await self._together.sleep(COARSE_S)
+            await asyncio.sleep(TICK_S if self._is_lively(loop.time()) else COARSE_S)
             if self.link.connected and loop.time() >= self._look_at_s:
                 await self._look_for_others()
             self._speak(loop.time())

@@ -180,7 +180,6 @@ class Service:
         self.alignment.on_change = self.in_force.realigned
         self.readiness = Readiness(self.vehicle, self.collector, self.conductor, self.mender, self.in_force)
         self.readiness.reboot_owed = lambda: reboot.owed
-        self.readiness.pause = self.link.together.sleep
         self.automatic = Automatic(
             self.vehicle,
             self.collector,
