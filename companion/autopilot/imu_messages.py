@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -13,12 +13,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.links.mavlink import Message
 from companion.physics.units import MG
 from companion.samples import Vector
-
-if TYPE_CHECKING:  # numpy is for those who have many messages at once
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Many = tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]
 
 MRAD: Final = 1e-3
 
@@ -56,9 +50,6 @@ class ImuMessage:
     message: type[Message]
     decode: Callable[[Message], Reading | str]
     """The reading, or why there is none."""
-    decode_many: Callable[[NDArray[Any]], Many]
-    """The same of many messages, (n,) records of their fields: (n,) whether there is a reading, (n,) device times in s,
-    (n, 6) rad/s and m/s^2."""
 
 
 _ACCEL_AND_GYRO: Final = 0b111111
@@ -115,34 +106,6 @@ def _raw(message: Message) -> Reading | str:
     return _integers(message, message.time_usec * 1e-6)
 
 
-_AXES: Final = ("xgyro", "ygyro", "zgyro", "xacc", "yacc", "zacc")
-
-
-def _highres_many(fields: NDArray[Any]) -> Many:
-    import numpy as np
-
-    rows = np.column_stack([fields[axis] for axis in _AXES]).astype(np.float64)
-    both = fields["fields_updated"] & _ACCEL_AND_GYRO == _ACCEL_AND_GYRO
-    usable = (fields["id"] == 0) & both & np.isfinite(rows).all(axis=1)
-    return usable, fields["time_usec"] * 1e-6, rows
-
-
-def _integers_many(fields: NDArray[Any], t_device_s: NDArray[np.float64]) -> Many:
-    import numpy as np
-
-    rows = np.column_stack([fields[axis] for axis in _AXES]) * np.repeat([MRAD, MG], 3)
-    return np.ones(len(fields), dtype=np.bool_), t_device_s, rows
-
-
-def _scaled_many(fields: NDArray[Any]) -> Many:
-    return _integers_many(fields, fields["time_boot_ms"] * 1e-3)
-
-
-def _raw_many(fields: NDArray[Any]) -> Many:
-    _, t_device_s, rows = _integers_many(fields, fields["time_usec"] * 1e-6)
-    return fields["id"] == 0, t_device_s, rows
-
-
 def _integer_kind(name: str) -> StreamKind:
     return StreamKind(name, gyro_step_rad_s=MRAD, accel_step_m_s2=MG, truncates=True)
 
@@ -151,12 +114,11 @@ HIGHRES: Final = ImuMessage(
     StreamKind("HIGHRES_IMU", gyro_step_rad_s=0.0, accel_step_m_s2=0.0, truncates=False),
     mavlink.MAVLink_highres_imu_message,
     _highres,
-    _highres_many,
 )
-SCALED: Final = ImuMessage(_integer_kind("SCALED_IMU"), mavlink.MAVLink_scaled_imu_message, _scaled, _scaled_many)
-SCALED2: Final = ImuMessage(_integer_kind("SCALED_IMU2"), mavlink.MAVLink_scaled_imu2_message, _scaled, _scaled_many)
-SCALED3: Final = ImuMessage(_integer_kind("SCALED_IMU3"), mavlink.MAVLink_scaled_imu3_message, _scaled, _scaled_many)
-RAW: Final = ImuMessage(_integer_kind("RAW_IMU"), mavlink.MAVLink_raw_imu_message, _raw, _raw_many)
+SCALED: Final = ImuMessage(_integer_kind("SCALED_IMU"), mavlink.MAVLink_scaled_imu_message, _scaled)
+SCALED2: Final = ImuMessage(_integer_kind("SCALED_IMU2"), mavlink.MAVLink_scaled_imu2_message, _scaled)
+SCALED3: Final = ImuMessage(_integer_kind("SCALED_IMU3"), mavlink.MAVLink_scaled_imu3_message, _scaled)
+RAW: Final = ImuMessage(_integer_kind("RAW_IMU"), mavlink.MAVLink_raw_imu_message, _raw)
 """Its name notwithstanding: calibrated and filtered, the same as SCALED_IMU (ArduPilot)."""
 
 ARDUPILOT: Final = {1: (HIGHRES, SCALED, RAW), 2: (SCALED2,), 3: (SCALED3,)}

@@ -16,11 +16,11 @@ Floats = NDArray[np.float64]
 MAX_LEVELS: Final = 1024
 """Integers between the lowest and the highest of one second that are counted one by one; at rest it is a tenth."""
 
-EVEN: Final = 1.4999
+_EVEN: Final = 1.4999
 """Steps of a counter that are all within so much of each other are one step each, whatever the usual one is."""
 _PINNED_SIGMAS: Final = 4.0
-PINNED_SAMPLES: Final = 5
-PINNED_DISTINCT: Final = 8
+_PINNED_SAMPLES: Final = 5
+_PINNED_DISTINCT: Final = 8
 
 
 class Counts(msgspec.Struct, frozen=True):
@@ -102,7 +102,7 @@ def missing_of(stamps: Floats) -> int:
     """
     steps = stamps[1:] - stamps[:-1]
     steps = steps[steps > 0]
-    if len(steps) == 0 or steps.max() < EVEN * steps.min():
+    if len(steps) == 0 or steps.max() < _EVEN * steps.min():
         return 0
     usual = float(median(steps))
     return int(np.maximum(np.rint(steps / usual) - 1.0, 0.0).sum())
@@ -115,11 +115,11 @@ def is_clipped(ordered: Floats, distinct: NDArray[np.int64]) -> bool:
     a quantised stream of a still sensor looks like that. And of 50 integers the lowest is the commonest by chance now
     and then, so that it must be so by four standard deviations of such counts.
     """
-    if len(ordered) <= PINNED_SAMPLES:
+    if len(ordered) <= _PINNED_SAMPLES:
         return False
-    tail = PINNED_SAMPLES - 1
+    tail = _PINNED_SAMPLES - 1
     suspects = np.flatnonzero(
-        (distinct >= PINNED_DISTINCT) & ((ordered[0] == ordered[tail]) | (ordered[-1] == ordered[-1 - tail]))
+        (distinct >= _PINNED_DISTINCT) & ((ordered[0] == ordered[tail]) | (ordered[-1] == ordered[-1 - tail]))
     )
     for channel in suspects:
         _, counts = np.unique(ordered[:, channel], return_counts=True)

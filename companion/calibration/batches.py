@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,22 +18,14 @@ from companion.calibration.batch import (
     MAX_LEVELS,
     Batch,
     Counts,
-    Floats,
     counts_of,
     first_of_each,
     is_clipped,
     missing_of,
     unrolled,
 )
-from companion.protocols.bulk import Block
-
-if TYPE_CHECKING:
-    from companion.calibration.seconds import Seconds
 
 __all__ = ["MAX_LEVELS", "MAX_SAMPLES", "Batch", "BatchSource", "Counts"]
-
-_Piece = tuple[Floats, Floats, Floats | None]
-"""Times, rows and stamps."""
 
 MAX_SAMPLES: Final = 4096
 """Kept of one slot; what comes beyond is dropped and counted. Ten times the fastest stream."""
@@ -45,16 +36,6 @@ _BACKWARD_SAMPLES: Final = 20
 _BACKWARD_S: Final = 2.0
 
 
-class _Block:
-    """A block that is being taken, and which part of it the second under way is, where it is nothing else."""
-
-    __slots__ = ("block", "seconds", "start", "stop")
-
-    def __init__(self, block: Block, seconds: Seconds) -> None:
-        self.block, self.seconds = block, seconds
-        self.start = self.stop = -1
-
-
 class BatchSource:
     """Collects one stream into batches. Never raises on what arrives; counts what it drops by reason.
 
@@ -63,14 +44,6 @@ class BatchSource:
         keep: how many batches are kept; the oldest go first.
         circle: the single channel is an angle in degrees on [0, 360); means are taken on the circle.
     """
-
-    _pieces: tuple[_Piece, ...] = ()
-    """Of the second under way, what came in blocks; what came later one by one is in the lists."""
-    _in_pieces = 0
-    """Samples of the second under way that are in `_pieces`."""
-
-    _block: _Block | None = None
-    """That is being taken, to save work."""
 
     steps: NDArray[np.float64] | None = None
     """(c,) of a stream of integers, of which every second keeps how often each one came; None for floats."""
@@ -103,10 +76,6 @@ class BatchSource:
         self._times: list[float] = []
         self._rows: list[tuple[float, ...]] = []
         self._stamps: list[float | None] = []
-        self._pieces = ()
-        self._in_pieces = 0
-        if self._block is not None:
-            self._block.start = self._block.stop = -1
         self._temperature_sum = 0.0
         self._temperature_count = 0
 
@@ -132,7 +101,7 @@ class BatchSource:
         self._newest = t_s
         self.last_s = t_s
         self._backward = 0
-        if len(self._rows) + self._in_pieces >= MAX_SAMPLES:
+        if len(self._rows) >= MAX_SAMPLES:
             self.dropped["too many a second"] += 1
             return ended
         self._times.append(t_s)
@@ -142,78 +111,6 @@ class BatchSource:
             self._temperature_sum += temperature_degc
             self._temperature_count += 1
         return ended
-
-    def take(self, block: Block, start: int, stop: int) -> tuple[int, bool]:
-        """Take samples of a block up to `stop`, or to the end of a second: `add` of each, at once.
-
-        Returns:
-            Where to go on, and whether a second has ended with the first of them, as `add` says it.
-        """
-        times = block.t_s
-        first_s = float(times[start])
-        ended = False
-        if not self._newest <= first_s < self._slot_end:
-            if not self._newest <= first_s < _MAX_TIME_S:
-                stamp = None if block.stamps is None else float(block.stamps[start])
-                temperature_degc = None if block.temperature_degc is None else float(block.temperature_degc[start])
-                return start + 1, self.add(first_s, tuple(block.rows[start].tolist()), temperature_degc, stamp)
-            ended = self._open(math.floor(first_s))
-        stop = start + int(times[start:stop].searchsorted(self._slot_end))
-        self._newest = self.last_s = float(times[stop - 1])
-        self._backward = 0
-        room = MAX_SAMPLES - len(self._rows) - self._in_pieces
-        kept = slice(start, min(stop, start + max(room, 0)))
-        if stop > kept.stop:
-            self.dropped["too many a second"] += stop - kept.stop
-        self._note(block, start, kept.stop)
-        self._collect_piece()
-        stamps = None if block.stamps is None else block.stamps[kept]
-        self._pieces = (*self._pieces, (times[kept], block.rows[kept], stamps))
-        self._in_pieces += kept.stop - start
-        if block.temperature_degc is not None and kept.stop > start:
-            # One after the other, as `add` does.
-            readings = np.concatenate(([self._temperature_sum], block.temperature_degc[kept]))
-            self._temperature_sum = float(np.add.accumulate(readings)[-1])
-            self._temperature_count += kept.stop - start
-        return stop, ended
-
-    def _note(self, block: Block, start: int, stop: int) -> None:
-        """Remember which part of a block the second under way is."""
-        known = self._block
-        if known is None or known.block is not block:
-            from companion.calibration.seconds import Seconds
-
-            known = self._block = _Block(block, Seconds(block, self._limits, circle=self._circle))
-        if not self._in_pieces and not self._rows:
-            known.start, known.stop = start, stop
-        elif known.stop == start:
-            known.stop = stop
-        else:
-            known.start = known.stop = -1
-
-    def _collect_piece(self) -> None:
-        """Put what came one by one behind the pieces."""
-        if not self._rows:
-            return
-        stamps = None if None in self._stamps else np.array(self._stamps, dtype=np.float64)
-        piece = np.array(self._times), np.array(self._rows, dtype=np.float64), stamps
-        self._pieces = (*self._pieces, piece)
-        self._in_pieces += len(self._rows)
-        self._times, self._rows, self._stamps = [], [], []
-
-    def _whole(self) -> _Piece:
-        """All samples of the second under way, at least one."""
-        if not self._in_pieces:
-            stamps = None if None in self._stamps else np.array(self._stamps, dtype=np.float64)
-            return np.array(self._times), np.array(self._rows, dtype=np.float64), stamps
-        self._collect_piece()
-        pieces = self._pieces
-        stamped = [stamps for _, _, stamps in pieces if stamps is not None]
-        return (
-            np.concatenate([times for times, _, _ in pieces]),
-            np.concatenate([rows for _, rows, _ in pieces]),
-            np.concatenate(stamped) if len(stamped) == len(pieces) else None,
-        )
 
     def _from_the_past(self, t_s: float) -> bool:
         if not math.isfinite(t_s) or abs(t_s) >= _MAX_TIME_S:
@@ -253,7 +150,7 @@ class BatchSource:
         return True
 
     def _close(self) -> None:
-        if self._slot is not None and (self._rows or self._in_pieces) and not self._partial:
+        if self._slot is not None and self._rows and not self._partial:
             batch = self._summarise(self._slot)
             if batch is not None:
                 self.batches[batch.slot] = batch
@@ -261,28 +158,9 @@ class BatchSource:
                     del self.batches[next(iter(self.batches))]
         self._clear()
 
-    def _worked_out(self) -> Batch | None:
-        """The second under way, where it has been summarised together with others; else None."""
-        known = self._block
-        if known is None or known.stop - known.start != len(self._rows) + self._in_pieces:
-            return None
-        batch = known.seconds.of(known.start, known.stop)
-        if batch is None:
-            return None
-        block = known.block
-        if (stamps := block.stamps) is not None:
-            if self._last_stamp != stamps[known.start - 1]:
-                self.lost += missing_of(np.concatenate(((self._last_stamp,), stamps[known.start : known.stop])))
-            self._last_stamp = stamps[known.stop - 1]
-        if self.steps is not None:
-            counts = counts_of(block.rows[known.start : known.stop], self.steps)
-            batch = msgspec.structs.replace(batch, counts=counts)
-        return batch
-
     def _summarise(self, slot: int) -> Batch | None:
-        if (batch := self._worked_out()) is not None:
-            return batch
-        times, rows, stamps = self._whole()
+        times, rows = np.array(self._times), np.array(self._rows, dtype=np.float64)
+        stamps = None if None in self._stamps else np.array(self._stamps, dtype=np.float64)
         if self._circle:
             rows = unrolled(rows)
         # NaN compares false, so this drops it too.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -13,7 +12,6 @@ from companion.calibration.settling import Lag
 from companion.calibration.sources import Source, compass_source, gradienter_source, imu_source
 from companion.calibration.stillness import ImuGate, Verdict
 from companion.calibration.windows import ImuInput, integer_steps
-from companion.protocols.bulk import Block, ImuBlock, PoseBlock
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 
 
@@ -78,39 +76,6 @@ class Intake(ABC):
         if source.batches.add(sample.t_s, row, sample.temperature_degc, stamp):
             self._evaluate()
 
-    def add_many(self, name: str, samples: Sequence[ImuSample]) -> None:
-        """Take samples of the IMU of that name, one after the other."""
-        source = self._imus.get(name)
-        if source is None:
-            self.unknown_samples += len(samples)
-            return
-        add, breaks = source.batches.add, self._breaks.get(name, 0)
-        for sample in samples:
-            if sample.breaks != breaks:
-                breaks = self._breaks[name] = sample.breaks
-                self._forget(f"imu {name} restarted", name)
-            stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
-            if add(sample.t_s, sample.gyro_rad_s + sample.accel_m_s2, sample.temperature_degc, stamp):
-                self._evaluate()
-
-    def add_block(self, name: str, block: ImuBlock, start: int = 0, stop: int | None = None) -> None:
-        """Take the samples of a block from `start` up to, without, `stop`: as `add_imu` of each of them."""
-        stop = len(block) if stop is None else stop
-        source = self._imus.get(name)
-        if source is None:
-            self.unknown_samples += max(stop - start, 0)
-            return
-        if block.breaks != self._breaks.get(name, 0) and start < stop:
-            self._breaks[name] = block.breaks
-            self._forget(f"imu {name} restarted", name)
-        self._take_block(source, block, start, stop)
-
-    def _take_block(self, source: Source, block: Block, start: int, stop: int) -> None:
-        while start < stop:
-            start, ended = source.batches.take(block, start, stop)
-            if ended:
-                self._evaluate()
-
     def add_tilt(self, sample: TiltSample) -> None:
         """Take one reading of the gradienter; dropped when none is expected."""
         if self._field is not None:
@@ -119,32 +84,6 @@ class Intake(ABC):
             self.unknown_samples += 1
         elif self._tilt.batches.add(sample.t_s, (sample.x_deg, sample.y_deg), sample.temperature_degc):
             self._evaluate()
-
-    def add_tilts(self, block: PoseBlock, start: int = 0, stop: int | None = None) -> None:
-        """Take readings of the gradienter from `start` up to, without, `stop`: as `add_tilt` of each of them."""
-        stop = len(block) if stop is None else stop
-        if start >= stop:
-            return
-        if self._field is not None:
-            x_deg, y_deg = block.rows[stop - 1].tolist()
-            self._field.take_tilt(TiltSample(float(block.t_s[stop - 1]), x_deg, y_deg))
-        if self._tilt is None:
-            self.unknown_samples += stop - start
-        else:
-            self._take_block(self._tilt, block, start, stop)
-
-    def add_headings(self, block: PoseBlock, start: int = 0, stop: int | None = None) -> None:
-        """Take headings of the device's own from `start` up to, without, `stop`: as `add_compass` of each of them."""
-        stop = len(block) if stop is None else stop
-        if start >= stop:
-            return
-        latest = CompassSample(float(block.t_s[stop - 1]), float(block.rows[stop - 1, 0]))
-        if self._field is not None and not self._field.takes_own(latest):
-            return
-        if self._heading is None:
-            self.unknown_samples += stop - start
-        else:
-            self._take_block(self._heading, block, start, stop)
 
     def add_compass(self, sample: CompassSample) -> bool:
         """Take one heading of the device's own; whether it is the one that counts (else that from its field does)."""

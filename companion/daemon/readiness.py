@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from typing import Final, Literal
 
 from companion.autopilot.vehicle import ArmState, Vehicle
@@ -69,8 +69,6 @@ class Readiness:
         self._woken = asyncio.Event()
         self.on_beat: Callable[[], None] = lambda: None
         """Called after every look that came to its end."""
-        self.pause: Callable[[float], Awaitable[None]] = asyncio.sleep
-        """Sleeps between two looks."""
 
     @property
     def at_arm(self) -> AtArm:
@@ -105,7 +103,7 @@ class Readiness:
             except Exception:
                 # Without a renewed answer the gate closes by itself.
                 logger.exception("looking whether it may arm failed")
-            await self.pause(POLL_S)
+            await asyncio.sleep(POLL_S)
 
     def look(self) -> None:
         """Work out the answer anew."""

@@ -7,7 +7,7 @@ import logging
 import math
 import os
 from collections.abc import Callable, Sequence
-from typing import Final, TypeGuard
+from typing import Final
 
 from companion.daemon.ledger import Offload
 from companion.daemon.sensor_health import SensorHealth
@@ -19,7 +19,7 @@ from companion.links.together import Together
 from companion.protocols.registry import Kind
 from companion.protocols.roles import Part
 from companion.protocols.stream_health import SILENT_AFTER_S
-from companion.samples import CompassSample, ImuSample, Sample
+from companion.samples import CompassSample, Sample
 
 logger = logging.getLogger(__name__)
 
@@ -36,13 +36,7 @@ HELD_AGAIN_S: Final = 5.0
 MOST_WORDS: Final = 20
 """Different things said to one device that are told in the log."""
 
-_IMU_ONLY: Final = {ImuSample}
 _WANTED: Final[dict[Kind, str]] = {"imu": "rates", "gradienter": "tilt", "compass": "heading"}
-
-
-def is_plain(samples: Sequence[Sample]) -> TypeGuard[Sequence[ImuSample]]:
-    """Whether they are readings of an IMU, at least one, and nothing else."""
-    return set(map(type, samples)) == _IMU_ONLY
 
 
 class SensorRole:
@@ -56,9 +50,9 @@ class SensorRole:
         self._counted = (0.0, 0)
         self._rate_hz = 0.0
 
-    def count(self, t_s: float, samples: int = 1) -> None:
-        """So many samples have been taken from bytes that were read at `t_s`."""
-        self._samples += samples
+    def count(self, t_s: float) -> None:
+        """A sample has been taken from bytes that were read at `t_s`."""
+        self._samples += 1
         self._last_s = t_s
         since_s, before = self._counted
         if t_s - since_s >= RATE_SPAN_S:
@@ -111,7 +105,6 @@ class SerialSensor:
         device: which, and how its line is set.
         take: gets what each role takes of each sample.
         offload: runs a blocking call elsewhere.
-        take_many: gets, instead, what an IMU's role takes of a read that brought nothing but readings of an IMU.
         together: waits for the reads of an IMU that is read at intervals.
     """
 
@@ -120,7 +113,6 @@ class SerialSensor:
         device: SerialDevice,
         take: Callable[[Role, Part], None],
         offload: Offload = asyncio.to_thread,
-        take_many: Callable[[Role, Sequence[ImuSample]], None] | None = None,
         together: Together | None = None,
     ) -> None:
         settings = PortSettings(device.port, device.baud, device.parity)
@@ -146,7 +138,7 @@ class SerialSensor:
         """Called with (name, bytes, time) before they are decoded; without bytes: some are missing."""
         self.on_samples: Callable[[Sequence[Sample], float], object] | None = None
         """Called with all samples of a read, and its time, before anybody else gets them: for what must not wait."""
-        self._take, self._offload, self._take_many = take, offload, take_many
+        self._take, self._offload = take, offload
         self._by_role = dict(zip(device.roles, self.roles, strict=True))
         self.other_north: str | None = None
         """The north of headings that were refused because another one is configured."""
@@ -214,18 +206,12 @@ class SerialSensor:
             self._breaks = breaks
             logger.warning("%s: the device restarted, or its clock jumped; measuring afresh", self.link.name)
         self.health.stream.took(data, samples, t_s)
-        if self._take_many is not None and is_plain(samples):
-            for used_as in self.roles:
-                if used_as.kind == "imu":
-                    used_as.count(t_s, len(samples))
-                    self._take_many(used_as.role, samples)
-        else:
-            for sample in samples:
-                if isinstance(sample, CompassSample) and any(role.refuses(sample) for role in self.device.roles):
-                    self.other_north = sample.north
-                for role, part in parts_of(sample, self.device.roles):
-                    self._by_role[role].count(t_s)
-                    self._take(role, part)
+        for sample in samples:
+            if isinstance(sample, CompassSample) and any(role.refuses(sample) for role in self.device.roles):
+                self.other_north = sample.north
+            for role, part in parts_of(sample, self.device.roles):
+                self._by_role[role].count(t_s)
+                self._take(role, part)
         if self.dialogue is not None and self._openings:
             self.dialogue.heard(data, len(samples), t_s)
             self._speak(t_s)
@@ -236,10 +222,7 @@ class SerialSensor:
         """Ask what is due: often while a conversation goes on, seldom otherwise, so that a stream costs no ticks."""
         loop = asyncio.get_running_loop()
         while True:
-            if self._is_lively(loop.time()):
-                await asyncio.sleep(TICK_S)
-            else:
-                await self._together.sleep(COARSE_S)
+            await asyncio.sleep(TICK_S if self._is_lively(loop.time()) else COARSE_S)
             if self.link.connected and loop.time() >= self._look_at_s:
                 await self._look_for_others()
             self._speak(loop.time())

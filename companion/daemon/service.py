@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from companion.autopilot.ekf import EkfWatch
@@ -112,8 +112,7 @@ class Service:
         self._imu_rate_hz = models.imu_rate_hz(config) if imu_rate_hz is None else imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}
         self.sensors = [
-            SerialSensor(device, self._take, offload, self._take_many, self.link.together)
-            for device in serial_devices(config)
+            SerialSensor(device, self._take, offload, self.link.together) for device in serial_devices(config)
         ]
         self.sensor_watch = SensorWatch(self.sensors, self.collector, self._corrected, self._say)
         self.recorder = Recorder(
@@ -181,7 +180,6 @@ class Service:
         self.alignment.on_change = self.in_force.realigned
         self.readiness = Readiness(self.vehicle, self.collector, self.conductor, self.mender, self.in_force)
         self.readiness.reboot_owed = lambda: reboot.owed
-        self.readiness.pause = self.link.together.sleep
         self.automatic = Automatic(
             self.vehicle,
             self.collector,
@@ -337,9 +335,6 @@ class Service:
         reading = collect(self.collector, role, part)
         if reading is not None:
             self.pose.take(reading)
-
-    def _take_many(self, role: Role, samples: Sequence[ImuSample]) -> None:
-        self.collector.add_many(role.name, samples)
 
     async def run(self) -> None:
         """Run until cancelled, reachable on the control socket.

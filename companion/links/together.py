@@ -7,7 +7,6 @@ came. While nothing drives, nothing waits.
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from collections.abc import Callable
 from typing import Final
@@ -31,7 +30,6 @@ class Together:
 
     def __init__(self) -> None:
         self._waiting: list[tuple[Take, bytes, float]] = []
-        self._sleepers: list[tuple[float, asyncio.Future[None]]] = []
         self._drivers = 0
         self._turns = 0
         """Of the drivers, since something was taken."""
@@ -56,9 +54,6 @@ class Together:
         self._drivers -= 1
         if self._drivers == 0:
             self.take()
-            sleepers, self._sleepers = self._sleepers, []
-            for due_s, sleeper in sleepers:
-                sleeper.get_loop().call_at(due_s, _wake, sleeper)
 
     def put(self, take: Take, data: bytes, t_s: float) -> None:
         """Let bytes that came at `t_s` wait for the next `take`; where nothing drives they are taken now."""
@@ -67,12 +62,10 @@ class Together:
             self.take()
 
     def turn(self, now_s: float) -> None:
-        """A driver is about to read: take what waits when it is time to, and wake who sleeps."""
+        """A driver is about to read: take what waits when it is time to."""
         self._turns += 1
         if self._turns >= TURNS or now_s % 1.0 < SECOND_S:
             self.take()
-        if self._sleepers:
-            self._wake_sleepers(now_s)
 
     def take(self) -> None:
         """Take all that waits, in its order."""
@@ -90,28 +83,3 @@ class Together:
                         logger.exception("taking what has waited failed")
         finally:
             self._taking = False
-
-    async def sleep(self, seconds: float) -> None:
-        """Sleep for so long; where something drives, until its turn after that, for what is not urgent."""
-        if not self.driven:
-            await asyncio.sleep(seconds)
-            return
-        loop = asyncio.get_running_loop()
-        entry = (loop.time() + seconds, loop.create_future())
-        self._sleepers.append(entry)
-        try:
-            await entry[1]
-        finally:
-            if entry in self._sleepers:
-                self._sleepers.remove(entry)
-
-    def _wake_sleepers(self, now_s: float) -> None:
-        due = [entry for entry in self._sleepers if entry[0] <= now_s]
-        for entry in due:
-            self._sleepers.remove(entry)
-            _wake(entry[1])
-
-
-def _wake(sleeper: asyncio.Future[None]) -> None:
-    if not sleeper.done():
-        sleeper.set_result(None)

@@ -9,17 +9,10 @@ from __future__ import annotations
 import binascii
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar, Final, Literal
+from typing import ClassVar, Final
 
 from companion.protocols.clock import SampleTimes
 from companion.samples import Sample
-
-if TYPE_CHECKING:  # numpy is for those who have many readings at once
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from companion.protocols.bulk import Block, Floats, Lines, PoseBlock
 
 AHEAD_S = 0.5
 """So far ahead of its line no stream gets: a baud rate then means nothing on that port (USB without a UART)."""
@@ -73,8 +66,6 @@ class Decoder(ABC):
     """`ImuSample.t_device_s` starts again at 0 after so long; None where the device has no clock, or it never does."""
     sequence_modulus: ClassVar[int | None] = None
     """`ImuSample.sequence` counts modulo this; None where there is none, or it never wraps."""
-    many: ClassVar[Literal["imu", "gradienter", "compass"] | None] = None
-    """Whose readings `receive_many` gives; None where it never gives any."""
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         self.seconds_per_byte = seconds_per_byte
@@ -102,35 +93,6 @@ class Decoder(ABC):
         if self.seconds_per_byte:
             self._check_line(len(data), t_s)
         return self.times.place(samples, t_s, self.frame_bytes * self.seconds_per_byte) if samples else samples
-
-    def receive_many(self, reads: Sequence[bytes], read_s: Sequence[float]) -> Block | None:
-        """The same as `receive` for one read after the other, at once and much quicker, where the stream is regular.
-
-        None: it is not, or this decoder knows no quicker way; then nothing was taken. Samples other than those of the
-        kind `many` are left out.
-        """
-        del reads, read_s
-        return None
-
-    def _line_after(self, lengths: NDArray[np.int64], read_s: Floats) -> float | None:
-        """How far ahead of its line the stream is after so many reads; None where it is too far, or nobody knows."""
-        import numpy as np
-
-        if self._read_s is None:
-            return None
-        ahead_s = self._ahead_s
-        steps_s = lengths * self.seconds_per_byte - np.diff(read_s, prepend=self._read_s)
-        # One after the other, like the sums of `_check_line`.
-        sums_s = np.add.accumulate(np.concatenate(([ahead_s], steps_s)))
-        if sums_s.min() >= -_STALL_S and sums_s.max() <= AHEAD_S:
-            return float(sums_s[-1])
-        for step_s in steps_s.tolist():
-            ahead_s += step_s
-            if ahead_s < -_STALL_S:
-                ahead_s = -_STALL_S
-            elif ahead_s > AHEAD_S:
-                return None
-        return ahead_s
 
     def _check_line(self, received: int, t_s: float) -> None:
         """Find out whether bytes come faster than the line could carry them: then its line time means nothing."""
@@ -191,46 +153,6 @@ class LineDecoder(Decoder):
         self._partial = partial
         return samples
 
-    def receive_many(self, reads: Sequence[bytes], read_s: Sequence[float]) -> PoseBlock | None:  # noqa: D102
-        text = b"".join((self._partial, *reads))
-        end = text.rfind(b"\n") + 1
-        lines = None if self._cut or not end or len(text) - end > self.LIMIT else self._lines(text[:end])
-        if lines is None:
-            return None
-        import numpy as np
-
-        from companion.protocols.bulk import PoseBlock
-
-        lengths = np.fromiter(map(len, reads), np.int64, len(reads))
-        read_at_s = np.array(read_s)
-        ahead_s = self._line_after(lengths, read_at_s) if self.seconds_per_byte else self._ahead_s
-        if ahead_s is None:
-            return None
-        read_ends = len(self._partial) + np.cumsum(lengths)
-        read = np.searchsorted(read_ends, lines.ends)
-        came_s = read_at_s[read] - self.seconds_per_byte * (read_ends[read] - lines.ends)
-        # All that one read brought is placed by the length of the last of it.
-        latest = np.searchsorted(read, read, side="right") - 1
-        arrival_s = came_s - lines.frame_bytes[latest] * self.seconds_per_byte
-        times = self.times.place_many(arrival_s, read_at_s[read], None)
-        if times is None:
-            return None
-        self._partial = text[end:]
-        if self.seconds_per_byte:
-            self._ahead_s, self._read_s = ahead_s, read_s[-1]
-        self.accepted += len(lines.rows)
-        self.frame_bytes = int(lines.frame_bytes[-1])
-        vars(self).update(lines.state)
-        return PoseBlock(times.t_s, lines.rows, read)
-
-    def _lines(self, text: bytes) -> Lines | None:
-        """What is in whole lines that are all good readings of the kind `many`, at least one.
-
-        None where that is not so, or nobody knows how to tell; nothing is changed.
-        """
-        del text
-        return None
-
     def interrupted(self) -> None:  # noqa: D102 - as in the base class
         if self._partial:
             self.rejected[CUT_SHORT] += 1
@@ -267,38 +189,24 @@ class SentenceDecoder(Decoder):
         text = self._partial + data.replace(b"\r", b"\n")
         lines = text.split(b"\n")
         remaining, partial = len(text), lines.pop()
-        seconds_per_byte, limit, read = self.seconds_per_byte, self.LIMIT, self._read
         samples: list[Sample] = []
-        accepted, latest = 0, b""
         for line in lines:
             if not line:
                 remaining -= 1
                 continue
             remaining -= len(line) + 1
+            sentence = self._last_sentence(line)
+            if not sentence:
+                continue
             try:
-                # Nearly every line is one whole sentence with two digits; only the others need a closer look.
-                if line.rfind(b"$") == 0 and len(line) <= limit:
-                    digits = _HEXADECIMAL.get(line[-2:])
-                    if digits is not None and line[-3] == _STAR:
-                        body = line[1:-3]
-                        if xor_checksum(body) != digits:
-                            raise RejectedError(CHECKSUM)
-                    else:
-                        body = body_of_sentence(line)
-                elif sentence := self._last_sentence(line):
-                    body = body_of_sentence(sentence)
-                else:
-                    continue
-                read(body, t_s - seconds_per_byte * remaining, samples)
-                accepted += 1
-                latest = line
+                self._read(body_of_sentence(sentence), t_s - self.seconds_per_byte * remaining, samples)
             except RejectedError as error:
                 self.rejected[error.reason] += 1
             except ValueError:
                 self.rejected[NOT_A_NUMBER] += 1
-        if accepted:
-            self.accepted += accepted
-            self.frame_bytes = len(latest) + 1
+            else:
+                self.accepted += 1
+                self.frame_bytes = len(line) + 1
         if partial or self._partial:
             self._partial = self._last_sentence(partial)
         return samples
@@ -342,36 +250,18 @@ _HEXADECIMAL: Final = {
     (high + low).encode(): int(high + low, 16) for high in "0123456789abcdefABCDEF" for low in "0123456789abcdefABCDEF"
 }
 """Every way to write a byte; a look-up is quicker than `int` and takes no "+5"."""
-_STAR: Final = ord("*")
-_from_bytes: Final = int.from_bytes
 
 
 def xor_checksum(body: bytes) -> int:
     """The checksum of NMEA 0183 and of its imitators: all bytes between "$" and "*" exclusive-ored."""
-    folded, size = _from_bytes(body, "little"), len(body)
-    # Fold halves onto each other: a loop over the bytes of a longer sentence takes several times as long.
-    if size > 32:
-        if size > 64:
-            if size > 128:
-                folded = _fold_long(folded, size)
-            folded ^= folded >> 512
-        folded ^= folded >> 256
-    folded ^= folded >> 128
-    folded ^= folded >> 64
-    folded ^= folded >> 32
-    folded ^= folded >> 16
-    return (folded ^ folded >> 8) & 0xFF
-
-
-def _fold_long(folded: int, size: int) -> int:
-    """Fold all that lies beyond 128 bytes onto them."""
-    shift = 1024
-    while shift * 2 < size * 8:
+    folded, shift = int.from_bytes(body, "little"), 8
+    while shift < 8 * len(body):
         shift *= 2
-    while shift >= 1024:
+    # Halves folded onto each other: a loop over the bytes takes several times as long.
+    while shift >= 8:
         folded ^= folded >> shift
         shift //= 2
-    return folded
+    return folded & 0xFF
 
 
 def body_of_sentence(sentence: bytes) -> bytes:
@@ -383,7 +273,7 @@ def body_of_sentence(sentence: bytes) -> bytes:
         RejectedError: there is no checksum, or it is wrong.
     """
     expected = _HEXADECIMAL.get(sentence[-2:])
-    if expected is not None and sentence[-3] == _STAR:
+    if expected is not None and sentence[-3:-2] == b"*":
         body = sentence[1:-3]
         if xor_checksum(body) != expected:
             raise RejectedError(CHECKSUM)

@@ -12,17 +12,13 @@ new ones); one that jumped forward belongs to another device, or the host slept.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections import Counter
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
 import msgspec
 
 from companion.samples import ImuSample, Sample
-
-if TYPE_CHECKING:  # who has one sample at a time does without numpy
-    from companion.protocols.bulk import Floats
 
 CREEP: Final = 100e-6
 """How fast the minimum may rise: two crystals of 50 ppm. A ceramic resonator is followed in steps of `STEP_S`."""
@@ -43,18 +39,6 @@ _BOOT_S: Final = 2.0
 """By so much more than it was not heard a device that restarted meanwhile may have been up: what waited unread."""
 
 LATE: Final = "late"
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class ManyTimes:
-    """Times of many samples, (n,) each."""
-
-    t_s: Floats
-    """By the host's clock."""
-    device_s: Floats | None
-    """By the device's own, unwrapped."""
-    clock: dict[str, Any]
-    """What `DeviceClock` knows behind them."""
 
 
 class DeviceClock:
@@ -135,61 +119,6 @@ class DeviceClock:
             delay_s -= self._step(arrival_s)
         return None if delay_s > LATE_S else arrival_s - delay_s
 
-    def host_many(self, raw_s: Floats, arrival_s: Floats) -> ManyTimes | None:
-        """`host_s` of one sample after the other, at once; None where a clock jumps or wraps or a sample is late.
-
-        Nothing changes until `keep` is told of what was found.
-        """
-        import numpy as np
-
-        if math.isnan(self._offset_s):
-            return None
-        advance_s = np.diff(raw_s, prepend=self._raw_s)
-        elapsed_s = np.diff(arrival_s, prepend=self._arrival_s)
-        if not ((advance_s >= 0.0) & (elapsed_s - advance_s <= LATE_S)).all():
-            return None
-        # One after the other, like the sums of `host_s`.
-        device_s = np.add.accumulate(np.concatenate(([self.device_s], advance_s)))[1:]
-        offset_s, delays = self._offset_s, []
-        for creep_s, lead_s in zip((CREEP * advance_s).tolist(), (arrival_s - device_s).tolist(), strict=True):
-            offset_s += creep_s
-            delay_s = lead_s - offset_s
-            if delay_s < 0.0:
-                if delay_s < -LATE_S:
-                    return None
-                offset_s += delay_s
-                delay_s = 0.0
-            delays.append(delay_s)
-        delay = np.array(delays)
-        spans = self._spans_after(delay, arrival_s) if delay.max() <= LATE_S else None
-        if spans is None:
-            return None
-        found = {"device_s": float(device_s[-1]), "_raw_s": float(raw_s[-1]), "_arrival_s": float(arrival_s[-1])}
-        return ManyTimes(
-            arrival_s - delay, device_s, {**found, **spans, "_offset_s": offset_s, "_restarted_in_silence": False}
-        )
-
-    def _spans_after(self, delay_s: Floats, arrival_s: Floats) -> dict[str, Any] | None:
-        """The span under way behind these samples; None where at the end of one the offset has to rise."""
-        span_end_s, least_s, seen = self._span_end_s, self._least_s, self._seen
-        start, count = 0, len(delay_s)
-        while start < count:
-            first = start + max(SPAN_SAMPLES - seen - 1, 0)
-            over = arrival_s[first:] >= span_end_s
-            end = first + int(over.argmax()) + 1 if over.any() else count
-            least_s = min(least_s, float(delay_s[start:end].min()))
-            seen += end - start
-            if over.any():
-                if least_s > STEP_S:
-                    return None
-                span_end_s, least_s, seen = float(arrival_s[end - 1]) + SPAN_S, math.inf, 0
-            start = end
-        return {"_span_end_s": span_end_s, "_least_s": least_s, "_seen": seen}
-
-    def keep(self, found: ManyTimes) -> None:
-        """The samples of `host_many` were taken."""
-        vars(self).update(found.clock)
-
     def _unwrapped(self, advance_s: float, elapsed_s: float) -> float:
         """How far the clock went on since the last sample; negative: it went back, and not because it wraps."""
         if self._wraps_s is None:
@@ -260,11 +189,7 @@ class SampleTimes:
                 if t_s is None:
                     self.dropped[LATE] += 1
                     continue
-                # `_in_order`, written out.
-                if t_s < self._newest_s <= read_s:
-                    t_s = self._newest_s
-                else:
-                    self._newest_s = t_s
+                t_s = self._in_order(t_s, read_s)
                 gyro, accel, warm = sample.gyro_rad_s, sample.accel_m_s2, sample.temperature_degc
                 placed.append(ImuSample(t_s, gyro, accel, warm, sequence, device_s, breaks))
                 # Whatever else the same frame brought was taken at the same time.
@@ -273,29 +198,6 @@ class SampleTimes:
                 t_s = frame_t_s if at_s == frame_at_s else self._in_order(at_s - frame_s, read_s)
                 placed.append(msgspec.structs.replace(sample, t_s=t_s))
         return placed
-
-    def place_many(self, arrival_s: Floats, read_s: Floats, device_s: Floats | None) -> ManyTimes | None:
-        """The times of many samples of an IMU without a counter, as `place` gives them; None: one at a time, please.
-
-        Args:
-            arrival_s: (n,) when the first byte of each one's frame came.
-            read_s: (n,) when the read was that completed it.
-            device_s: (n,) its device's clock, as sent.
-        """
-        import numpy as np
-
-        found = ManyTimes(arrival_s, None, {}) if device_s is None else self.clock.host_many(device_s, arrival_s)
-        if found is None:
-            return None
-        times_s = np.concatenate(([self._newest_s], found.t_s))
-        if not (times_s[1:] >= times_s[:-1]).all():
-            times_s = np.maximum.accumulate(times_s)
-            # Only a sample whose read came before the newest may go backwards, which nobody here has to understand.
-            if not (times_s[:-1] <= read_s).all():
-                return None
-        self.clock.keep(found)
-        self._newest_s = float(times_s[-1])
-        return dataclasses.replace(found, t_s=times_s[1:])
 
     def status(self) -> dict[str, object]:
         """For people: what the device's clock did, and what was dropped for it."""

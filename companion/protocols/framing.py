@@ -7,14 +7,10 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from companion.protocols.base import CUT_SHORT, Decoder
 from companion.samples import Sample
-
-if TYPE_CHECKING:
-    from companion.protocols.bulk import Frames, ImuBlock
 
 WAIT: Final = -1
 """More bytes are needed to tell."""
@@ -48,8 +44,7 @@ class FrameDecoder(Decoder):
             if end == WAIT:
                 break
             if self.accepted != accepted:
-                # Where it took several, they were alike.
-                self.frame_bytes = (end - at) // (self.accepted - accepted)
+                self.frame_bytes = end - at
             at = end
         self._buffer = buffer[at:]
         while self._chunks and self._chunks[0][0] <= origin + at:
@@ -62,69 +57,11 @@ class FrameDecoder(Decoder):
         self._buffer = b""
         self._chunks.clear()
 
-    def receive_many(self, reads: Sequence[bytes], read_s: Sequence[float]) -> ImuBlock | None:  # noqa: D102
-        buffer = b"".join((self._buffer, *reads))
-        frames = self._frames(buffer)
-        if frames is None or not all(reads):
-            return None
-        import numpy as np
-
-        from companion.protocols.bulk import ImuBlock
-
-        lengths = np.fromiter(map(len, reads), np.int64, len(reads))
-        read_at_s = np.array(read_s)
-        ahead_s = self._line_after(lengths, read_at_s) if self.seconds_per_byte else self._ahead_s
-        if ahead_s is None:
-            return None
-        # Where in the stream every frame and every read ends.
-        first = self._received - len(self._buffer)
-        ends = first + frames.frame_bytes * np.arange(1, len(frames.rows) + 1)
-        before = len(self._chunks)
-        chunk_ends = np.concatenate(([end for end, _ in self._chunks], self._received + np.cumsum(lengths))).astype(int)
-        chunk_s = np.concatenate(([t_s for _, t_s in self._chunks], read_at_s))
-        # Nearly always every read was one frame.
-        chunk = np.arange(len(ends)) if np.array_equal(chunk_ends, ends) else np.searchsorted(chunk_ends, ends)
-        came_s = chunk_s[chunk] - self.seconds_per_byte * (chunk_ends[chunk] - ends)
-        arrival_s = came_s - frames.frame_bytes * self.seconds_per_byte
-        times = self.times.place_many(arrival_s, chunk_s[chunk], frames.device_s)
-        if times is None:
-            return None
-        consumed = int(ends[-1])
-        self._received = int(chunk_ends[-1])
-        self._buffer = buffer[consumed - first :]
-        left = int(np.searchsorted(chunk_ends, consumed, side="right"))
-        self._chunks = deque(zip(chunk_ends[left:].tolist(), chunk_s[left:].tolist(), strict=True))
-        if self.seconds_per_byte:
-            self._ahead_s, self._read_s = ahead_s, read_s[-1]
-        self.accepted += len(ends)
-        self.frame_bytes = frames.frame_bytes
-        self._took(frames)
-        return ImuBlock(
-            t_s=times.t_s,
-            rows=frames.rows,
-            temperature_degc=frames.temperature_degc,
-            stamps=times.device_s,
-            breaks=self.times.clock.breaks,
-            reads=np.maximum(chunk - before, 0),
-        )
-
-    def _frames(self, buffer: bytes) -> Frames | None:
-        """What is in a buffer that holds nothing but whole good frames of one kind, each with one reading of an IMU.
-
-        The last may be cut. None where that is not so, or nobody knows how to tell; nothing is changed.
-        """
-        del buffer
-        return None
-
-    def _took(self, frames: Frames) -> None:
-        """What `_frames` found has been taken."""
-
     @abstractmethod
     def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         """Read what begins at `at`, of which `origin` is the buffer's place in the stream.
 
         Returns where to go on, always further on, or `WAIT`. How much of it has arrived must not change the outcome.
-        Several frames of one length may be taken at once where all of them are accepted.
         """
 
     def _skip_to(self, start: bytes, buffer: bytes, at: int) -> int:

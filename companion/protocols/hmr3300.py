@@ -12,9 +12,7 @@ is believed only if it follows a whole line end: the rest "3.4, 18.6, -0.5" of a
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, ClassVar
-
-import msgspec
+from typing import ClassVar
 
 from companion.protocols.base import (
     CALIBRATING,
@@ -32,10 +30,6 @@ from companion.protocols.base import (
 )
 from companion.samples import CompassSample, MagSample, Sample
 
-if TYPE_CHECKING:
-    from companion.protocols.bulk import Lines
-
-_numbers = msgspec.json.Decoder(list[float])
 _DEGREES = re.compile(rb"[+-]?\d{1,3}\.\d{1,3}")
 _COUNTS = re.compile(rb"[+-]?\d{1,6}")
 _FRAGMENT = re.compile(rb"[-+0-9., ]+")
@@ -49,7 +43,6 @@ class Hmr3300Decoder(LineDecoder):
     """Lines of an HMR3300 or HMR3200; gives `CompassSample`, or `MagSample` in counts in mode *M."""
 
     LIMIT: ClassVar[int] = 40
-    many = "compass"
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)
@@ -80,43 +73,6 @@ class Hmr3300Decoder(LineDecoder):
         if not follows_line_end:
             raise RejectedError(CUT_SHORT)
         return self._measurement(text, t_s)
-
-    def _lines(self, text: bytes) -> Lines | None:
-        """Lines of three angles, `123.4, 18.6, -0.5`, whose digits JSON would write so too."""
-        count = text.count(b"\r\n")
-        if not self._follows_line_end or text.translate(None, b"0123456789.-, \r\n"):
-            return None
-        if not count == text.count(b"\r") == text.count(b"\n") or text.count(b".") != 3 * count:
-            return None
-        try:
-            flat = _numbers.decode(b"[" + text[:-2].replace(b"\r\n", b",") + b"]")
-        except msgspec.MsgspecError:
-            return None
-        import numpy as np
-
-        from companion.protocols.bulk import Lines
-
-        octets = np.frombuffer(text, np.uint8)
-        ends, commas = (np.flatnonzero(octets == ord(each)) for each in "\n,")
-        if len(flat) != 3 * count or len(commas) != 2 * count:
-            return None
-        starts, between = np.append(0, ends[:-1] + 1), commas.reshape(count, 2)
-        if not ((between[:, 0] > starts).all() and (between[:, 1] < ends).all()):
-            return None
-        # Behind each point at most three decimals, then the comma or the line's end.
-        stops = np.column_stack((between, ends - 1)).ravel()
-        if (stops - np.flatnonzero(octets == ord("."))).max() > 4 or (ends - starts).max() > self.LIMIT:
-            return None
-        values = np.array(flat).reshape(count, 3)
-        headings, tilts = values[:, 0], values[:, 1:]
-        if not ((headings >= 0.0) & (headings < 360.0)).all() or np.abs(tilts).max() > 90.0:
-            return None
-        return Lines(
-            rows=values[:, :1].copy(),
-            ends=ends + 1,
-            frame_bytes=ends + 1 - starts,
-            state={"_triples": min(self._triples + count, _SURE), "_singles": 0},
-        )
 
     def _measurement(self, text: bytes, t_s: float) -> Sample:
         if text.startswith(b"#"):

@@ -11,7 +11,7 @@ first. Commands are single letters that the device echoes; an echo in front of a
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from companion.protocols.base import (
     CUT_SHORT,
@@ -29,9 +29,6 @@ from companion.protocols.base import (
 )
 from companion.samples import TiltSample
 
-if TYPE_CHECKING:
-    from companion.protocols.bulk import Lines
-
 _LAST_AXIS = re.compile(rb".*([XY])=", re.DOTALL)
 _DEGREES = re.compile(rb"[+-]\d\d\.(\d{2,3})")
 _SENTINEL = re.compile(rb"\+{3,}|-{3,}")
@@ -41,8 +38,6 @@ _DAMAGED = re.compile(rb"[\x00\x80-\xff]")
 _SURE = 4
 """So many readings running with fewer decimals than before are the device's way; fewer of them have lost a digit."""
 
-_X, _Y, _END = tuple(b"X="), tuple(b"Y="), tuple(b"\r\n")
-
 _SPOILED: Literal["spoiled"] = "spoiled"
 
 
@@ -50,7 +45,6 @@ class InclinometerXyDecoder(LineDecoder):
     """Pairs of lines of an `X=.../Y=...` gradienter; gives `TiltSample`, timed at the end of the Y line."""
 
     LIMIT: ClassVar[int] = 64
-    many = "gradienter"
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)
@@ -86,44 +80,6 @@ class InclinometerXyDecoder(LineDecoder):
         self._x(text)
         self._x_bytes = len(line) + 1
         return None
-
-    def _lines(self, text: bytes) -> Lines | None:
-        """Lines `X=+00.430` and `Y=-01.250` in turn, with as many decimals as ever."""
-        import numpy as np
-
-        from companion.protocols.bulk import Lines, fixed_point
-
-        if not self._decimals or self._x_deg == _SPOILED:
-            return None
-        waiting = isinstance(self._x_deg, float)
-        size = len(_X) + 3 + self._decimals + 3
-        count, left = divmod(len(text), size)
-        if left or count + waiting < 2:
-            return None
-        table = np.frombuffer(text, np.uint8).reshape(count, size)
-        first, second = (_Y, _X) if waiting else (_X, _Y)
-        if not ((table[0::2, :2] == first).all() and (table[1::2, :2] == second).all()):
-            return None
-        if not (table[:, -2:] == _END).all():
-            return None
-        values = fixed_point(table[:, 2:-2], self._decimals)
-        if values is None or np.abs(values).max() > 90.0:
-            return None
-        sizes = np.full(count, size)
-        if isinstance(self._x_deg, float):
-            values, sizes = np.append(self._x_deg, values), np.append(self._x_bytes, sizes)
-        pairs = len(values) // 2
-        rest = values[2 * pairs :].tolist()
-        return Lines(
-            rows=values[: 2 * pairs].reshape(pairs, 2),
-            ends=size * np.arange(2 - waiting, count + 1, 2),
-            frame_bytes=sizes[: 2 * pairs].reshape(pairs, 2).sum(axis=1),
-            state={
-                "_x_deg": rest[0] if rest else None,
-                "_x_bytes": size if count > 1 else self._x_bytes,
-                "_fewer_running": 0,
-            },
-        )
 
     def _frame_bytes(self, line: bytes) -> int:
         """Both lines: a pair is taken together, before the first of them is sent."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import binascii
 import re
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from companion.protocols.base import (
     CHECKSUM,
@@ -23,20 +23,10 @@ from companion.protocols.base import (
     RejectedError,
     body_of_sentence,
 )
-from companion.protocols.checks import (
-    ACCEL_LIMIT_M_S2,
-    GYRO_LIMIT_RAD_S,
-    TEMPERATURE_LIMIT_DEGC,
-    check_attitude,
-    check_imu,
-    numbers,
-)
+from companion.protocols.checks import check_attitude, check_imu, numbers
 from companion.protocols.framing import WAIT, FrameDecoder
 from companion.protocols.vectornav_binary import Layout, header_bytes, layout_of
 from companion.samples import AttitudeSample, ImuSample, MagSample, Sample
-
-if TYPE_CHECKING:
-    from companion.protocols.bulk import Frames
 
 SENTENCE_LIMIT = 250
 """Bytes of a sentence after its "$"; the longest asynchronous one has some 200."""
@@ -57,7 +47,6 @@ class VectorNavDecoder(FrameDecoder):
     """VectorNav outputs; gives `ImuSample`, `AttitudeSample` and `MagSample` as far as a frame has them."""
 
     device_clock_wraps_s: ClassVar[float | None] = 2**64 / 1e9
-    many = "imu"
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)
@@ -79,11 +68,6 @@ class VectorNavDecoder(FrameDecoder):
         """Where to go on after what begins with a sync byte, or `WAIT` for more bytes."""
         available, header = len(buffer) - at, self._header
         layout = self._layouts.get(header) if header and buffer.startswith(header, at) else None
-        if layout is not None and layout.is_plain:
-            # The next ones of many that are alike.
-            end = self._run(buffer, at, origin, samples, layout)
-            if end > at:
-                return end
         if layout is None:
             if available < 2:
                 return WAIT
@@ -113,67 +97,6 @@ class VectorNavDecoder(FrameDecoder):
         except RejectedError as error:
             self.rejected[error.reason] += 1
         return end
-
-    def _frames(self, buffer: bytes) -> Frames | None:
-        header = self._header
-        if not header or not buffer.startswith(header):
-            return None
-        layout = self._layouts.get(header) or layout_of(header)
-        whole = len(buffer) // layout.frame_bytes * layout.frame_bytes
-        if not buffer.startswith(header[: len(buffer) - whole], whole):
-            return None
-        return layout.frames(header, buffer, whole)
-
-    def _took(self, frames: Frames) -> None:
-        self._layouts[frames.header] = layout_of(frames.header)
-
-    def _run(self, buffer: bytes, at: int, origin: int, samples: list[Sample], layout: Layout) -> int:
-        """Take plain frames with the last good one's header, one behind the other, as long as they are whole and good.
-
-        They are all that a fast IMU sends; here they cost half. Returns where to go on.
-        """
-        size, header, offset = layout.frame_bytes, self._header, layout.payload_offset
-        unpack, crc, line_s = layout.payload.unpack_from, binascii.crc_hqx, self.seconds_per_byte
-        assert layout.imu is not None
-        (gyro, accel), warm, startup = layout.imu, layout.temperature, layout.time_startup
-        behind_gyro, behind_accel = gyro + 3, accel + 3
-        last, before = len(buffer) - size, len(samples)
-        most_rad_s, most_m_s2, most_degc = GYRO_LIMIT_RAD_S, ACCEL_LIMIT_M_S2, TEMPERATURE_LIMIT_DEGC
-        t_device_s = temperature_degc = None
-        chunk_end, chunk_s = -1, 0.0
-        while at <= last and buffer.startswith(header, at):
-            end = at + size
-            if crc(buffer[at + 1 : end], 0):
-                break
-            values = unpack(buffer, at + offset)
-            gx, gy, gz = rate = values[gyro:behind_gyro]
-            ax, ay, az = force = values[accel:behind_accel]
-            # `check_imu`, written out; what it refuses is left to whoever takes it next, and counts it.
-            if not (
-                -most_rad_s <= gx <= most_rad_s
-                and -most_rad_s <= gy <= most_rad_s
-                and -most_rad_s <= gz <= most_rad_s
-                and -most_m_s2 <= ax <= most_m_s2
-                and -most_m_s2 <= ay <= most_m_s2
-                and -most_m_s2 <= az <= most_m_s2
-            ):
-                break
-            if warm is not None:
-                temperature_degc = values[warm]
-                if not -most_degc <= temperature_degc <= most_degc:
-                    break
-            if startup is not None:
-                t_device_s = values[startup] / 1e9
-            stop = origin + end
-            if stop > chunk_end:
-                # `_time_of`, which also forgets what is used up, for the first one of each read.
-                self._time_of(stop)
-                chunk_end, chunk_s = self._chunks[0]
-            t_s = chunk_s - line_s * (chunk_end - stop)
-            samples.append(ImuSample(t_s, rate, force, temperature_degc, None, t_device_s))
-            at = end
-        self.accepted += len(samples) - before
-        return at
 
     def _sentence(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         """Where to go on after what begins with a "$", or `WAIT` for more bytes."""

@@ -8,17 +8,12 @@ after it; older firmware gave some bits other meanings, which then fails the CRC
 
 from __future__ import annotations
 
-import re
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from companion.protocols.base import NOTHING_OF_USE, UNKNOWN_FIELD, UNKNOWN_GROUP, RejectedError
 from companion.protocols.checks import check_attitude, check_imu, check_vector
 from companion.samples import AttitudeSample, ImuSample, MagSample, Sample, Vector
-
-if TYPE_CHECKING:
-    from companion.protocols.bulk import Frames
 
 _Fields = tuple[tuple[str, str], ...]
 
@@ -100,11 +95,6 @@ class Layout:
     attitude: int | None
     mag: int | None
 
-    @property
-    def is_plain(self) -> bool:
-        """Whether it holds one reading of an IMU and nothing else that is used here."""
-        return self.imu is not None and self.attitude is None and self.mag is None
-
     def samples(self, frame: bytes, start: int, t_s: float) -> list[Sample]:
         """The samples in a frame that begins at `start` and has passed its CRC.
 
@@ -132,38 +122,6 @@ class Layout:
         if not samples:
             raise RejectedError(NOTHING_OF_USE)
         return samples
-
-    def frames(self, header: bytes, buffer: bytes, size: int) -> Frames | None:
-        """The readings in the first `size` bytes, where these are good frames with this header and nothing else.
-
-        None where they are not, or where a frame has more in it than one reading of an IMU.
-        """
-        if self.imu is None or self.attitude is not None or self.mag is not None or size == 0:
-            return None
-        import numpy as np
-
-        from companion.protocols import bulk
-
-        table = np.frombuffer(buffer, np.uint8, size).reshape(-1, self.frame_bytes)
-        if (table[:, : len(header)] != np.frombuffer(header, np.uint8)).any() or bulk.crc16_xmodem(table[:, 1:]).any():
-            return None
-        gyro, accel = self.imu
-        rows = np.empty((len(table), 6))
-        rows[:, :3] = bulk.field(table, self._offset(gyro), "<f4", 3)
-        rows[:, 3:] = bulk.field(table, self._offset(accel), "<f4", 3)
-        temperature_degc = device_s = None
-        if self.temperature is not None:
-            temperature_degc = bulk.field(table, self._offset(self.temperature), "<f4")[:, 0].astype(np.float64)
-        if self.time_startup is not None:
-            device_s = bulk.field(table, self._offset(self.time_startup), "<u8")[:, 0].astype(np.float64) / 1e9
-        if not bulk.all_believable(rows, temperature_degc):
-            return None
-        return bulk.Frames(self.frame_bytes, header, rows, temperature_degc, device_s)
-
-    def _offset(self, value: int) -> int:
-        """Where in a frame the value of that number begins."""
-        codes = "".join(code * int(count or 1) for count, code in re.findall(r"(\d*)([a-zA-Z])", self.payload.format))
-        return self.payload_offset + struct.calcsize("<" + codes[:value])
 
 
 def layout_of(header: bytes) -> Layout:

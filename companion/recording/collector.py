@@ -12,7 +12,6 @@ from companion.calibration.outlook import Glance, Status
 from companion.calibration.pose_models import CompassModel, GradienterModel
 from companion.calibration.rolling import ImuInput, RollingCollector, Settings, Window
 from companion.calibration.settling import AT_ONCE, Lag
-from companion.protocols.bulk import ImuBlock, PoseBlock
 from companion.recording.journal import Journal
 from companion.samples import CompassSample, ImuSample, TiltSample
 
@@ -75,33 +74,9 @@ class RecordedCollector(RollingCollector):
             self.journal.imu(name, sample, self._message_of(name), sample.t_s)
         super().add_imu(name, sample)
 
-    def add_block(self, name: str, block: ImuBlock, start: int = 0, stop: int | None = None) -> None:  # noqa: D102
-        if self.journal.queues:
-            message = self._message_of(name)
-            for sample in block.samples(start, stop):
-                self.journal.imu(name, sample, message, sample.t_s)
-        super().add_block(name, block, start, stop)
-
-    def add_many(self, name: str, samples: Sequence[ImuSample]) -> None:  # noqa: D102
-        if self.journal.queues:
-            message = self._message_of(name)
-            for sample in samples:
-                self.journal.imu(name, sample, message, sample.t_s)
-        super().add_many(name, samples)
-
     def add_tilt(self, sample: TiltSample) -> None:  # noqa: D102
         self.journal.tilt(sample)
         super().add_tilt(sample)
-
-    def add_tilts(self, block: PoseBlock, start: int = 0, stop: int | None = None) -> None:  # noqa: D102
-        stop = len(block) if stop is None else stop
-        for t_s, (x_deg, y_deg) in zip(block.t_s[start:stop].tolist(), block.rows[start:stop].tolist(), strict=True):
-            self.add_tilt(TiltSample(t_s, x_deg, y_deg))
-
-    def add_headings(self, block: PoseBlock, start: int = 0, stop: int | None = None) -> None:  # noqa: D102
-        stop = len(block) if stop is None else stop
-        for t_s, (heading_deg,) in zip(block.t_s[start:stop].tolist(), block.rows[start:stop].tolist(), strict=True):
-            self.add_compass(CompassSample(t_s, heading_deg))
 
     def _take_heading(self, sample: CompassSample) -> None:
         self.journal.compass(sample)

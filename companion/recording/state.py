@@ -97,7 +97,6 @@ _VALUES: Final[dict[str, type]] = {
 _FORGOTTEN: Final[dict[tuple[str, str], Callable[[], Any]]] = {
     ("RollingCollector", "_estimates"): Estimates,
     ("RollingCollector", "_trace"): TraceLog,
-    ("BatchSource", "_block"): lambda: None,
     ("ImuGate", "_means"): lambda: None,
     ("ImuGate", "_ordered"): lambda: None,
     ("PoseGate", "_refined"): lambda: None,

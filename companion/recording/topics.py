@@ -8,16 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 import msgspec
 
 from companion.calibration.record import ImuRecord, Record, to_json
 from companion.samples import CompassSample, ImuSample, TiltSample
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 FORMAT_VERSION: Final = "1"
 METADATA: Final = "companion"
@@ -118,25 +114,6 @@ def is_finite(values: Sequence[float]) -> bool:
 
 def _nine(values: Sequence[float]) -> str:
     return f"[{','.join([f'{value:.9g}' for value in values])}]"
-
-
-def nine_digits(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Finite numbers as they come back from a message that holds nine digits of each."""
-    import numpy as np
-
-    size = np.abs(values)
-    with np.errstate(divide="ignore"):
-        tens = 8.0 - np.floor(np.log10(size))
-    sure = (tens >= 0.0) & (tens <= 22.0)
-    # A power of ten up to 10^22 is exact, and so is a quotient of it and a whole number: rounded once, as text is.
-    power = 10.0 ** np.where(sure, tens, 0.0)
-    scaled = size * power
-    whole = np.rint(scaled)
-    sure &= (scaled > 1e8 + 1.0) & (scaled < 1e9 - 1.0) & (np.abs(scaled - whole) < 0.499)
-    found = np.copysign(whole / power, values)
-    for place in np.flatnonzero(~sure).tolist():
-        found.flat[place] = float(f"{values.flat[place]:.9g}")
-    return found
 
 
 def _known(value: float | None) -> bool:

@@ -5,7 +5,6 @@ The mounting turns the sensor's axes into the vehicle's (x forward, y right, z d
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
 import math
 from collections.abc import Iterable
@@ -13,7 +12,6 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.calibration.allan import noise_profile
 from companion.calibration.measurement import Measurement
@@ -29,7 +27,7 @@ from companion.daemon.course import in_words
 from companion.daemon.report import Draft
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import rotation_matrix
-from companion.protocols.bulk import ImuBlock
+from companion.samples import ImuSample
 
 MIN_STILL_S: Final = 5.0
 MAX_STILL_S: Final = 3600.0
@@ -60,7 +58,7 @@ class PoseGiven(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def estimate(
-    blocks: Iterable[ImuBlock],
+    samples: Iterable[ImuSample],
     pose: PoseGiven,
     *,
     mounting: Mounting = "ROTATION_NONE",
@@ -69,13 +67,13 @@ def estimate(
     """The biases from the longest still stretch of a log.
 
     Args:
-        blocks: samples in order of time, by any clock in seconds.
+        samples: in order of time, by any clock in seconds.
         pose: how it stood.
         mounting: sensor to vehicle FRD.
         profile: the sensor's model, or figures learned, for its Allan figures.
 
     Raises:
-        StorageError: as `csv_columns.read`, where the blocks are its.
+        StorageError: as `csv_columns.read`, where the samples are its.
     """
     settings = Settings(
         min_still_s=MIN_STILL_S, max_s=MAX_STILL_S, target_gyro_sigma_rad_s=0.0, target_accel_sigma_m_s2=0.0
@@ -87,24 +85,19 @@ def estimate(
     still_s, obstacle = 0.0, "no samples"
     offset_s: float | None = None
     now_s = looked_s = _FIRST_S
-    for block in blocks:
+    for sample in samples:
         if offset_s is None:
-            offset_s = _FIRST_S - float(block.t_s[0])
-        times_s = block.t_s + offset_s
-        block = dataclasses.replace(block, t_s=times_s)
-        taken = 0
+            offset_s = _FIRST_S - sample.t_s
+        now_s = sample.t_s + offset_s
         # Whoever looks has not seen the sample yet that tells him that it is time to.
-        while (look := _first_after(times_s, taken, looked_s)) < len(block):
-            collector.add_block(NAME, block, taken, look)
-            taken, now_s = look, float(times_s[look])
+        if now_s - looked_s >= 1.0:
             looked_s = math.floor(now_s)
             glance = collector.glance(now_s)
             obstacle = glance.obstacle or obstacle
             if glance.obstacle is None and glance.still_s >= max(MIN_STILL_S, _LONGER * still_s):
                 found.append(_measurement(collector, now_s))
                 still_s = glance.still_s
-        collector.add_block(NAME, block, taken)
-        now_s = float(times_s[-1])
+        collector.add_imu(NAME, ImuSample(now_s, sample.gyro_rad_s, sample.accel_m_s2, sample.temperature_degc))
     glance = collector.glance(now_s + 0.3)
     if glance.obstacle is None and glance.still_s > max(still_s, MIN_STILL_S - 1.0):
         found.append(_measurement(collector, now_s + 0.3))
@@ -127,17 +120,6 @@ def _in_options(words: str) -> str:
     for of_the_daemon, of_the_command in _IN_OPTIONS:
         words = words.replace(of_the_daemon, of_the_command)
     return words
-
-
-def _first_after(times_s: NDArray[np.float64], start: int, looked_s: float) -> int:
-    """The first sample from `start` on that comes a second after the last look; behind the last where none does."""
-    found = start + int(np.searchsorted(times_s[start:], looked_s + 1.0))
-    # The sum may be off by its last bit, the difference is what counts.
-    while found > start and times_s[found - 1] - looked_s >= 1.0:
-        found -= 1
-    while found < len(times_s) and times_s[found] - looked_s < 1.0:
-        found += 1
-    return found
 
 
 def _measurement(collector: RollingCollector, now_s: float) -> Measurement | str:

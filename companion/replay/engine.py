@@ -9,14 +9,11 @@ that only the autopilot can tell: what was written and read back, and with which
 from __future__ import annotations
 
 import datetime
-import gc
-import itertools
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from typing import Any, Final
 
 import msgspec
-import numpy as np
 
 from companion.autopilot.imu_calibration import ImuCalibration
 from companion.calibration.record import Record, from_json
@@ -30,18 +27,11 @@ from companion.protocols.base import Decoder
 from companion.recording import state, topics
 from companion.recording.files import versions
 from companion.recording.walk import Attachment, Messages, Metadata, Recording
-from companion.replay.blocks import Share
 from companion.replay.calibrations import Calibrations, Replayed
-from companion.replay.rows import Numbers, Row, is_of
 from companion.replay.telemetry import Telemetry
-from companion.samples import Sample
 
 __all__ = ["Replay", "Replayed", "Result"]
 
-AT_ONCE: Final = 16384
-"""Messages that are gathered before they are replayed; half of them samples, they are some seconds of a 1 kHz IMU."""
-AT_ONCE_BYTES: Final = 16 * 1024 * 1024
-"""Of them; ours have a sixth of that."""
 _UNUSABLE: Final = (msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 """What a handler says of a message that nobody could have written."""
 _raw: Final = msgspec.json.Decoder(topics.RawBytes)
@@ -77,14 +67,10 @@ class Replay:
 
     Args:
         recording: the file.
-        in_blocks: what is regular is decoded and collected many samples at once; else one by one, which gives the same.
     """
 
-    def __init__(self, recording: Recording, *, in_blocks: bool = True) -> None:
+    def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self._in_blocks = in_blocks
-        self._gathered: list[Messages] = []
-        self._how_many = self._bytes = 0
         self._config: Config | None = None
         self._versions: dict[str, str] = {}
         self._collector: RollingCollector | None = None
@@ -107,22 +93,11 @@ class Replay:
         Raises:
             StorageError: one line: it is not one of ours, or it was made by a version whose state is not known here.
         """
-        # Nothing here goes round in circles, however long it takes; looking for that among all the samples that are
-        # held for a moment takes a tenth of the time, with the autopilot's a quarter.
-        collecting = gc.isenabled()
-        gc.disable()
-        try:
-            return self._run()
-        finally:
-            if collecting:
-                gc.enable()
-
-    def _run(self) -> Result:
         for item in self._recording.runs(self._is_wanted):
             if isinstance(item, Messages):
-                self._gather(item)
+                for number, data in zip(item.numbers.tolist(), item.data, strict=True):
+                    self._message(self._recording.topics[number], data)
             elif isinstance(item, Metadata) and item.name == topics.METADATA:
-                self._flush()
                 self._versions = item.table
                 if (found := item.table.get("format")) != topics.FORMAT_VERSION:
                     raise StorageError(
@@ -130,9 +105,7 @@ class Replay:
                         f" companion {item.table.get('companion')})"
                     )
             elif isinstance(item, Attachment) and item.name == topics.CONFIG:
-                self._flush()
                 self._configure(item.data)
-        self._flush()
         if self._collector is None:
             cut = self._recording.cut_short
             whose = f"{cut}, before anything was recorded" if cut else "an MCAP file, but not a recording of companion"
@@ -179,70 +152,6 @@ class Replay:
     def _is_wanted(self, topic: str) -> bool:
         return self._config is None or self._handler_of(topic) is not None
 
-    def _gather(self, messages: Messages) -> None:
-        self._gathered.append(messages)
-        self._how_many += len(messages.data)
-        self._bytes += sum(map(len, messages.data))
-        if self._how_many >= AT_ONCE or self._bytes >= AT_ONCE_BYTES:
-            self._flush()
-
-    def _flush(self) -> None:
-        """Replay what has been gathered."""
-        gathered, self._gathered, self._how_many, self._bytes = self._gathered, [], 0, 0
-        if not gathered:
-            return
-        numbers = np.concatenate([each.numbers for each in gathered])
-        data = list(itertools.chain.from_iterable(each.data for each in gathered))
-        start = 0
-        # A state brings other decoders.
-        for state_at in np.flatnonzero(is_of(numbers, self._recording.topics, topics.STATE)).tolist():
-            self._row(numbers[start:state_at], data[start:state_at])
-            self._message(topics.STATE, data[state_at])
-            start = state_at + 1
-        self._row(numbers[start:], data[start:])
-
-    def _row(self, numbers: Numbers, data: list[bytes]) -> None:
-        """Replay messages among which no state is."""
-        if self._collector is None or not data:
-            return
-        row = Row(numbers, data, self._recording.topics)
-        if self._in_blocks:
-            try:
-                for name, roles in self._roles.items():
-                    row.share_serial(name, roles, self._decoders[name])
-                row.share_telemetry(self._telemetry, self._autopilots)
-            except _UNUSABLE as error:
-                raise self._unusable(row.topic, error) from None
-        self._strange.update(row.strange)
-        for place, looking, share in row.order():
-            for each in looking:
-                self._take_samples(each, place)
-            if share is not None:
-                self._take_samples(share, place)
-                self._collect_singles(share, place)
-            elif place < len(data):
-                self._message(row.topics[numbers[place]], data[place])
-        last_s = row.last_s
-        if last_s is not None:
-            self._at(last_s)
-
-    def _take_samples(self, share: Share, place: int) -> None:
-        """Give the collector what has come in a share up to the message at that place."""
-        if self._collector is not None:
-            try:
-                share.collect(self._collector, place)
-            except _UNUSABLE as error:
-                raise self._unusable(share.topic, error) from None
-
-    def _collect_singles(self, share: Share, place: int) -> None:
-        try:
-            self._collect((share.role,), share.one_by_one.get(place, ()))
-        except _UNUSABLE as error:
-            raise self._unusable(share.topic, error) from None
-
-    def _unusable(self, topic: str, error: Exception) -> StorageError:
-        return StorageError(f"{self._recording.path}: a message on {topic} cannot be used by this version ({error})")
-
     def _message(self, topic: str, data: bytes) -> None:
         try:
             handler = self._handlers[topic]
@@ -253,7 +162,9 @@ class Replay:
         try:
             handler(data)
         except _UNUSABLE as error:
-            raise self._unusable(topic, error) from None
+            raise StorageError(
+                f"{self._recording.path}: a message on {topic} cannot be used by this version ({error})"
+            ) from None
 
     def _handler_of(self, topic: str) -> Callable[[bytes], None] | None:
         known: dict[str, Callable[[bytes], None]] = {
@@ -299,11 +210,8 @@ class Replay:
         if raw.data is None:
             decoder.interrupted()
             return
-        self._collect(self._roles[name], decoder.receive(raw.data, raw.t_s))
-
-    def _collect(self, roles: Sequence[Role], samples: Iterable[Sample]) -> None:
-        for sample in samples:
-            for role, part in parts_of(sample, roles):
+        for sample in decoder.receive(raw.data, raw.t_s):
+            for role, part in parts_of(sample, self._roles[name]):
                 if self._collector is not None:
                     collect(self._collector, role, part)
 

@@ -14,7 +14,6 @@ from companion.calibration.robust import huber_line, huber_mean
 from companion.calibration.rolling import RollingCollector, Status
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import rotation_matrix
-from companion.recording.state import freeze, to_json
 from companion.rotations import ROTATION_NAMES
 from companion.samples import CompassSample, ImuSample, TiltSample
 from tests.support import still_aircraft as still
@@ -32,44 +31,6 @@ EVENTS = st.one_of(
     st.tuples(st.just("reset"), st.sampled_from([None, "fc", "nobody"])),
     st.tuples(st.just("again"), st.booleans()),
 )
-
-
-SAMPLES = st.builds(
-    ImuSample,
-    TIMES | st.floats(0.0, 4.0),
-    VECTORS,
-    VECTORS,
-    st.none() | FLOATS,
-    st.none() | st.integers(0, 255),
-    st.none() | st.floats(0.0, 9.0),
-    st.integers(0, 2),
-)
-
-
-@settings(deadline=None, max_examples=100)
-@given(st.lists(st.lists(SAMPLES, max_size=12) | st.integers(1, 9), max_size=12))
-def test_many_samples_at_once_are_one_after_the_other(parts: list[list[ImuSample] | int]) -> None:
-    collectors = [
-        RollingCollector(still.settings(max_s=20.0), [still.imu()], gradienter=False, compass=False) for _ in range(2)
-    ]
-    one_by_one, at_once = collectors
-    now_s = 0.0
-    for part in parts:
-        if isinstance(part, int):
-            # A regular stream, in bursts that know nothing of seconds.
-            steps = [now_s + 0.07 * n for n in range(part * 14)]
-            part = [ImuSample(t, (1e-3, 2e-3, t * 1e-5), (0.1, t * 1e-5, -9.8), 25.0, None, t) for t in steps]
-            now_s = steps[-1]
-        for sample in part:
-            one_by_one.add_imu("fc", sample)
-        at_once.add_many("fc", part)
-        at_once.add_many("nobody", part)
-    assert at_once.unknown_samples == sum(0 if isinstance(p, int) else len(p) for p in parts) + sum(
-        14 * p for p in parts if isinstance(p, int)
-    )
-    at_once.unknown_samples = 0
-    first, second = (to_json(freeze(collector, RollingCollector)) for collector in collectors)
-    assert first == second
 
 
 @settings(deadline=None, max_examples=150)

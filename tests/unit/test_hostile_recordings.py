@@ -254,4 +254,4 @@ def test_a_line_without_end_is_refused(
     path = tmp_path / "log.csv"
     path.write_bytes(content)
     assert companion([command, str(path)]) == 1
-    assert capsys.readouterr().err == f"companion: {path}, line {line}: found no line end within 16384 bytes\n"
+    assert capsys.readouterr().err == f"companion: {path}, line {line}: found no line end within 16384 characters\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable
 
 import pytest
@@ -10,7 +9,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.links.mavlink import MavlinkLink
 from companion.links.together import MOST_WAITING, SECOND_S, TURNS, Together
-from tests.support.virtual_time import run_virtual
 
 READ_S = 0.0205
 START_S = 1000.2
@@ -37,17 +35,6 @@ def attitude(boot_ms: int) -> bytes:
 def heartbeat() -> bytes:
     packed: bytes = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(codec())
     return packed
-
-
-async def drive(together: Together, seconds: float) -> None:
-    """Be a fast stream for so long."""
-    loop = asyncio.get_running_loop()
-    until_s = loop.time() + seconds
-    together.drive()
-    while loop.time() < until_s:
-        await asyncio.sleep(READ_S)
-        together.turn(loop.time())
-    together.rest()
 
 
 class TestWaiting:
@@ -121,60 +108,6 @@ class TestWaiting:
         together.put(taker, b"second", 1.0)
         together.take()
         assert [data for data, _ in taker.got] == [b"first", b"second", b"late"]
-
-
-class TestSleep:
-    def test_without_a_stream_it_is_an_ordinary_sleep(self) -> None:
-        async def main() -> float:
-            loop = asyncio.get_running_loop()
-            since_s = loop.time()
-            await Together().sleep(0.1)
-            return loop.time() - since_s
-
-        assert run_virtual(main()) == pytest.approx(0.1)
-
-    def test_wakes_with_a_read_and_not_much_later(self) -> None:
-        async def main() -> float:
-            together, loop = Together(), asyncio.get_running_loop()
-            driving = asyncio.create_task(drive(together, 1.0))
-            await asyncio.sleep(0)
-            since_s = loop.time()
-            await together.sleep(0.1)
-            span_s = loop.time() - since_s
-            await driving
-            return span_s
-
-        assert 0.1 <= run_virtual(main()) <= 0.1 + READ_S
-
-    def test_a_stream_that_ends_leaves_nobody_asleep(self) -> None:
-        async def main() -> float:
-            together, loop = Together(), asyncio.get_running_loop()
-            driving = asyncio.create_task(drive(together, 0.1))
-            await asyncio.sleep(0)
-            since_s = loop.time()
-            await together.sleep(0.5)
-            await driving
-            return loop.time() - since_s
-
-        assert run_virtual(main()) == pytest.approx(0.5)
-
-    @pytest.mark.parametrize("still_driven", [False, True])
-    def test_can_be_cancelled(self, still_driven: bool) -> None:
-        async def main() -> None:
-            together = Together()
-            together.drive()
-            sleeping = asyncio.create_task(together.sleep(0.1))
-            await asyncio.sleep(0)
-            if not still_driven:
-                together.rest()
-            sleeping.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await sleeping
-            if still_driven:
-                together.turn(asyncio.get_running_loop().time() + 1.0)
-            await asyncio.sleep(1.0)
-
-        run_virtual(main())
 
 
 class TestMavlink:

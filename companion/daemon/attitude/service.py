@@ -76,7 +76,6 @@ class AttitudeService:
     ) -> None:
         self.on_beat: Callable[[], None] = lambda: None
         self._config, self._vehicle, self._say = config, vehicle, say
-        self._together = link.together
         self.carrier = Carrier(config, carrying_imu(config), vehicle, collector, in_force, offload)
         self.difference = Difference(link, vehicle, self.carrier.now, self.carrier.kept_at)
         self.health = Health(self.carrier, self.difference, vehicle)
@@ -190,7 +189,7 @@ class AttitudeService:
                     logger.exception("attitude met a fault of the program")
                     self.health.stop(INTERNAL)
                     await asyncio.sleep(1.0)
-                await self._together.sleep(TICK_S)
+                await asyncio.sleep(TICK_S)
         finally:
             self._running = False
             self.health.stop("the companion ends")
