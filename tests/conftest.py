@@ -5,7 +5,12 @@ from __future__ import annotations
 import gc
 import signal
 
+import hypothesis
 import pytest
+
+# How long an example takes says something of the machine, not of the code.
+hypothesis.settings.register_profile("anywhere", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
+hypothesis.settings.load_profile("anywhere")
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # So it is under `nohup` and in the background of a script, and every command that a test starts would inherit it:
