@@ -78,7 +78,7 @@ class _Columns:
     def _no_number(self, fields: Sequence[str], where: str) -> StorageError:
         """Which of the fields is none."""
         columns = [column for column, _ in self._wanted]
-        if self._temperature is not None:
+        if self._temperature is not None and fields[self._temperature].strip(_AROUND):
             columns.append(self._temperature)
         wrong = next((column for column in columns if not _is_number(fields[column].strip(_AROUND))), columns[0])
         return StorageError(f"{where}: found {fields[wrong]!r} in column {self.names[wrong]}; allowed: a number")
