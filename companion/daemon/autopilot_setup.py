@@ -14,7 +14,7 @@ from companion.autopilot.float32 import same_float32
 from companion.autopilot.heading_parameters import RISKS, changes_for, wanted_for
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.vehicle import Vehicle
-from companion.autopilot.writer import Change, ParameterWriter, WriteFailedError
+from companion.autopilot.writer import Change, ParameterWriter
 from companion.calibration.record import WrittenParameter
 from companion.component.statustext import Severity, Weight
 from companion.config import Config
@@ -137,24 +137,9 @@ class AutopilotSetup:
         if not changes:
             return self._reply("applied", "the autopilot is set up already; nothing was written")
         kept = self._kept(changes)
-        await self._ledger.begin(_change_set(self._vehicle, changes))
-        try:
+        async with self._ledger.transaction(_change_set(self._vehicle, changes)):
             written = await self._writer.apply(changes)
-        except WriteFailedError as error:
-            if error.left_changed:
-                self._ledger.orphaned.set()
-            else:
-                await self._ledger.abandon()
-            raise
-        except BaseException:
-            # Nothing was written, or we are being torn down: the mender looks what is in force.
-            self._ledger.orphaned.set()
-            raise
-        try:
-            await self._ledger.commit(_change_set(self._vehicle, kept))
-        except StorageError:
-            self._ledger.orphaned.set()  # what cannot be undone later must not stay
-            raise
+            await self._ledger.done(_change_set(self._vehicle, kept))
         names = ", ".join(change.parameter for change in changes)
         logger.warning("autopilot-setup wrote %s", names)
         self._say(Severity.WARNING, "Heading set-up written: restart the autopilot", Weight.RESULT)

@@ -97,6 +97,8 @@ class FirmwareCalibration:
     ) -> Done:
         """All offsets, the firmware's calibration, the gyro offsets again: all, or all the old values are back.
 
+        In a transaction of these changes, which grows with what the firmware may change besides.
+
         Args:
             changes: all that is wanted.
             gyros: the gyros' part of it.
@@ -104,11 +106,9 @@ class FirmwareCalibration:
             go_on: told what is going on.
 
         Raises:
-            NotDisarmedError: nothing was written.
+            NothingWrittenError: as `ParameterWriter.apply`.
             WriteFailedError: as `ParameterWriter.apply`.
-            StorageError: the old values could not be kept; nothing was written.
         """
-        await self._ledger.begin(self._set(*map(_changed, changes)))
         boots = self._vehicle.boots
         written = await self._writer.apply(changes)
         wanted = {change.parameter: change.after for change in changes}
@@ -116,7 +116,7 @@ class FirmwareCalibration:
         try:
             ours = [_changed(change) for change in changes if change.parameter not in before.values]
             family = [Changed(name, value, None) for name, value in before.values.items()]
-            await self._ledger.begin(self._set(*ours, *family))
+            await self._ledger.widen(self._set(*ours, *family))
             calibration = await calibrate_gyros(self._parameters, now, go_on)
             go_on(f"writing {len(gyros)} fine gyro offsets")
             coarse = calibration.after.values
@@ -126,7 +126,7 @@ class FirmwareCalibration:
                 for name, (old, new) in changed(before, calibration.after).items()
                 if name not in wanted
             )
-            await self._ledger.begin(self._set(*map(_changed, (*changes, *collateral))))
+            await self._ledger.widen(self._set(*map(_changed, (*changes, *collateral))))
         except CompanionError as error:
             await self._put_back(changes, before, boots, error)
             raise

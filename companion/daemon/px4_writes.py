@@ -95,25 +95,18 @@ class Px4Writes:
             return False
         logger.info("bringing offsets into use that PX4 may have ignored: %s", ", ".join(c.parameter for c in changes))
         targets = [(imu.in_force, _again(imu.in_force)) for imu in unsure]
-        await self._ledger.begin(change_set(self._vehicle, changes))
         try:
-            with contextlib.ExitStack() as stack:
-                for imu in unsure:
-                    stack.enter_context(imu.changing())
-                async with self.standing_by(targets) as look:
-                    await self._writer.apply(changes, look)
+            async with self._ledger.transaction(change_set(self._vehicle, changes)):
+                with contextlib.ExitStack() as stack:
+                    for imu in unsure:
+                        stack.enter_context(imu.changing())
+                    async with self.standing_by(targets) as look:
+                        await self._writer.apply(changes, look)
+                await self._ledger.undone()
         except WriteFailedError as error:
-            if error.left_changed:
-                self._ledger.orphaned.set()
-            else:
-                await self._ledger.abandon()
-            if error.kind == "not as believed" and not error.left_changed:
-                return True  # learned: the offsets are read again, from another slot
-            raise
-        except BaseException:
-            self._ledger.orphaned.set()
-            raise
-        await self._ledger.abandon()
+            if error.kind != "not as believed" or error.left_changed:
+                raise
+            # Something was learned: the offsets are read again, from another slot.
         return True
 
 
