@@ -137,9 +137,9 @@ class AutopilotSetup:
         if not changes:
             return self._reply("applied", "the autopilot is set up already; nothing was written")
         kept = self._kept(changes)
-        async with self._ledger.transaction(_change_set(self._vehicle, changes)):
+        async with self._ledger.transaction(ChangeSet.of(self._vehicle.system_id, changes)):
             written = await self._writer.apply(changes)
-            await self._ledger.done(_change_set(self._vehicle, kept))
+            await self._ledger.done(ChangeSet.of(self._vehicle.system_id, kept))
         names = ", ".join(change.parameter for change in changes)
         logger.warning("autopilot-setup wrote %s", names)
         self._say(Severity.WARNING, "Heading set-up written: restart the autopilot", Weight.RESULT)
@@ -168,12 +168,6 @@ class AutopilotSetup:
         written = await self._mender.undo(force=force)
         self._say(Severity.WARNING, "Heading set-up taken back: restart the autopilot", Weight.RESULT)
         return self._reply("undone", f"{len(written)} old values back; {REBOOT}", written=_plain(written))
-
-
-def _change_set(vehicle: Vehicle, changes: list[Change]) -> ChangeSet:
-    if vehicle.system_id is None:
-        raise AutopilotError("no autopilot has been heard yet")
-    return ChangeSet(vehicle.system_id, tuple(Changed(one.parameter, one.before, one.after) for one in changes))
 
 
 def _same(one: float, other: float) -> bool:

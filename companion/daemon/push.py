@@ -28,9 +28,10 @@ from companion.daemon.firmware_calibration import FirmwareCalibration, settles_w
 from companion.daemon.job import JobCancelledError
 from companion.daemon.ledger import Ledger, Offload
 from companion.daemon.plan import Plan, Planner, Target
-from companion.daemon.px4_writes import Px4Writes, change_set, step_from_far
+from companion.daemon.px4_writes import Px4Writes, step_from_far
 from companion.daemon.report import Draft
 from companion.errors import AutopilotError, CalibrationRefusedError, NotDisarmedError, StorageError
+from companion.storage.changes import ChangeSet
 
 logger = logging.getLogger(__name__)
 
@@ -109,7 +110,7 @@ class Pusher:
         """
         await self._wait_disarmed()
         firmware = await self._firmware.prepare(plan.gyros, draft.warnings.append)
-        async with self._ledger.transaction(change_set(self._vehicle, plan.everything)):
+        async with self._ledger.transaction(ChangeSet.of(self._vehicle.system_id, plan.everything)):
             with self._changing(plan, everything=firmware is not None):
                 try:
                     plan = await self._write(plan, firmware, draft, go_on)
@@ -145,7 +146,7 @@ class Pusher:
         if problems:
             raise AutopilotError(await self._roll_back(plan, draft, "; ".join(problems)))
         try:
-            await self._ledger.done(change_set(self._vehicle, plan.everything))
+            await self._ledger.done(ChangeSet.of(self._vehicle.system_id, plan.everything))
         except StorageError as error:
             # What cannot be undone later must not stay.
             raise AutopilotError(await self._roll_back(plan, draft, str(error))) from error
