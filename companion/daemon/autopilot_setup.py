@@ -106,7 +106,9 @@ class AutopilotSetup:
         open_rows = [
             row
             for row in rows
-            if isinstance(now := row["now"], float) and isinstance(to := row["wanted"], float) and not _same(now, to)
+            if isinstance(now := row["now"], float)
+            and isinstance(to := row["wanted"], float)
+            and not same_float32(now, to)
         ]
         state = "applied" if not open_rows else "not applied"
         reason = "the autopilot is set up" if not open_rows else f"{len(open_rows)} parameters to change"
@@ -168,10 +170,6 @@ class AutopilotSetup:
         written = await self._mender.undo(force=force)
         self._say(Severity.WARNING, "Heading set-up taken back: restart the autopilot", Weight.RESULT)
         return self._reply("undone", f"{len(written)} old values back; {REBOOT}", written=_plain(written))
-
-
-def _same(one: float, other: float) -> bool:
-    return same_float32(one, other)
 
 
 def _plain(written: dict[str, WrittenParameter]) -> object:

@@ -9,6 +9,7 @@ import logging
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
+from companion.autopilot.change import NothingWrittenError, WriteFailedError
 from companion.autopilot.firmwares import settle_s
 from companion.autopilot.float32 import same_float32
 from companion.autopilot.gyro_calibration import GyroParameters
@@ -16,7 +17,7 @@ from companion.autopilot.pace import has_passed, moment
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.vehicle import ArmState, Vehicle
 from companion.autopilot.verify import Verdict
-from companion.autopilot.writer import ParameterWriter, WriteFailedError
+from companion.autopilot.writer import ParameterWriter
 from companion.calibration.record import Outcome, WrittenParameter
 from companion.calibration.rolling import RollingCollector, Window
 from companion.calibration.solve import Solution
@@ -197,7 +198,7 @@ class Pusher:
                 left = error.left_changed
                 if error.kind == "changed by someone else":
                     end = "somebody else changed them"
-            except AutopilotError:  # armed, silent, or calibrating itself: nothing was put back
+            except NothingWrittenError:
                 left = [change.parameter for change in plan.everything]
                 self._mark(plan, draft, left, "failed")
         if left:
