@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import ClassVar, Literal
 
 from companion.autopilot.float32 import float32
 from companion.calibration.record import WrittenParameter
-from companion.errors import AutopilotError, AutopilotRebootedError
+from companion.errors import AutopilotError, AutopilotRebootedError, NotDisarmedError
 
 FailureKind = Literal[
     "refused",
@@ -46,6 +46,12 @@ class Change:
     def ours(self) -> tuple[float, ...]:
         """The values that we may have left in the autopilot, besides the old one."""
         return (self.after,) if self.via is None else (self.after, self.via)
+
+
+class NothingWrittenError(NotDisarmedError):
+    """Refused before anything was sent: armed, unknown whether armed, or the autopilot calibrates itself."""
+
+    left_changed: ClassVar[tuple[str, ...]] = ()
 
 
 class WriteFailedError(AutopilotError):

@@ -16,7 +16,13 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.change import Change, FailureKind, RebootedWhileWritingError, WriteFailedError
+from companion.autopilot.change import (
+    Change,
+    FailureKind,
+    NothingWrittenError,
+    RebootedWhileWritingError,
+    WriteFailedError,
+)
 from companion.autopilot.float32 import same_float32
 from companion.autopilot.pace import let_pass, moment
 from companion.autopilot.parameters import ParameterClient
@@ -108,8 +114,7 @@ class ParameterWriter:
             Every parameter as "stored": read back afresh, its effect not yet looked at.
 
         Raises:
-            NotDisarmedError: not disarmed at the start; nothing was written.
-            AutopilotError: the autopilot is just calibrating itself; nothing was written.
+            NothingWrittenError: not disarmed at the start, or the autopilot is just calibrating itself.
             WriteFailedError: nothing, or everything that could be, is as before.
             asyncio.CancelledError: cancelled; the old values are put back first, see `written`.
         """
@@ -142,7 +147,7 @@ class ParameterWriter:
             Every parameter as "rolled_back".
 
         Raises:
-            NotDisarmedError: not disarmed at the start; nothing was put back.
+            NothingWrittenError: as `apply`; nothing was put back.
             WriteFailedError: `left_changed` names what could not be put back.
             asyncio.CancelledError: cancelled; see `written`.
         """
@@ -164,7 +169,7 @@ class ParameterWriter:
             Every parameter as "rolled_back", `before` and `after` as in the changes.
 
         Raises:
-            NotDisarmedError, WriteFailedError, asyncio.CancelledError: as `apply`; "rolled_back" in the
+            NothingWrittenError, WriteFailedError, asyncio.CancelledError: as `apply`; "rolled_back" in the
                 error then means that the value from before the undo is in force.
         """
         swapped = [dataclasses.replace(c, before=c.after, after=c.before) for c in reversed(changes)]
@@ -194,9 +199,9 @@ class ParameterWriter:
         state = self._vehicle.arm_state
         if state is not ArmState.DISARMED:
             why = "the aircraft is armed" if state is ArmState.ARMED else "it is unknown whether the aircraft is armed"
-            raise NotDisarmedError(f"nothing is written: {why}")
+            raise NothingWrittenError(f"nothing is written: {why}")
         if self._vehicle.system_status == mavlink.MAV_STATE_CALIBRATING:
-            raise AutopilotError(f"nothing is written: {self._vehicle.name} is calibrating its own sensors")
+            raise NothingWrittenError(f"nothing is written: {self._vehicle.name} is calibrating its own sensors")
         self._boots = self._vehicle.boots
         return items
 

@@ -14,7 +14,7 @@ from companion.autopilot.float32 import same_float32
 from companion.autopilot.heading_parameters import RISKS, changes_for, wanted_for
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.vehicle import Vehicle
-from companion.autopilot.writer import Change, ParameterWriter, WriteFailedError
+from companion.autopilot.writer import Change, ParameterWriter
 from companion.calibration.record import WrittenParameter
 from companion.component.statustext import Severity, Weight
 from companion.config import Config
@@ -106,7 +106,9 @@ class AutopilotSetup:
         open_rows = [
             row
             for row in rows
-            if isinstance(now := row["now"], float) and isinstance(to := row["wanted"], float) and not _same(now, to)
+            if isinstance(now := row["now"], float)
+            and isinstance(to := row["wanted"], float)
+            and not same_float32(now, to)
         ]
         state = "applied" if not open_rows else "not applied"
         reason = "the autopilot is set up" if not open_rows else f"{len(open_rows)} parameters to change"
@@ -137,24 +139,9 @@ class AutopilotSetup:
         if not changes:
             return self._reply("applied", "the autopilot is set up already; nothing was written")
         kept = self._kept(changes)
-        await self._ledger.begin(_change_set(self._vehicle, changes))
-        try:
+        async with self._ledger.transaction(ChangeSet.of(self._vehicle.system_id, changes)):
             written = await self._writer.apply(changes)
-        except WriteFailedError as error:
-            if error.left_changed:
-                self._ledger.orphaned.set()
-            else:
-                await self._ledger.abandon()
-            raise
-        except BaseException:
-            # Nothing was written, or we are being torn down: the mender looks what is in force.
-            self._ledger.orphaned.set()
-            raise
-        try:
-            await self._ledger.commit(_change_set(self._vehicle, kept))
-        except StorageError:
-            self._ledger.orphaned.set()  # what cannot be undone later must not stay
-            raise
+            await self._ledger.done(ChangeSet.of(self._vehicle.system_id, kept))
         names = ", ".join(change.parameter for change in changes)
         logger.warning("autopilot-setup wrote %s", names)
         self._say(Severity.WARNING, "Heading set-up written: restart the autopilot", Weight.RESULT)
@@ -183,16 +170,6 @@ class AutopilotSetup:
         written = await self._mender.undo(force=force)
         self._say(Severity.WARNING, "Heading set-up taken back: restart the autopilot", Weight.RESULT)
         return self._reply("undone", f"{len(written)} old values back; {REBOOT}", written=_plain(written))
-
-
-def _change_set(vehicle: Vehicle, changes: list[Change]) -> ChangeSet:
-    if vehicle.system_id is None:
-        raise AutopilotError("no autopilot has been heard yet")
-    return ChangeSet(vehicle.system_id, tuple(Changed(one.parameter, one.before, one.after) for one in changes))
-
-
-def _same(one: float, other: float) -> bool:
-    return same_float32(one, other)
 
 
 def _plain(written: dict[str, WrittenParameter]) -> object:

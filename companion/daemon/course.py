@@ -39,7 +39,7 @@ from companion.daemon.plan import Plan
 from companion.daemon.push import Pusher
 from companion.daemon.reboot import Reboot
 from companion.daemon.report import Draft
-from companion.errors import AutopilotError, CalibrationRefusedError, CompanionError
+from companion.errors import AutopilotError, CalibrationRefusedError
 from companion.physics.units import DEG_H, MG
 from companion.recording.collector import RecordedCollector
 
@@ -193,10 +193,6 @@ class Course:
             return
         self.machine.on(Event.WRITE)
         job.progress(MEASURED_PERCENT, f"writing {len(plan.changes)} parameters")
-        plan = await self._pusher.write(plan, draft, lambda words: job.progress(MEASURED_PERCENT, words))
-        self._late = "checking"
-        self.machine.on(Event.WRITTEN)
-        job.progress(WRITTEN_PERCENT, "watching the telemetry take the new offsets")
 
         def go_on(words: str) -> None:
             job.check_cancelled()
@@ -206,16 +202,11 @@ class Course:
                 words or "watching the telemetry take the new offsets",
             )
 
-        try:
+        async with self._pusher.written(plan, draft, lambda words: job.progress(MEASURED_PERCENT, words)) as plan:
+            self._late = "checking"
+            self.machine.on(Event.WRITTEN)
+            job.progress(WRITTEN_PERCENT, "watching the telemetry take the new offsets")
             await self._pusher.verify(plan, window, draft, go_on)
-        except JobCancelledError as cancelled:
-            try:
-                await self._pusher.roll_back(plan, draft, str(cancelled))
-            except CompanionError as said:
-                raise JobCancelledError(str(said)) from None
-        except BaseException:
-            self._pusher.leave_to_mender()
-            raise
         self._late = "restarting" if job.reboot else "checking"
         boots = self._vehicle.boots
         await self._reboot.conclude(job, plan, window, draft)

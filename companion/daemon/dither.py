@@ -130,45 +130,46 @@ class Ditherer:
         self, window: ImuWindow, imu: AutopilotImu, job: Job, progress: Callable[[str], None]
     ) -> Dithered:
         work = self._prepare(window, imu)
-        await self._ledger.begin(self._journal(work))
-        in_force = work.before
-        done: list[Step] = []
-        voids = 0
         with imu.changing():
             try:
-                while len(done) < STEPS:
-                    progress(f"dithering IMU {imu.instance}: step {len(done) + 1}/{STEPS}")
-                    self.left_s = (STEPS - len(done)) * self._step_s()
-                    self._check(job, work)
-                    wanted = work.values[len(done)]
-                    await self._writer.apply([Change(name, in_force[name], wanted[name]) for name in wanted])
-                    in_force = wanted
-                    step, moved = await self._collect(work, wanted, job)
-                    why = moved or why_void(done, step, work.steps_si)
-                    if why is None:
-                        done.append(step)
-                        continue
-                    voids += 1
-                    logger.info("dithering %s: step %d is void: %s", work.name, len(done) + 1, why)
-                    if voids > MOST_VOID:
-                        raise CalibrationRefusedError(f"imu {work.name}: not still while its offsets dithered: {why}")
-                progress(f"dithering IMU {imu.instance}: putting its offsets back")
-                await self._writer.restore(
-                    [Change(name, before, in_force[name]) for name, before in work.before.items()]
-                )
-                await self._ledger.abandon()
+                async with self._ledger.transaction(self._journal(work), stepwise=True):
+                    done = await self._steps(work, job, progress)
+                    await self._ledger.undone()
             except (CompanionError, JobCancelledError) as error:
-                self._ledger.orphaned.set()
+                if not self._ledger.pending:
+                    raise  # the old values could not be kept, so nothing was written
                 words = f"{error}; {await self._put_back()}"
                 kind = JobCancelledError if isinstance(error, JobCancelledError) else AutopilotError
                 raise kind(words) from error
-            except BaseException:
-                self._ledger.orphaned.set()
-                raise
         await imu.refresh()
         if _in_force(imu.in_force) != work.before:
             raise AutopilotError(f"imu {work.name}: somebody changed its offsets while they were dithered")
         return combine(done, work.steps_si, self._profiles[window.name], self._horizon_s)
+
+    async def _steps(self, work: _Job, job: Job, progress: Callable[[str], None]) -> list[Step]:
+        """All steps, and the old values again."""
+        in_force = work.before
+        done: list[Step] = []
+        voids = 0
+        while len(done) < STEPS:
+            progress(f"dithering IMU {work.imu.instance}: step {len(done) + 1}/{STEPS}")
+            self.left_s = (STEPS - len(done)) * self._step_s()
+            self._check(job, work)
+            wanted = work.values[len(done)]
+            await self._writer.apply([Change(name, in_force[name], wanted[name]) for name in wanted])
+            in_force = wanted
+            step, moved = await self._collect(work, wanted, job)
+            why = moved or why_void(done, step, work.steps_si)
+            if why is None:
+                done.append(step)
+                continue
+            voids += 1
+            logger.info("dithering %s: step %d is void: %s", work.name, len(done) + 1, why)
+            if voids > MOST_VOID:
+                raise CalibrationRefusedError(f"imu {work.name}: not still while its offsets dithered: {why}")
+        progress(f"dithering IMU {work.imu.instance}: putting its offsets back")
+        await self._writer.restore([Change(name, before, in_force[name]) for name, before in work.before.items()])
+        return done
 
     def _step_s(self) -> float:
         """What a step takes: writing it, the telemetry showing it, whole seconds of it, the last of them complete."""
@@ -244,7 +245,7 @@ class Ditherer:
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + BACK_WITHIN_S
         while loop.time() < deadline_s and self._vehicle.arm_state is not ArmState.ARMED:
-            if not self._ledger.orphaned.is_set():
+            if not self._ledger.pending:
                 return "old offsets put back"
             await asyncio.sleep(POLL_S)
         return "old offsets NOT back yet: will be once disarmed and heard"

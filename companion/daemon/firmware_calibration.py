@@ -36,7 +36,7 @@ from companion.calibration.record import WrittenParameter
 from companion.daemon.ledger import Ledger
 from companion.errors import AutopilotError, AutopilotRebootedError, CompanionError, NotDisarmedError
 from companion.physics.units import DEG_H
-from companion.storage.changes import Changed, ChangeSet
+from companion.storage.changes import ChangeSet
 
 logger = logging.getLogger(__name__)
 
@@ -97,6 +97,8 @@ class FirmwareCalibration:
     ) -> Done:
         """All offsets, the firmware's calibration, the gyro offsets again: all, or all the old values are back.
 
+        In a transaction of these changes, which grows with what the firmware may change besides.
+
         Args:
             changes: all that is wanted.
             gyros: the gyros' part of it.
@@ -104,19 +106,16 @@ class FirmwareCalibration:
             go_on: told what is going on.
 
         Raises:
-            NotDisarmedError: nothing was written.
+            NothingWrittenError: as `ParameterWriter.apply`.
             WriteFailedError: as `ParameterWriter.apply`.
-            StorageError: the old values could not be kept; nothing was written.
         """
-        await self._ledger.begin(self._set(*map(_changed, changes)))
         boots = self._vehicle.boots
         written = await self._writer.apply(changes)
         wanted = {change.parameter: change.after for change in changes}
         now = dataclasses.replace(before, values={n: wanted.get(n, value) for n, value in before.values.items()})
         try:
-            ours = [_changed(change) for change in changes if change.parameter not in before.values]
-            family = [Changed(name, value, None) for name, value in before.values.items()]
-            await self._ledger.begin(self._set(*ours, *family))
+            ours = [change for change in changes if change.parameter not in before.values]
+            await self._ledger.widen(ChangeSet.of(self._vehicle.system_id, ours, before.values))
             calibration = await calibrate_gyros(self._parameters, now, go_on)
             go_on(f"writing {len(gyros)} fine gyro offsets")
             coarse = calibration.after.values
@@ -126,7 +125,7 @@ class FirmwareCalibration:
                 for name, (old, new) in changed(before, calibration.after).items()
                 if name not in wanted
             )
-            await self._ledger.begin(self._set(*map(_changed, (*changes, *collateral))))
+            await self._ledger.widen(ChangeSet.of(self._vehicle.system_id, (*changes, *collateral)))
         except CompanionError as error:
             await self._put_back(changes, before, boots, error)
             raise
@@ -197,17 +196,10 @@ class FirmwareCalibration:
             return "armed in the middle" if armed else "arm state unknown"
         return "no answer"
 
-    def _set(self, *changes: Changed) -> ChangeSet:
-        return ChangeSet(system_id=self._vehicle.system_id or 0, changes=changes)
-
 
 def settles_within_s(outcome: Outcome | None) -> float:
     """How long the EKF is waited for after a write, at most, by what became of the firmware's calibration."""
     return SETTLE_RESET_S if outcome == "reset" else SETTLE_ALONE_S
-
-
-def _changed(change: Change) -> Changed:
-    return Changed(change.parameter, change.before, change.after)
 
 
 def _with_before(written: WrittenParameter, before: float) -> WrittenParameter:

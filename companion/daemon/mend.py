@@ -12,7 +12,7 @@ from companion.autopilot.float32 import same_float32
 from companion.autopilot.gyro_calibration import wait_until_over
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.vehicle import ArmState, Vehicle
-from companion.autopilot.writer import Change, ParameterWriter, WriteFailedError
+from companion.autopilot.writer import Change, ParameterWriter
 from companion.calibration.record import WrittenParameter
 from companion.component.statustext import Severity, Weight
 from companion.daemon.ledger import Ledger
@@ -56,7 +56,7 @@ class Mender:
     @property
     def pending(self) -> bool:
         """Whether an interrupted write still waits to be put back."""
-        return self._ledger.orphaned.is_set()
+        return self._ledger.pending
 
     def why_no_undo(self) -> str | None:
         """Why there is nothing to undo, or None when there is."""
@@ -72,18 +72,14 @@ class Mender:
         if self._ledger.lost_write:
             self._say(Severity.WARNING, "Interrupted write, file damaged: calibrate", Weight.RESULT)
         while True:
-            await self._ledger.orphaned.wait()
+            open_set = await self._ledger.interrupted()
             try:
-                await self._mend()
+                await self._mend(open_set)
             except (AutopilotError, StorageError) as error:
                 logger.warning("putting old values back: %s; trying again", error)
                 await asyncio.sleep(RETRY_S)
 
-    async def _mend(self) -> None:
-        open_set = self._ledger.open
-        if open_set is None:
-            self._ledger.orphaned.clear()
-            return
+    async def _mend(self, open_set: ChangeSet) -> None:
         await self._vehicle.wait_found()
         strange = self._ledger.strange_to(self._vehicle.firmware, open_set)
         if strange or open_set.system_id != self._vehicle.system_id:
@@ -91,7 +87,7 @@ class Mender:
             words = f"An interrupted write on system {open_set.system_id} is not this aircraft's; there check: {names}"
             logger.warning("%s", words)
             self._say(Severity.WARNING, words, Weight.REFUSAL)
-            await self._ledger.abandon()
+            await self._ledger.undone()
             return
         while self._vehicle.arm_state is not ArmState.DISARMED:
             await asyncio.sleep(POLL_S)
@@ -106,7 +102,7 @@ class Mender:
             await self._ledger.forget_undo(
                 open_set.system_id
             )  # it was an undo that was interrupted, and now it is done
-        await self._ledger.abandon()
+        await self._ledger.undone()
         words = f"Interrupted write: {f'{len(ours)} old values put back' if ours else 'nothing of ours was in force'}"
         if foreign:
             words += f"; changed by others, left alone: {', '.join(foreign)}"
@@ -139,26 +135,11 @@ class Mender:
             )
         if foreign:
             logger.warning("changed by somebody else since, left alone: %s", "; ".join(foreign))
-        await self._ledger.begin(undoable)
-        try:
+        async with self._ledger.transaction(undoable):
             with self._changing():
                 written = await self._writer.undo(ours)
-        except WriteFailedError as error:
-            # In force is what was before the undo, unless something could not be put back: then the mender looks.
-            if error.left_changed:
-                self._ledger.orphaned.set()
-            else:
-                await self._ledger.abandon()
-            raise
-        except BaseException:
-            self._ledger.orphaned.set()
-            raise
-        try:
             await self._ledger.forget_undo(undoable.system_id)
-            await self._ledger.abandon()
-        except BaseException:
-            self._ledger.orphaned.set()
-            raise
+            await self._ledger.undone()
         return written
 
     async def _sort(self, changes: ChangeSet) -> tuple[Sequence[Change], Sequence[str]]:

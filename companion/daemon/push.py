@@ -6,16 +6,18 @@ import asyncio
 import contextlib
 import dataclasses
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
+from companion.autopilot.change import NothingWrittenError, WriteFailedError
 from companion.autopilot.firmwares import settle_s
 from companion.autopilot.float32 import same_float32
+from companion.autopilot.gyro_calibration import GyroParameters
 from companion.autopilot.pace import has_passed, moment
 from companion.autopilot.parameters import ParameterClient
 from companion.autopilot.vehicle import ArmState, Vehicle
 from companion.autopilot.verify import Verdict
-from companion.autopilot.writer import ParameterWriter, WriteFailedError
+from companion.autopilot.writer import ParameterWriter
 from companion.calibration.record import Outcome, WrittenParameter
 from companion.calibration.rolling import RollingCollector, Window
 from companion.calibration.solve import Solution
@@ -24,11 +26,13 @@ from companion.daemon import estimating
 from companion.daemon.autopilot_imu import AutopilotImu
 from companion.daemon.effect import OnTheWay, Sides, in_short, judge_vectors, nearly_visible
 from companion.daemon.firmware_calibration import FirmwareCalibration, settles_within_s
+from companion.daemon.job import JobCancelledError
 from companion.daemon.ledger import Ledger, Offload
 from companion.daemon.plan import Plan, Planner, Target
-from companion.daemon.px4_writes import Px4Writes, change_set, step_from_far
+from companion.daemon.px4_writes import Px4Writes, step_from_far
 from companion.daemon.report import Draft
 from companion.errors import AutopilotError, CalibrationRefusedError, NotDisarmedError, StorageError
+from companion.storage.changes import ChangeSet
 
 logger = logging.getLogger(__name__)
 
@@ -87,15 +91,18 @@ class Pusher:
         """As `Planner.plan`; nothing to write where results are not pushed."""
         return await self._planner.plan(solution, draft, push=self.enabled)
 
-    async def write(self, plan: Plan, draft: Draft, go_on: Callable[[str], None]) -> Plan:
-        """Write and read back; on failure the old values are put back.
+    @contextlib.asynccontextmanager
+    async def written(self, plan: Plan, draft: Draft, go_on: Callable[[str], None]) -> AsyncIterator[Plan]:
+        """Write and read back; on failure, also of the block, the old values are put back.
+
+        The block verifies what was written: `verify` alone lets it stay.
 
         Args:
             plan: what to write.
             draft: filled with what was.
             go_on: told what takes longer.
 
-        Returns:
+        Yields:
             The plan, and what the firmware has changed besides.
 
         Raises:
@@ -103,27 +110,27 @@ class Pusher:
             StorageError: the old values could not be kept, so nothing was written.
         """
         await self._wait_disarmed()
-        before = await self._firmware.prepare(plan.gyros, draft.warnings.append)
-        if before is None:
-            await self._ledger.begin(change_set(self._vehicle, plan.everything))
-        with self._changing(plan, everything=before is not None):
-            try:
-                if before is None:
-                    async with self._px4.standing_by([(t.calibration, t.changes) for t in plan.targets]) as look:
-                        self._note(plan, draft, await self._writer.apply(plan.changes, look))
-                    return plan
-                done = await self._firmware.write(plan.changes, plan.gyros, before, go_on)
-                self._note(plan, draft, done.written)
-                draft.warnings += done.warnings
-                return dataclasses.replace(plan, collateral=done.collateral, firmware=done.outcome)
-            except WriteFailedError as error:
-                self._note(plan, draft, error.written)
-                await self._settle(error.left_changed)
-                raise
-            except BaseException:
-                # Nothing was written, or we are being torn down: the mender looks what is in force.
-                self._ledger.orphaned.set()
-                raise
+        firmware = await self._firmware.prepare(plan.gyros, draft.warnings.append)
+        async with self._ledger.transaction(ChangeSet.of(self._vehicle.system_id, plan.everything)):
+            with self._changing(plan, everything=firmware is not None):
+                try:
+                    plan = await self._write(plan, firmware, draft, go_on)
+                except WriteFailedError as error:
+                    self._note(plan, draft, error.written)
+                    raise
+            yield plan
+
+    async def _write(
+        self, plan: Plan, firmware: GyroParameters | None, draft: Draft, go_on: Callable[[str], None]
+    ) -> Plan:
+        if firmware is None:
+            async with self._px4.standing_by([(t.calibration, t.changes) for t in plan.targets]) as look:
+                self._note(plan, draft, await self._writer.apply(plan.changes, look))
+            return plan
+        done = await self._firmware.write(plan.changes, plan.gyros, firmware, go_on)
+        self._note(plan, draft, done.written)
+        draft.warnings += done.warnings
+        return dataclasses.replace(plan, collateral=done.collateral, firmware=done.outcome)
 
     async def verify(self, plan: Plan, before: Window, draft: Draft, go_on: Callable[[str], None]) -> None:
         """Watch the telemetry take the step that it must; `go_on(words)` is called now and then meanwhile.
@@ -131,7 +138,22 @@ class Pusher:
         Raises:
             AutopilotError: the autopilot does not use what it stored; the old values are back, or it is said which
                 are not.
+            JobCancelledError: raised by `go_on`; likewise.
         """
+        try:
+            problems = await self._problems(plan, before, draft, go_on)
+        except JobCancelledError as cancelled:
+            raise JobCancelledError(await self._roll_back(plan, draft, str(cancelled))) from None
+        if problems:
+            raise AutopilotError(await self._roll_back(plan, draft, "; ".join(problems)))
+        try:
+            await self._ledger.done(ChangeSet.of(self._vehicle.system_id, plan.everything))
+        except StorageError as error:
+            # What cannot be undone later must not stay.
+            raise AutopilotError(await self._roll_back(plan, draft, str(error))) from error
+
+    async def _problems(self, plan: Plan, before: Window, draft: Draft, go_on: Callable[[str], None]) -> list[str]:
+        """Why what was written must not stay."""
         verdicts, why_not = await self._look(plan, before, go_on)
         # What somebody has changed meanwhile explains what the telemetry shows, so it comes first.
         problems = await self._no_longer_in_force(plan)
@@ -145,13 +167,7 @@ class Pusher:
                 draft.warn(target.name, f"effect of the written offsets not seen: {why_not}")
             elif not explained:
                 problems += self._note_verdicts(target, verdicts[target.name], draft)
-        if problems:
-            await self.roll_back(plan, draft, "; ".join(problems))
-        try:
-            await self._ledger.commit(change_set(self._vehicle, plan.everything))
-        except StorageError as error:
-            # What cannot be undone later must not stay.
-            await self.roll_back(plan, draft, str(error))
+        return problems
 
     async def look_again(self, plan: Plan, before: Window, go_on: Callable[[str], None]) -> tuple[list[str], str]:
         """After a restart: what the telemetry shows to be wrong; and why it could not be looked at, if so."""
@@ -168,52 +184,33 @@ class Pusher:
         """Wait until the autopilot's EKF agrees with the new gyro offsets; what a pilot should know, if it does not."""
         return await self._firmware.settle(plan.gyros, plan.firmware, go_on)
 
-    async def roll_back(self, plan: Plan, draft: Draft, reason: str) -> None:
-        """Put the old values back and say so.
-
-        Raises:
-            AutopilotError: always; `reason`, and what became of the old values.
-        """
-        left: Sequence[str]
+    async def _roll_back(self, plan: Plan, draft: Draft, reason: str) -> str:
+        """Put the old values back; `reason`, and what became of them."""
+        left: Sequence[str] = ()
         end = "will be once disarmed"
         with contextlib.suppress(NotDisarmedError):
             await self._wait_disarmed()  # after a restart the first heartbeat is still to come
         with self._changing(plan, everything=bool(plan.collateral)):
             try:
                 self._note(plan, draft, await self._writer.restore(plan.everything))
-                left = ()
             except WriteFailedError as error:
                 self._note(plan, draft, error.written)
                 left = error.left_changed
                 if error.kind == "changed by someone else":
                     end = "somebody else changed them"
-            except NotDisarmedError:
+            except NothingWrittenError:
                 left = [change.parameter for change in plan.everything]
                 self._mark(plan, draft, left, "failed")
-        await self._settle(left)
         if left:
-            raise AutopilotError(f"{reason}; old values NOT back in {', '.join(left)}: {end}")
-        raise AutopilotError(f"{reason}; old values put back")
+            return f"{reason}; old values NOT back in {', '.join(left)}: {end}"
+        with contextlib.suppress(StorageError):
+            await self._ledger.undone()
+        return f"{reason}; old values put back"
 
     def mark_lost(self, plan: Plan, draft: Draft, parameters: Iterable[str]) -> None:
         """These have been written and seen, and are no longer there."""
         for target in plan.targets:
             self._mark(Plan((target,), plan.boots), draft, list(parameters), "failed")
-
-    async def _settle(self, left: Sequence[str]) -> None:
-        """After a write that failed: nothing is open any more, or the mender has to end it."""
-        if left:
-            self._ledger.orphaned.set()
-        else:
-            try:
-                await self._ledger.abandon()
-            except StorageError:
-                self._ledger.orphaned.set()
-
-    def leave_to_mender(self) -> None:
-        """Whatever is open and has not been brought to an end is the mender's now."""
-        if self._ledger.open is not None:
-            self._ledger.orphaned.set()
 
     async def _no_longer_in_force(self, plan: Plan) -> list[str]:
         """What somebody has changed while we looked at the telemetry."""

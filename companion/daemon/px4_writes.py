@@ -20,7 +20,7 @@ from companion.daemon.autopilot_imu import AutopilotImu
 from companion.daemon.far_step import FarMean, FarStep, FarStepWatch
 from companion.daemon.ledger import Ledger
 from companion.samples import Vector
-from companion.storage.changes import Changed, ChangeSet
+from companion.storage.changes import ChangeSet
 
 logger = logging.getLogger(__name__)
 
@@ -95,34 +95,19 @@ class Px4Writes:
             return False
         logger.info("bringing offsets into use that PX4 may have ignored: %s", ", ".join(c.parameter for c in changes))
         targets = [(imu.in_force, _again(imu.in_force)) for imu in unsure]
-        await self._ledger.begin(change_set(self._vehicle, changes))
         try:
-            with contextlib.ExitStack() as stack:
-                for imu in unsure:
-                    stack.enter_context(imu.changing())
-                async with self.standing_by(targets) as look:
-                    await self._writer.apply(changes, look)
+            async with self._ledger.transaction(ChangeSet.of(self._vehicle.system_id, changes)):
+                with contextlib.ExitStack() as stack:
+                    for imu in unsure:
+                        stack.enter_context(imu.changing())
+                    async with self.standing_by(targets) as look:
+                        await self._writer.apply(changes, look)
+                await self._ledger.undone()
         except WriteFailedError as error:
-            if error.left_changed:
-                self._ledger.orphaned.set()
-            else:
-                await self._ledger.abandon()
-            if error.kind == "not as believed" and not error.left_changed:
-                return True  # learned: the offsets are read again, from another slot
-            raise
-        except BaseException:
-            self._ledger.orphaned.set()
-            raise
-        await self._ledger.abandon()
+            if error.kind != "not as believed" or error.left_changed:
+                raise
+            # Something was learned: the offsets are read again, from another slot.
         return True
-
-
-def change_set(vehicle: Vehicle, changes: Sequence[Change]) -> ChangeSet:
-    """What is kept of changes before the first of them is made."""
-    return ChangeSet(
-        system_id=vehicle.system_id or 0,
-        changes=tuple(Changed(change.parameter, change.before, change.after, change.via) for change in changes),
-    )
 
 
 def far_steps(calibration: ImuCalibration, changes: Sequence[Change]) -> list[FarStep]:

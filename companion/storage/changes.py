@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
 import msgspec
 
+from companion.autopilot.change import Change
 from companion.autopilot.vehicle import Firmware
 from companion.autopilot.written import CALIBRATION, Ranges
 from companion.storage.atomic import remove_durably, write_atomically
@@ -42,6 +43,21 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     system_id: int
     changes: tuple[Changed, ...]
+
+    @classmethod
+    def of(
+        cls, system_id: int | None, changes: Iterable[Change], unforeseen: Mapping[str, float] | None = None
+    ) -> ChangeSet:
+        """What is kept of changes before the first of them is made.
+
+        Args:
+            system_id: of the vehicle; of one that is not known nothing can be kept.
+            changes: ours.
+            unforeseen: what the firmware will overwrite, by name the old values.
+        """
+        found = [Changed(change.parameter, change.before, change.after, change.via) for change in changes]
+        found += [Changed(name, before, None) for name, before in (unforeseen or {}).items()]
+        return cls(system_id or 0, tuple(found))
 
     @property
     def names(self) -> list[str]:

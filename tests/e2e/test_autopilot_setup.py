@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import pytest
 
+from companion.autopilot.vehicle import ArmState
 from companion.cli.setup import setup_lines
 from companion.errors import CompanionError
 from tests.e2e.test_attitude_push import flight
@@ -76,8 +77,10 @@ def test_only_disarmed_and_only_with_a_stream_to_come(tmp_path: Path) -> None:
                 await ask(flying.rig, "apply")
             assert not [write for write in flying.rig.double.writes if "EK3" in write.name or "VISO" in write.name]
             flying.rig.autopilot.disarm()
-            await asyncio.sleep(4.5)  # 3 s after the last armed heartbeat it counts as disarmed
+            await flying.rig.until(lambda: flying.rig.service.vehicle.arm_state is ArmState.DISARMED, 10.0)
+            # Nothing was written, so nothing is looked after first.
             assert (await ask(flying.rig, "apply"))["state"] == "applied"
+            assert not [text for text in flying.rig.ground.texts() if "Interrupted write" in text]
         rig = Rig(tmp_path / "off")
         async with rig.running():
             await rig.ready()

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from companion.autopilot.vehicle import ArmState
 from companion.calibration.machine import State
 from companion.calibration.record import Record
 from companion.calibration.request import What
@@ -291,6 +292,29 @@ def test_cancelled_anywhere_nothing_is_left_changed(tmp_path: Path, state: State
             assert not rig.service.mender.pending
             assert rig.service.conductor.state is State.CANCELLED
             assert not rig.service.conductor.cancel("the test")
+
+    run_virtual(main())
+
+
+def test_cancelled_and_armed_at_once_the_old_values_come_back_once_disarmed(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=14.0).running() as rig:
+            await rig.ready()
+            before = values(rig.double)
+            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.conductor.state is State.VERIFYING, 60.0)
+            rig.double.arm()
+            await rig.until(lambda: rig.service.vehicle.arm_state is ArmState.ARMED, 5.0)
+            assert rig.service.conductor.cancel("the test")
+            result = await job.finished
+            assert result.outcome == "cancelled"
+            assert "old values NOT back in INS_" in result.reason
+            assert result.reason.endswith(": will be once disarmed")
+            assert values(rig.double) != before
+            assert rig.service.mender.pending
+            rig.double.disarm()
+            await rig.until(lambda: not rig.service.mender.pending, 20.0)
+            assert values(rig.double) == before
 
     run_virtual(main())
 

@@ -328,6 +328,28 @@ def test_a_daemon_that_died_during_the_firmwares_calibration_puts_everything_bac
         run_virtual(again(*kept, coarse))
 
 
+def test_a_daemon_that_died_after_it_leaves_alone_what_others_have_changed_since(tmp_path: Path) -> None:
+    first, second, foreign = tmp_path / "first", tmp_path / "second", "INS_GYR2OFFS_X"
+
+    async def until_it_dies() -> tuple[dict[str, float], dict[str, float]]:
+        async with make(first, auxiliary=True).running() as rig:
+            await rig.ready()
+            before = imu_parameters(rig)
+            started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.conductor.state is State.VERIFYING, 90.0)
+            second.mkdir()
+            (second / "journal.json").write_bytes((first / "journal.json").read_bytes())
+            return before, imu_parameters(rig)
+
+    async def again(before: dict[str, float], left: dict[str, float]) -> None:
+        assert left[foreign] != before[foreign]
+        async with make(second, auxiliary=True, parameters={**left, foreign: 0.0025}).running() as rig:
+            await rig.until(lambda: not rig.service.mender.pending, 60.0)
+            assert imu_parameters(rig) == {**before, foreign: np.float32(0.0025)}
+
+    run_virtual(again(*run_virtual(until_it_dies())))
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_a_fifth_of_all_packets_lost_leaves_the_whole_result_or_the_old_values(tmp_path: Path, seed: int) -> None:
     async def main() -> None:

@@ -190,6 +190,7 @@ def test_a_small_accelerometer_vector_is_brought_into_use_before_anything_is_mea
             assert result.outcome == "done", result
             (fc,) = record.imus
             assert in_use_as_stored(rig)
+            assert not [text for text in rig.ground.texts() if "Interrupted write" in text]
             left = rig.px4.residual(1, rig.now_s)
             assert fc.accel_sigma_use_m_s2 is not None
             assert np.abs(left.accel_m_s2 / fc.accel_sigma_use_m_s2).max() < 3.5

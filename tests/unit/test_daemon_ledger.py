@@ -1,0 +1,223 @@
+"""`Ledger.transaction`: what becomes of a write, by how its block ends; compared with what lies on the disk."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.autopilot.change import NothingWrittenError, WriteFailedError
+from companion.daemon.ledger import Ledger
+from companion.errors import AutopilotError, StorageError
+from companion.storage.changes import Changed, ChangeLog, ChangeSet
+from companion.storage.state import StateFile
+
+NAMES = ("INS_GYROFFS_X", "INS_GYROFFS_Y")
+OLD = ChangeSet(1, (Changed(NAMES[0], before=0.001, after=0.002),))
+WIDER = ChangeSet(1, (*OLD.changes, Changed(NAMES[1], before=0.003, after=None)))
+
+HALF_BACK = WriteFailedError("no answer", "silent", {}, NAMES[:1])
+ALL_BACK = WriteFailedError("refused", "read-only", {}, ())
+NOTHING = NothingWrittenError("nothing is written: the aircraft is armed")
+
+
+class TornDown(BaseException):
+    """None of those that anybody expects."""
+
+
+Block = Callable[[Ledger], Awaitable[None]]
+
+
+def on_disk(folder: Path, name: str = "journal.json") -> ChangeSet | None:
+    found: ChangeSet | None = StateFile(folder / name, ChangeSet).read()
+    return found
+
+
+def raises(error: BaseException) -> Block:
+    async def block(ledger: Ledger) -> None:
+        raise error
+
+    return block
+
+
+async def wordless(ledger: Ledger) -> None:
+    """Nobody says how it ended."""
+
+
+async def done_and_then(ledger: Ledger) -> None:
+    await ledger.done(OLD)
+    raise AutopilotError("after the end")
+
+
+async def undone_and_then(ledger: Ledger) -> None:
+    await ledger.undone()
+    raise WriteFailedError("no answer", "after the end", {}, NAMES[:1])
+
+
+class Disk:
+    """Runs the ledger's calls at once, and refuses what it shall."""
+
+    def __init__(self) -> None:
+        self.refuses: set[str] = set()
+        """Of "write" and "clear"."""
+
+    async def offload(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        await asyncio.sleep(0)
+        if function.__name__ in self.refuses:
+            raise StorageError(f"{function.__name__}: no space left")
+        return function(*arguments)
+
+
+def opened(folder: Path, disk: Disk | None = None) -> Ledger:
+    ledger = Ledger(ChangeLog(folder), (disk or Disk()).offload)
+    ledger.load()
+    return ledger
+
+
+async def end_of(ledger: Ledger, block: Block, *, stepwise: bool = False) -> BaseException | None:
+    async def write() -> None:
+        async with ledger.transaction(OLD, stepwise=stepwise):
+            await block(ledger)
+
+    (found,) = await asyncio.gather(write(), return_exceptions=True)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("block", "stepwise", "over"),
+    [
+        (raises(ALL_BACK), False, True),
+        (raises(NOTHING), False, True),
+        (raises(HALF_BACK), False, False),
+        (raises(ALL_BACK), True, False),
+        (raises(NOTHING), True, False),
+        (raises(AutopilotError("no heartbeat")), False, False),
+        (raises(StorageError("full")), False, False),
+        (raises(asyncio.CancelledError()), False, False),
+        (raises(TornDown()), False, False),
+        (wordless, False, False),
+        (done_and_then, False, True),
+        (undone_and_then, False, True),
+    ],
+    ids=[
+        "old values back", "nothing written", "left changed", "a step put back", "a step not written", "another error",
+        "the disk", "cancelled", "torn down", "no word", "an error after done", "an error after undone",
+    ],
+)  # fmt: skip
+def test_a_write_is_over_when_it_is_known_to_be_and_else_the_menders(
+    tmp_path: Path, block: Block, stepwise: bool, over: bool
+) -> None:
+    async def main() -> None:
+        ledger = opened(tmp_path)
+        await end_of(ledger, block, stepwise=stepwise)
+        assert ledger.pending is not over
+        assert on_disk(tmp_path) == (None if over else OLD)
+        if not over:
+            assert await asyncio.wait_for(ledger.interrupted(), 1.0) == OLD
+            await ledger.undone()
+            assert not ledger.pending
+            assert on_disk(tmp_path) is None
+        assert await end_of(ledger, raises(ALL_BACK)) is ALL_BACK  # the next one may write
+
+    asyncio.run(main())
+
+
+def test_the_old_values_are_on_disk_before_the_block_and_grow_with_it(tmp_path: Path) -> None:
+    async def main() -> None:
+        ledger = opened(tmp_path)
+        async with ledger.transaction(OLD):
+            assert on_disk(tmp_path) == OLD
+            assert not ledger.pending
+            await ledger.widen(WIDER)
+            assert on_disk(tmp_path) == WIDER
+            await ledger.done(WIDER)
+        assert not ledger.pending
+        assert on_disk(tmp_path) is None
+        assert on_disk(tmp_path, "undo-1.json") == WIDER == ledger.undoable[1]
+
+    asyncio.run(main())
+
+
+def test_nothing_is_written_whose_old_values_cannot_be_kept(tmp_path: Path) -> None:
+    async def main() -> None:
+        disk, called = Disk(), []
+        ledger = opened(tmp_path, disk)
+        disk.refuses = {"write"}
+
+        async def block(ledger: Ledger) -> None:
+            called.append(ledger)
+
+        assert isinstance(await end_of(ledger, block), StorageError)
+        assert not called
+        assert not ledger.pending
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("refused", ["write", "clear"])
+def test_a_disk_that_refuses_the_end_leaves_the_write_to_the_mender_and_nothing_to_undo(
+    tmp_path: Path, refused: str
+) -> None:
+    async def main() -> None:
+        disk = Disk()
+        ledger = opened(tmp_path, disk)
+
+        async def block(ledger: Ledger) -> None:
+            disk.refuses = {refused}
+            await ledger.done(OLD)
+
+        assert isinstance(await end_of(ledger, block), StorageError)
+        assert ledger.pending
+        assert on_disk(tmp_path) == OLD
+        assert not ledger.undoable
+
+    asyncio.run(main())
+
+
+def test_an_error_is_told_as_it_is_though_the_disk_refuses_to_end_it(tmp_path: Path) -> None:
+    async def main() -> None:
+        disk = Disk()
+        ledger = opened(tmp_path, disk)
+        disk.refuses = {"clear"}
+        assert await end_of(ledger, raises(ALL_BACK)) is ALL_BACK
+        assert ledger.pending
+
+    asyncio.run(main())
+
+
+def test_a_second_write_does_not_take_the_place_of_one_that_is_open(tmp_path: Path) -> None:
+    async def main() -> None:
+        ledger = opened(tmp_path)
+        async with ledger.transaction(OLD):
+            with pytest.raises(AutopilotError, match="putting old values back first"):
+                async with ledger.transaction(WIDER):
+                    raise AssertionError("written over")
+            assert not ledger.pending
+            assert on_disk(tmp_path) == OLD
+            await ledger.undone()
+
+    asyncio.run(main())
+
+
+def test_a_second_write_does_not_take_the_place_of_one_that_was_interrupted(tmp_path: Path) -> None:
+    async def main() -> None:
+        ledger = opened(tmp_path)
+        await end_of(ledger, raises(HALF_BACK))
+        assert "putting old values back first" in str(await end_of(ledger, wordless))
+        assert ledger.pending
+        assert on_disk(tmp_path) == OLD
+
+    asyncio.run(main())
+
+
+def test_what_a_daemon_that_died_left_open_is_found_at_the_start(tmp_path: Path) -> None:
+    async def main() -> None:
+        ChangeLog(tmp_path).journal.write(OLD)
+        ledger = opened(tmp_path)
+        assert ledger.pending
+        assert await asyncio.wait_for(ledger.interrupted(), 1.0) == OLD
+
+    asyncio.run(main())
