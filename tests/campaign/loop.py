@@ -48,9 +48,10 @@ class CampaignLoop(VirtualTimeLoop):
         return future
 
     async def create_connection(self, *what: Any, **options: Any) -> Any:
-        """As asyncio's; whoever looks at the page, which is on TCP, is waited for."""
+        """As asyncio's; whoever looks at the page, which is on TCP, is waited for. Unix sockets carry at once."""
         transport, protocol = await super().create_connection(*what, **options)
-        self._real.add(transport)
+        if transport.get_extra_info("socket").family != socket.AF_UNIX:
+            self._real.add(transport)
         return transport, protocol
 
     async def sock_connect(self, sock: socket.socket, address: Any) -> None:
