@@ -69,8 +69,11 @@ def test_a_daemon_that_writes_while_armed_is_caught() -> None:
 
 
 def test_a_daemon_that_does_not_mend_is_caught() -> None:
+    async def never(_open_set: object) -> None:
+        await asyncio.Event().wait()
+
     def sabotage(stage: Stage) -> None:
-        stage.service.mender._mend = asyncio.Event().wait  # type: ignore[assignment,method-assign]
+        stage.service.mender._mend = never  # type: ignore[assignment,method-assign]
 
     outcome = run_cell(FAULTS["arms-in-write"], "solving", SEED, sabotage=sabotage)
     assert any("still to be put back" in words for words in outcome.problems), outcome

@@ -23,7 +23,7 @@ from tests.e2e.test_signing import KEY, START_S, signed_rig, virtual_clock
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
-CASES = 200
+CASES = 100
 CASES_A_TEST = 25
 ACTS_S = 10.0
 WIRE_S = 0.05
