@@ -20,12 +20,12 @@ from typing import Any, Final
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.calibration.allan import noise_profile
+from companion.calibration.collector.rolling import ImuInput, RollingCollector, Settings
+from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
-from companion.calibration.rolling import ImuInput, RollingCollector, Settings
 from companion.component.arm_authorisation import ArmAuthoriser
 from companion.daemon.job import Job
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 from companion.protocols.registry import Kind, make_decoder
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay

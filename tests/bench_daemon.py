@@ -39,7 +39,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
-from companion.links.serial_port import SerialOpener
+from companion.links.serial.port import SerialOpener
 from sim.scenario import Scenario
 from sim.serve import configuration
 from tests import bench_profile, obvious_script

@@ -13,10 +13,10 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from companion.calibration.allan import noise_profile
-from companion.calibration.coverage import Kept, coverage
-from companion.calibration.profile_fit import fit_profile
-from companion.calibration.rest import Rests, rests
+from companion.calibration.noise.allan import noise_profile
+from companion.calibration.profiling.coverage import Kept, coverage
+from companion.calibration.profiling.profile_fit import fit_profile
+from companion.calibration.profiling.rest import Rests, rests
 from companion.replay.csv_columns import read_arrays
 from tests.support.made_noise import DEG_H, adis16405, write_csv
 

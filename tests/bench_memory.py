@@ -18,7 +18,7 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from companion.daemon.control import ask
+from companion.daemon.faces.control import ask
 from companion.errors import DaemonUnreachableError
 from tests.bench_arming import running
 from tests.support.broker import Broker

@@ -23,8 +23,8 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Final
 
-from companion.links.bytestream import READ_BYTES, ByteLink, PortSettings
-from companion.protocols.vectornav import VectorNavDecoder
+from companion.links.serial.bytestream import READ_BYTES, ByteLink, PortSettings
+from companion.protocols.imus.vectornav import VectorNavDecoder
 from companion.samples import Sample
 from tests.support.frames import vectornav_imu
 

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.history import Measured, Point, PowerUp
-from companion.calibration.joint import Weighed, weigh
-from companion.calibration.pose_effect import PoseEffect, pose_effect
-from companion.calibration.prior import Expectation, ExpectedImu, Now, expect
-from companion.calibration.record import Pose, PoseSigma, Site
-from companion.calibration.solve import ImuSolution, Shared, Solution
+from companion.calibration.solution.history import Measured, Point, PowerUp
+from companion.calibration.solution.joint import Weighed, weigh
+from companion.calibration.solution.pose_effect import PoseEffect, pose_effect
+from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, expect
+from companion.calibration.solution.record import Pose, PoseSigma, Site
+from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 
 Array = NDArray[np.float64]
 DEG = np.pi / 180.0

@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from companion.cli import DONE, FAILED, load_config, print_json, print_lines, seconds
-from companion.daemon.control import ask
+from companion.daemon.faces.control import ask
 
 Object = dict[str, Any]
 

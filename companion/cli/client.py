@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from companion.cli import DONE, FAILED, load_config, print_json, print_lines, show
-from companion.daemon.control import ask
+from companion.daemon.faces.control import ask
 
 Object = dict[str, Any]
 

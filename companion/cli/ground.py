@@ -132,7 +132,7 @@ async def _interruptible(station: Station) -> AsyncIterator[None]:
 
 
 def _key(path: Path) -> bytes:
-    from companion.links.mavlink_keys import read_key
+    from companion.links.mavlink.keys import read_key
 
     try:
         return read_key(path)
@@ -141,7 +141,7 @@ def _key(path: Path) -> bytes:
 
 
 def _url(text: str) -> str:
-    from companion.links.mavlink_transport import parse_url
+    from companion.links.mavlink.transport import parse_url
 
     try:
         parse_url(text)

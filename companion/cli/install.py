@@ -50,7 +50,7 @@ async def uninstall(options: argparse.Namespace) -> int:
 async def udev_rule(options: argparse.Namespace) -> int:
     """`companion udev-rule`: the rule on stdout, what to do with it on stderr."""
     from companion.installation import udev
-    from companion.links.ports import list_ports
+    from companion.links.serial.ports import list_ports
 
     rule, words = udev.rule(options.name, options.port, list_ports())
     if getattr(options, "json", False):

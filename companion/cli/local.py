@@ -14,8 +14,8 @@ from companion.cli import DONE, FAILED, config_path, load_config, logs, print_js
 from companion.errors import CompanionError, LinkError
 
 if TYPE_CHECKING:
-    from companion.links.listening import Heard
-    from companion.links.ports import SerialPort
+    from companion.links.serial.listening import Heard
+    from companion.links.serial.ports import SerialPort
 
 
 async def run(options: argparse.Namespace) -> int:
@@ -24,10 +24,10 @@ async def run(options: argparse.Namespace) -> int:
     # Where the whole process stands still the watchdog's SIGABRT is the only witness: let it say where that was.
     faulthandler.enable()
     logs.set_up("debug" if options.verbose else config.log.level)
-    from companion.daemon import footprint
+    from companion.daemon.process import footprint
 
     footprint.prepare()
-    from companion.daemon import process
+    from companion.daemon.process import run as process
 
     await process.run(config, config_path(options))
     return DONE
@@ -35,7 +35,7 @@ async def run(options: argparse.Namespace) -> int:
 
 async def ports(options: argparse.Namespace) -> int:
     """`companion ports`: listed; listened to only when that is asked for."""
-    from companion.links.ports import list_ports
+    from companion.links.serial.ports import list_ports
 
     found = list_ports()
     listened = None if options.listen is None else await _listen(options.listen, found)
@@ -54,7 +54,7 @@ async def ports(options: argparse.Namespace) -> int:
 
 async def _listen(wanted: Sequence[str], found: Sequence[SerialPort]) -> dict[str, Heard | str]:
     """Who speaks on each port, or why that is not known."""
-    from companion.links.listening import listen
+    from companion.links.serial.listening import listen
 
     async def one(port: str) -> Heard | str:
         try:
@@ -121,7 +121,7 @@ async def web_token(options: argparse.Namespace) -> int:
 
 async def check(options: argparse.Namespace) -> int:
     """`companion check`."""
-    from companion.daemon.check import run_check
+    from companion.daemon.process.check import run_check
 
     config = load_config(options, profiles=True)
     findings = await run_check(config, options.seconds)

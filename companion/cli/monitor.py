@@ -18,7 +18,7 @@ import time
 from typing import Any, Final, Protocol
 
 from companion.cli import DONE, load_config, print_json, print_lines, show
-from companion.daemon.control import ask
+from companion.daemon.faces.control import ask
 from companion.errors import DaemonUnreachableError
 from companion.printable import printable
 

@@ -18,10 +18,10 @@ from companion.physics.units import DEG_H, MG
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from companion.calibration.allan import AllanModel, NoiseProfile
-    from companion.calibration.coverage import Kept
-    from companion.calibration.profile_fit import AxisFinding, Finding
-    from companion.calibration.rest import Rests
+    from companion.calibration.noise.allan import AllanModel, NoiseProfile
+    from companion.calibration.profiling.coverage import Kept
+    from companion.calibration.profiling.profile_fit import AxisFinding, Finding
+    from companion.calibration.profiling.rest import Rests
     from companion.replay.still_log import StillLog
 
 LEAST_SHARE: Final = 0.90
@@ -113,7 +113,7 @@ async def profile(options: argparse.Namespace) -> int:
 
 
 def _compared(options: argparse.Namespace) -> NoiseProfile | None:
-    from companion.calibration.allan import noise_profile
+    from companion.calibration.noise.allan import noise_profile
     from companion.storage.profiles import given_profile
 
     if options.profile is None:
@@ -138,10 +138,10 @@ def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s
     Raises:
         CalibrationRefusedError: the recordings tell nothing of it.
     """
-    from companion.calibration.allan import noise_profile
-    from companion.calibration.coverage import coverage
-    from companion.calibration.profile_fit import fit_profile
-    from companion.calibration.rest import joined, rests
+    from companion.calibration.noise.allan import noise_profile
+    from companion.calibration.profiling.coverage import coverage
+    from companion.calibration.profiling.profile_fit import fit_profile
+    from companion.calibration.profiling.rest import joined, rests
 
     whole = [log for log in logs if not log.truncated]
     if not whole:
@@ -261,7 +261,7 @@ def _figures(model: AllanModel) -> tuple[float, float, float]:
 
 def _cell(axis: AxisFinding, which: int, unit: float, digits: int) -> str:
     """A figure with its standard error, or its upper limit where it is not told."""
-    from companion.calibration.allan import FLOOR_OF_FLICKER
+    from companion.calibration.noise.allan import FLOOR_OF_FLICKER
 
     factor = (1.0, FLOOR_OF_FLICKER, 1.0)[which] / unit
     digits += 2 * (which == 2)

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from companion.cli import DONE, FAILED, load_config, print_json, print_lines, seconds, show, storage_path
-from companion.daemon.control import ask
+from companion.daemon.faces.control import ask
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
-    from companion.calibration.record import Record
+    from companion.calibration.solution.record import Record
     from companion.replay.engine import Result
 
 Object = dict[str, Any]

@@ -13,7 +13,7 @@ from companion.cli import DONE, FAILED, USAGE, Command, load_config, print_json,
 from companion.errors import CompanionError, ConfigError, StorageError
 
 if TYPE_CHECKING:
-    from companion.calibration.allan import NoiseProfile
+    from companion.calibration.noise.allan import NoiseProfile
 
 
 def add_command(add: Callable[[str, Command, str], argparse.ArgumentParser], count: Callable[[str], int]) -> None:
@@ -64,7 +64,7 @@ def _where(options: argparse.Namespace) -> tuple[Path, dict[str, NoiseProfile]]:
     Raises:
         ConfigError: there is no configuration to say where, and no --storage.
     """
-    from companion.calibration.allan import noise_profile
+    from companion.calibration.noise.allan import noise_profile
 
     try:
         config = load_config(options, profiles=True)

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from companion.calibration.record import Magnetic
+from companion.calibration.solution.record import Magnetic
 from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
-    from companion.links.listening import Heard
-    from companion.links.ports import SerialPort
+    from companion.links.serial.listening import Heard
+    from companion.links.serial.ports import SerialPort
     from companion.protocols.guess import Candidate, Line
 
 Object = dict[str, Any]

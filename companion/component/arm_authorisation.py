@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.service import ArmGate, VehicleView
 from companion.component.statustext import Severity, Weight
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 
 VALID_S: Final = 10
 """How long the autopilot may arm on an ACCEPTED without asking again; 0 would expire at once."""

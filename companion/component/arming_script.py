@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.service import ArmGate, VehicleView
 from companion.component.statustext import to_ascii
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 
 PERIOD_S: Final = 0.5
 PAYLOAD_TYPE: Final = 33191

@@ -28,7 +28,7 @@ from companion.component.identity import autopilot_version
 from companion.component.permission import Permission
 from companion.component.service import CalibrationService, Job, Refusal
 from companion.component.statustext import Severity, Weight
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 
 logger = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from companion.component.own_parameters import OwnParameters
 from companion.component.permission import Permission
 from companion.component.service import ArmGate, CalibrationService, VehicleView
 from companion.component.statustext import Severity, StatusText, Weight
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 
 HEARTBEAT_PERIOD_S = 1.0
 _RETRY_S = 0.05

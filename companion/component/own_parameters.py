@@ -22,7 +22,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.component.permission import Permission
 from companion.component.statustext import Severity, Weight
 from companion.errors import CompanionError
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 
 logger = logging.getLogger(__name__)
 

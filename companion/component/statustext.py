@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 
 CHUNK_BYTES = 50
 MAX_TEXT_BYTES = 4 * CHUNK_BYTES - 1

@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 from typing import Final
 
-from companion.calibration.align_record import AlignmentRecord
-from companion.calibration.doubt import Doubt
-from companion.calibration.history import Triad
-from companion.calibration.record import Record, WrittenParameter
+from companion.calibration.alignment.align_record import AlignmentRecord
 from companion.calibration.request import What
+from companion.calibration.solution.doubt import Doubt
+from companion.calibration.solution.history import Triad
+from companion.calibration.solution.record import Record, WrittenParameter
 from companion.component.service import JobResult
 
 ALIGNMENT: Final = "gradienter alignment"

@@ -20,7 +20,7 @@ from typing import Any, ClassVar, Final
 from companion.errors import AutopilotError, ConfigError, LinkError
 from companion.ground.exchange import Ack
 from companion.ground.heard import Heard, Target
-from companion.links.mavlink_transport import parse_url
+from companion.links.mavlink.transport import parse_url
 
 logger = logging.getLogger(__name__)
 

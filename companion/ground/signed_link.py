@@ -13,9 +13,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.links.mavlink import MavlinkLink, Message
-from companion.links.mavlink_signing import Signing
-from companion.links.mavlink_transport import run_transport
+from companion.links.mavlink.link import MavlinkLink, Message
+from companion.links.mavlink.signing import Signing
+from companion.links.mavlink.transport import run_transport
 
 
 class SignedLink:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 
 from companion.errors import CompanionError, ConfigError
-from companion.links.ports import SerialPort
+from companion.links.serial.ports import SerialPort
 
 FILE = "/etc/udev/rules.d/71-companion-devices.rules"
 _IGNORED = 'ENV{ID_MM_DEVICE_IGNORE}="1", ENV{ID_MM_PORT_IGNORE}="1"'

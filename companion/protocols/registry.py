@@ -8,25 +8,25 @@ from typing import Literal
 
 from companion.config.sections import Law
 from companion.errors import ConfigError
-from companion.protocols.base import Decoder
-from companion.protocols.dialogue import Dialogue
-from companion.protocols.hmr3300 import Hmr3300Decoder
-from companion.protocols.hmr3300_dialogue import Hmr3300Dialogue
-from companion.protocols.imu_dialogues import MipDialogue, VectorNavDialogue, XsensDialogue
-from companion.protocols.imu_line import ImuLineDecoder
-from companion.protocols.inclinometer_xy import InclinometerXyDecoder
-from companion.protocols.inclinometer_xy_dialogue import InclinometerXyDialogue
-from companion.protocols.jewell import JewellDecoder
-from companion.protocols.mip import MipDecoder
-from companion.protocols.nmea import NmeaDecoder
-from companion.protocols.os5000 import Os5000Decoder
-from companion.protocols.pni import PniDecoder, PniDialogue
-from companion.protocols.polls import Hmr3000Dialogue, JewellDialogue
-from companion.protocols.rion import RionDecoder, RionDialogue
-from companion.protocols.stim300 import Stim300Decoder
-from companion.protocols.vectornav import VectorNavDecoder
-from companion.protocols.witmotion import WitMotionDecoder
-from companion.protocols.xsens import XsensDecoder
+from companion.protocols.compasses.hmr3300 import Hmr3300Decoder
+from companion.protocols.compasses.hmr3300_dialogue import Hmr3300Dialogue
+from companion.protocols.compasses.nmea import NmeaDecoder
+from companion.protocols.compasses.os5000 import Os5000Decoder
+from companion.protocols.compasses.pni import PniDecoder, PniDialogue
+from companion.protocols.decoding.base import Decoder
+from companion.protocols.decoding.dialogue import Dialogue
+from companion.protocols.decoding.polls import Hmr3000Dialogue, JewellDialogue
+from companion.protocols.imus.imu_dialogues import MipDialogue, VectorNavDialogue, XsensDialogue
+from companion.protocols.imus.imu_line import ImuLineDecoder
+from companion.protocols.imus.mip import MipDecoder
+from companion.protocols.imus.stim300 import Stim300Decoder
+from companion.protocols.imus.vectornav import VectorNavDecoder
+from companion.protocols.imus.witmotion import WitMotionDecoder
+from companion.protocols.imus.xsens import XsensDecoder
+from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.inclinometers.inclinometer_xy_dialogue import InclinometerXyDialogue
+from companion.protocols.inclinometers.jewell import JewellDecoder
+from companion.protocols.inclinometers.rion import RionDecoder, RionDialogue
 
 Kind = Literal["imu", "gradienter", "compass"]
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from companion.protocols.base import (
+from companion.protocols.decoding.base import (
     CALIBRATING,
     COMMAND_REFUSED,
     NON_FINITE,

@@ -7,11 +7,11 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from companion.calibration.estimates import Work
-from companion.calibration.outlook import Glance, Status
-from companion.calibration.pose_models import CompassModel, GradienterModel
-from companion.calibration.rolling import ImuInput, RollingCollector, Settings, Window
-from companion.calibration.settling import AT_ONCE, Lag
+from companion.calibration.collector.outlook import Glance, Status
+from companion.calibration.collector.rolling import ImuInput, RollingCollector, Settings, Window
+from companion.calibration.means.estimates import Work
+from companion.calibration.means.pose_models import CompassModel, GradienterModel
+from companion.calibration.stillness.settling import AT_ONCE, Lag
 from companion.recording.journal import Journal
 from companion.samples import CompassSample, ImuSample, TiltSample
 

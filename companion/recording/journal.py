@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import msgspec
 
-from companion.calibration.record import Record
+from companion.calibration.solution.record import Record
 from companion.recording import topics
 from companion.recording.state import to_json
 from companion.samples import CompassSample, ImuSample, TiltSample

@@ -18,28 +18,28 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
-from companion.autopilot.imu_calibration import FarStep, ImuCalibration, ImuParameters
-from companion.autopilot.rivals import Rival
-from companion.calibration.allan import AllanModel, NoiseProfile
-from companion.calibration.batches import Batch, BatchSource, Counts
-from companion.calibration.estimates import Estimates
-from companion.calibration.field_heading import FieldHeading
-from companion.calibration.heading_watch import HeadingWatch
-from companion.calibration.pose_effect import PoseEffect
-from companion.calibration.pose_models import CompassModel, GradienterModel
-from companion.calibration.pose_windows import FieldWindow, HeadingWindow, TiltWindow
-from companion.calibration.prior import Expectation, Expected, ExpectedImu
-from companion.calibration.rolling import RollingCollector
-from companion.calibration.settling import Lag, Settling
-from companion.calibration.site import Whereabouts
-from companion.calibration.sources import Source
-from companion.calibration.stillness import ImuGate, PoseGate, Verdict
-from companion.calibration.stop import Settings
-from companion.calibration.stretch import Stretch
-from companion.calibration.trace import TraceLog
-from companion.calibration.windows import Hidden, ImuInput, ImuWindow, Window
+from companion.autopilot.firmware.imu_calibration import FarStep, ImuCalibration, ImuParameters
+from companion.autopilot.firmware.rivals import Rival
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.collector.sources import Source
+from companion.calibration.collector.stop import Settings
+from companion.calibration.collector.trace import TraceLog
+from companion.calibration.means.estimates import Estimates
+from companion.calibration.means.field_heading import FieldHeading
+from companion.calibration.means.pose_models import CompassModel, GradienterModel
+from companion.calibration.means.pose_windows import FieldWindow, HeadingWindow, TiltWindow
+from companion.calibration.means.windows import Hidden, ImuInput, ImuWindow, Window
+from companion.calibration.noise.allan import AllanModel, NoiseProfile
+from companion.calibration.seconds.batches import Batch, BatchSource, Counts
+from companion.calibration.solution.pose_effect import PoseEffect
+from companion.calibration.solution.prior import Expectation, Expected, ExpectedImu
+from companion.calibration.solution.site import Whereabouts
+from companion.calibration.stillness.gates import ImuGate, PoseGate, Verdict
+from companion.calibration.stillness.heading_watch import HeadingWatch
+from companion.calibration.stillness.settling import Lag, Settling
+from companion.calibration.stillness.stretch import Stretch
 from companion.errors import StorageError
-from companion.protocols.clock import DeviceClock, SampleTimes
+from companion.protocols.decoding.clock import DeviceClock, SampleTimes
 from companion.protocols.registry import PROTOCOLS
 
 _CHANGING: Final[dict[str, type]] = {

@@ -12,7 +12,7 @@ from typing import Any, Final, Literal
 
 import msgspec
 
-from companion.calibration.record import ImuRecord, Record, to_json
+from companion.calibration.solution.record import ImuRecord, Record, to_json
 from companion.samples import CompassSample, ImuSample, TiltSample
 
 FORMAT_VERSION: Final = "1"

@@ -7,13 +7,11 @@ from collections.abc import Mapping
 
 import msgspec
 
-from companion.autopilot.imu_calibration import ImuCalibration
-from companion.calibration.record import ImuRecord, Record
-from companion.calibration.solve import Solution
-from companion.calibration.windows import Window
-from companion.daemon.course import in_words
-from companion.daemon.plan import whole_of
-from companion.daemon.report import Draft
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
+from companion.calibration.means.windows import Window
+from companion.calibration.solution.draft import Draft, in_words
+from companion.calibration.solution.record import ImuRecord, Record
+from companion.calibration.solution.solve import Solution
 
 
 def record_again(recorded: Record, solution: Solution, solved_with: Mapping[str, ImuCalibration | None]) -> Record:

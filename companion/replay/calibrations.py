@@ -6,21 +6,19 @@ from typing import Any, Final
 
 import msgspec
 
-from companion.autopilot.imu_calibration import ImuCalibration
-from companion.calibration.joint import weigh
-from companion.calibration.measurement import Measurement
-from companion.calibration.prior import Expectation
-from companion.calibration.record import AlignmentUsed, Record
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
+from companion.calibration.collector.measurement import Measurement
+from companion.calibration.collector.rolling import RollingCollector, Window
 from companion.calibration.request import What
-from companion.calibration.rolling import RollingCollector, Window
-from companion.calibration.site import Whereabouts
-from companion.calibration.solve import ImuSolution, Solution, solve_at
+from companion.calibration.solution.draft import Draft, in_words
+from companion.calibration.solution.joint import weigh
+from companion.calibration.solution.prior import Expectation
+from companion.calibration.solution.record import AlignmentUsed, Record
+from companion.calibration.solution.site import Whereabouts
+from companion.calibration.solution.solve import ImuSolution, Solution, solve_at
 from companion.config import Config
-from companion.daemon import models
-from companion.daemon.alignment import aligned
-from companion.daemon.course import in_words
-from companion.daemon.plan import whole_of
-from companion.daemon.report import Draft
+from companion.configured import models
+from companion.configured.models import aligned
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array
 from companion.replay.again import record_again, refined_window

@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from companion.calibration.record import Record
+from companion.calibration.solution.record import Record
 
 _SIGMAS = {
     "gyro_bias_rad_s": "gyro_sigma_use_rad_s",

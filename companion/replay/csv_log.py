@@ -13,18 +13,17 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.calibration.allan import noise_profile
-from companion.calibration.measurement import Measurement
-from companion.calibration.pose_windows import HeadingWindow, TiltWindow
-from companion.calibration.record import Record
+from companion.calibration.collector.measurement import Measurement
+from companion.calibration.collector.rolling import RollingCollector, Settings, Window
+from companion.calibration.means.pose_windows import HeadingWindow, TiltWindow
+from companion.calibration.means.windows import ImuInput
+from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
-from companion.calibration.rolling import RollingCollector, Settings, Window
-from companion.calibration.site import Whereabouts
-from companion.calibration.solve import CompassModel, GradienterModel, solve_at
-from companion.calibration.windows import ImuInput
+from companion.calibration.solution.draft import Draft, in_words
+from companion.calibration.solution.record import Record
+from companion.calibration.solution.site import Whereabouts
+from companion.calibration.solution.solve import CompassModel, GradienterModel, solve_at
 from companion.config import Mounting, Noise
-from companion.daemon.course import in_words
-from companion.daemon.report import Draft
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import rotation_matrix
 from companion.samples import ImuSample

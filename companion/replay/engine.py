@@ -15,15 +15,15 @@ from typing import Any, Final
 
 import msgspec
 
-from companion.autopilot.imu_calibration import ImuCalibration
-from companion.calibration.record import Record, from_json
-from companion.calibration.rolling import RollingCollector, Window
-from companion.calibration.site import Whereabouts
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.calibration.collector.rolling import RollingCollector, Window
+from companion.calibration.solution.draft import Draft
+from companion.calibration.solution.record import Record, from_json
+from companion.calibration.solution.site import Whereabouts
 from companion.config import Config
-from companion.daemon.report import Draft
-from companion.daemon.serial_devices import Role, collect, parts_of, serial_devices
+from companion.configured.devices import Role, collect, parts_of, serial_devices
 from companion.errors import CalibrationRefusedError, StorageError
-from companion.protocols.base import Decoder
+from companion.protocols.decoding.base import Decoder
 from companion.recording import state, topics
 from companion.recording.files import versions
 from companion.recording.walk import Attachment, Messages, Metadata, Recording

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.autopilot import imu_messages
+from companion.autopilot.telemetry import imu_messages
 from companion.config import Config, Noise
 from companion.errors import StorageError
 from companion.recording import topics

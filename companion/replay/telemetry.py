@@ -7,9 +7,9 @@ from typing import Any, Final
 
 import msgspec
 
-from companion.autopilot import imu_messages
-from companion.autopilot.imu_messages import ImuMessage, Reading
-from companion.links.mavlink import MavlinkLink
+from companion.autopilot.telemetry import imu_messages
+from companion.autopilot.telemetry.imu_messages import ImuMessage, Reading
+from companion.links.mavlink.link import MavlinkLink
 from companion.recording import topics
 from companion.samples import ImuSample
 

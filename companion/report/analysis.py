@@ -10,8 +10,8 @@ from typing import Final, Literal
 
 import msgspec
 
-from companion.calibration.record import Record
-from companion.calibration.trace import MAX_SECONDS, Axes, ImuTrace, Trace, VerdictTrace
+from companion.calibration.collector.trace import MAX_SECONDS, Axes, ImuTrace, Trace, VerdictTrace
+from companion.calibration.solution.record import Record
 
 Triad = Literal["gyro", "accel"]
 State = Literal["still", "moving", "fault", "unknown"]
@@ -51,7 +51,7 @@ def allan(trace: Trace, imu: ImuTrace, triad: Triad) -> Allan | None:
     """
     import numpy as np
 
-    from companion.calibration.allan import allan_variance
+    from companion.calibration.noise.allan import allan_variance
 
     places = _measured(trace) if trace.measured is not None else _longest_still(trace)
     values = imu.gyro_rad_s if triad == "gyro" else imu.accel_m_s2

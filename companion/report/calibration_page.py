@@ -8,9 +8,9 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.allan import AllanModel
-from companion.calibration.record import Arming, ImuRecord, Outcome, Record
-from companion.calibration.trace import Axes, Trace
+from companion.calibration.collector.trace import Axes, Trace
+from companion.calibration.noise.allan import AllanModel
+from companion.calibration.solution.record import Arming, ImuRecord, Outcome, Record
 from companion.report import svg
 from companion.report.analysis import Triad, history
 from companion.report.markup import Child, Markup, join, number, tag

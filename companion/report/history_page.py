@@ -10,7 +10,7 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.record import Arming, Record
+from companion.calibration.solution.record import Arming, Record
 from companion.report import svg
 from companion.report.analysis import history, unix_s
 from companion.report.markup import Child, Markup, join, tag

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from companion import __version__
-from companion.calibration.allan import NoiseProfile
-from companion.calibration.record import Arming, Record
+from companion.calibration.noise.allan import NoiseProfile
+from companion.calibration.solution.record import Arming, Record
 from companion.physics.units import DEG_H, MG
 from companion.report import svg
 from companion.report.advice import advice

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from companion.calibration.trace import ImuTrace, Trace
+from companion.calibration.collector.trace import ImuTrace, Trace
 from companion.report import svg
 from companion.report.analysis import Run, Triad, allan, runs
 from companion.report.markup import Child, Markup, tag

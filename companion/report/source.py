@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from companion.calibration.record import Arming, Record
+from companion.calibration.solution.record import Arming, Record
 from companion.errors import StorageError
 from companion.report import calibration_page, history_page
 from companion.report.page import Profiles

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from companion.calibration.align_record import AlignmentRecord, check
+from companion.calibration.alignment.align_record import AlignmentRecord, check
 from companion.storage.state import StateFile
 
 

@@ -7,7 +7,7 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.history import Point, check
+from companion.calibration.solution.history import Point, check
 from companion.storage.state import StateFile
 
 FORMAT_VERSION: Final = 1

@@ -15,9 +15,9 @@ from typing import Final
 
 import msgspec
 
-from companion.autopilot.change import Change
-from companion.autopilot.vehicle import Firmware
-from companion.autopilot.written import CALIBRATION, Ranges
+from companion.autopilot.firmware.written import CALIBRATION, Ranges
+from companion.autopilot.parameters.change import Change
+from companion.autopilot.vehicle.vehicle import Firmware
 from companion.storage.atomic import remove_durably, write_atomically
 from companion.storage.state import StateFile
 

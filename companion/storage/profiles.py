@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import msgspec
 
-from companion.calibration.allan import PROFILES, AllanModel, NoiseProfile
+from companion.calibration.noise.allan import PROFILES, AllanModel, NoiseProfile
 from companion.config import Noise
 from companion.config.profiles import CATALOGUE
 from companion.errors import ConfigError, StorageError

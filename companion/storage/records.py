@@ -11,9 +11,9 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration import trace as traces
-from companion.calibration.record import Record, from_json, to_json
-from companion.calibration.trace import Trace
+from companion.calibration.collector import trace as traces
+from companion.calibration.collector.trace import Trace
+from companion.calibration.solution.record import Record, from_json, to_json
 from companion.errors import StorageError
 from companion.storage.atomic import remove_durably, write_atomically
 from companion.storage.state import UNREADABLE, read_regular, sealed, unsealed

@@ -21,8 +21,8 @@ import msgspec
 
 from companion import __version__
 from companion.errors import CompanionError
-from companion.links.backoff import Backoff
-from companion.links.request import parse_request
+from companion.links.system.backoff import Backoff
+from companion.links.system.request import parse_request
 from companion.web.access import (
     TOKEN_HEADER,
     Access,

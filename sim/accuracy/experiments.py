@@ -13,9 +13,9 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from companion.calibration.allan import noise_profile
-from companion.calibration.rolling import Window
-from companion.calibration.windows import ImuInput
+from companion.calibration.collector.rolling import Window
+from companion.calibration.means.windows import ImuInput
+from companion.calibration.noise.allan import noise_profile
 from companion.errors import CalibrationRefusedError
 from sim.accuracy import paper, peers
 from sim.accuracy.stand import (

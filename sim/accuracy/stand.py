@@ -16,12 +16,12 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.pose_models import CompassModel, GradienterModel
+from companion.calibration.collector.rolling import RollingCollector, Settings, Window
+from companion.calibration.means.pose_models import CompassModel, GradienterModel
+from companion.calibration.means.windows import ImuInput
 from companion.calibration.request import What
-from companion.calibration.rolling import RollingCollector, Settings, Window
-from companion.calibration.site import LocalEarth, local_earth
-from companion.calibration.solve import ImuSolution, Solution, solve
-from companion.calibration.windows import ImuInput
+from companion.calibration.solution.site import LocalEarth, local_earth
+from companion.calibration.solution.solve import ImuSolution, Solution, solve
 from companion.physics.gradienter import Law
 from companion.samples import CompassSample, ImuSample, TiltSample
 from sim.aircraft import Pose, Site, VirtualAircraft

@@ -8,14 +8,14 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.calibration.allan import noise_profile
+from companion.calibration.collector.rolling import RollingCollector, Settings
+from companion.calibration.means.windows import ImuInput
+from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
-from companion.calibration.rolling import RollingCollector, Settings
-from companion.calibration.site import LocalEarth, Whereabouts, local_earth
-from companion.calibration.solve import CompassModel, GradienterModel, ImuSolution, Solution, solve
-from companion.calibration.windows import ImuInput
+from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
+from companion.calibration.solution.solve import CompassModel, GradienterModel, ImuSolution, Solution, solve
 from companion.physics.gradienter import Law
-from companion.protocols.base import Decoder
+from companion.protocols.decoding.base import Decoder
 from companion.protocols.registry import Kind, make_decoder
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
 from sim.aircraft import Site

@@ -15,7 +15,7 @@ import numpy as np
 
 from companion.attitude.estimator import AttitudeEstimator, AttitudeSettings
 from companion.attitude.quaternion import Quaternion
-from companion.calibration.allan import noise_profile
+from companion.calibration.noise.allan import noise_profile
 from companion.physics.frames import body_from_ned
 from companion.physics.units import DEG
 from companion.samples import CompassSample, ImuSample

@@ -20,9 +20,9 @@ from typing import Any, NamedTuple
 
 from companion.calibration.machine import Event, State
 from companion.config import parse
-from companion.daemon.control import ControlServer
-from companion.daemon.service import Service
-from companion.links.mavlink import MavlinkLink
+from companion.daemon.faces.control import ControlServer
+from companion.daemon.process.service import Service
+from companion.links.mavlink.link import MavlinkLink
 from sim.devices import Frame, SerialDevice, VectorNavBinary
 from tests.campaign import loopback
 from tests.campaign.clock import WallClock

@@ -11,10 +11,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.record import Record
 from companion.calibration.request import What
+from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
-from companion.daemon.align_steps import Plan
+from companion.daemon.calibrating.align_steps import Plan
 from companion.daemon.job import Job
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay

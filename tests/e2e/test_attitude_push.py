@@ -16,7 +16,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.calibration.request import What
-from companion.daemon.attitude.service import AttitudeService
+from companion.daemon.heading.attitude_service import AttitudeService
 from companion.daemon.job import Job
 from sim.aircraft import Pose
 from sim.flight import BankedCircles
@@ -477,7 +477,7 @@ def test_a_fault_of_ours_costs_the_push_and_nothing_else(tmp_path: Path, monkeyp
 
 def test_off_is_off() -> None:
     """Neither imported nor listening."""
-    code = "import companion.daemon.service, sys; print([m for m in sys.modules if 'attitude' in m])"
+    code = "import companion.daemon.process.service, sys; print([m for m in sys.modules if 'attitude' in m])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
 

@@ -12,7 +12,7 @@ import pytest
 from companion.calibration.machine import State
 from companion.calibration.request import What
 from companion.component.service import Refusal
-from companion.daemon import automatic
+from companion.daemon.arming import automatic
 from companion.daemon.job import Job
 from sim.imu_model import DEG_H, MG
 from tests.e2e.test_calibration import FC_PARAMETERS

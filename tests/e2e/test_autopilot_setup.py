@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import pytest
 
-from companion.autopilot.vehicle import ArmState
+from companion.autopilot.vehicle.vehicle import ArmState
 from companion.cli.setup import setup_lines
 from companion.errors import CompanionError
 from tests.e2e.test_attitude_push import flight

@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.history import PowerUp
-from companion.calibration.record import Record
+from companion.calibration.solution.history import PowerUp
+from companion.calibration.solution.record import Record
 from companion.daemon.job import Job
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay

@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.record import Record
 from companion.calibration.request import What
+from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
 from sim.autopilot import offset_names

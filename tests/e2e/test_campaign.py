@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from companion.autopilot.vehicle import ArmState, Vehicle
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.component.commands import CommandServer
 from tests.campaign.__main__ import SEED, slice_of
 from tests.campaign.catalogue import FAULTS

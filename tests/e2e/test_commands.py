@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from companion.calibration.record import ImuRecord, Record, WrittenParameter
+from companion.calibration.solution.record import ImuRecord, Record, WrittenParameter
 from sim.pty_device import PtyDevice
 from sim.scenario import Scenario, demo
 from sim.serve import configuration
@@ -304,7 +304,7 @@ def test_ports_lists_what_the_kernel_has() -> None:
 
 def test_the_daemon_stays_light() -> None:
     """What must not be imported to run: each costs start-up time and memory on a small board."""
-    code = "import sys, companion.daemon.service, companion.cli.local; print(' '.join(sys.modules))"
+    code = "import sys, companion.daemon.process.service, companion.cli.local; print(' '.join(sys.modules))"
 
     async def main() -> bytes:
         process = await asyncio.create_subprocess_exec(
@@ -314,7 +314,7 @@ def test_the_daemon_stays_light() -> None:
         return out
 
     modules = set(asyncio.run(main()).decode().split())
-    assert "companion.daemon.service" in modules
+    assert "companion.daemon.process.service" in modules
     for heavy in (
         "pymavlink.mavutil",
         "lxml",

@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.dither import STEPS
-from companion.calibration.record import Record
+from companion.calibration.means.dither import STEPS
 from companion.calibration.request import What
+from companion.calibration.solution.record import Record
 from companion.component.service import JobResult
 from companion.config.sections import Imu, Push
 from companion.daemon.job import Job

@@ -19,8 +19,8 @@ import pytest
 
 from companion import cli
 from companion.cli import client, local
-from companion.daemon import check
-from companion.links.bytestream import ByteLink
+from companion.daemon.process import check
+from companion.links.serial.bytestream import ByteLink
 from tests.support.documents import DOCUMENTS, session
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual

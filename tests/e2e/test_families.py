@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.calibration.record import ImuRecord, Record
 from companion.calibration.request import What
+from companion.calibration.solution.record import ImuRecord, Record
 from companion.config import parse
-from companion.daemon import models
+from companion.configured import models
 from companion.daemon.job import Job
-from companion.daemon.service import Service
+from companion.daemon.process.service import Service
 from companion.protocols.registry import PROTOCOLS
 from sim.aircraft import Pose, VirtualAircraft
 from sim.autopilot import ArduPilotDouble

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.autopilot.vehicle import ArmState
+from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.machine import State
-from companion.calibration.record import Record
 from companion.calibration.request import What
+from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from sim.autopilot import ArduPilotDouble, offset_names

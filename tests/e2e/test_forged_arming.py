@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.daemon import signing as daemon_signing
-from companion.links.mavlink_signing import ticks_of
+from companion.daemon.devices import signing as daemon_signing
+from companion.links.mavlink.signing import ticks_of
 from sim.px4.double import PX4Double
 from tests.e2e.test_interleavings import people
 from tests.e2e.test_signing import KEY, START_S, signed_rig, virtual_clock

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from companion.autopilot.verify import Verdict
+from companion.autopilot.parameters.verify import Verdict
 from companion.calibration.machine import State
-from companion.daemon import effect, push
+from companion.daemon.offsets import effect, push
 from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual

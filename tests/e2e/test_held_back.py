@@ -13,7 +13,7 @@ from companion.calibration.machine import State
 from companion.calibration.request import What
 from companion.cli.show import monitor_lines, record_lines
 from companion.component.service import Refusal
-from companion.daemon import automatic
+from companion.daemon.arming import automatic
 from companion.daemon.job import Job
 from sim.devices import Gradienter
 from sim.imu_model import MG

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.vehicle import ArmState
+from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.request import What
-from companion.calibration.validity import Why
+from companion.calibration.solution.validity import Why
 from companion.component.service import Refusal
 from sim.autopilot import offset_names
 from sim.imu_model import DEG_H

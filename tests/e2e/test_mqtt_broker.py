@@ -13,10 +13,10 @@ import pytest
 
 from companion.calibration.machine import State
 from companion.config import parse
-from companion.daemon.mqtt import face
-from companion.daemon.mqtt.face import FLUSH_S
-from companion.daemon.service import Service
-from companion.links import mqtt as link
+from companion.daemon.faces.mqtt import face
+from companion.daemon.faces.mqtt.face import FLUSH_S
+from companion.daemon.process.service import Service
+from companion.links.mqtt import client as link
 from tests.support.broker import BEST, KINDS, Broker, Kind, broker, hurry, peer
 from tests.support.mqtt_daemon import (
     ALONE,

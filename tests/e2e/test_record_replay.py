@@ -18,14 +18,14 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from companion.autopilot.vehicle import ArmState
-from companion.calibration.record import Record
+from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.request import What
+from companion.calibration.solution.record import Record
 from companion.cli import main as companion
 from companion.config.sections import Config, Noise
-from companion.daemon import recorder as recorder_module
-from companion.daemon.control import Object
+from companion.daemon.recorder import recorder as recorder_module
 from companion.errors import CompanionError, StorageError
+from companion.links.system.request import Object
 from companion.recording import topics
 from companion.recording.files import Ring, versions
 from companion.recording.walk import MAGIC, Message, Recording

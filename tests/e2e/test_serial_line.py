@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.calibration.request import What
 from companion.config import parse
-from companion.daemon import models
+from companion.configured import models
 from companion.daemon.job import Job
 from sim.imu_model import DEG_H, MG
 from tests.support.rig import Rig

@@ -24,11 +24,11 @@ WATCHDOG_S = 2.0
 HANGING = """
 import asyncio, sys
 from companion.cli import main
-from companion.daemon import supervisor
-from companion.daemon.in_force import InForce
+from companion.daemon.process import supervisor
+from companion.daemon.arming.in_force import InForce
 from companion.component.component import Component
-from companion.links import bytestream
-from companion.links.bytestream import ByteLink
+from companion.links.serial import bytestream
+from companion.links.serial.bytestream import ByteLink
 
 supervisor.ESTIMATOR_S = supervisor.COMPONENT_S = 3.0
 bytestream.BEAT_WITHIN_S, supervisor.MARGIN_S = 3.0, 0.0

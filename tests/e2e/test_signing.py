@@ -16,9 +16,9 @@ from typing import Any, Literal
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.vehicle import ArmState
-from companion.daemon import signing as daemon_signing
-from companion.links.mavlink_signing import SigningClock, ticks_of
+from companion.autopilot.vehicle.vehicle import ArmState
+from companion.daemon.devices import signing as daemon_signing
+from companion.links.mavlink.signing import SigningClock, ticks_of
 from tests.support.component import ACCEPTED, CALIBRATE, CANCEL, DENIED, Ground, command_message
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual

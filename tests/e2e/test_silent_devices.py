@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from companion.daemon.sensors import SerialSensor
-from companion.daemon.serial_devices import Role, SerialDevice
+from companion.configured.devices import Role, SerialDevice
+from companion.daemon.devices.sensors import SerialSensor
 from companion.protocols.registry import PROTOCOLS, Kind
 from companion.protocols.roles import Part
 from companion.samples import CompassSample, TiltSample

@@ -9,9 +9,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.calibration.request import What
 from companion.component.service import Refusal
-from companion.daemon.align_steps import Plan
+from companion.daemon.calibrating.align_steps import Plan
+from companion.daemon.calibrating.start_limit import MOST_REQUESTERS, StartLimit
 from companion.daemon.job import Job
-from companion.daemon.start_limit import MOST_REQUESTERS, StartLimit
 from tests.support.component import ACCEPTED, CALIBRATE, CANCEL, TEMPORARILY_REJECTED
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual

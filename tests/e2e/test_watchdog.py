@@ -10,8 +10,8 @@ import pytest
 
 from companion.calibration.request import What
 from companion.component.service import Refusal
-from companion.daemon.supervisor import Supervisor
-from companion.links.service_manager import ServiceManager
+from companion.daemon.process.supervisor import Supervisor
+from companion.links.system.service_manager import ServiceManager
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 

@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.autopilot.ardupilot import parameters_of
-from companion.autopilot.imu_calibration import (
+from companion.autopilot.firmware.ardupilot import parameters_of
+from companion.autopilot.firmware.imu_calibration import (
     ImuCalibration,
     changes_for,
     offsets_after,

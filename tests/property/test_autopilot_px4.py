@@ -9,12 +9,12 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.autopilot.firmwares import read_calibration
-from companion.autopilot.imu_calibration import changes_for, output_step
-from companion.autopilot.parameters import ParameterClient
-from companion.autopilot.vehicle import Vehicle
-from companion.autopilot.writer import ParameterWriter
-from companion.links.mavlink import MavlinkLink
+from companion.autopilot.firmware.firmwares import read_calibration
+from companion.autopilot.firmware.imu_calibration import changes_for, output_step
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.links.mavlink.link import MavlinkLink
 from companion.samples import Vector
 from tests.support.scripted_autopilot import f32, flying_on
 from tests.support.scripted_px4 import ICM, ScriptedPx4

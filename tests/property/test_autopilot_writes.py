@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.autopilot.float32 import same_float32
-from companion.autopilot.parameters import ParameterClient
-from companion.autopilot.vehicle import ArmState, Vehicle
-from companion.autopilot.writer import Change, ParameterWriter, WriteFailedError
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.float32 import same_float32
+from companion.autopilot.parameters.writer import Change, ParameterWriter, WriteFailedError
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.errors import NotDisarmedError
-from companion.links.mavlink import MavlinkLink, Message
+from companion.links.mavlink.link import MavlinkLink, Message
 from tests.support.scripted_autopilot import ScriptedAutopilot, f32, flying_on
 from tests.support.virtual_time import run_virtual
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.calibration.batches import BatchSource
-from companion.calibration.robust import huber_line, huber_mean
-from companion.calibration.rolling import RollingCollector, Status
+from companion.calibration.collector.rolling import RollingCollector, Status
+from companion.calibration.noise.robust import huber_line, huber_mean
+from companion.calibration.seconds.batches import BatchSource
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import rotation_matrix
 from companion.rotations import ROTATION_NAMES

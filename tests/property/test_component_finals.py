@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component import requests
 from companion.component.service import Refusal
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 from tests.support.component import (
     ACCEPTED,
     CALIBRATE,

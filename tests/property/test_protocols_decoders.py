@@ -12,28 +12,28 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from companion.protocols import mip as mip_protocol
-from companion.protocols import stim300_datagrams
-from companion.protocols import xsens as xsens_protocol
-from companion.protocols.base import Decoder, LineDecoder, SentenceDecoder, xor_checksum
-from companion.protocols.framing import FrameDecoder
-from companion.protocols.hmr3300 import Hmr3300Decoder
-from companion.protocols.imu_line import ImuLineDecoder
-from companion.protocols.inclinometer_xy import InclinometerXyDecoder
-from companion.protocols.jewell import JewellDecoder
-from companion.protocols.mip import MipDecoder
-from companion.protocols.nmea import NmeaDecoder
-from companion.protocols.os5000 import Os5000Decoder
-from companion.protocols.pni import LONGEST as PNI_LONGEST
-from companion.protocols.pni import PniDecoder
-from companion.protocols.rion import LONGEST as RION_LONGEST
-from companion.protocols.rion import RionDecoder
-from companion.protocols.stim300 import Stim300Decoder
-from companion.protocols.vectornav import SENTENCE_LIMIT, VectorNavDecoder
-from companion.protocols.vectornav_binary import MAX_FRAME_BYTES
-from companion.protocols.witmotion import FRAME_BYTES as WIT_BYTES
-from companion.protocols.witmotion import WitMotionDecoder
-from companion.protocols.xsens import XsensDecoder
+from companion.protocols.compasses.hmr3300 import Hmr3300Decoder
+from companion.protocols.compasses.nmea import NmeaDecoder
+from companion.protocols.compasses.os5000 import Os5000Decoder
+from companion.protocols.compasses.pni import LONGEST as PNI_LONGEST
+from companion.protocols.compasses.pni import PniDecoder
+from companion.protocols.decoding.base import Decoder, LineDecoder, SentenceDecoder, xor_checksum
+from companion.protocols.decoding.framing import FrameDecoder
+from companion.protocols.imus import mip as mip_protocol
+from companion.protocols.imus import stim300_datagrams
+from companion.protocols.imus import xsens as xsens_protocol
+from companion.protocols.imus.imu_line import ImuLineDecoder
+from companion.protocols.imus.mip import MipDecoder
+from companion.protocols.imus.stim300 import Stim300Decoder
+from companion.protocols.imus.vectornav import SENTENCE_LIMIT, VectorNavDecoder
+from companion.protocols.imus.vectornav_binary import MAX_FRAME_BYTES
+from companion.protocols.imus.witmotion import FRAME_BYTES as WIT_BYTES
+from companion.protocols.imus.witmotion import WitMotionDecoder
+from companion.protocols.imus.xsens import XsensDecoder
+from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.inclinometers.jewell import JewellDecoder
+from companion.protocols.inclinometers.rion import LONGEST as RION_LONGEST
+from companion.protocols.inclinometers.rion import RionDecoder
 from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
 from tests.support.frames import (
     STIM_CONTENTS,

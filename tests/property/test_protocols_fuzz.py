@@ -12,21 +12,21 @@ from collections import deque
 
 import pytest
 
-from companion.protocols.base import Decoder
-from companion.protocols.hmr3300 import Hmr3300Decoder
-from companion.protocols.imu_line import ImuLineDecoder
-from companion.protocols.inclinometer_xy import InclinometerXyDecoder
-from companion.protocols.jewell import JewellDecoder
-from companion.protocols.mip import MipDecoder
-from companion.protocols.nmea import NmeaDecoder
-from companion.protocols.os5000 import Os5000Decoder
-from companion.protocols.pni import PniDecoder
+from companion.protocols.compasses.hmr3300 import Hmr3300Decoder
+from companion.protocols.compasses.nmea import NmeaDecoder
+from companion.protocols.compasses.os5000 import Os5000Decoder
+from companion.protocols.compasses.pni import PniDecoder
+from companion.protocols.decoding.base import Decoder
+from companion.protocols.imus.imu_line import ImuLineDecoder
+from companion.protocols.imus.mip import MipDecoder
+from companion.protocols.imus.stim300 import Stim300Decoder
+from companion.protocols.imus.vectornav import VectorNavDecoder
+from companion.protocols.imus.witmotion import WitMotionDecoder
+from companion.protocols.imus.xsens import MAX_DATA_BYTES, XsensDecoder
+from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.inclinometers.jewell import JewellDecoder
+from companion.protocols.inclinometers.rion import RionDecoder
 from companion.protocols.registry import PROTOCOLS, make_decoder
-from companion.protocols.rion import RionDecoder
-from companion.protocols.stim300 import Stim300Decoder
-from companion.protocols.vectornav import VectorNavDecoder
-from companion.protocols.witmotion import WitMotionDecoder
-from companion.protocols.xsens import MAX_DATA_BYTES, XsensDecoder
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
 from tests.support.frames import (
     imu_line,

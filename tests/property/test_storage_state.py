@@ -11,7 +11,7 @@ import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.calibration.record import Arming
+from companion.calibration.solution.record import Arming
 from companion.storage.alignment import AlignmentStore
 from companion.storage.biases import BiasStore
 from companion.storage.bounded import BoundedList

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.calibration.request import What
 from companion.component.component import Component
 from companion.component.service import ArmAnswer, Job, JobResult, Refusal
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 from tests.support.wire import Wire
 
 CALIBRATE, CANCEL, UNDO, PREFLIGHT = 31010, 31011, 31012, 241

@@ -13,7 +13,7 @@ from pathlib import Path
 
 CODE = """
 import os, sys
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 
 def first(self, message):
     assert message.get_type() == "HEARTBEAT", message

@@ -8,8 +8,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from companion.calibration.allan import noise_profile
-from companion.calibration.record import (
+from companion.calibration.collector.trace import Axes, ImuTrace, Trace, VerdictTrace
+from companion.calibration.noise.allan import noise_profile
+from companion.calibration.solution.record import (
     Arming,
     ImuRecord,
     Pose,
@@ -18,7 +19,6 @@ from companion.calibration.record import (
     Site,
     WrittenParameter,
 )
-from companion.calibration.trace import Axes, ImuTrace, Trace, VerdictTrace
 from companion.physics.units import DEG_H, MG
 from companion.storage.atomic import write_atomically
 from companion.storage.records import RecordStore

@@ -17,11 +17,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.rolling import RollingCollector
-from companion.calibration.site import Whereabouts
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.solution.site import Whereabouts
 from companion.config import Config, parse
-from companion.daemon import models
-from companion.daemon.serial_devices import serial_devices
+from companion.configured import models
+from companion.configured.devices import serial_devices
 from companion.recording import journal, topics
 from companion.recording.files import RecordingFile, versions
 from companion.recording.journal import Beginning, Entry

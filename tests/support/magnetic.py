@@ -8,11 +8,11 @@ import math
 import msgspec
 import numpy as np
 
-from companion.calibration.field_heading import FieldHeading
-from companion.calibration.pose_windows import FieldUnit, FieldWindow, HeadingWindow
-from companion.calibration.site import LocalEarth, Whereabouts, local_earth
-from companion.calibration.solve import CompassModel, GradienterModel
-from companion.calibration.windows import Window
+from companion.calibration.means.field_heading import FieldHeading
+from companion.calibration.means.pose_windows import FieldUnit, FieldWindow, HeadingWindow
+from companion.calibration.means.windows import Window
+from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
+from companion.calibration.solution.solve import CompassModel, GradienterModel
 from companion.samples import MagSample, TiltSample
 from tests.support.windows import Array, ideal_window, ned_from_body
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from companion.config import parse
-from companion.daemon.service import Service
+from companion.daemon.process.service import Service
 from tests.support.broker import BEST, Heard
 
 ALONE = """

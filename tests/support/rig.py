@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from companion.config import parse
-from companion.daemon.ledger import Offload
-from companion.daemon.service import Service
-from companion.links.mavlink import MavlinkLink
+from companion.daemon.offload import Offload
+from companion.daemon.process.service import Service
+from companion.links.mavlink.link import MavlinkLink
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.autopilot import ArduPilotDouble
 from sim.devices import HMR3300, Gradienter, Law, SerialDevice, VectorNavBinary

@@ -14,7 +14,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 from tests.support.wire import Wire
 
 IMU_OF = {

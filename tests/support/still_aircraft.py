@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.allan import AllanModel, NoiseProfile, noise_profile
-from companion.calibration.rolling import ImuInput, RollingCollector, Settings
+from companion.calibration.collector.rolling import ImuInput, RollingCollector, Settings
+from companion.calibration.noise.allan import AllanModel, NoiseProfile, noise_profile
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import CompassSample, ImuSample, TiltSample
 

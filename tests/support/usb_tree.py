@@ -40,7 +40,7 @@ needs_udevadm = pytest.mark.skipif(_WHY_NOT is not None, reason=str(_WHY_NOT))
 
 
 class UsbTree:
-    """The tree below a root, as `companion.links.ports` reads it too."""
+    """The tree below a root, as `companion.links.serial.ports` reads it too."""
 
     def __init__(self, root: Path) -> None:
         self.root = root

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.pose_windows import HeadingWindow, TiltWindow
-from companion.calibration.windows import ImuWindow, Window
+from companion.calibration.means.pose_windows import HeadingWindow, TiltWindow
+from companion.calibration.means.windows import ImuWindow, Window
 
 Array = NDArray[np.float64]
 RATE_RAD_S = 7.292115e-5

@@ -13,7 +13,7 @@ BUFFER_BYTES = 1024.0
 
 
 class End(Protocol):
-    """What a wire can be plugged into: companion.links.mavlink.MavlinkLink and the simulator's autopilots."""
+    """What a wire can be plugged into: companion.links.mavlink.link.MavlinkLink and the simulator's autopilots."""
 
     def attach(self, transmit: Callable[[bytes], None] | None) -> None: ...
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from companion.attitude.estimator import Attitude, AttitudeEstimator, AttitudeSettings, Phase
 from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD
-from companion.calibration.allan import noise_profile
+from companion.calibration.noise.allan import noise_profile
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import ImuSample
 from sim.aircraft import Pose, Site, VirtualAircraft

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from companion.attitude.estimator import AttitudeEstimator, AttitudeSettings
 from companion.attitude.quaternion import Quaternion, from_matrix
 from companion.attitude.strapdown import Strapdown
-from companion.calibration.allan import noise_profile
+from companion.calibration.noise.allan import noise_profile
 from companion.physics.units import DEG_H
 from companion.samples import ImuSample
 from tests.support.recordings import shared

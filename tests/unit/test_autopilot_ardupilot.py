@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.ardupilot import parameters_of
-from companion.autopilot.firmwares import read_calibration
-from companion.autopilot.imu_calibration import (
+from companion.autopilot.firmware.ardupilot import parameters_of
+from companion.autopilot.firmware.firmwares import read_calibration
+from companion.autopilot.firmware.imu_calibration import (
     ImuCalibration,
     accel_offset_after,
     changes_for,
@@ -18,10 +18,10 @@ from companion.autopilot.imu_calibration import (
     output_step,
     whole_bias,
 )
-from companion.autopilot.parameters import ParameterClient
-from companion.autopilot.vehicle import Vehicle
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.errors import AutopilotError, AutopilotRebootedError, CalibrationRefusedError
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 from tests.support.scripted_autopilot import ScriptedAutopilot, f32, flying_on
 from tests.support.virtual_time import run_virtual
 

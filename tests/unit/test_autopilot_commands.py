@@ -5,8 +5,8 @@ import asyncio
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.commands import MAX_WAITING, Commands
-from companion.links.mavlink import MavlinkLink
+from companion.autopilot.vehicle.commands import MAX_WAITING, Commands
+from companion.links.mavlink.link import MavlinkLink
 from tests.support.virtual_time import run_virtual
 
 SET_INTERVAL = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL

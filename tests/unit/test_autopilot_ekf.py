@@ -9,9 +9,9 @@ from collections.abc import Callable
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.ekf import EkfWatch
-from companion.autopilot.vehicle import Vehicle
-from companion.links.mavlink import MavlinkLink
+from companion.autopilot.vehicle.ekf import EkfWatch
+from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.links.mavlink.link import MavlinkLink
 from tests.support.scripted_autopilot import ScriptedAutopilot, flying_on
 from tests.support.virtual_time import run_virtual
 

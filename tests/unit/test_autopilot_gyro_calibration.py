@@ -9,9 +9,9 @@ from typing import cast
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.gyro_calibration import TIMEOUT_S, GyroParameters, calibrate_gyros
-from companion.autopilot.parameters import ParameterClient
-from companion.autopilot.vehicle import ArmState
+from companion.autopilot.firmware.gyro_calibration import TIMEOUT_S, GyroParameters, calibrate_gyros
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.vehicle.vehicle import ArmState
 from tests.support.virtual_time import run_virtual
 
 OFFSETS = {f"INS_GYROFFS_{axis}": 0.01 for axis in "XYZ"}

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.imu_stream import ImuStream, StreamKind
-from companion.autopilot.vehicle import Vehicle
-from companion.links.mavlink import MavlinkLink
+from companion.autopilot.telemetry.imu_stream import ImuStream, StreamKind
+from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.links.mavlink.link import MavlinkLink
 from companion.samples import ImuSample
 from tests.support.scripted_autopilot import ScriptedAutopilot, flying_on
 from tests.support.virtual_time import run_virtual

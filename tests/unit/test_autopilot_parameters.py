@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.float32 import float32, same_float32
-from companion.autopilot.parameters import ParameterClient
-from companion.autopilot.vehicle import Vehicle
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.float32 import float32, same_float32
+from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.errors import (
     AutopilotRebootedError,
     NotDisarmedError,
@@ -20,7 +20,7 @@ from companion.errors import (
     ParameterRefusedError,
     ParameterTimeoutError,
 )
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 from tests.support.scripted_autopilot import ScriptedAutopilot, f32, flying_on
 from tests.support.virtual_time import run_virtual
 from tests.support.wire import Wire

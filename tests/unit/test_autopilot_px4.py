@@ -11,15 +11,15 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from companion.autopilot.change import Change, WriteFailedError
-from companion.autopilot.firmwares import needs_reboot, read_calibration, warnings_about
-from companion.autopilot.imu_calibration import ImuCalibration, changes_for
-from companion.autopilot.parameters import ParameterClient
-from companion.autopilot.px4_slots import NO_IMU, Slot, SlotMemory
-from companion.autopilot.vehicle import Vehicle
-from companion.autopilot.writer import ParameterWriter
+from companion.autopilot.firmware.firmwares import needs_reboot, read_calibration, warnings_about
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
+from companion.autopilot.firmware.px4_slots import NO_IMU, Slot, SlotMemory
+from companion.autopilot.parameters.change import Change, WriteFailedError
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.errors import AutopilotError, NotDisarmedError, ParameterRefusedError
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 from tests.support.scripted_autopilot import f32, flying_on
 from tests.support.scripted_px4 import ICM, INT32, ScriptedPx4
 from tests.support.virtual_time import run_virtual

@@ -7,10 +7,10 @@ from collections.abc import AsyncIterator
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.boot_clock import BootClock
-from companion.autopilot.vehicle import ArmState, Vehicle
-from companion.autopilot.whereabouts import Position
-from companion.links.mavlink import MavlinkLink
+from companion.autopilot.vehicle.boot_clock import BootClock
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.autopilot.vehicle.whereabouts import Position
+from companion.links.mavlink.link import MavlinkLink
 from tests.support.scripted_autopilot import ScriptedAutopilot, flying_on
 from tests.support.virtual_time import run_virtual
 

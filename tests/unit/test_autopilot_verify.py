@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from companion.autopilot.verify import Observation, Verdict, judge
+from companion.autopilot.parameters.verify import Observation, Verdict, judge
 from companion.samples import Vector
 
 NAMES = ("INS_GYROFFS_X", "INS_GYROFFS_Y", "INS_GYROFFS_Z")

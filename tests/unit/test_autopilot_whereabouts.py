@@ -8,7 +8,7 @@ from collections.abc import Callable, Coroutine
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.whereabouts import TimeAndPlace
+from companion.autopilot.vehicle.whereabouts import TimeAndPlace
 from tests.support.virtual_time import run_virtual
 
 HOME = (47.3977, 8.5456, 488.0)

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.firmwares import read_calibration
-from companion.autopilot.imu_calibration import changes_for, output_step
-from companion.autopilot.imu_stream import ImuStream
-from companion.autopilot.parameters import ParameterClient
-from companion.autopilot.vehicle import Vehicle
-from companion.autopilot.verify import Observation, judge
-from companion.autopilot.writer import ParameterWriter, WriteFailedError
+from companion.autopilot.firmware.firmwares import read_calibration
+from companion.autopilot.firmware.imu_calibration import changes_for, output_step
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.verify import Observation, judge
+from companion.autopilot.parameters.writer import ParameterWriter, WriteFailedError
+from companion.autopilot.telemetry.imu_stream import ImuStream
+from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.errors import AutopilotRebootedError
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 from companion.samples import ImuSample, Vector
 from sim.aircraft import Pose, VirtualAircraft
 from sim.autopilot import ArduPilotDouble

@@ -6,11 +6,11 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from companion.autopilot.parameters import ParameterClient
-from companion.autopilot.vehicle import Vehicle
-from companion.autopilot.writer import Change, ParameterWriter, WriteFailedError
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.writer import Change, ParameterWriter, WriteFailedError
+from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.errors import AutopilotRebootedError, NotDisarmedError
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 from tests.support.scripted_autopilot import ScriptedAutopilot, f32, flying_on
 from tests.support.virtual_time import run_virtual
 from tests.support.wire import Wire

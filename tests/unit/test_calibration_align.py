@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.align import Alignment, align, in_words
-from companion.calibration.align_model import Ground, ImuStand, Model, Priors, Stand
+from companion.calibration.alignment.align import Alignment, align, in_words
+from companion.calibration.alignment.align_model import Ground, ImuStand, Model, Priors, Stand
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import rotation_matrix
 from companion.physics.gradienter import Law

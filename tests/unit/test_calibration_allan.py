@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.allan import (
+from companion.calibration.noise.allan import (
     FLOOR_OF_FLICKER,
     PROFILES,
     AllanModel,

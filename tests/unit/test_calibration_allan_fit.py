@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.allan_fit import AxisFit, Curve, _scatter, curve, fit_axis
+from companion.calibration.noise.allan_fit import AxisFit, Curve, _scatter, curve, fit_axis
 from tests.support.made_noise import FLICKER_OF_FLOOR, slow
 
 Floats = NDArray[np.float64]

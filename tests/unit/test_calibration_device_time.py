@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 import pytest
 
-from companion.calibration.batches import Batch
-from companion.calibration.rolling import RollingCollector
-from companion.calibration.sources import SourceStatus
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.collector.sources import SourceStatus
+from companion.calibration.seconds.batches import Batch
 from companion.errors import CalibrationRefusedError
-from companion.protocols.imu_line import ImuLineDecoder
+from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.samples import ImuSample
 from tests.support.frames import imu_line
 from tests.support.serial_reads import RATE_HZ, Floats, Reads, reads

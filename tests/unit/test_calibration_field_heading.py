@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from companion.calibration.field_heading import FieldHeading
-from companion.calibration.heading_watch import HeadingWatch
-from companion.calibration.pose_models import CompassModel, GradienterModel, vehicle_heading_rad
-from companion.calibration.rolling import RollingCollector
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.means.field_heading import FieldHeading
+from companion.calibration.means.pose_models import CompassModel, GradienterModel, vehicle_heading_rad
+from companion.calibration.stillness.heading_watch import HeadingWatch
 from companion.physics.frames import wrap_deg
 from companion.physics.units import DEG
 from companion.samples import CompassSample, MagSample, TiltSample

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.allan import NoiseProfile
-from companion.calibration.batches import MAX_LEVELS, Batch, BatchSource
-from companion.calibration.integers import integer_means
-from companion.calibration.stop import is_enough
-from companion.calibration.windows import ImuEstimate, ImuInput, imu_estimates, integer_steps
+from companion.calibration.collector.stop import is_enough
+from companion.calibration.means.integers import integer_means
+from companion.calibration.means.windows import ImuEstimate, ImuInput, imu_estimates, integer_steps
+from companion.calibration.noise.allan import NoiseProfile
+from companion.calibration.seconds.batches import MAX_LEVELS, Batch, BatchSource
 from companion.physics.units import DEG_H, MG
 from tests.support.still_aircraft import QUIET, imu, settings
 

@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from companion.calibration.quantised import (
+from companion.calibration.means.quantised import (
     EDGE_RMS,
     MIN_BEYOND_TWO,
     Cells,

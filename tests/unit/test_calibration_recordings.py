@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.rolling import RollingCollector
+from companion.calibration.collector.rolling import RollingCollector
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import MG
 from tests.support.recordings import Recording, px4, xio, xsens_counts
@@ -22,7 +22,7 @@ class Played:
     """A recording after the collector: one entry a second, and the still stretches."""
 
     def __init__(self, recording: Recording, **asked: float) -> None:
-        from companion.calibration.allan import noise_profile
+        from companion.calibration.noise.allan import noise_profile
 
         self.collector = RollingCollector(
             settings(**asked), [imu("fc", noise_profile(None))], gradienter=False, compass=False

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import stats
 
-from companion.calibration.ramps import slope_limit
-from companion.calibration.robust import HUBER_C, Floats, huber_line, huber_mean, median, robust_mean
+from companion.calibration.means.ramps import slope_limit
+from companion.calibration.noise.robust import HUBER_C, Floats, huber_line, huber_mean, median, robust_mean
 
 
 def test_huber_mean_solves_its_own_equation() -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration import estimates
-from companion.calibration.allan import AllanModel, NoiseProfile
-from companion.calibration.rolling import RollingCollector, Settings
+from companion.calibration.collector.rolling import RollingCollector, Settings
+from companion.calibration.means import estimates
+from companion.calibration.noise.allan import AllanModel, NoiseProfile
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import CompassSample, ImuSample, TiltSample

@@ -10,14 +10,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from companion.calibration.allan import noise_profile
-from companion.calibration.batches import Batch
-from companion.calibration.rolling import RollingCollector, Window
-from companion.calibration.settling import AT_ONCE, UNKNOWN_DEG, Lag, Settling
-from companion.calibration.windows import ImuInput
+from companion.calibration.collector.rolling import RollingCollector, Window
+from companion.calibration.means.windows import ImuInput
+from companion.calibration.noise.allan import noise_profile
+from companion.calibration.seconds.batches import Batch
+from companion.calibration.stillness.settling import AT_ONCE, UNKNOWN_DEG, Lag, Settling
 from companion.config import Compass
 from companion.config import Gradienter as Section
-from companion.daemon.models import lag
+from companion.configured.models import lag
 from companion.errors import CalibrationRefusedError
 from companion.physics.gradienter import attitude_from_readings
 from companion.protocols.registry import PROTOCOLS, make_decoder

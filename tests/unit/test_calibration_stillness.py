@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.allan import noise_profile
-from companion.calibration.batches import Batch, BatchSource
-from companion.calibration.channels import lower_quartile
-from companion.calibration.stillness import (
+from companion.calibration.noise.allan import noise_profile
+from companion.calibration.noise.channels import lower_quartile
+from companion.calibration.seconds.batches import Batch, BatchSource
+from companion.calibration.stillness.gates import (
     GLRT_RATIO,
     ImuGate,
     Verdict,
     compass_gate,
     gradienter_gate,
 )
-from companion.calibration.stretch import Stretch
+from companion.calibration.stillness.stretch import Stretch
 from companion.physics.units import DEG, MG
 
 Floats = NDArray[np.float64]

@@ -6,9 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration import trace as traces
-from companion.calibration.rolling import RollingCollector
-from companion.calibration.trace import MAX_SECONDS, Trace
+from companion.calibration.collector import trace as traces
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.collector.trace import MAX_SECONDS, Trace
 from tests.support.still_aircraft import BIAS, FORCE, GYRO_NOISE, RATE_HZ, Feeder, imu, settings
 
 YAW_90 = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

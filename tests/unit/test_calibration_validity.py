@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.calibration.allan import PROFILES, AllanModel, use_variance
-from companion.calibration.validity import (
+from companion.calibration.noise.allan import PROFILES, AllanModel, use_variance
+from companion.calibration.solution.validity import (
     DRIFT_SIGMAS,
     Held,
     Limits,

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.allan import AllanModel, NoiseProfile, noise_profile, slope_variance, use_variance
-from companion.calibration.batches import Batch
-from companion.calibration.pose_windows import heading_window, tilt_window
-from companion.calibration.windows import ImuInput, imu_estimates
+from companion.calibration.means.pose_windows import heading_window, tilt_window
+from companion.calibration.means.windows import ImuInput, imu_estimates
+from companion.calibration.noise.allan import AllanModel, NoiseProfile, noise_profile, slope_variance, use_variance
+from companion.calibration.seconds.batches import Batch
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H
 from tests.support.still_aircraft import QUIET, imu

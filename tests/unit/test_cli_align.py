@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from companion import cli
-from companion.calibration.align_record import AlignmentRecord, GradienterSettings
+from companion.calibration.alignment.align_record import AlignmentRecord, GradienterSettings
 from companion.cli.align import alignment_lines
 from companion.errors import StorageError
 from companion.storage.alignment import AlignmentStore

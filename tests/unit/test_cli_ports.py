@@ -8,8 +8,8 @@ import dataclasses
 import pytest
 
 from companion.cli import local
-from companion.links import listening
-from companion.links.ports import SerialPort
+from companion.links.serial import listening
+from companion.links.serial.ports import SerialPort
 from companion.protocols.guess import Candidate, Line
 
 PORT = SerialPort(

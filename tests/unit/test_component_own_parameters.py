@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.component.component import Component
 from companion.component.own_parameters import OwnParameters
 from companion.errors import CalibrationRefusedError
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 from tests.support.component import Ground, bench
 from tests.support.virtual_time import run_virtual
 

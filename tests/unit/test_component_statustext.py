@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.component import Component
 from companion.component.statustext import Severity, StatusText, Weight, split_chunks, to_ascii
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 from tests.support.component import Ground, bench
 from tests.support.virtual_time import run_virtual
 

@@ -7,7 +7,7 @@ from typing import get_args
 
 import pytest
 
-from companion.calibration.allan import PROFILES
+from companion.calibration.noise.allan import PROFILES
 from companion.config import Config, load, parse
 from companion.config.sections import Profile
 from companion.errors import ConfigError

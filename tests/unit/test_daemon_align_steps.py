@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from companion.daemon.align_steps import Plan, Seen, objection, request, turned_deg
+from companion.daemon.calibrating.align_steps import Plan, Seen, objection, request, turned_deg
 
 
 def stands(heading_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Seen:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from companion.config import parse
-from companion.daemon.service import Service
+from companion.daemon.process.service import Service
 from companion.errors import CompanionError
 from tests.support.mqtt_daemon import ALONE
 

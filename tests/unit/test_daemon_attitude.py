@@ -12,17 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from companion.attitude.estimator import Attitude
 from companion.attitude.quaternion import Quaternion
-from companion.autopilot.attitude_messages import attitude_messages, vision_position_estimate
-from companion.autopilot.heading_parameters import changes_for
-from companion.calibration.record import ImuRecord, Outcome, WrittenParameter
-from companion.calibration.site import Whereabouts, local_earth
+from companion.autopilot.firmware.heading_parameters import changes_for
+from companion.autopilot.telemetry.attitude_messages import attitude_messages, vision_position_estimate
+from companion.calibration.solution.record import ImuRecord, Outcome, WrittenParameter
+from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.config import Imu, parse
-from companion.daemon import models
-from companion.daemon.attitude.difference import turn_between
-from companion.daemon.attitude.sender import Sender, is_sane
-from companion.daemon.attitude.source import settings_of, without_truncation
+from companion.configured import models
+from companion.daemon.heading.difference import turn_between
+from companion.daemon.heading.sender import Sender, is_sane
+from companion.daemon.heading.source import settings_of, without_truncation
 from companion.errors import AutopilotError
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 from companion.samples import ImuSample
 
 HERE = local_earth(Whereabouts(40.0, 116.0, 50.0, "test", None))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from companion.daemon.beats import Beats
+from companion.daemon.process.beats import Beats
 
 
 def test_who_is_silent_is_missed_and_who_comes_back_is_not() -> None:

@@ -13,9 +13,10 @@ from pathlib import Path
 import pytest
 
 from companion.config import Control
-from companion.daemon import control
-from companion.daemon.control import ControlServer, Object, ask
+from companion.daemon.faces import control
+from companion.daemon.faces.control import ControlServer, ask
 from companion.errors import CalibrationRefusedError, DaemonUnreachableError, LinkError
+from companion.links.system.request import Object
 
 
 async def _echo(request: Object) -> AsyncIterator[Object]:

@@ -8,12 +8,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.autopilot.ardupilot import parameters_of
-from companion.autopilot.imu_calibration import ImuCalibration
-from companion.autopilot.verify import Verdict
-from companion.autopilot.writer import Change
-from companion.calibration.windows import ImuWindow
-from companion.daemon.effect import Sides, judge_vectors
+from companion.autopilot.firmware.ardupilot import parameters_of
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.parameters.verify import Verdict
+from companion.autopilot.parameters.writer import Change
+from companion.calibration.means.windows import ImuWindow
+from companion.daemon.offsets.effect import Sides, judge_vectors
 
 NOISE_RAD_S = 1e-4
 """Of a second's mean."""

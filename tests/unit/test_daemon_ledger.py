@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from companion.autopilot.change import NothingWrittenError, WriteFailedError
-from companion.daemon.ledger import Ledger
+from companion.autopilot.parameters.change import NothingWrittenError, WriteFailedError
+from companion.daemon.offsets.ledger import Ledger
 from companion.errors import AutopilotError, StorageError
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from companion.storage.state import StateFile

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from companion.config import Config, parse
-from companion.daemon import models
+from companion.configured import models
 
 AUTOPILOT = '[mavlink]\nurl = "tcp:h:1"\n[[imu]]\nname = "fc"\nsource = "autopilot"\n'
 

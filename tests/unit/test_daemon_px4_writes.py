@@ -11,17 +11,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from companion.autopilot.change import Change, WriteFailedError
-from companion.autopilot.firmwares import read_calibration
-from companion.autopilot.imu_calibration import ImuCalibration, changes_for
-from companion.autopilot.parameters import ParameterClient
-from companion.autopilot.px4_slots import NO_IMU, SlotMemory
-from companion.autopilot.vehicle import Vehicle
-from companion.autopilot.writer import ParameterWriter
-from companion.daemon.far_step import FarStepWatch
-from companion.daemon.ledger import Ledger
-from companion.daemon.px4_writes import Px4Writes, step_from_far
-from companion.links.mavlink import MavlinkLink
+from companion.autopilot.firmware.firmwares import read_calibration
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
+from companion.autopilot.firmware.px4_slots import NO_IMU, SlotMemory
+from companion.autopilot.parameters.change import Change, WriteFailedError
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.daemon.offsets.far_step import FarStepWatch
+from companion.daemon.offsets.ledger import Ledger
+from companion.daemon.offsets.px4_writes import Px4Writes, step_from_far
+from companion.links.mavlink.link import MavlinkLink
 from companion.storage.changes import ChangeLog
 from tests.support.scripted_autopilot import flying_on
 from tests.support.scripted_px4 import ICM, ScriptedPx4

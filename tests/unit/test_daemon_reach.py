@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from companion.autopilot.parameters import ParameterClient
-from companion.autopilot.vehicle import Vehicle
-from companion.daemon.reach import Reach
-from companion.links.mavlink import MavlinkLink
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.daemon.devices.reach import Reach
+from companion.links.mavlink.link import MavlinkLink
 from tests.support.scripted_autopilot import ScriptedAutopilot, flying_on
 from tests.support.scripted_px4 import ScriptedPx4
 from tests.support.virtual_time import run_virtual

@@ -18,11 +18,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.config import Config, parse
-from companion.daemon import sensors
-from companion.daemon.sensors import SerialSensor
-from companion.daemon.serial_devices import Role, SerialDevice, serial_devices
-from companion.links.bytestream import ByteLink
-from companion.protocols.dialogue import Dialogue
+from companion.configured.devices import Role, SerialDevice, serial_devices
+from companion.daemon.devices import sensors
+from companion.daemon.devices.sensors import SerialSensor
+from companion.links.serial.bytestream import ByteLink
+from companion.protocols.decoding.dialogue import Dialogue
 from companion.protocols.registry import PROTOCOLS, ProtocolInfo
 from companion.protocols.roles import Part
 from companion.samples import CompassSample, ImuSample, TiltSample

@@ -12,14 +12,14 @@ from typing import Any, cast
 
 import pytest
 
-from companion.autopilot.vehicle import Vehicle
+from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.config import parse
-from companion.daemon import signing as daemon_signing
-from companion.daemon.models import doubtful
-from companion.daemon.signing import AHEAD_S, LinkSigning
+from companion.configured.models import doubtful
+from companion.daemon.devices import signing as daemon_signing
+from companion.daemon.devices.signing import AHEAD_S, LinkSigning
 from companion.errors import StorageError
-from companion.links.mavlink import MavlinkLink
-from companion.links.mavlink_signing import EPOCH_S, TICKS_PER_S, SigningClock
+from companion.links.mavlink.link import MavlinkLink
+from companion.links.mavlink.signing import EPOCH_S, TICKS_PER_S, SigningClock
 from companion.storage import signing_time
 from companion.storage.signing_time import FILE, this_boot
 from tests.support.rig import inline

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import pytest
 
-from companion.daemon import models
+from companion.configured import models
 from companion.protocols.registry import PROTOCOLS, Kind, ProtocolInfo
 from tests.support.documents import ROOT
 

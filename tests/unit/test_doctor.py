@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from companion.config import Config, parse
-from companion.daemon.doctor import sensor_findings, system_findings, where_it_may_be
-from companion.links.port_faults import PortFault, port_faults, same_ports
-from companion.links.ports import lasting_name, latency_timer_ms
+from companion.daemon.devices.doctor import sensor_findings, system_findings, where_it_may_be
+from companion.links.serial.faults import PortFault, port_faults, same_ports
+from companion.links.serial.ports import lasting_name, latency_timer_ms
 from tests.support.usb_tree import UsbTree
 
 CONFIG = """

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.daemon import flight_line
+from companion.daemon.faces import flight_line
 from companion.ground import words
 from companion.ground.heard import Fields, Heard, Target, Vehicle
 

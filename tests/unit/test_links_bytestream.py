@@ -22,12 +22,13 @@ from typing import Any
 import pytest
 
 from companion.errors import LinkError
-from companion.links import bytestream, serial_port
-from companion.links.backoff import Backoff
-from companion.links.budget import Budget
-from companion.links.bytestream import OUT_BUFFER_BYTES, QUICK_READS, ByteLink, PortSettings
-from companion.links.serial_port import SerialOpener, open_serial
-from companion.links.together import Together
+from companion.links.serial import bytestream
+from companion.links.serial import port as serial_port
+from companion.links.serial.bytestream import OUT_BUFFER_BYTES, QUICK_READS, ByteLink, PortSettings
+from companion.links.serial.port import SerialOpener, open_serial
+from companion.links.system.backoff import Backoff
+from companion.links.system.budget import Budget
+from companion.links.system.together import Together
 
 NOBODY = 65534
 FAST = 4_000_000
@@ -385,7 +386,7 @@ def run_as_nobody(code: str) -> str:
     """Run Python that has given up its rights after its imports (this checkout may be closed to others)."""
     drop = f"import os\nos.setgroups([])\nos.setgid({NOBODY})\nos.setuid({NOBODY})\n"
     imports = (
-        "import serial\nfrom companion.errors import LinkError\nfrom companion.links.serial_port import open_serial\n"
+        "import serial\nfrom companion.errors import LinkError\nfrom companion.links.serial.port import open_serial\n"
     )
     root = Path(__file__).parents[2]
     command = [sys.executable, "-c", imports + drop + code]
@@ -595,7 +596,7 @@ def test_an_unexpected_fault_while_opening_is_an_event_and_no_silence(monkeypatc
 
 
 def test_one_warning_a_loss_and_word_when_it_is_back(path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.DEBUG, logger="companion.links.bytestream")
+    caplog.set_level(logging.DEBUG, logger="companion.links.serial.bytestream")
 
     async def main() -> None:
         with plugged(path) as pty:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 
 HEARTBEAT = mavlink.MAVLink_heartbeat_message
 STATUSTEXT = mavlink.MAVLink_statustext_message

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.links import mavlink_frames
-from companion.links.mavlink import MavlinkLink
-from companion.links.mavlink_frames import kind_at, read
+from companion.links.mavlink import frames as mavlink_frames
+from companion.links.mavlink.frames import kind_at, read
+from companion.links.mavlink.link import MavlinkLink
 
 KINDS: dict[int, Any] = mavlink.mavlink_map
 MIXTURE = [

@@ -15,10 +15,10 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.errors import LinkError
-from companion.links import mavlink_transport
-from companion.links.mavlink import MavlinkLink
-from companion.links.mavlink_signing import Signing
-from companion.links.mavlink_transport import MAX_PEERS, run_transport
+from companion.links.mavlink import transport as mavlink_transport
+from companion.links.mavlink.link import MavlinkLink
+from companion.links.mavlink.signing import Signing
+from companion.links.mavlink.transport import MAX_PEERS, run_transport
 
 HEARTBEAT = mavlink.MAVLink_heartbeat_message
 DEADLINE_S = 5.0

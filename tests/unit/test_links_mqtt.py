@@ -9,8 +9,8 @@ from typing import Any, Self
 import pytest
 
 from companion.config.sections import Mqtt
-from companion.links import mqtt
-from companion.links.mqtt import MqttLink
+from companion.links.mqtt import client as mqtt
+from companion.links.mqtt.client import MqttLink
 from tests.support.virtual_time import run_virtual
 
 

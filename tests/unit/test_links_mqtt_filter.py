@@ -15,9 +15,10 @@ import pytest
 import trustme
 
 from companion.config.sections import Mqtt
-from companion.links import mqtt, mqtt_filter
-from companion.links.mqtt import Incoming, MqttLink
-from companion.links.mqtt_filter import BrokerFaultError, MqttFilter, NoGreetingError
+from companion.links.mqtt import client as mqtt
+from companion.links.mqtt import filter as mqtt_filter
+from companion.links.mqtt.client import Incoming, MqttLink
+from companion.links.mqtt.filter import BrokerFaultError, MqttFilter, NoGreetingError
 from tests.support.hostile_broker import Attack, HostileBroker, huge, packet, publish, variable
 
 STATUS, REQUESTS = "companion/7/status", "companion/7/request/+"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.links.ports import Holder, SerialPort, find_holders, list_ports
+from companion.links.serial.ports import Holder, SerialPort, find_holders, list_ports
 
 FTDI_ID = "/dev/serial/by-id/usb-FTDI_FT232R_USB_UART_A50285BI-if00-port0"
 CH340_ID = "/dev/serial/by-id/usb-1a86_USB_Serial-if00-port0"

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.links.mavlink import MavlinkLink
-from companion.links.together import MOST_WAITING, SECOND_S, TURNS, Together
+from companion.links.mavlink.link import MavlinkLink
+from companion.links.system.together import MOST_WAITING, SECOND_S, TURNS, Together
 
 READ_S = 0.0205
 START_S = 1000.2

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.arming_script import ArmingScript
 from companion.component.service import ArmAnswer
-from companion.links.mavlink import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink
 from companion.lua import ARMING_SCRIPT
 from tests.support.component import FakeVehicle, ScriptedGate
 

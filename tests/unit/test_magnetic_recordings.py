@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.magnetic import Heading, assess
-from companion.calibration.pose_windows import FieldWindow, HeadingWindow
-from companion.calibration.site import LocalEarth, Whereabouts, local_earth
+from companion.calibration.means.pose_windows import FieldWindow, HeadingWindow
+from companion.calibration.solution.magnetic import Heading, assess
+from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.physics.earth import MagneticField
 from companion.physics.magnetic import heading_rad, inclination_rad
 from companion.physics.units import DEG

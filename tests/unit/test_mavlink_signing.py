@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.errors import LinkError
-from companion.links.mavlink import MavlinkLink
-from companion.links.mavlink_keys import read_key
-from companion.links.mavlink_signing import (
+from companion.links.mavlink.keys import read_key
+from companion.links.mavlink.link import MavlinkLink
+from companion.links.mavlink.signing import (
     EPOCH_S,
     LAST,
     MAX_STRANGERS,

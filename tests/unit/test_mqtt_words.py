@@ -12,8 +12,8 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from companion.config import Mqtt
 from companion.errors import LinkError
-from companion.links.mqtt_secrets import is_open_to_all, read_password, tls_context
-from companion.links.mqtt_words import explain
+from companion.links.mqtt.credentials import is_open_to_all, read_password, tls_context
+from companion.links.mqtt.words import explain
 
 HOST = "192.0.2.1"
 

@@ -11,10 +11,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.allan import PROFILES, AllanModel, noise_profile
+from companion.calibration.noise.allan import PROFILES, AllanModel, noise_profile
 from companion.cli import main as companion
 from companion.config import Config, Noise, parse
-from companion.daemon import models
+from companion.configured import models
 from companion.errors import ConfigError, StorageError
 from companion.recording import topics
 from companion.recording.files import RecordingFile, versions

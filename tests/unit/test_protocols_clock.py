@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.protocols.clock import LATE, LATE_S, SPAN_S, DeviceClock, SampleTimes
-from companion.protocols.imu_line import ImuLineDecoder
-from companion.protocols.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.decoding.clock import LATE, LATE_S, SPAN_S, DeviceClock, SampleTimes
+from companion.protocols.imus.imu_line import ImuLineDecoder
+from companion.protocols.imus.vectornav import VectorNavDecoder
+from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
 from companion.protocols.registry import PROTOCOLS
-from companion.protocols.vectornav import VectorNavDecoder
 from companion.samples import AttitudeSample, ImuSample, TiltSample
 from tests.support.frames import imu_line
 from tests.support.serial_reads import RATE_HZ, Reads, reads

@@ -7,13 +7,13 @@ from collections.abc import Callable
 
 import pytest
 
-from companion.protocols.base import Decoder
-from companion.protocols.dialogue import SILENT_S, Dialogue
-from companion.protocols.inclinometer_xy import InclinometerXyDecoder
-from companion.protocols.inclinometer_xy_dialogue import InclinometerXyDialogue
-from companion.protocols.jewell import JewellDecoder
-from companion.protocols.nmea import NmeaDecoder
-from companion.protocols.polls import AGAIN_S, ANSWER_S, PATIENCE, Hmr3000Dialogue, JewellDialogue
+from companion.protocols.compasses.nmea import NmeaDecoder
+from companion.protocols.decoding.base import Decoder
+from companion.protocols.decoding.dialogue import SILENT_S, Dialogue
+from companion.protocols.decoding.polls import AGAIN_S, ANSWER_S, PATIENCE, Hmr3000Dialogue, JewellDialogue
+from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.inclinometers.inclinometer_xy_dialogue import InclinometerXyDialogue
+from companion.protocols.inclinometers.jewell import JewellDecoder
 from sim.aircraft import Pose, VirtualAircraft
 from sim.compasses import NmeaCompass
 from sim.devices import Gradienter, SerialDevice

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from companion.protocols.hmr3300 import Hmr3300Decoder
+from companion.protocols.compasses.hmr3300 import Hmr3300Decoder
 from companion.samples import CompassSample, MagSample, Sample
 
 LINE = b"123.4, 18.6, -0.5\r\n"

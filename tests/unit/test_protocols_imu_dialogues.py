@@ -6,8 +6,14 @@ import itertools
 
 import pytest
 
-from companion.protocols.dialogue import SILENT_S
-from companion.protocols.imu_dialogues import LONGEST_PAUSE_S, MipDialogue, VectorNavDialogue, WhenSilent, XsensDialogue
+from companion.protocols.decoding.dialogue import SILENT_S
+from companion.protocols.imus.imu_dialogues import (
+    LONGEST_PAUSE_S,
+    MipDialogue,
+    VectorNavDialogue,
+    WhenSilent,
+    XsensDialogue,
+)
 from companion.protocols.registry import PROTOCOLS
 from sim.aircraft import VirtualAircraft
 from sim.devices import SerialDevice

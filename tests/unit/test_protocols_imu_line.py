@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from companion.protocols.imu_line import ImuLineDecoder
+from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.samples import ImuSample, Sample
 from tests.support.frames import imu_line, sentence
 

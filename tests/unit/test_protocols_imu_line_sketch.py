@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.protocols.imu_line import ImuLineDecoder
+from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.samples import ImuSample
 
 SKETCH = Path(__file__).parents[2] / "docs" / "imu_line" / "imu_line.ino"

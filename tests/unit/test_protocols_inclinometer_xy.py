@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from companion.protocols.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
 from companion.samples import Sample, TiltSample
 
 X, Y = b"X=+00.430\r\n", b"Y=-00.084\r\n"

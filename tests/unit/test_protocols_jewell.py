@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from companion.protocols.jewell import JewellDecoder
+from companion.protocols.inclinometers.jewell import JewellDecoder
 from companion.samples import Sample, TiltSample
 from tests.support.frames import sentence
 

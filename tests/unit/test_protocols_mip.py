@@ -7,7 +7,7 @@ import struct
 
 import pytest
 
-from companion.protocols.mip import MAX_FRAME_BYTES, MipDecoder
+from companion.protocols.imus.mip import MAX_FRAME_BYTES, MipDecoder
 from companion.samples import ImuSample, MagSample, Sample
 from tests.support.frames import big_floats, fletcher, mip, mip_imu
 

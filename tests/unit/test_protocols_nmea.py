@@ -8,7 +8,7 @@ import pynmea2
 import pytest
 from pynmeagps import NMEAReader
 
-from companion.protocols.nmea import HOLD_S, NmeaDecoder
+from companion.protocols.compasses.nmea import HOLD_S, NmeaDecoder
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 from tests.support.frames import sentence, xor
 

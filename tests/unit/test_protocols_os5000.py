@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from companion.protocols.os5000 import Os5000Decoder
+from companion.protocols.compasses.os5000 import Os5000Decoder
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 from tests.support.frames import sentence
 

@@ -7,7 +7,7 @@ import struct
 
 import pytest
 
-from companion.protocols.pni import PniDecoder
+from companion.protocols.compasses.pni import PniDecoder
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 from tests.support.frames import pni, pni_data, pni_heading
 

@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 import pytest
 
-from companion.protocols.base import Decoder
-from companion.protocols.dialogue import SILENT_S
-from companion.protocols.pni import PniDecoder, PniDialogue
-from companion.protocols.polling import ANSWER_S, PollDialogue
+from companion.protocols.compasses.pni import PniDecoder, PniDialogue
+from companion.protocols.decoding.base import Decoder
+from companion.protocols.decoding.dialogue import SILENT_S
+from companion.protocols.decoding.polling import ANSWER_S, PollDialogue
+from companion.protocols.inclinometers.rion import RionDecoder, RionDialogue
 from companion.protocols.registry import PROTOCOLS
-from companion.protocols.rion import RionDecoder, RionDialogue
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import SerialDevice

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from companion.protocols.rion import RionDecoder
+from companion.protocols.inclinometers.rion import RionDecoder
 from companion.samples import CompassSample, Sample, TiltSample
 from tests.support.frames import rion, rion_angle, rion_angles, rion_long
 

@@ -7,8 +7,8 @@ import math
 import pytest
 
 from companion.physics.gradienter import attitude_from_readings
-from companion.protocols.stim300 import Stim300Decoder
-from companion.protocols.stim300_datagrams import MAX_FRAME_BYTES, is_whole
+from companion.protocols.imus.stim300 import Stim300Decoder
+from companion.protocols.imus.stim300_datagrams import MAX_FRAME_BYTES, is_whole
 from companion.samples import ImuSample, Sample, TiltSample
 from sim.aircraft import Pose, VirtualAircraft
 from sim.binary_imus import Stim300

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from companion.protocols.base import Decoder
+from companion.protocols.decoding.base import Decoder
 from companion.protocols.registry import PROTOCOLS, Kind, make_decoder
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
 from tests.support.frames import (

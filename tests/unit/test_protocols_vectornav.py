@@ -7,8 +7,8 @@ import struct
 
 import pytest
 
-from companion.protocols.vectornav import VectorNavDecoder
-from companion.protocols.vectornav_binary import MAX_FRAME_BYTES
+from companion.protocols.imus.vectornav import VectorNavDecoder
+from companion.protocols.imus.vectornav_binary import MAX_FRAME_BYTES
 from companion.samples import AttitudeSample, ImuSample, MagSample, Sample
 from tests.support.frames import (
     COMMON_SIZES,

@@ -7,7 +7,7 @@ import struct
 
 import pytest
 
-from companion.protocols.witmotion import WitMotionDecoder
+from companion.protocols.imus.witmotion import WitMotionDecoder
 from companion.samples import ImuSample, MagSample, Sample, TiltSample
 from tests.support.frames import sum8, wit, wit_imu
 

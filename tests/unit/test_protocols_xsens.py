@@ -7,7 +7,7 @@ import struct
 
 import pytest
 
-from companion.protocols.xsens import MAX_DATA_BYTES, MAX_FRAME_BYTES, XsensDecoder
+from companion.protocols.imus.xsens import MAX_DATA_BYTES, MAX_FRAME_BYTES, XsensDecoder
 from companion.samples import ImuSample, MagSample, Sample
 from tests.support.frames import big_floats, mtdata2, xbus, xsens_imu
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.calibration.rolling import RollingCollector
-from companion.calibration.site import Whereabouts
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.solution.site import Whereabouts
 from companion.errors import StorageError
 from companion.protocols.registry import PROTOCOLS, Kind, make_decoder
 from companion.recording.state import freeze, from_json, to_json

@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.calibration.record import Axes, Magnetic
+from companion.calibration.solution.record import Axes, Magnetic
 from companion.cli import main
 from companion.physics.units import DEG_H, MG
 from companion.report import calibration_page as calibration

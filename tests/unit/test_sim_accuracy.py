@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.calibration.allan import noise_profile
-from companion.calibration.windows import ImuInput
+from companion.calibration.means.windows import ImuInput
+from companion.calibration.noise.allan import noise_profile
 from sim.accuracy import cli, experiments, paper, peers, tables
 from sim.accuracy.experiments import FloorRun, IntegerRun, WhiteRun, floors, integers, predicted, white
 from sim.accuracy.figures import Figure, beside, covered, rms

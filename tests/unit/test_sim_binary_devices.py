@@ -11,9 +11,9 @@ import pytest
 
 from companion.physics.frames import rotation_matrix
 from companion.physics.gradienter import up_in_sensor
-from companion.protocols.pni import PniDecoder
-from companion.protocols.rion import RionDecoder
-from companion.protocols.witmotion import WitMotionDecoder
+from companion.protocols.compasses.pni import PniDecoder
+from companion.protocols.imus.witmotion import WitMotionDecoder
+from companion.protocols.inclinometers.rion import RionDecoder
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.imu_model import ImuModel

@@ -13,8 +13,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from companion.calibration.record import ImuRecord, Record, WrittenParameter, to_json
-from companion.calibration.trace import Trace
+from companion.calibration.collector.trace import Trace
+from companion.calibration.solution.record import ImuRecord, Record, WrittenParameter, to_json
 from companion.errors import StorageError
 from companion.storage import records as records_module
 from companion.storage.atomic import remove_durably, write_atomically

@@ -15,8 +15,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from companion.autopilot.written import HEADING_SETUP
-from companion.calibration.record import Arming
+from companion.autopilot.firmware.written import HEADING_SETUP
+from companion.calibration.solution.record import Arming
 from companion.errors import StorageError
 from companion.storage import signing_time
 from companion.storage.alignment import AlignmentStore

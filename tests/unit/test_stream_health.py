@@ -6,9 +6,9 @@ import math
 
 import pytest
 
-from companion.protocols.base import NON_FINITE
-from companion.protocols.imu_line import ImuLineDecoder
-from companion.protocols.inclinometer_xy import InclinometerXyDecoder
+from companion.protocols.decoding.base import NON_FINITE
+from companion.protocols.imus.imu_line import ImuLineDecoder
+from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
 from companion.protocols.stream_health import RAILS_DEG, SILENT_AFTER_S, StreamHealth
 from companion.samples import CompassSample, ImuSample, TiltSample
 from tests.support.chatter import imu_frame, tilt_frame

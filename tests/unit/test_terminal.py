@@ -23,11 +23,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.cli import logs, main, monitor
 from companion.cli.logs import JournalFormatter, OneLineFormatter
-from companion.daemon.check import Finding
+from companion.daemon.process.check import Finding
 from companion.errors import LinkError
 from companion.ground.display import Display
 from companion.ground.heard import Heard, Target
-from companion.links.ports import Holder, SerialPort
+from companion.links.serial.ports import Holder, SerialPort
 from companion.printable import printable
 from tests.support.ground_wire import StationOnTheWire
 from tests.support.rig import Rig
@@ -199,8 +199,8 @@ def test_what_is_on_the_ports(
         description=EVIL, driver=EVIL, vendor_id=None, product_id=None, serial_number=EVIL, usb_interface=EVIL,
         interface_number=EVIL, latency_timer_ms=None, is_console=False, holders=(Holder(1, EVIL),),
     )  # fmt: skip
-    monkeypatch.setattr("companion.links.ports.list_ports", lambda: [port])
-    monkeypatch.setattr("companion.links.listening.listen", listen)
+    monkeypatch.setattr("companion.links.serial.ports.list_ports", lambda: [port])
+    monkeypatch.setattr("companion.links.serial.listening.listen", listen)
     for more in ([], ["--listen"]):
         assert main([*form, "ports", *more]) == 0
         out, said = capsys.readouterr()
@@ -215,7 +215,7 @@ def test_what_the_check_finds(
         logging.getLogger("companion.links").warning("the autopilot says %s", EVIL)
         return [Finding(EVIL, good=False, words=EVIL), Finding("fine", good=True, words=f"firmware {EVIL}")]
 
-    monkeypatch.setattr("companion.daemon.check.run_check", run_check)
+    monkeypatch.setattr("companion.daemon.process.check.run_check", run_check)
     monkeypatch.setattr(logging.getLogger(), "handlers", [])  # as outside of a test
     assert main(["-c", str(config), *form, "check"]) == 1
     out, said = capsys.readouterr()

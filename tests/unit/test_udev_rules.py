@@ -9,7 +9,7 @@ import pytest
 from companion import cli
 from companion.errors import CompanionError, ConfigError
 from companion.installation import files, udev
-from companion.links.ports import list_ports
+from companion.links.serial.ports import list_ports
 from tests.support.usb_tree import UsbTree, needs_udevadm
 
 

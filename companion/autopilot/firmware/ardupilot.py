@@ -1,0 +1,137 @@
+"""ArduPilot's bias parameters: names, what R is made of, and what is odd about them.
+
+R is the board orientation, AHRS_ORIENTATION (autopilots 1.2); AHRS_TRIM turns the reported attitude only, never IMU
+data. `CALTEMP` is left alone, for then new = old + residual holds (recipe (a) of autopilots 1.6).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Final
+
+from companion.autopilot.firmware.board_rotation import read_board_rotation
+from companion.autopilot.firmware.imu_calibration import ACCEL_SCALE_RANGE, ImuCalibration, ImuParameters
+from companion.autopilot.firmware.rivals import read_rivals
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.values import read_integer, read_offsets, read_scales
+from companion.errors import AutopilotError, AutopilotRebootedError
+
+INSTANCES: Final = (1, 2, 3, 4, 5)
+"""4 and 5 exist from 4.4 on boards with auxiliary instances; no message carries them, so none can be measured."""
+
+_TCAL_LEARNING: Final = 2
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ArduPilotParameters(ImuParameters):
+    """The names of one IMU's parameters; the first instance is irregular, 4 and 5 are again (autopilots 1.1)."""
+
+    gyro_caltemp: str
+    """Temperature of the gyro's calibration, deg C; never written."""
+    accel_caltemp: str
+    """Temperature of the accelerometer's calibration, deg C; never written."""
+    tcal_enable: str
+    """Temperature calibration: 0 off, 1 on, 2 learning."""
+    use: str
+    """Whether the autopilot uses this IMU."""
+
+
+def parameters_of(instance: int) -> ArduPilotParameters:
+    """The names of one IMU's parameters, `instance` counting from 1.
+
+    Raises:
+        AutopilotError: no such instance.
+    """
+    if instance not in INSTANCES:
+        raise AutopilotError(f"IMU {instance} is not known; allowed are {', '.join(map(str, INSTANCES))}")
+    if instance > 3:
+        return ArduPilotParameters(
+            gyro_offset=_xyz(f"INS{instance}_GYROFFS_{{}}"),
+            accel_offset=_xyz(f"INS{instance}_ACCOFFS_{{}}"),
+            accel_scale=_xyz(f"INS{instance}_ACCSCAL_{{}}"),
+            gyro_id=f"INS{instance}_GYR_ID",
+            accel_id=f"INS{instance}_ACC_ID",
+            gyro_caltemp=f"INS{instance}_GYR_CALTEMP",
+            accel_caltemp=f"INS{instance}_ACC_CALTEMP",
+            tcal_enable=f"INS{instance}_TCAL_ENABLE",
+            use=f"INS{instance}_USE",
+        )
+    n = "" if instance == 1 else str(instance)
+    # The offsets of the first are INS_GYROFFS and INS_ACCOFFS, those of the others INS_GYR2OFFS and INS_ACC2OFFS.
+    gyro = "INS_GYRO" if instance == 1 else f"INS_GYR{n}O"
+    return ArduPilotParameters(
+        gyro_offset=_xyz(f"{gyro}FFS_{{}}"),
+        accel_offset=_xyz(f"INS_ACC{n}OFFS_{{}}"),
+        accel_scale=_xyz(f"INS_ACC{n}SCAL_{{}}"),
+        gyro_id=f"INS_GYR{n}_ID",
+        accel_id=f"INS_ACC{n}_ID",
+        gyro_caltemp=f"INS_GYR{instance}_CALTEMP",
+        accel_caltemp=f"INS_ACC{instance}_CALTEMP",
+        tcal_enable=f"INS_TCAL{instance}_ENABLE",
+        use=f"INS_USE{n}",
+    )
+
+
+async def read_calibration(parameters: ParameterClient, instance: int) -> ImuCalibration:
+    """Read afresh what ArduPilot corrects one of its IMUs with.
+
+    Raises:
+        AutopilotError: no such IMU, its temperature calibration is learning, an orientation or a value that cannot be
+            worked with; or no answer (ParameterTimeoutError), or a restart meanwhile (AutopilotRebootedError).
+    """
+    vehicle = parameters.vehicle
+    names = parameters_of(instance)
+    boots = vehicle.boots
+    if await parameters.read_optional(names.gyro_offset[0]) is None:
+        raise AutopilotError(f"the autopilot has no IMU {instance}: {names.gyro_offset[0]} does not exist")
+    gyro_id = await read_integer(parameters, names.gyro_id)
+    accel_id = await read_integer(parameters, names.accel_id)
+    for sensor, name, found in (("gyro", names.gyro_id, gyro_id), ("accelerometer", names.accel_id, accel_id)):
+        if found == 0:
+            raise AutopilotError(f"the autopilot has no IMU {instance}: {name} = 0, so there is no {sensor}")
+    tcal_enable = await read_integer(parameters, names.tcal_enable)
+    if tcal_enable == _TCAL_LEARNING:
+        raise AutopilotError(
+            f"{names.tcal_enable} = 2: IMU {instance} is learning its temperature calibration;"
+            " let it finish, or set it to 0 or 1"
+        )
+    calibration = ImuCalibration(
+        instance=instance,
+        parameters=names,
+        gyro_offset_rad_s=await read_offsets(parameters, names.gyro_offset),
+        accel_offset_m_s2=await read_offsets(parameters, names.accel_offset),
+        accel_scale=await read_scales(parameters, names.accel_scale),
+        gyro_id=gyro_id,
+        accel_id=accel_id,
+        orientation=await read_board_rotation(parameters),
+        tcal_enable=tcal_enable,
+        zero_is_uncalibrated=True,
+        rivals=await read_rivals(parameters),
+    )
+    used = await read_integer(parameters, names.use)
+    await vehicle.hear_boot_time()
+    if vehicle.boots != boots:
+        raise AutopilotRebootedError(f"{vehicle.name} restarted while the parameters of IMU {instance} were read")
+    return dataclasses.replace(calibration, warnings=_warnings(calibration, names, used=used != 0))
+
+
+def _warnings(calibration: ImuCalibration, names: ArduPilotParameters, *, used: bool) -> tuple[str, ...]:
+    instance = calibration.instance
+    found = [rival.words for rival in calibration.rivals]
+    if not any(calibration.accel_offset_m_s2):
+        found.append(
+            f"{names.accel_offset[0]}, _Y and _Z are 0: the autopilot takes IMU {instance}'s accelerometers for"
+            ' uncalibrated and may still refuse to arm ("3D Accel calibration needed") until its accelerometer'
+            " calibration is accepted once (PREFLIGHT_CALIBRATION, param5 = 76)"
+        )
+    low, high = ACCEL_SCALE_RANGE
+    if not all(low <= scale <= high for scale in calibration.accel_scale):
+        found.append(f"{names.accel_scale[0]}, _Y or _Z is outside {low} to {high}: the scale calibration looks wrong")
+    if not used:
+        found.append(f"{names.use} = 0: the autopilot does not use IMU {instance}")
+    return tuple(found)
+
+
+def _xyz(pattern: str) -> tuple[str, str, str]:
+    x, y, z = (pattern.format(axis) for axis in "XYZ")
+    return x, y, z

@@ -1,0 +1,254 @@
+"""What an autopilot corrects one IMU with, whichever firmware it runs, and the algebra of its offsets.
+
+Per sample both firmwares compute, with R their rotation from the IMU's axes to the vehicle's (autopilots 1.2, 4.1):
+
+    gyro  = R (raw - gyro_offset)
+    accel = R diag(accel_scale) (raw - accel_offset)
+
+so offsets live in the IMU's own axes, before scale and before rotation. A temperature calibration, where one is
+active, takes its part off `raw` first. The firmwares differ in the names of the parameters, in what R is made of and
+in what they do with a value: `ardupilot` and `px4` read, `firmwares` picks.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from companion.autopilot.firmware.rivals import Rival
+from companion.autopilot.parameters.float32 import float32, same_float32
+from companion.autopilot.parameters.writer import Change
+from companion.calibration.solution.solve import ImuSolution
+from companion.errors import CalibrationRefusedError
+from companion.physics.frames import Array, Matrix
+from companion.physics.units import DEG
+from companion.samples import Vector
+
+MAX_GYRO_RESIDUAL_RAD_S: Final = 5.0 * DEG
+"""More than this left in the output is a moving aircraft or a broken sensor, not a bias: ArduPilot itself takes 5
+deg/s between two gyros for a fault ("Gyros inconsistent"), and current MEMS gyros start within 1 deg/s."""
+
+MAX_ACCEL_RESIDUAL_M_S2: Final = 1.0
+"""As above: the worst parts still flown are specified at 80 mg (0.8 m/s^2, MPU-6000, vertical axis), ArduPilot
+refuses to arm at 0.75 m/s^2 between two accelerometers, and a wrong mounting or gradienter law soon exceeds it."""
+
+MAX_GYRO_OFFSET_RAD_S: Final = 20.0 * DEG
+"""Whole offset: the loosest zero-rate specification of a part still flown (MPU-6000, 20 deg/s)."""
+
+MAX_ACCEL_OFFSET_M_S2: Final = 3.5
+"""Whole offset: ArduPilot's documented range of INS_ACCOFFS, which nothing enforces; PX4 has none."""
+
+ACCEL_SCALE_RANGE: Final = (0.8, 1.2)
+"""ArduPilot's documented range of INS_ACCSCAL, which nothing enforces; PX4 has none."""
+
+NOT_ZERO_M_S2: Final = 1e-6
+"""Written where three offsets of exactly zero would mean "not calibrated": ArduPilot would refuse to arm."""
+
+_AXES: Final = "XYZ"
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ImuParameters:
+    """The names of the parameters that correct one IMU; vectors are X, Y, Z."""
+
+    gyro_offset: tuple[str, str, str]
+    """rad/s."""
+    accel_offset: tuple[str, str, str]
+    """m/s^2."""
+    accel_scale: tuple[str, str, str]
+    """No unit."""
+    gyro_id: str
+    """The gyro's device id; 0 where there is none."""
+    accel_id: str
+    """The accelerometer's device id; 0 where there is none."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class FarStep:
+    """By how much, and to which side, an offset is first set wrong where small changes would be ignored.
+
+    PX4 ignores a vector of offsets that differs by no more than 0.01 (rad/s, m/s^2) from the one that it uses
+    (autopilots 4.2), and it looks at most once a second, so that of three writes it may see any one alone: X may be
+    taken and a small Y after it not (9.3.2). But if every axis makes a step of more than 0.01, then whatever was in
+    use before, old, new or mixed, the last look sees a vector that is far enough from it.
+    """
+
+    gyro_rad_s: Vector
+    accel_m_s2: Vector
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class ImuCalibration:
+    """What the autopilot corrects one IMU with, as read."""
+
+    instance: int
+    """1 to 3: whose telemetry it acts on."""
+    parameters: ImuParameters
+    gyro_offset_rad_s: Vector
+    accel_offset_m_s2: Vector
+    accel_scale: Vector
+    gyro_id: int | None
+    accel_id: int | None
+    orientation: Matrix
+    """3x3, the IMU's axes to the vehicle's FRD: R."""
+    tcal_enable: int | None = None
+    """ArduPilot's temperature calibration; None where the firmware has none."""
+    zero_is_uncalibrated: bool = False
+    """Three accelerometer offsets of exactly zero mean "not calibrated"."""
+    far_step: FarStep | None = None
+    """Where the firmware ignores small changes: how they are brought in all the same."""
+    gyro_grid_rad_s: float = 0.0
+    """Steps of the sensor's own readings behind the telemetry, where they are known and coarse; else 0."""
+    accel_grid_m_s2: float = 0.0
+    accel_offset_may_be_unused: bool = False
+    """The parameters may hold other accelerometer offsets than those that the firmware uses."""
+    rivals: tuple[Rival, ...] = ()
+    """What in the autopilot overwrites offsets of ours later."""
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def corrections(self) -> dict[str, float]:
+        """By parameter: everything that acts on this IMU's output, as far as single parameters tell."""
+        names = self.parameters
+        return {
+            **dict(zip(names.gyro_offset, self.gyro_offset_rad_s, strict=True)),
+            **dict(zip(names.accel_offset, self.accel_offset_m_s2, strict=True)),
+            **dict(zip(names.accel_scale, self.accel_scale, strict=True)),
+        }
+
+    def contradicts(self, values: Mapping[str, float]) -> bool:
+        """Whether one of these parameters is among the corrections and has another value there."""
+        known = self.corrections
+        return any(name in known and not same_float32(known[name], value) for name, value in values.items())
+
+
+def offsets_after(
+    calibration: ImuCalibration, gyro_residual_rad_s: Vector, accel_residual_m_s2: Vector
+) -> tuple[Vector, Vector]:
+    """The gyro (rad/s) and accelerometer (m/s^2) offsets that take the residuals out of the output.
+
+    Args:
+        calibration: in force while the residuals were measured.
+        gyro_residual_rad_s: mean output minus truth, vehicle FRD.
+        accel_residual_m_s2: likewise.
+
+    Raises:
+        CalibrationRefusedError: not plausible, see the limits at the top.
+    """
+    return gyro_offset_after(calibration, gyro_residual_rad_s), accel_offset_after(calibration, accel_residual_m_s2)
+
+
+def gyro_offset_after(calibration: ImuCalibration, residual_rad_s: Vector) -> Vector:
+    """gyro_offset + R^-1 residual, rounded to float32; see `offsets_after`."""
+    _require_plausible("gyro residual", residual_rad_s, MAX_GYRO_RESIDUAL_RAD_S, DEG, "deg/s", calibration.instance)
+    step = calibration.orientation.T @ np.asarray(residual_rad_s)
+    after = _vector(np.asarray(calibration.gyro_offset_rad_s) + step)
+    _require_plausible("gyro offset", after, MAX_GYRO_OFFSET_RAD_S, DEG, "deg/s", calibration.instance)
+    return after
+
+
+def accel_offset_after(calibration: ImuCalibration, residual_m_s2: Vector) -> Vector:
+    """accel_offset + diag(1/accel_scale) R^-1 residual, rounded to float32; see `offsets_after`."""
+    _require_plausible(
+        "accelerometer residual", residual_m_s2, MAX_ACCEL_RESIDUAL_M_S2, 1.0, "m/s^2", calibration.instance
+    )
+    step = (calibration.orientation.T @ np.asarray(residual_m_s2)) / np.asarray(calibration.accel_scale)
+    after = _vector(np.asarray(calibration.accel_offset_m_s2) + step)
+    _require_plausible("accelerometer offset", after, MAX_ACCEL_OFFSET_M_S2, 1.0, "m/s^2", calibration.instance)
+    if calibration.zero_is_uncalibrated and not any(after):
+        return float32(NOT_ZERO_M_S2), 0.0, 0.0
+    return after
+
+
+def changes_for(
+    calibration: ImuCalibration, gyro_residual_rad_s: Vector | None, accel_residual_m_s2: Vector | None
+) -> list[Change]:
+    """What to write, accelerometers first (autopilots 9.3: the better order); None: that half stays as it is.
+
+    Raises:
+        CalibrationRefusedError: as `offsets_after`.
+    """
+    names = calibration.parameters
+    changes: list[Change] = []
+    if accel_residual_m_s2 is not None:
+        after = accel_offset_after(calibration, accel_residual_m_s2)
+        far = calibration.far_step.accel_m_s2 if calibration.far_step else None
+        changes += vector_changes(names.accel_offset, calibration.accel_offset_m_s2, after, far)
+    if gyro_residual_rad_s is not None:
+        after = gyro_offset_after(calibration, gyro_residual_rad_s)
+        far = calibration.far_step.gyro_rad_s if calibration.far_step else None
+        changes += vector_changes(names.gyro_offset, calibration.gyro_offset_rad_s, after, far)
+    return changes
+
+
+def vector_changes(names: tuple[str, str, str], before: Vector, after: Vector, far: Vector | None) -> list[Change]:
+    """The changes of one vector; by way of a far one, at least `far` from both ends on every axis, if one is given."""
+    if far is None:
+        return list(map(Change, names, before, after))
+    vias = [max(b, a) + step if step > 0 else min(b, a) + step for b, a, step in zip(before, after, far, strict=True)]
+    return list(map(Change, names, before, after, vias))
+
+
+def output_step(calibration: ImuCalibration, changes: Sequence[Change]) -> tuple[Vector, Vector]:
+    """By how much the output must move when the changes are in force: gyro rad/s, accelerometer m/s^2, vehicle FRD."""
+    names = calibration.parameters
+    by_name = {change.parameter: change.after - change.before for change in changes}
+    gyro = np.array([by_name.get(name, 0.0) for name in names.gyro_offset])
+    accel = np.array([by_name.get(name, 0.0) for name in names.accel_offset])
+    rotation = calibration.orientation
+    return _plain(-rotation @ gyro), _plain(-rotation @ (np.asarray(calibration.accel_scale) * accel))
+
+
+def whole_bias(
+    calibration: ImuCalibration, gyro_residual_rad_s: Vector, accel_residual_m_s2: Vector
+) -> tuple[Vector, Vector]:
+    """The sensor's whole bias: what it would show without any offset (its scale kept) minus truth, vehicle FRD.
+
+    residual + R gyro_offset, and residual + R diag(accel_scale) accel_offset.
+    """
+    rotation = calibration.orientation
+    gyro = np.asarray(gyro_residual_rad_s) + rotation @ np.asarray(calibration.gyro_offset_rad_s)
+    return _plain(gyro), _plain(np.asarray(accel_residual_m_s2) + rotation @ accel_taken_off(calibration))
+
+
+def whole_of(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:
+    """Whole gyro and accelerometer bias of an IMU whose owner subtracts offsets already."""
+    gyro, accel = whole_bias(calibration, _residual(found.gyro_rad_s), _residual(found.accel_m_s2))
+    return (
+        np.array(gyro) if found.gyro_rad_s is not None else None,
+        np.array(accel) if found.accel_m_s2 is not None else None,
+    )
+
+
+def _residual(found: Array | None) -> Vector:
+    return (0.0, 0.0, 0.0) if found is None else _vector(found)
+
+
+def accel_taken_off(calibration: ImuCalibration) -> Array:
+    """What the offsets take off the accelerometer: diag(accel_scale) accel_offset, (3,), m/s^2, its own axes."""
+    scaled: Array = np.asarray(calibration.accel_scale) * np.asarray(calibration.accel_offset_m_s2)
+    return scaled
+
+
+def _require_plausible(what: str, vector: Vector, limit: float, unit: float, words: str, instance: int) -> None:
+    for axis, value in zip(_AXES, vector, strict=True):
+        if not math.isfinite(value):
+            raise CalibrationRefusedError(f"IMU {instance}: {what} {axis} is {value}")
+        if abs(value) > limit:
+            raise CalibrationRefusedError(
+                f"IMU {instance}: {what} {axis} is {value / unit:.3g} {words}, allowed are {limit / unit:.3g}"
+            )
+
+
+def _vector(values: Array) -> Vector:
+    x, y, z = (float32(float(value)) for value in values)
+    return x, y, z
+
+
+def _plain(values: Array) -> Vector:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

@@ -1,0 +1,218 @@
+"""PX4's bias parameters: slots by device id, what R is made of, and what PX4 does with a value (autopilots 4).
+
+    R = R(SENS_BOARD_X/Y/Z_OFF) R(SENS_BOARD_ROT)    of an internal sensor
+    R = R(SENS_BOARD_X/Y/Z_OFF) R(CAL_*_ROT)         of an external one
+
+so the level adjustment, unlike ArduPilot's trim, does turn IMU data. A thermal calibration (TC_*) takes its part off
+before the offsets and may be on or off.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from companion.autopilot.firmware.imu_calibration import ACCEL_SCALE_RANGE, FarStep, ImuCalibration, ImuParameters
+from companion.autopilot.firmware.px4_slots import PREFIX, SLOTS, Sensor, Slot, SlotMemory
+from companion.autopilot.firmware.rivals import read_rivals
+from companion.autopilot.parameters.change import Change
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.values import read_integer, read_offsets, read_scales
+from companion.errors import AutopilotError, AutopilotRebootedError
+from companion.physics.frames import Matrix, rotation_matrix
+from companion.physics.units import MG
+from companion.rotations import ROTATION_NAMES
+from companion.samples import Vector
+
+IGNORED_STEP: Final = 0.01
+"""A vector of offsets no farther than this (rad/s, m/s^2) from the one in use is ignored (autopilots 4.2)."""
+
+MARGIN: Final = 1.05
+"""Both sides round to 32 bits."""
+
+FAR_GYRO_RAD_S: Final = 0.02
+FAR_ACCEL_M_S2: Final = 0.05
+
+TILTS_M_S2: Final = 0.1 * MG
+"""An accelerometer step of this size turns EKF2's attitude by 0.006 deg at most."""
+
+FAR_SIGNS: Final[dict[int, Vector]] = {1: (1.0, 1.0, 1.0), 2: (-1.0, -1.0, -1.0), 3: (1.0, -1.0, 1.0)}
+"""By instance: of several IMUs written at once each makes another far step, so that they cannot be mistaken."""
+
+SIMULATED_GYRO_GRID_RAD_S: Final = math.radians(2000.0 / 32768.0) / 4.0
+SIMULATED_ACCEL_GRID_M_S2: Final = 1e3 * MG / 2048.0 / 4.0
+"""PX4's simulator passes one of its IMUs through 16 bits, and telemetry is the mean of three such readings with weights
+1, 2, 1: the floats of its HIGHRES_IMU are a quarter of a step apart. A real sensor's telemetry is the mean of many
+readings with noise of their own: no steps are left there."""
+
+_INTERNAL: Final = -1
+_SIMULATION_BUS: Final = 4
+_MAYBE_INTERNAL_BUSES: Final = (1, 2)
+"""I2C and SPI; whether such a sensor is inside the autopilot is a fact of the board. PX4 keeps it in CAL_*_ROT."""
+
+# Of number 38 both firmwares' drivers know better angles, but PX4 turns calibrated data by these.
+_PX4_ONLY_DEG: Final = {38: (90.0, 68.0, 293.0)}
+
+
+def parameters_of(gyro_slot: int, accel_slot: int) -> ImuParameters:
+    """The names of one IMU's parameters; its gyro and its accelerometer may stand in slots of different numbers."""
+    gyro, accel = f"{PREFIX['gyro']}{gyro_slot}", f"{PREFIX['accel']}{accel_slot}"
+    return ImuParameters(
+        gyro_offset=(f"{gyro}_XOFF", f"{gyro}_YOFF", f"{gyro}_ZOFF"),
+        accel_offset=(f"{accel}_XOFF", f"{accel}_YOFF", f"{accel}_ZOFF"),
+        accel_scale=(f"{accel}_XSCALE", f"{accel}_YSCALE", f"{accel}_ZSCALE"),
+        gyro_id=f"{gyro}_ID",
+        accel_id=f"{accel}_ID",
+    )
+
+
+async def read_slots(parameters: ParameterClient, sensor: Sensor) -> tuple[Slot, ...]:
+    """All slots that hold a device id, in order.
+
+    Raises:
+        AutopilotError: as `ParameterClient.read_optional`.
+    """
+    found: list[Slot] = []
+    for number in range(SLOTS):
+        device_id = await read_integer(parameters, f"{PREFIX[sensor]}{number}_ID")
+        if device_id:
+            priority = await read_integer(parameters, f"{PREFIX[sensor]}{number}_PRIO")
+            found.append(Slot(number, device_id, enabled=priority != 0))
+    return tuple(found)
+
+
+async def read_calibration(parameters: ParameterClient, instance: int, memory: SlotMemory) -> ImuCalibration:
+    """Read afresh what PX4 corrects one of its IMUs with.
+
+    Raises:
+        AutopilotError: no slot for such an IMU, or it is switched off, or a value that cannot be worked with; or no
+            answer (ParameterTimeoutError), or a restart meanwhile (AutopilotRebootedError).
+    """
+    vehicle = parameters.vehicle
+    boots = vehicle.boots
+    accel = memory.choose("accel", instance, await read_slots(parameters, "accel"))
+    gyro = memory.choose("gyro", instance, await read_slots(parameters, "gyro"), like=accel.device_id)
+    names = parameters_of(gyro.number, accel.number)
+    offset = await read_offsets(parameters, names.accel_offset)
+    small = too_small_to_apply_at_boot(offset)
+    signs = FAR_SIGNS[instance]
+    calibration = ImuCalibration(
+        instance=instance,
+        parameters=names,
+        gyro_offset_rad_s=await read_offsets(parameters, names.gyro_offset),
+        accel_offset_m_s2=offset,
+        accel_scale=await read_scales(parameters, names.accel_scale),
+        gyro_id=gyro.device_id,
+        accel_id=accel.device_id,
+        orientation=await _read_rotation(parameters, gyro, accel),
+        far_step=FarStep(
+            gyro_rad_s=_times(FAR_GYRO_RAD_S, signs),
+            accel_m_s2=_times(FAR_ACCEL_M_S2, signs),
+        ),
+        gyro_grid_rad_s=SIMULATED_GYRO_GRID_RAD_S if _bus(gyro) == _SIMULATION_BUS else 0.0,
+        accel_grid_m_s2=SIMULATED_ACCEL_GRID_M_S2 if _bus(accel) == _SIMULATION_BUS else 0.0,
+        accel_offset_may_be_unused=small and not memory.in_use(names.accel_offset, offset, boots),
+        rivals=await read_rivals(parameters, memory.rivals),
+    )
+    await vehicle.hear_boot_time()
+    if vehicle.boots != boots:
+        raise AutopilotRebootedError(f"{vehicle.name} restarted while the parameters of IMU {instance} were read")
+    return dataclasses.replace(calibration, warnings=_warnings(calibration))
+
+
+def too_small_to_apply_at_boot(accel_offset_m_s2: Vector) -> bool:
+    """Whether PX4 will start without this vector: it compares with zero then, and small differences are ignored."""
+    return 0.0 < math.hypot(*accel_offset_m_s2) <= MARGIN * IGNORED_STEP
+
+
+def needs_reboot(changes: Sequence[Change]) -> bool:
+    """Whether EKF2 will keep a wrong tilt until a restart: it learns the step of an accelerometer very slowly."""
+    return any(
+        change.parameter.startswith(PREFIX["accel"]) and abs(change.after - change.before) > TILTS_M_S2
+        for change in changes
+    )
+
+
+def stale_tilt_deg(changes: Sequence[Change]) -> float:
+    """How far EKF2's tilt may be off until a restart, because the accelerometers step under it; 0 without a step."""
+    step: dict[str, float] = {}
+    for change in changes:
+        if change.parameter.startswith(PREFIX["accel"]):
+            slot = change.parameter.partition("_")[2].partition("_")[0]
+            step[slot] = math.hypot(step.get(slot, 0.0), change.after - change.before)
+    return math.degrees(max(step.values(), default=0.0) / (1e3 * MG))
+
+
+def warnings_about(calibration: ImuCalibration, changes: Sequence[Change]) -> tuple[str, ...]:
+    """What PX4 makes of these changes later, for people."""
+    found: list[str] = []
+    after = {change.parameter: change.after for change in changes}
+    names = calibration.parameters.accel_offset
+    x, y, z = (after.get(n, old) for n, old in zip(names, calibration.accel_offset_m_s2, strict=True))
+    if too_small_to_apply_at_boot((x, y, z)):
+        found.append(
+            f"{names[0]}, Y and Z are {math.hypot(x, y, z) / MG:.2f} mg in all: below 1 mg (0.01 m/s^2) PX4 starts"
+            " without them; calibrate again after a restart"
+        )
+    return tuple(found)
+
+
+async def _read_rotation(parameters: ParameterClient, gyro: Slot, accel: Slot) -> Matrix:
+    level = rotation_matrix(
+        (
+            await _read_angle(parameters, "SENS_BOARD_X_OFF"),
+            await _read_angle(parameters, "SENS_BOARD_Y_OFF"),
+            await _read_angle(parameters, "SENS_BOARD_Z_OFF"),
+        )
+    )
+    gyro_mounting = await _read_mounting(parameters, "gyro", gyro)
+    accel_mounting = await _read_mounting(parameters, "accel", accel)
+    if not np.array_equal(gyro_mounting, accel_mounting):
+        raise AutopilotError(
+            f"{PREFIX['gyro']}{gyro.number}_ROT and {PREFIX['accel']}{accel.number}_ROT mount the two halves of one IMU"
+            " differently; set both as it is mounted"
+        )
+    matrix: Matrix = level @ accel_mounting
+    return matrix
+
+
+def _bus(slot: Slot) -> int:
+    """The kind of bus in a device id."""
+    return slot.device_id & 0b111
+
+
+async def _read_angle(parameters: ParameterClient, name: str) -> float:
+    angle_deg = await parameters.read(name)
+    if not math.isfinite(angle_deg):
+        raise AutopilotError(f"{name} is {angle_deg}; an angle was expected")
+    return angle_deg
+
+
+async def _read_mounting(parameters: ParameterClient, sensor: Sensor, slot: Slot) -> Matrix:
+    """How a sensor is mounted on the vehicle, level adjustment apart."""
+    own = await read_integer(parameters, f"{PREFIX[sensor]}{slot.number}_ROT")
+    bus = _bus(slot)
+    internal = bus == _SIMULATION_BUS or (bus in _MAYBE_INTERNAL_BUSES and own in (_INTERNAL, None))
+    number = await read_integer(parameters, "SENS_BOARD_ROT") if internal else own
+    # PX4 takes a number that it does not know for no rotation.
+    if number is None or not 0 <= number < len(ROTATION_NAMES):
+        number = 0
+    return rotation_matrix(_PX4_ONLY_DEG.get(number) or ROTATION_NAMES[number])
+
+
+def _warnings(calibration: ImuCalibration) -> tuple[str, ...]:
+    found = [rival.words for rival in calibration.rivals]
+    low, high = ACCEL_SCALE_RANGE
+    if not all(low <= scale <= high for scale in calibration.accel_scale):
+        name = calibration.parameters.accel_scale[0]
+        found.append(f"{name}, Y or Z is outside {low} to {high}: the scale calibration looks wrong")
+    return tuple(found)
+
+
+def _times(size: float, signs: Vector) -> Vector:
+    x, y, z = signs
+    return size * x, size * y, size * z

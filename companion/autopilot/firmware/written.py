@@ -1,0 +1,86 @@
+"""Every parameter that the companion ever writes, and which values: nothing else is kept, or believed of a file.
+
+Wide enough for whatever an autopilot may have had before, which an undo puts back; far too narrow for nonsense.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Final
+
+from companion.autopilot.firmware import ardupilot, heading_parameters, px4
+from companion.autopilot.firmware.imu_calibration import (
+    MAX_ACCEL_OFFSET_M_S2,
+    MAX_ACCEL_RESIDUAL_M_S2,
+    MAX_GYRO_OFFSET_RAD_S,
+    MAX_GYRO_RESIDUAL_RAD_S,
+    ImuParameters,
+)
+from companion.autopilot.firmware.px4_slots import SLOTS
+from companion.autopilot.firmware.rivals import rivals_of
+from companion.autopilot.vehicle.vehicle import Firmware
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Range:
+    """The values of one parameter; both ends are in it."""
+
+    low: float
+    high: float
+    whole: bool = False
+    unit: str = ""
+
+    def holds(self, value: float) -> bool:
+        """Whether a value is one of them; NaN is not."""
+        return self.low <= value <= self.high and not (self.whole and value != int(value))
+
+    def __str__(self) -> str:
+        kind = "whole numbers " if self.whole else ""
+        return f"{kind}{self.low:.3g} to {self.high:.3g}{self.unit and f' {self.unit}'}"
+
+
+Ranges = Mapping[str, Range]
+"""By parameter."""
+
+_GYRO_RAD_S: Final = MAX_GYRO_OFFSET_RAD_S + MAX_GYRO_RESIDUAL_RAD_S + 0.05
+"""An offset from which a calibration still comes to a plausible one, or a step beyond it on the way: the far one, or a
+dither's 36 steps of 1 mrad/s."""
+_ACCEL_M_S2: Final = MAX_ACCEL_OFFSET_M_S2 + MAX_ACCEL_RESIDUAL_M_S2 + 0.4
+"""Likewise; a dither's 36 steps are of 1 mg."""
+
+GYRO_OFFSET: Final = Range(-_GYRO_RAD_S, _GYRO_RAD_S, unit="rad/s")
+ACCEL_OFFSET: Final = Range(-_ACCEL_M_S2, _ACCEL_M_S2, unit="m/s^2")
+_CALTEMP: Final = Range(-300.0, 200.0, unit="deg C")
+"""-300: not known."""
+_DEVICE_ID: Final = Range(0.0, 2.0**24, whole=True)
+_SWITCH: Final = Range(0.0, 255.0, whole=True)
+
+
+def _offsets(names: ImuParameters) -> dict[str, Range]:
+    return {**dict.fromkeys(names.gyro_offset, GYRO_OFFSET), **dict.fromkeys(names.accel_offset, ACCEL_OFFSET)}
+
+
+def _ardupilot() -> dict[str, Range]:
+    found: dict[str, Range] = {}
+    for names in map(ardupilot.parameters_of, ardupilot.INSTANCES):
+        # Its own gyro calibration, which we start, sets the last two: what it has overwritten is put back.
+        found |= {**_offsets(names), names.gyro_caltemp: _CALTEMP, names.gyro_id: _DEVICE_ID}
+    return found
+
+
+def _px4() -> dict[str, Range]:
+    return {name: one for slot in range(SLOTS) for name, one in _offsets(px4.parameters_of(slot, slot)).items()}
+
+
+CALIBRATION: Final[Mapping[Firmware, Ranges]] = {
+    "ardupilot": {**_ardupilot(), **dict.fromkeys(rivals_of("ardupilot"), _SWITCH)},
+    "px4": {**_px4(), **dict.fromkeys(rivals_of("px4"), _SWITCH)},
+}
+"""By a calibration and its undo."""
+
+HEADING_SETUP: Final[Mapping[Firmware, Ranges]] = {
+    firmware: {one.parameter: Range(0.0, one.most, whole=one.whole) for one in wanted}
+    for firmware, wanted in heading_parameters.WANTED.items()
+}
+"""By `companion autopilot-setup` and its undo."""

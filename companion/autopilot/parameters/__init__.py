@@ -1,0 +1,1 @@
+"""The autopilot's parameters: read, written one by one while disarmed, read back."""

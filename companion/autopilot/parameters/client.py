@@ -1,0 +1,361 @@
+"""Single parameters over MAVLink: read by name, write one, watch what anybody writes.
+
+Every write is guarded: immediately before each PARAM_SET that leaves, the first as well as every repetition, the
+aircraft must be disarmed. Neither autopilot refuses a PARAM_SET while armed (autopilots 1.3, 4.4), so nobody else
+will. MAVLink has no transaction: between a PARAM_SET and its answer the aircraft may arm; `writer` looks again at
+the end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.parameters.encoding import REAL32, decode, encode, is_integer
+from companion.autopilot.parameters.float32 import float32, same_float32
+from companion.autopilot.parameters.inbox import Inbox, Rebooted, Refusal
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
+from companion.errors import (
+    AutopilotRebootedError,
+    NotDisarmedError,
+    ParameterMismatchError,
+    ParameterRefusedError,
+    ParameterTimeoutError,
+)
+from companion.links.mavlink.link import MavlinkLink, Unsubscribe
+
+logger = logging.getLogger(__name__)
+
+_NO_ERROR: Final = 0
+_DOES_NOT_EXIST: Final = 1
+_REMEMBERED_TYPES: Final = 4096
+"""More parameters than any firmware has; what is not remembered is asked for."""
+
+_TRIES: Final = 4
+_TRIES_MORE: Final = 8
+"""While the autopilot's heartbeats come, or the line is known to lose packets: with a fifth of them lost both ways
+four tries fail once in sixty exchanges, which is once a calibration; eight once in 3500."""
+_LOSSY: Final = 0.05
+"""Share of answered requests that had to be repeated, above which silence says little about a name."""
+_LOSS_MEMORY: Final = 0.1
+
+_AT_ONCE: Final = 6
+"""Requests in flight: ArduPilot queues some twenty and answers one every few milliseconds."""
+
+
+class ParameterClient:
+    """The parameters of one autopilot.
+
+    Args:
+        link: the connection.
+        vehicle: whose parameters they are, and whether it is armed.
+        timeout_s: how long one message's answer is awaited.
+    """
+
+    def __init__(self, link: MavlinkLink, vehicle: Vehicle, *, timeout_s: float = 1.0) -> None:
+        self.vehicle = vehicle
+        self.writes = 0
+        """How many PARAM_SET have left, repetitions included."""
+        self._link = link
+        self._timeout_s = timeout_s
+        self._repeated = 0.0
+        """Share of requests that were answered only after a repetition, of late."""
+        self._inboxes: list[Inbox] = []
+        self._watchers: list[Callable[[str, float], None]] = []
+        self._answering: str | None = None
+        self._absent: set[str] = set()
+        """Names that this boot of the autopilot has shown not to have: told by silence, that takes seconds to learn."""
+        self._types: dict[str, int] = {}
+        """MAV_PARAM_TYPE by name, as heard since the last restart; so these exist, however silent it is about them."""
+        self._unsubscribe = [
+            link.subscribe(mavlink.MAVLink_param_value_message, self._on_value),
+            link.subscribe(mavlink.MAVLink_param_error_message, self._on_error),
+            vehicle.watch(self._on_event),
+        ]
+
+    async def read(self, name: str) -> float:
+        """Ask for a parameter by name and return what comes.
+
+        Raises:
+            ParameterTimeoutError: no answer within all retries.
+            ParameterRefusedError: PARAM_ERROR, such as that it does not exist.
+            AutopilotRebootedError: the autopilot restarted meanwhile.
+        """
+        tries = 0
+        with self._exchange(name) as inbox:
+            for tries in self._required_tries():
+                answer = await self._ask(inbox, name, -1)
+                if answer is not None:
+                    self._learn_loss(tries)
+                if isinstance(answer, float):
+                    return answer
+                if isinstance(answer, Refusal):
+                    raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.words}")
+        raise ParameterTimeoutError(
+            f"{self.vehicle.name} does not answer for {name} ({tries} requests, {self._timeout_s:g} s each)"
+            f"{self.vehicle.why_silent}"
+        )
+
+    async def read_optional(self, name: str) -> float | None:
+        """Like `read`, but None when the autopilot has no such parameter.
+
+        Firmware from ArduPilot 4.7 and PX4 1.17 on says so (PARAM_ERROR); older ones are silent. Silence means that
+        it does not exist only while heartbeats come and the autopilot answers for another parameter right after;
+        otherwise requests do not reach it. ArduPilot 4.8 is often silent too: its PARAM_ERROR to a read may leave by
+        another of its links. So what is absent is remembered until it restarts or announces the name.
+
+        Raises:
+            ParameterTimeoutError: no answer to anything.
+            ParameterRefusedError: PARAM_ERROR other than that it does not exist.
+            AutopilotRebootedError: the autopilot restarted meanwhile.
+        """
+        if name in self._absent:
+            return None
+        boots = self.vehicle.boots
+        with self._exchange(name) as inbox:
+            for tries in range(1, (_TRIES_MORE if self._repeated > _LOSSY else _TRIES) + 1):
+                answer = await self._ask(inbox, name, -1)
+                if answer is not None:
+                    self._learn_loss(tries)
+                if isinstance(answer, float):
+                    return answer
+                if isinstance(answer, Refusal):
+                    if answer.code == _DOES_NOT_EXIST:
+                        self._absent.add(name)
+                        return None
+                    raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.words}")
+        if not self.vehicle.alive or not await self._answers_at_all():
+            raise ParameterTimeoutError(
+                f"{self.vehicle.name} answers neither for {name} nor for anything else{self.vehicle.why_silent}"
+            )
+        # It answers again or for others only: a silence that ends in this moment must not be taken for an absence.
+        with self._exchange(name) as inbox:
+            answer = await self._ask(inbox, name, -1)
+        if isinstance(answer, float):
+            return answer
+        if name in self._types:
+            raise ParameterTimeoutError(
+                f"{self.vehicle.name} does not answer for {name} any more ({tries + 1} requests, {self._timeout_s:g} s"
+                f" each){self.vehicle.why_silent}"
+            )
+        if self.vehicle.boots == boots:
+            self._absent.add(name)
+        return None
+
+    async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]:
+        """Read several by name, a few requests at a time.
+
+        Args:
+            names: which.
+            optional: names that do not exist are left out, instead of an error.
+
+        Raises:
+            ParameterTimeoutError, ParameterRefusedError, AutopilotRebootedError: as `read` and `read_optional`.
+        """
+        wanted = list(names)
+        read = self.read_optional if optional else self.read
+        found: dict[str, float] = {}
+        for start in range(0, len(wanted), _AT_ONCE):
+            some = wanted[start : start + _AT_ONCE]
+            answers = await asyncio.gather(*map(read, some), return_exceptions=True)
+            for name, answer in zip(some, answers, strict=True):
+                if isinstance(answer, BaseException):
+                    raise answer
+                if answer is not None:
+                    found[name] = answer
+        return found
+
+    async def write(self, name: str, value: float) -> float:
+        """Set a parameter and wait for the autopilot to confirm that very value.
+
+        It is sent as the type that the autopilot has told of it; a REAL32 is rounded to float32. Another value in
+        between may be an answer to somebody else's write, so the wait goes on; if nothing else comes it is what the
+        autopilot made of ours.
+
+        Returns:
+            The confirmed value, within 1 ulp of what was asked.
+
+        Raises:
+            NotDisarmedError: armed, or unknown whether armed, when a PARAM_SET was about to leave. If it was a
+                repetition, the first one may have had its effect.
+            ParameterTimeoutError: no answer within all retries; it may have had its effect.
+            ParameterMismatchError: answered with another value.
+            ParameterRefusedError: PARAM_ERROR, or the value is not a finite number.
+            AutopilotRebootedError: the autopilot restarted meanwhile; it may have had its effect.
+        """
+        kind = await self._type_of(name)
+        whole = is_integer(kind)
+        wanted = value if whole else float32(value)
+        carried = encode(wanted, kind, bytewise=self.vehicle.integers_bytewise)
+        if not math.isfinite(wanted) or carried is None:
+            what = "a whole number" if whole else "a number"
+            raise ParameterRefusedError(f"{name}: {value} is not {what} that may be written")
+        other: float | None = None
+        tries = 0
+        # The last heartbeat may be older than an arming; one that was asked for just now is not.
+        await self.vehicle.fresh_heartbeat()
+        with self._exchange(name) as inbox:
+            for tries in self._required_tries():
+                if other is not None and tries > _TRIES:
+                    break
+                self._require_disarmed(name)
+                deadline_s = self._send(self._set_message(name, carried, kind), inbox)
+                while (answer := await self._next(inbox, deadline_s)) is not None:
+                    if isinstance(answer, Refusal):
+                        raise ParameterRefusedError(
+                            f"{self.vehicle.name} refuses {name} = {wanted:.9g}: {answer.words}"
+                        )
+                    if answer == wanted if whole else same_float32(answer, wanted):
+                        self._learn_loss(tries)
+                        return answer
+                    other = answer
+                await self.vehicle.fresh_heartbeat()
+        if other is not None:
+            raise ParameterMismatchError(f"{name} was set to {wanted:.9g}, {self.vehicle.name} answers {other:.9g}")
+        raise ParameterTimeoutError(
+            f"{self.vehicle.name} does not answer to setting {name} ({tries} times, {self._timeout_s:g} s each)"
+            f"{self.vehicle.why_silent}"
+        )
+
+    @property
+    def answering(self) -> bool:
+        """Whether the autopilot has answered a request since it started."""
+        return self._answering is not None
+
+    def watch(self, callback: Callable[[str, float], None]) -> Unsubscribe:
+        """Be told of every PARAM_VALUE of the autopilot, whoever caused it; returns how to stop that."""
+        self._watchers.append(callback)
+
+        def unsubscribe() -> None:
+            if callback in self._watchers:
+                self._watchers.remove(callback)
+
+        return unsubscribe
+
+    def close(self) -> None:
+        """Stop listening."""
+        for unsubscribe in self._unsubscribe:
+            unsubscribe()
+
+    def _require_disarmed(self, name: str) -> None:
+        state = self.vehicle.arm_state
+        if state is not ArmState.DISARMED:
+            why = "the aircraft is armed" if state is ArmState.ARMED else "it is unknown whether the aircraft is armed"
+            raise NotDisarmedError(f"{name} is not written: {why}")
+
+    @contextlib.contextmanager
+    def _exchange(self, name: str) -> Iterator[Inbox]:
+        inbox = Inbox(name)
+        self._inboxes.append(inbox)
+        try:
+            yield inbox
+        finally:
+            self._inboxes.remove(inbox)
+
+    def _required_tries(self) -> Iterator[int]:
+        """1, 2, ... of a request that must be answered: the more, while the autopilot is heard."""
+        for tries in range(1, _TRIES_MORE + 1):
+            if tries > _TRIES and not self.vehicle.alive:
+                return
+            yield tries
+
+    def _learn_loss(self, tries: int) -> None:
+        self._repeated += _LOSS_MEMORY * (float(tries > 1) - self._repeated)
+
+    def _send(
+        self, message: mavlink.MAVLink_param_set_message | mavlink.MAVLink_param_request_read_message, inbox: Inbox
+    ) -> float:
+        """Send; the deadline of the answer. Nothing may be awaited between the guard and this."""
+        if self._link.send(message) and isinstance(message, mavlink.MAVLink_param_set_message):
+            self.writes += 1
+        return asyncio.get_running_loop().time() + self._timeout_s
+
+    async def _next(self, inbox: Inbox, deadline_s: float) -> float | Refusal | None:
+        answer = await inbox.get(deadline_s)
+        if isinstance(answer, Rebooted):
+            raise AutopilotRebootedError(f"{self.vehicle.name} restarted while {inbox.name} was exchanged")
+        return answer
+
+    async def _ask(self, inbox: Inbox, name: str, index: int) -> float | Refusal | None:
+        """One PARAM_REQUEST_READ and the first answer to it."""
+        deadline_s = self._send(self._read_message(name, index), inbox)
+        answer = await self._next(inbox, deadline_s)
+        if isinstance(answer, float):
+            self._answering = inbox.name if index < 0 else self._answering
+        return answer
+
+    async def _answers_at_all(self) -> bool:
+        """Whether a parameter that must exist is answered for: the last one that was, else the first of the list."""
+        name, index = (self._answering, -1) if self._answering is not None else ("", 0)
+        with self._exchange(name) as inbox:
+            for _ in self._required_tries():
+                if await self._ask(inbox, name, index) is not None:
+                    return True
+        return False
+
+    async def _type_of(self, name: str) -> int:
+        """The type to write a parameter as; only firmware that carries integers byte by byte minds."""
+        if not self.vehicle.integers_bytewise:
+            return REAL32
+        if name not in self._types:
+            await self.read(name)
+        return self._types.get(name, REAL32)
+
+    def _target(self) -> tuple[int, int]:
+        if self.vehicle.system_id is None:
+            raise ParameterTimeoutError("no autopilot has been heard yet")
+        return self.vehicle.system_id, self.vehicle.component_id
+
+    def _read_message(self, name: str, index: int) -> mavlink.MAVLink_param_request_read_message:
+        return mavlink.MAVLink_param_request_read_message(*self._target(), _wire_name(name), index)
+
+    def _set_message(self, name: str, carried: float, kind: int) -> mavlink.MAVLink_param_set_message:
+        return mavlink.MAVLink_param_set_message(*self._target(), _wire_name(name), carried, kind)
+
+    def _on_value(self, message: mavlink.MAVLink_param_value_message, _t_s: float) -> None:
+        if not self.vehicle.sent(message):
+            return
+        name, value = message.param_id, decode(message, bytewise=self.vehicle.integers_bytewise)
+        self._absent.discard(name)
+        if len(self._types) < _REMEMBERED_TYPES or name in self._types:
+            self._types[name] = message.param_type
+        for inbox in self._inboxes:
+            if inbox.name == name or (inbox.name == "" and message.param_index == 0):
+                inbox.put(value)
+        for callback in tuple(self._watchers):
+            try:
+                callback(name, value)
+            except Exception:
+                logger.exception("a watcher failed on %s", name)
+
+    def _on_error(self, message: mavlink.MAVLink_param_error_message, _t_s: float) -> None:
+        addressed = message.target_system in (0, self._link.system_id) and message.target_component in (
+            0,
+            self._link.component_id,
+        )
+        if not self.vehicle.sent(message) or not addressed or message.error == _NO_ERROR:
+            return
+        for inbox in self._inboxes:
+            if inbox.name == message.param_id:
+                inbox.put(Refusal(message.error))
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        if event == "rebooted":
+            self._answering = None
+            self._absent.clear()
+            self._types.clear()
+            for inbox in self._inboxes:
+                inbox.put(Rebooted())
+
+
+def _wire_name(name: str) -> bytes:
+    data = name.encode("ascii")
+    if len(data) > 16:  # the codec would cut it, and the rest may be another parameter's name
+        raise ValueError(f"{name!r} is longer than the 16 characters of a MAVLink parameter name")
+    return data

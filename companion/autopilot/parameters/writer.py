@@ -1,0 +1,407 @@
+"""Several parameters as one: all of them are written, or the old values are back, or it is said which are not.
+
+MAVLink knows no transaction, so this is the nearest thing to one (autopilots section 8): a fresh look at each old
+value, guarded writes one by one, a fresh read-back of every one, a last look at the arm state; and on any failure
+the old values again in reverse order, just as guarded. What cannot be put back, because the aircraft armed or fell
+silent, is in the error by name.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import logging
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Final
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.parameters.change import (
+    Change,
+    FailureKind,
+    NothingWrittenError,
+    RebootedWhileWritingError,
+    WriteFailedError,
+)
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.float32 import same_float32
+from companion.autopilot.parameters.pace import let_pass, moment
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.calibration.solution.record import Outcome, WrittenParameter
+from companion.errors import (
+    AutopilotError,
+    AutopilotRebootedError,
+    NotDisarmedError,
+    ParameterMismatchError,
+    ParameterRefusedError,
+)
+
+__all__ = ["Change", "ParameterWriter", "RebootedWhileWritingError", "WriteFailedError"]
+
+logger = logging.getLogger(__name__)
+
+HOLD_S: Final = 2.5
+"""So long a value on the way (`Change.via`) stays: PX4 looks at its parameters at most once a second (autopilots 9.2),
+and 2.5 s is what a real one was tried with (9.3.2)."""
+
+TAKEN_S: Final = 1.3
+"""So long after the last value of a way PX4 has taken it into use; until then the one on the way acts."""
+
+_LATE_ECHO_S: Final = 0.3
+"""Let answers to earlier writes pass before reading back: ArduPilot answers to X with Y and Z, old ones, as well."""
+
+_RECOVERY_S: Final = 30.0
+"""How long a restarted or silent autopilot is awaited before its old values are given up."""
+
+_PUT_BACK_S: Final = 60.0
+"""How long putting back may take in all, of an autopilot whose heartbeat comes but who answers badly."""
+
+_TELL_REBOOT_S: Final = 2.0
+"""After heartbeats have come back: how long the time since boot is awaited."""
+
+_ROUNDS: Final = 2
+"""How often putting back is tried; a late echo may have passed for a confirmation the first time."""
+
+
+@dataclasses.dataclass(slots=True)
+class _Item:
+    """A change on its way."""
+
+    change: Change
+    sent: bool = False
+    confirmed: bool = False
+    """The autopilot has answered with a value of ours: another one found later is somebody else's."""
+    read_back: float | None = None
+    outcome: Outcome = "failed"
+    left: bool = False
+
+
+class _Failure(Exception):  # noqa: N818 - never leaves this module
+    def __init__(self, kind: FailureKind, reason: str) -> None:
+        super().__init__(reason)
+        self.kind: FailureKind = kind
+
+
+class ParameterWriter:
+    """Writes sets of parameters to one autopilot, one set at a time.
+
+    Args:
+        parameters: single parameters.
+        vehicle: whether it is armed, whether it restarted.
+    """
+
+    def __init__(self, parameters: ParameterClient, vehicle: Vehicle) -> None:
+        self.written: dict[str, WrittenParameter] = {}
+        """Outcomes of the last operation, whatever its end: also when it was cancelled."""
+        self.left_changed: tuple[str, ...] = ()
+        self._parameters = parameters
+        self._vehicle = vehicle
+        self._lock = asyncio.Lock()
+        self._boots = 0
+        self._give_up_s = self._deadline_s = 0.0
+
+    async def apply(
+        self, changes: Sequence[Change], on_the_way: Callable[[], Awaitable[str | None]] | None = None
+    ) -> dict[str, WrittenParameter]:
+        """Write all changes or none; a parameter that already has its new value is not written again.
+
+        Args:
+            changes: the whole set.
+            on_the_way: called while the values on the way (`Change.via`) are in force, of which it may look at the
+                effect; what it returns is a reason to put everything back.
+
+        Returns:
+            Every parameter as "stored": read back afresh, its effect not yet looked at.
+
+        Raises:
+            NothingWrittenError: not disarmed at the start, or the autopilot is just calibrating itself.
+            WriteFailedError: nothing, or everything that could be, is as before.
+            asyncio.CancelledError: cancelled; the old values are put back first, see `written`.
+        """
+        async with self._lock:
+            items = self._begin(changes)
+            try:
+                await self._check_before(items)
+                await self._write_on_the_way(items, on_the_way)
+                for item in items:
+                    if item.change.before != item.change.after or item.sent:
+                        await self._write(item, item.change.after)
+                await self._read_back(items)
+                await self._check_end()
+            except _Failure as failure:
+                await self._fail(items, failure)
+            except asyncio.CancelledError:
+                await self._put_back(items, leave_foreign=False)
+                logger.warning("writing was cancelled; left changed: %s", ", ".join(self.left_changed) or "nothing")
+                raise
+            for item in items:
+                item.outcome = "stored"
+            return self._publish(items)
+
+    async def restore(self, changes: Sequence[Change]) -> dict[str, WrittenParameter]:
+        """Put back `before` of every change, last first: after a verification that failed.
+
+        As much as can be is put back. A value that is neither `before` nor `after` is somebody else's and is left.
+
+        Returns:
+            Every parameter as "rolled_back".
+
+        Raises:
+            NothingWrittenError: as `apply`; nothing was put back.
+            WriteFailedError: `left_changed` names what could not be put back.
+            asyncio.CancelledError: cancelled; see `written`.
+        """
+        async with self._lock:
+            items = self._begin(changes)
+            for item in items:
+                item.sent = True
+            await self._put_back(items, leave_foreign=True)
+            if self.left_changed:
+                foreign = {item.change.parameter: item.read_back for item in items if item.left}
+                reason = ", ".join(f"{name} is {_words(value)}" for name, value in foreign.items())
+                raise WriteFailedError(self._kind_now(items), reason, self.written, self.left_changed)
+            return self.written
+
+    async def undo(self, changes: Sequence[Change]) -> dict[str, WrittenParameter]:
+        """Put back `before` of every change, or none: refused when somebody has changed one since.
+
+        Returns:
+            Every parameter as "rolled_back", `before` and `after` as in the changes.
+
+        Raises:
+            NothingWrittenError, WriteFailedError, asyncio.CancelledError: as `apply`; "rolled_back" in the
+                error then means that the value from before the undo is in force.
+        """
+        swapped = [dataclasses.replace(c, before=c.after, after=c.before) for c in reversed(changes)]
+        done = await self.apply(swapped)
+        if any(change.via is not None for change in changes):
+            # Nobody looks at the telemetry after this, and who is told that it is done may arm.
+            await let_pass(self._vehicle, moment(self._vehicle), TAKEN_S)
+        self.written = {
+            change.parameter: WrittenParameter(
+                before=change.before,
+                after=change.after,
+                read_back=done[change.parameter].read_back,
+                outcome="rolled_back",
+            )
+            for change in changes
+        }
+        return self.written
+
+    # --- forward
+
+    def _begin(self, changes: Sequence[Change]) -> list[_Item]:
+        names = [change.parameter for change in changes]
+        if len(set(names)) != len(names):
+            raise ValueError("a parameter is named twice")
+        items = [_Item(change) for change in changes]
+        self._publish(items)
+        state = self._vehicle.arm_state
+        if state is not ArmState.DISARMED:
+            why = "the aircraft is armed" if state is ArmState.ARMED else "it is unknown whether the aircraft is armed"
+            raise NothingWrittenError(f"nothing is written: {why}")
+        if self._vehicle.system_status == mavlink.MAV_STATE_CALIBRATING:
+            raise NothingWrittenError(f"nothing is written: {self._vehicle.name} is calibrating its own sensors")
+        self._boots = self._vehicle.boots
+        return items
+
+    async def _check_before(self, items: list[_Item]) -> None:
+        for item in items:
+            name, before = item.change.parameter, item.change.before
+            now = await self._read(name)
+            if not same_float32(now, before):
+                raise _Failure(
+                    "changed by someone else",
+                    f"{name} is {_words(now)} now but was {_words(before)} when it was measured; nothing was written",
+                )
+
+    async def _write_on_the_way(
+        self, items: list[_Item], on_the_way: Callable[[], Awaitable[str | None]] | None
+    ) -> None:
+        indirect = [(item, item.change.via) for item in items if item.change.via is not None]
+        for item, via in indirect:
+            await self._write(item, via)
+        if not indirect:
+            return
+        written = moment(self._vehicle)
+        wrong = None if on_the_way is None else await on_the_way()
+        await let_pass(self._vehicle, written, HOLD_S)
+        await self._check_end()
+        if wrong is not None:
+            raise _Failure("not as believed", wrong)
+
+    async def _write(self, item: _Item, value: float) -> None:
+        name = item.change.parameter
+        sent_before = self._parameters.writes
+        try:
+            await self._parameters.write(name, value)
+            item.confirmed = True
+        except AutopilotError as error:
+            raise self._failure(error) from error
+        finally:
+            item.sent |= self._parameters.writes > sent_before
+        self._check_boot(f"after {name} was written")
+
+    async def _read_back(self, items: list[_Item]) -> None:
+        await asyncio.sleep(_LATE_ECHO_S)
+        for item in items:
+            name, wanted = item.change.parameter, item.change.after
+            item.read_back = await self._read(name)
+            if not same_float32(item.read_back, wanted):
+                await asyncio.sleep(_LATE_ECHO_S)
+                item.read_back = await self._read(name)
+            if not same_float32(item.read_back, wanted):
+                kind: FailureKind = "changed by someone else" if item.confirmed else "answered another value"
+                raise _Failure(kind, f"{name} was set to {_words(wanted)} and reads {_words(item.read_back)}")
+
+    async def _check_end(self) -> None:
+        await self._vehicle.hear_boot_time()
+        self._check_boot("before all was read back")
+        state = self._vehicle.arm_state
+        if state is ArmState.ARMED:
+            raise _Failure("armed in the middle", "the aircraft armed while its parameters were written")
+        if state is ArmState.UNKNOWN:
+            raise _Failure("arm state unknown", "the autopilot's heartbeat stopped while its parameters were written")
+
+    def _check_boot(self, when: str) -> None:
+        if self._vehicle.boots != self._boots:
+            raise _Failure("rebooted in the middle", f"{self._vehicle.name} restarted {when}")
+
+    async def _read(self, name: str) -> float:
+        try:
+            value = await self._parameters.read(name)
+        except AutopilotError as error:
+            raise self._failure(error) from error
+        self._check_boot(f"before {name} was read")
+        return value
+
+    def _failure(self, error: AutopilotError) -> _Failure:
+        kind: FailureKind
+        if self._vehicle.boots != self._boots or isinstance(error, AutopilotRebootedError):
+            kind = "rebooted in the middle"
+        elif isinstance(error, NotDisarmedError):
+            armed = self._vehicle.arm_state is ArmState.ARMED
+            kind = "armed in the middle" if armed else "arm state unknown"
+        elif isinstance(error, ParameterMismatchError):
+            kind = "answered another value"
+        elif isinstance(error, ParameterRefusedError):
+            kind = "refused"
+        else:
+            kind = "no answer"
+        return _Failure(kind, str(error))
+
+    # --- back
+
+    async def _fail(self, items: list[_Item], failure: _Failure) -> None:
+        kind, reason = failure.kind, str(failure)
+        if not self._vehicle.alive and any(item.sent for item in items):
+            # It fell silent: if it comes back, learn first whether it restarted.
+            self._give_up_s = asyncio.get_running_loop().time() + _RECOVERY_S
+            if await self._wait_disarmed():
+                await self._vehicle.hear_boot_time(_TELL_REBOOT_S)
+        elif kind in ("answered another value", "changed by someone else", "no answer") and any(
+            item.sent for item in items
+        ):
+            # Another value may be that of a start-up calibration, which is not ours to overwrite.
+            await self._vehicle.hear_boot_time()
+        if self._vehicle.boots != self._boots and kind != "rebooted in the middle":
+            kind, reason = "rebooted in the middle", f"{self._vehicle.name} restarted ({reason})"
+        await self._put_back(items, leave_foreign=kind == "rebooted in the middle")
+        error = RebootedWhileWritingError if kind == "rebooted in the middle" else WriteFailedError
+        raise error(kind, reason, self.written, self.left_changed) from failure
+
+    async def _put_back(self, items: list[_Item], *, leave_foreign: bool) -> None:
+        touched = [item for item in reversed(items) if item.sent]
+        for item in touched:
+            item.outcome, item.left, item.read_back = "failed", True, None  # until known better
+        now_s = asyncio.get_running_loop().time()
+        self._give_up_s, self._deadline_s = now_s + _RECOVERY_S, now_s + _PUT_BACK_S
+        try:
+            for _ in range(_ROUNDS):
+                remaining = [item for item in touched if item.left]
+                if not remaining:
+                    break
+                foreign = leave_foreign or self._vehicle.boots != self._boots
+                indirect = [(item, item.change.via) for item in remaining if item.change.via is not None]
+                for item, via in indirect:
+                    await self._put_back_one(item, via, leave_foreign=foreign)
+                if indirect and self._vehicle.alive and not self._late():
+                    await asyncio.sleep(HOLD_S)
+                for item in remaining:
+                    await self._put_back_one(item, item.change.before, leave_foreign=foreign)
+                await asyncio.sleep(TAKEN_S if indirect and self._vehicle.alive else _LATE_ECHO_S)
+                for item in touched:
+                    item.read_back = await self._look(item.change.parameter)
+                    item.left = not _same(item.read_back, item.change.before)
+                    item.outcome = "failed" if item.left else "rolled_back"
+        finally:
+            self._publish(items)
+
+    async def _put_back_one(self, item: _Item, value: float, *, leave_foreign: bool) -> None:
+        """Set one parameter to its old value, or to the one on the way to it."""
+        change = item.change
+        if not await self._wait_disarmed() or self._late():
+            return
+        if leave_foreign or item.confirmed:
+            # What is neither ours nor the old value came from a start-up calibration or another ground station. Of a
+            # value that was never confirmed nobody knows: it may be what the autopilot has made of ours.
+            now = await self._look(change.parameter)
+            if not any(_same(now, ours) for ours in change.ours) and (leave_foreign or now is not None):
+                return
+        try:
+            await self._parameters.write(change.parameter, value)
+        except AutopilotError as error:
+            logger.warning("%s is not put back yet: %s", change.parameter, error)
+
+    async def _look(self, name: str) -> float | None:
+        """What is in force, or None when it cannot be known; a restart meanwhile only means asking again."""
+        if not self._vehicle.alive or self._late():
+            return None
+        for _ in range(2):
+            try:
+                return await self._parameters.read(name)
+            except AutopilotRebootedError:
+                continue
+            except AutopilotError as error:
+                logger.error("%s could not be read: %s", name, error)  # noqa: TRY400 - one line
+                return None
+        return None
+
+    async def _wait_disarmed(self) -> bool:
+        """Whether it is disarmed; while that is unknown it is awaited, for a limited time in all."""
+        loop = asyncio.get_running_loop()
+        # The state may become known without an event, so there is none to wait for.
+        while self._vehicle.arm_state is ArmState.UNKNOWN and loop.time() < self._give_up_s:
+            await asyncio.sleep(0.1)
+        return self._vehicle.arm_state is ArmState.DISARMED
+
+    def _late(self) -> bool:
+        return asyncio.get_running_loop().time() > self._deadline_s
+
+    def _kind_now(self, items: list[_Item]) -> FailureKind:
+        if self._vehicle.arm_state is ArmState.ARMED:
+            return "armed in the middle"
+        if self._vehicle.arm_state is ArmState.UNKNOWN:
+            return "arm state unknown"
+        if any(item.left and item.read_back is None for item in items):
+            return "no answer"
+        foreign = any(item.left and not any(_same(item.read_back, own) for own in item.change.ours) for item in items)
+        return "changed by someone else" if foreign else "answered another value"
+
+    def _publish(self, items: list[_Item]) -> dict[str, WrittenParameter]:
+        self.written = {
+            item.change.parameter: WrittenParameter(
+                before=item.change.before, after=item.change.after, read_back=item.read_back, outcome=item.outcome
+            )
+            for item in items
+        }
+        self.left_changed = tuple(item.change.parameter for item in items if item.left)
+        return self.written
+
+
+def _same(one: float | None, other: float) -> bool:
+    return one is not None and same_float32(one, other)
+
+
+def _words(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.9g}"

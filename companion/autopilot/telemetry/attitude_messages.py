@@ -1,0 +1,71 @@
+"""Our attitude in MAVLink's words, for each firmware as it consumes them (autopilots section 6).
+
+VISION_POSITION_ESTIMATE and not ODOMETRY: of an attitude without a position PX4 takes ODOMETRY for one in a frame of
+its own, not north's, and ArduPilot demands such a frame in so many words; and Euler angles have no norm that could be
+off by more than the 1e-5 that PX4 allows. Neither firmware fuses roll and pitch.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.attitude.estimator import Attitude
+from companion.autopilot.vehicle.vehicle import Firmware
+
+NOWHERE_VARIANCE_M2: Final = 1e4
+"""Of the position that is none: ArduPilot bounds its sigma to 100 m."""
+_X, _Y, _Z, _ROLL, _PITCH, _YAW = 0, 6, 11, 15, 18, 20
+"""Where the diagonal stands in the upper right triangle, row by row."""
+_U32: Final = 2**32
+
+
+def microseconds(t_s: float) -> int:
+    """A time of our own clock as it goes over the wire, in everything that we send: one clock for one link."""
+    return round(t_s * 1e6)
+
+
+def vision_position_estimate(
+    firmware: Firmware, attitude: Attitude, reset_counter: int
+) -> mavlink.MAVLink_vision_position_estimate_message:
+    """Attitude in NED against true north, and no position.
+
+    ArduPilot throws the whole message away for a position that is not a number, and takes the root of the sum of all
+    three angles' variances for the sigma of yaw, so roll's and pitch's are left out. PX4 must not be given a position.
+    """
+    sigma_roll, sigma_pitch, sigma_yaw = attitude.sigma_rad
+    covariance = [0.0] * 21
+    covariance[_X] = covariance[_Y] = covariance[_Z] = NOWHERE_VARIANCE_M2
+    covariance[_YAW] = sigma_yaw**2
+    nowhere = 0.0
+    if firmware == "px4":
+        covariance[_ROLL], covariance[_PITCH] = sigma_roll**2, sigma_pitch**2
+        nowhere = math.nan
+    return mavlink.MAVLink_vision_position_estimate_message(
+        microseconds(attitude.t_s),
+        nowhere,
+        nowhere,
+        nowhere,
+        attitude.roll_rad,
+        attitude.pitch_rad,
+        attitude.yaw_rad,
+        covariance,
+        reset_counter % 256,
+    )
+
+
+def attitude_messages(
+    attitude: Attitude,
+) -> tuple[mavlink.MAVLink_attitude_message, mavlink.MAVLink_attitude_quaternion_message]:
+    """ATTITUDE and ATTITUDE_QUATERNION for ground stations and logs; both autopilots ignore them."""
+    boot_ms = int(attitude.t_s * 1e3) % _U32
+    q = np.array(attitude.quaternion, dtype=np.float32)
+    w, x, y, z = (q / np.linalg.norm(q)).tolist()
+    angles = (attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
+    return (
+        mavlink.MAVLink_attitude_message(boot_ms, *angles, *attitude.rate_rad_s),
+        mavlink.MAVLink_attitude_quaternion_message(boot_ms, w, x, y, z, *attitude.rate_rad_s),
+    )

@@ -1,0 +1,380 @@
+"""The samples of one of the autopilot's IMUs, from the best message that it will send.
+
+What is asked for is lost at every restart of the autopilot, may be refused, answered late or never; so nothing is
+believed but the messages that arrive: the answer to a request only saves time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import logging
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.telemetry import imu_messages
+from companion.autopilot.telemetry.imu_messages import ImuMessage, Reading, StreamKind
+from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
+from companion.links.mavlink.link import MavlinkLink, Message
+from companion.samples import ImuSample
+
+__all__ = ["ImuStream", "StreamKind"]
+
+logger = logging.getLogger(__name__)
+
+SILENCE_S: Final = 2.0
+"""After this long without a sample the stream is asked for again."""
+
+SLOWER_RATES_HZ: Final = (100.0, 50.0, 40.0, 25.0, 10.0)
+"""Tried in turn when a rate is denied: ArduPilot allows 1.25 times its loop rate, Plane's 50 Hz loop 40 Hz."""
+
+_ASKS: Final = 3
+"""How often a message is asked for that nobody refuses and that does not come."""
+
+_BETTER_AGAIN_S: Final = 30.0
+"""How often a better message that merely never came is asked for again."""
+
+_LOOK_S: Final = 0.25
+_TURN_S: Final = 1.0
+BEAT_WITHIN_S: Final = 20.0
+"""A request may wait behind fifteen others, each of which goes unanswered (`autopilot.commands`)."""
+_REFUSED: Final = -1
+_ABSENT_AFTER: Final = 10
+_TEMPERATURE_RATE_HZ: Final = 2.0
+_TEMPERATURE_AGE_S: Final = 5.0
+
+
+@dataclasses.dataclass(slots=True)
+class _Source:
+    """One message as a possible source of samples."""
+
+    message: ImuMessage
+    rates_hz: Sequence[float]
+    rate: int = 0
+    refused: bool = False
+    last_s: float = -math.inf
+    recent: int = 0
+    zeros: int = 0
+    reason: str = ""
+    device_s: float = -math.inf
+
+    @property
+    def name(self) -> str:
+        return self.message.kind.message
+
+    @property
+    def absent(self) -> bool:
+        return self.zeros >= _ABSENT_AFTER
+
+    def forget(self) -> None:
+        """The autopilot may be another firmware now."""
+        self.rate, self.refused, self.zeros, self.recent, self.reason = 0, False, 0, 0, ""
+        self.last_s = self.device_s = -math.inf
+
+
+class ImuStream:
+    """Asks for one IMU's messages, keeps them coming and hands on their samples in vehicle FRD.
+
+    Args:
+        link: the connection.
+        vehicle: whose IMU it is.
+        instance: 1, 2 or 3.
+        on_sample: called with every sample.
+        rate_hz: wanted; slower when the autopilot denies it.
+        on_kind_change: called before the first sample of another message (and with None when there is none any
+            more), so that nobody mixes two resolutions in one mean.
+    """
+
+    def __init__(
+        self,
+        link: MavlinkLink,
+        vehicle: Vehicle,
+        instance: int,
+        on_sample: Callable[[ImuSample], None],
+        *,
+        rate_hz: float = 100.0,
+        on_kind_change: Callable[[StreamKind | None], None] | None = None,
+    ) -> None:
+        if instance not in imu_messages.ARDUPILOT:
+            raise ValueError(f"no IMU {instance}: 1, 2 or 3")
+        self.kind: StreamKind | None = None
+        """What the samples come from; None while there are none."""
+        self.samples = 0
+        self.problem = f"waiting for the autopilot to start IMU {instance}"
+        """Why there are no samples, one line; empty while there are."""
+        self.on_beat: Callable[[], None] = lambda: None
+        """Called at every turn of `run`: at least every `BEAT_WITHIN_S`, whether samples come or not."""
+        self.rejected: Counter[str] = Counter()
+        """Messages that gave no sample, by reason."""
+        self._vehicle, self._instance = vehicle, instance
+        self._on_sample, self._on_kind_change = on_sample, on_kind_change
+        self._rates_hz = [rate_hz, *(rate for rate in SLOWER_RATES_HZ if rate < rate_hz)]
+        self._link = link
+        self._sources: list[_Source] = []
+        self._current: _Source | None = None
+        self._temperature: tuple[float, float] | None = None
+        self._restart = asyncio.Event()
+        self._arrived = asyncio.Event()
+
+    @property
+    def rate_hz(self) -> float | None:
+        """The rate that was asked for last and not denied; None while nothing comes."""
+        return None if self._current is None else self._current.rates_hz[self._current.rate]
+
+    async def run(self) -> None:
+        """Keep the samples coming until cancelled; raises nothing else."""
+        messages = {*imu_messages.ARDUPILOT[self._instance], *imu_messages.PX4[self._instance]}
+        subscriptions = [self._link.subscribe(each.message, self._on_message) for each in messages]
+        subscriptions.append(self._vehicle.watch(self._on_event))
+        try:
+            while True:
+                try:
+                    await self._serve()
+                except Exception:
+                    logger.exception("the stream of IMU %d failed; starting again", self._instance)
+                    await asyncio.sleep(1.0)
+        finally:
+            for unsubscribe in subscriptions:
+                unsubscribe()
+            self._switch(None)
+
+    # --- which message, at which rate
+
+    async def _serve(self) -> None:
+        """From finding the autopilot to losing it."""
+        if not self._vehicle.alive:
+            self._lose("no heartbeat from the autopilot")
+        await self._until_found()
+        self._restart.clear()
+        if self._vehicle.firmware == "ardupilot":
+            messages = imu_messages.ARDUPILOT[self._instance]
+        elif self._vehicle.firmware == "px4":
+            messages = imu_messages.PX4[self._instance]
+        else:
+            self._lose("this autopilot is neither ArduPilot nor PX4: what its IMU messages carry is not known")
+            await self._pause(60.0)
+            return
+        self._sources = [_Source(message, self._rates_hz) for message in messages]
+        self._temperature = None
+        while not self._restart.is_set():
+            found = await self._find()
+            if found is None:
+                self._lose(self._why_none())
+                await self._pause(5.0)
+                for source in self._sources:
+                    source.refused = False
+            else:
+                await self._keep(found)
+
+    async def _until_found(self) -> None:
+        while True:
+            self.on_beat()
+            try:
+                async with asyncio.timeout(_TURN_S):
+                    await self._vehicle.wait_found()
+            except TimeoutError:
+                continue
+            return
+
+    async def _find(self) -> _Source | None:
+        """The first source, best first, that sends."""
+        for source in self._sources:
+            for _ in range(_ASKS):
+                if self._restart.is_set() or source.refused:
+                    break
+                result = await self._ask(source)
+                if result != _REFUSED and await self._sends(source):
+                    return source
+                if source.absent:
+                    break
+                if result is None and source.rate + 1 < len(source.rates_hz):
+                    source.rate += 1  # the denial may have been lost or be late
+        return None
+
+    async def _ask(self, source: _Source) -> int | None:
+        """Ask for a message at the fastest rate that is not denied: the last answer, None when none came in time."""
+        while True:
+            self.on_beat()
+            rate_hz = source.rates_hz[source.rate]
+            result = await self._vehicle.commands.request_message_interval(source.message.message.id, rate_hz)
+            if result == mavlink.MAV_RESULT_DENIED and not self._restart.is_set():
+                # Too fast; or, in the same word, no such message.
+                if source.rate + 1 < len(source.rates_hz):
+                    source.rate += 1
+                    continue
+                source.rate, source.refused, source.reason = 0, True, "denied"
+            elif result in (mavlink.MAV_RESULT_UNSUPPORTED, mavlink.MAV_RESULT_FAILED):
+                source.refused, source.reason = True, "not supported"
+            return _REFUSED if source.refused else result
+
+    async def _sends(self, source: _Source) -> bool:
+        """Whether the source brings a sample within the time of a silence."""
+        loop = asyncio.get_running_loop()
+        deadline_s = loop.time() + SILENCE_S
+        asked_s = loop.time()
+        while not self._restart.is_set() and not source.absent:
+            if source.last_s >= asked_s or loop.time() - source.last_s < _LOOK_S:
+                return True
+            try:
+                async with asyncio.timeout_at(deadline_s):
+                    self._arrived.clear()
+                    await self._arrived.wait()
+            except TimeoutError:
+                break
+        return False
+
+    async def _keep(self, source: _Source) -> None:
+        """Serve from a source until it falls silent for good, a better one sends, or the autopilot is lost."""
+        loop = asyncio.get_running_loop()
+        self._switch(source)
+        silent_asks = 0
+        asked_s = temperature_s = better_s = loop.time()
+        await self._ask_for_temperature(source)
+        for each in self._sources:
+            each.recent = 0
+        while not await self._pause(_LOOK_S):
+            now_s = loop.time()
+            better = self._better_than(source)
+            if better is not None:
+                self._switch(better)
+                source = better
+                await self._ask_for_temperature(source)
+            if now_s - source.last_s < SILENCE_S:
+                silent_asks = 0
+                if self._temperature_is_old(now_s) and now_s - temperature_s > _TEMPERATURE_AGE_S:
+                    temperature_s = now_s
+                    await self._ask_for_temperature(source)
+                if now_s - better_s > _BETTER_AGAIN_S:
+                    better_s = now_s
+                    await self._ask_for_better(source)
+            elif source.absent:
+                return
+            elif now_s - asked_s >= SILENCE_S:
+                self.problem = f"{source.name} has been silent for {now_s - source.last_s:.0f} s; asked for it again"
+                if silent_asks >= _ASKS:
+                    return
+                silent_asks += 1
+                asked_s = now_s
+                if await self._ask(source) == _REFUSED:
+                    return
+
+    def _better_than(self, source: _Source) -> _Source | None:
+        """A better source that has begun to send at a useful rate."""
+        found = None
+        for each in self._sources[: self._sources.index(source)]:
+            if each.recent >= 10.0 * _LOOK_S and not each.absent and found is None:
+                found = each
+            each.recent = 0
+        return found
+
+    async def _ask_for_better(self, source: _Source) -> None:
+        for each in self._sources[: self._sources.index(source)]:
+            if not each.refused and not each.reason:
+                await self._ask(each)
+
+    async def _ask_for_temperature(self, source: _Source) -> None:
+        """HIGHRES_IMU carries the barometer's; the IMU's comes with the integer messages."""
+        if source.message is imu_messages.HIGHRES:
+            for each in self._sources[1:]:
+                message_id = each.message.message.id
+                result = await self._vehicle.commands.request_message_interval(message_id, _TEMPERATURE_RATE_HZ)
+                if result in (mavlink.MAV_RESULT_ACCEPTED, None):
+                    return
+
+    def _temperature_is_old(self, now_s: float) -> bool:
+        return self._temperature is None or now_s - self._temperature[1] > _TEMPERATURE_AGE_S
+
+    async def _pause(self, seconds: float) -> bool:
+        """Wait, but not beyond the loss or restart of the autopilot; True when that came."""
+        deadline_s = asyncio.get_running_loop().time() + seconds
+        while not self._restart.is_set():
+            self.on_beat()
+            left_s = deadline_s - asyncio.get_running_loop().time()
+            if left_s <= 0.0:
+                return False
+            try:
+                async with asyncio.timeout(min(left_s, _TURN_S)):
+                    await self._restart.wait()
+            except TimeoutError:
+                continue
+        return True
+
+    # --- what arrives
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        if event in ("lost", "rebooted"):
+            self._lose("the autopilot restarted" if event == "rebooted" else "no heartbeat from the autopilot")
+            for source in self._sources:
+                source.forget()
+            self._restart.set()
+
+    def _on_message(self, message: Message, t_s: float) -> None:
+        if not self._vehicle.sent(message):
+            return
+        kind = type(message)
+        for source in self._sources:
+            if source.message.message is kind:
+                break
+        else:
+            return
+        reading = source.message.decode(message)
+        if isinstance(reading, str):
+            self.rejected[reading] += 1
+            source.reason = reading
+            return
+        if reading.all_zero:
+            self.rejected["all zero"] += 1
+            source.zeros = min(source.zeros + 1, _ABSENT_AFTER)
+            self._arrived.set()
+            return
+        if -0.5 < reading.t_device_s - source.device_s <= 0.0:
+            self.rejected["repeated or late"] += 1
+            return
+        source.device_s, source.last_s, source.zeros, source.reason = reading.t_device_s, t_s, 0, ""
+        source.recent += 1
+        if not self._arrived.is_set():
+            self._arrived.set()
+        if reading.temperature_degc is not None:
+            self._temperature = (reading.temperature_degc, t_s)
+        if source is self._current:
+            self._hand_on(reading, t_s)
+
+    def _hand_on(self, reading: Reading, t_s: float) -> None:
+        self.samples += 1
+        self.problem = ""
+        known = self._temperature
+        temperature = None if known is None or t_s - known[1] > _TEMPERATURE_AGE_S else known[0]
+        self._on_sample(ImuSample(t_s, reading.gyro_rad_s, reading.accel_m_s2, temperature, None, reading.t_device_s))
+
+    def _lose(self, problem: str) -> None:
+        self._switch(None)
+        if problem != self.problem:
+            # The loss of the autopilot itself has been said once already.
+            logger.log(logging.WARNING if self._vehicle.alive else logging.DEBUG, "IMU %d: %s", self._instance, problem)
+        self.problem = problem
+
+    def _switch(self, source: _Source | None) -> None:
+        if source is self._current:
+            return
+        self._current = source
+        kind = None if source is None else source.message.kind
+        if source is not None:
+            self.problem = ""
+            logger.info("IMU %d: %s at up to %g Hz", self._instance, source.name, source.rates_hz[source.rate])
+        if kind != self.kind:
+            self.kind = kind
+            if self._on_kind_change is not None:
+                self._on_kind_change(kind)
+
+    def _why_none(self) -> str:
+        ordinal = {1: "first", 2: "second", 3: "third"}[self._instance]
+        if all(source.absent for source in self._sources if not source.refused and not source.reason):
+            zero = [source.name for source in self._sources if source.absent]
+            if zero:
+                return f"{zero[0]} is all zero: there is no {ordinal} IMU"
+        words = [f"{source.name} {source.reason or 'does not come'}" for source in self._sources]
+        return f"no samples of IMU {self._instance}: {', '.join(words)}"

@@ -1,0 +1,1 @@
+"""What the autopilot is and says of itself: heartbeats, arm state, place, clock; and commands to it."""

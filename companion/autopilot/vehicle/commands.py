@@ -1,0 +1,147 @@
+"""Commands to the autopilot, one at a time, and the wait for their COMMAND_ACK.
+
+An ACK names the command but not its parameters, so two SET_MESSAGE_INTERVAL in flight could not be told apart: of
+each command one is in flight, the others wait their turn. No answer is an answer too (None): an autopilot may be
+slow with its ACKs or never send them, and nobody may hang on that.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Final
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.links.mavlink.link import MavlinkLink
+
+logger = logging.getLogger(__name__)
+
+_COPY_S: Final = 0.5
+MAX_WAITING: Final = 16
+"""Commands of one kind that may wait; beyond that the newest is dropped, counted, and answered None at once."""
+
+
+class _Request:
+    """One command: what is sent, how long its answer is awaited, and who waits."""
+
+    def __init__(self, parameters: tuple[float, ...], timeout_s: float, answer: asyncio.Future[int | None]) -> None:
+        self.parameters = parameters
+        self.timeout_s = timeout_s
+        self.answer = answer
+
+    def settle(self, result: int | None) -> None:
+        if not self.answer.done():
+            self.answer.set_result(result)
+
+
+class Commands:
+    """COMMAND_LONG to one autopilot.
+
+    Args:
+        link: the connection.
+        target: the (system, component) to command, or None while it is not known yet.
+    """
+
+    def __init__(self, link: MavlinkLink, target: Callable[[], tuple[int, int] | None]) -> None:
+        self.dropped = 0
+        self.results: Counter[str] = Counter()
+        """Answers by result's name, plus "no answer"."""
+        self._link = link
+        self._target = target
+        self._queues: dict[int, deque[_Request]] = {}
+        self._in_flight: dict[int, _Request] = {}
+        self._timers: dict[int, asyncio.TimerHandle] = {}
+        self._last_ack = (0, 0, 0, -math.inf)
+        self._unsubscribe = link.subscribe(mavlink.MAVLink_command_ack_message, self._on_ack)
+
+    def send(self, command: int, *parameters: float, timeout_s: float = 0.5) -> asyncio.Future[int | None]:
+        """Send when its turn comes; the future brings the MAV_RESULT, or None when none came in time.
+
+        The time runs from the sending; IN_PROGRESS starts it anew. The future never carries an exception, so it may
+        be left alone.
+        """
+        answer: asyncio.Future[int | None] = asyncio.get_running_loop().create_future()
+        queue = self._queues.setdefault(command, deque())
+        request = _Request(parameters, timeout_s, answer)
+        if len(queue) >= MAX_WAITING:
+            self.dropped += 1
+            request.settle(None)
+        else:
+            queue.append(request)
+            self._next(command)
+        return answer
+
+    def request_message_interval(self, message_id: int, rate_hz: float) -> asyncio.Future[int | None]:
+        """Ask for a message at a rate (MAV_CMD_SET_MESSAGE_INTERVAL)."""
+        return self.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, round(1e6 / rate_hz))
+
+    def request_message(self, message_id: int) -> asyncio.Future[int | None]:
+        """Ask for a message once (MAV_CMD_REQUEST_MESSAGE)."""
+        return self.send(mavlink.MAV_CMD_REQUEST_MESSAGE, message_id)
+
+    def close(self) -> None:
+        """Stop; whoever waits gets None."""
+        self._unsubscribe()
+        for timer in self._timers.values():
+            timer.cancel()
+        self._timers.clear()
+        for request in [*self._in_flight.values(), *(r for queue in self._queues.values() for r in queue)]:
+            request.settle(None)
+        self._in_flight.clear()
+        self._queues.clear()
+
+    def _next(self, command: int) -> None:
+        queue = self._queues.get(command)
+        target = self._target()
+        while queue and command not in self._in_flight:
+            request = queue.popleft()
+            if request.answer.done():  # whoever waited has gone
+                continue
+            if target is None:
+                request.settle(None)
+                continue
+            padded = (*request.parameters, *(0.0,) * (7 - len(request.parameters)))
+            self._link.send(mavlink.MAVLink_command_long_message(*target, command, 0, *padded))
+            self._in_flight[command] = request
+            self._arm_timer(command, request)
+
+    def _arm_timer(self, command: int, request: _Request) -> None:
+        if command in self._timers:
+            self._timers[command].cancel()
+        loop = asyncio.get_running_loop()
+        self._timers[command] = loop.call_later(request.timeout_s, self._finish, command, None)
+
+    def _finish(self, command: int, result: int | None) -> None:
+        self._timers.pop(command).cancel()
+        request = self._in_flight.pop(command)
+        self.results["no answer" if result is None else _result_name(result)] += 1
+        request.settle(result)
+        self._next(command)
+
+    def _on_ack(self, message: mavlink.MAVLink_command_ack_message, t_s: float) -> None:
+        request = self._in_flight.get(message.command)
+        if request is None or (message.get_srcSystem(), message.get_srcComponent()) != self._target():
+            return
+        # Zero is everybody: older firmware does not say whom it answers.
+        if message.target_system not in (0, self._link.system_id):
+            return
+        if message.target_component not in (0, self._link.component_id):
+            return
+        # Two routes bring a packet twice; the second must not answer the next request of the same command.
+        copy = (message.command, message.get_seq(), message.result)
+        if copy == self._last_ack[:3] and t_s - self._last_ack[3] < _COPY_S:
+            return
+        self._last_ack = (*copy, t_s)
+        if message.result == mavlink.MAV_RESULT_IN_PROGRESS:
+            self._arm_timer(message.command, request)
+        else:
+            self._finish(message.command, message.result)
+
+
+def _result_name(result: int) -> str:
+    known = mavlink.enums["MAV_RESULT"].get(result)
+    return known.name if known is not None else str(result)

@@ -1,0 +1,494 @@
+"""The autopilot as seen from outside: which one it is, whether it is armed, whether it restarted, where it stands.
+
+Whoever writes to it asks `arm_state` immediately before every message that leaves. A heartbeat tells the past: the
+state is UNKNOWN as soon as the last one is 2 s old, and after a restart until the next one. It is DISARMED only when no
+armed heartbeat has come under the vehicle's ids for 3 s, from whomever (`arming_watch`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import enum
+import logging
+import math
+from collections.abc import Callable
+from typing import Final, Literal
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.vehicle.arming_watch import ArmingWatch
+from companion.autopilot.vehicle.boot_clock import BootClock
+from companion.autopilot.vehicle.commands import Commands
+from companion.autopilot.vehicle.latch import Latch, is_aircraft
+from companion.autopilot.vehicle.standing_requests import StandingRequests
+from companion.autopilot.vehicle.whereabouts import Position, TimeAndPlace
+from companion.links.mavlink.link import MavlinkLink, Message, Unsubscribe
+from companion.links.mavlink.signing import EARLIEST_S
+
+logger = logging.getLogger(__name__)
+
+HEARTBEAT_TIMEOUT_S: Final = 2.0
+"""Without a heartbeat for this long nobody knows whether the aircraft is armed (autopilots section 8)."""
+
+HEARTBEAT_RATE_HZ: Final = 5.0
+"""Asked of ArduPilot on our own link: a second is a long time not to know of an arming (autopilots 5.1)."""
+
+FRESH_WITHIN_S: Final = 0.3
+"""An autopilot that sends heartbeats on request does so within 20 ms of it; slow radios need more."""
+
+_BEHIND_ANSWER_S: Final = 0.03
+"""How long after its answer to the request a heartbeat may leave ArduPilot (20 ms); PX4 sends it before the answer."""
+_OVERDUE_S: Final = 1.1
+_TICK_S: Final = 0.5
+_STALL_S: Final = 1.0
+_CONFLICT_S: Final = 5.0
+"""So long after the last sign of a second autopilot under our vehicle's ids nothing is believed of either."""
+_RESTARTS_S: Final = 1.0
+"""No autopilot restarts twice in that time: two whose times since boot alternate do."""
+
+Firmware = Literal["ardupilot", "px4", "other"]
+VehicleEvent = Literal["armed", "disarmed", "lost", "found", "rebooted"]
+"""What `Vehicle.watch` tells. "found": latched, or heard again after "lost". "armed" and "disarmed": the heartbeat
+says so and the one before, if any, said otherwise; so the first heartbeat of all brings "found" and one of them.
+"disarmed" comes when that is believed: 3 s after the last armed heartbeat."""
+
+
+_FIRMWARES: Final[dict[int, Firmware]] = {
+    mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot",
+    mavlink.MAV_AUTOPILOT_PX4: "px4",
+}
+
+
+class ArmState(enum.Enum):
+    """Whether the motors may turn. Only DISARMED permits a write."""
+
+    DISARMED = "disarmed"
+    ARMED = "armed"
+    UNKNOWN = "unknown"
+
+
+class Vehicle:
+    """The one autopilot that is calibrated.
+
+    Args:
+        link: the connection; its system id follows the vehicle's when that is latched.
+        system_id: the vehicle's, or None to latch the first real autopilot that is heard. Once latched it stays.
+
+    A real autopilot is a heartbeat with a known autopilot type and the type of a vehicle: ground stations,
+    gimbals, ADS-B receivers and the like are ignored, whatever they claim. Component 1 is taken at once; another
+    component only if it is ArduPilot or PX4 and component 1 stays silent for 2 s.
+    """
+
+    def __init__(self, link: MavlinkLink, *, system_id: int | None = None) -> None:
+        self.system_id: int | None = None
+        self.component_id: int = mavlink.MAV_COMP_ID_AUTOPILOT1
+        self.firmware: Firmware | None = None
+        self.version: str | None = None
+        """Such as "4.6.1" or "4.8.0-dev"; None until AUTOPILOT_VERSION has come."""
+        self.capabilities: int | None = None
+        """MAV_PROTOCOL_CAPABILITY bits; None until AUTOPILOT_VERSION has come."""
+        self.system_status: int | None = None
+        """MAV_STATE of the last heartbeat."""
+        self.signs = False
+        """Whether its last heartbeat was signed (MAVLink 2)."""
+        self.boots = 0
+        """How many restarts were seen."""
+        self.place = TimeAndPlace()
+        """What it says of time and place."""
+        self.commands = Commands(link, self._target)
+        self._link = link
+        self._latch = Latch(system_id)
+        self._heartbeat_s: float | None = None
+        self._heartbeat_link_id: int | None = None
+        self._arming = ArmingWatch()
+        self._armed_told: bool | None = None
+        self._contradiction_logged = False
+        self._conflict_s = self._restarted_s = -math.inf
+        self._lost = True
+        self._trusted_from_s = -math.inf
+        self._boot_clock = BootClock()
+        self._watchers: list[Callable[[VehicleEvent], None]] = []
+        self._found = asyncio.Event()
+        self._heartbeat_waiters: list[asyncio.Event] = []
+        self._boot_time_heard = asyncio.Event()
+        self._wanted = StandingRequests(self.commands)
+        self._version_asked_s, self._version_pause_s = -math.inf, 2.0
+        self._lost_timer: asyncio.TimerHandle | None = None
+        self._tick_timer: asyncio.TimerHandle | None = None
+        self._tick_due_s = math.inf
+        self._closed = False
+        self._unsubscribe = [
+            link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat),
+            link.subscribe(mavlink.MAVLink_system_time_message, self._on_system_time),
+            link.subscribe(mavlink.MAVLink_autopilot_version_message, self._on_version),
+            link.subscribe(mavlink.MAVLink_global_position_int_message, self._on_global_position),
+            link.subscribe(mavlink.MAVLink_gps_raw_int_message, self._on_gps),
+            link.subscribe(mavlink.MAVLink_attitude_message, self._on_boot_ms),
+            link.subscribe(mavlink.MAVLink_scaled_imu_message, self._on_boot_ms),
+            link.subscribe(mavlink.MAVLink_scaled_imu2_message, self._on_boot_ms),
+            link.subscribe(mavlink.MAVLink_scaled_imu3_message, self._on_boot_ms),
+            link.subscribe(mavlink.MAVLink_raw_imu_message, self._on_boot_us),
+            link.subscribe(mavlink.MAVLink_highres_imu_message, self._on_boot_us),
+        ]
+
+    @property
+    def arm_state(self) -> ArmState:
+        """ARMED or DISARMED while the latched autopilot's last heartbeat is younger than 2 s, else UNKNOWN.
+
+        ARMED for 3 s after any armed heartbeat; UNKNOWN while there is a `conflict`.
+        """
+        now_s = asyncio.get_running_loop().time()
+        armed = self._arming.armed(now_s)
+        if self._lost or armed is None or self._heartbeat_s is None or self.conflict is not None:
+            return ArmState.UNKNOWN
+        # After a stall of our own loop the next heartbeats read are old ones that waited in a buffer.
+        stalled = now_s - self._tick_due_s > _STALL_S or self._heartbeat_s < self._trusted_from_s
+        if stalled or now_s - self._heartbeat_s >= HEARTBEAT_TIMEOUT_S:
+            return ArmState.UNKNOWN
+        return ArmState.ARMED if armed else ArmState.DISARMED
+
+    @property
+    def conflict(self) -> str | None:
+        """What is wrong when two autopilots speak under the ids of one; then the arm state is UNKNOWN."""
+        now_s = asyncio.get_running_loop().time()
+        if self._arming.contradicts_itself(now_s):
+            return f"system id {self.system_id} says armed and disarmed by turns: two autopilots, or a forger"
+        if now_s - self._conflict_s < _CONFLICT_S:
+            return f"two autopilots have system id {self.system_id}"
+        return None
+
+    @property
+    def alive(self) -> bool:
+        """Whether the latched autopilot's heartbeat came within the last 2 s."""
+        age_s = self.heartbeat_age_s
+        return not self._lost and age_s is not None and age_s < HEARTBEAT_TIMEOUT_S
+
+    @property
+    def heartbeat_age_s(self) -> float | None:
+        """Seconds since the latched autopilot's last heartbeat; None before the first."""
+        if self._heartbeat_s is None:
+            return None
+        return asyncio.get_running_loop().time() - self._heartbeat_s
+
+    @property
+    def unix_time_s(self) -> float | None:
+        """UTC as the autopilot has it (from its GNSS), carried on by the loop's clock; None when it has none."""
+        return self.place.unix_time_s
+
+    @property
+    def position(self) -> Position | None:
+        """Where it stands, as far as the autopilot can be believed; None when it says no place."""
+        return self.place.position
+
+    @property
+    def name(self) -> str:
+        """For people: "ArduPilot 4.6.1, system 1"."""
+        if self.system_id is None:
+            return "no autopilot"
+        words = {"ardupilot": "ArduPilot", "px4": "PX4"}.get(self.firmware or "", "autopilot")
+        return f"{words}{' ' + self.version if self.version else ''}, system {self.system_id}"
+
+    @property
+    def why_silent(self) -> str:
+        """To be put behind the words that it does not answer although it is heard: what is known of the cause."""
+        return "; it signs what it sends: does it refuse what is not signed?" if self.signs else ""
+
+    @property
+    def integers_bytewise(self) -> bool:
+        """Whether integer parameters travel as the bytes of an int32 in the float field, not as a number.
+
+        By the capability bit; else by who it is: older PX4 and ArduPilot set neither bit (autopilots 7.5).
+        """
+        if self.capabilities is not None:
+            if self.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE:
+                return True
+            if self.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST:
+                return False
+        return self.firmware == "px4"
+
+    def sent(self, message: Message) -> bool:
+        """Whether a message came from the latched autopilot."""
+        header = message.get_header()
+        return header.srcComponent == self.component_id and header.srcSystem == self.system_id
+
+    def watch(self, callback: Callable[[VehicleEvent], None]) -> Unsubscribe:
+        """Be told of events, in the order in which they are seen; returns how to stop that."""
+        self._watchers.append(callback)
+
+        def unsubscribe() -> None:
+            if callback in self._watchers:
+                self._watchers.remove(callback)
+
+        return unsubscribe
+
+    @property
+    def boot_s(self) -> float | None:
+        """Its time since boot as it was heard last."""
+        return self._boot_clock.latest_s
+
+    async def hear_boot_time(self, timeout_s: float = 1.0) -> bool:
+        """Ask for the time since boot and wait for it; afterwards `boots` counts every restart until now.
+
+        Without this a quick restart shows only once its time messages come again. False: none came in time.
+        """
+        heard = self._boot_time_heard
+        heard.clear()
+        request = self.commands.request_message(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
+        try:
+            async with asyncio.timeout(timeout_s):
+                await heard.wait()
+        except TimeoutError:
+            return False
+        finally:
+            request.cancel()
+        return True
+
+    async def wait_found(self) -> None:
+        """Wait, without limit, until the autopilot is being heard."""
+        await self._found.wait()
+
+    async def fresh_heartbeat(self, within_s: float = FRESH_WITHIN_S) -> bool:
+        """Ask for a heartbeat and wait for it, so that an arming is known at once and not at the next beat.
+
+        The heartbeat that comes first may be another's than the one asked for: waited for is the autopilot's answer to
+        the request too, and the time that the heartbeat may be behind it.
+
+        False when none came in time (old firmware, a lossy link): then what `arm_state` says is all there is.
+        """
+        heard = asyncio.Event()
+        self._heartbeat_waiters.append(heard)
+        heartbeat_id: int = mavlink.MAVLINK_MSG_ID_HEARTBEAT
+        request = self.commands.request_message(heartbeat_id)
+        try:
+            async with asyncio.timeout(within_s):
+                await request
+                await asyncio.sleep(_BEHIND_ANSWER_S)
+                await heard.wait()
+        except TimeoutError:
+            return False
+        finally:
+            request.cancel()  # or unanswered ones would queue up before the next
+            self._heartbeat_waiters.remove(heard)
+        return True
+
+    def close(self) -> None:
+        """Stop listening; the arm state is UNKNOWN from here on."""
+        self._closed = True
+        self._lost = True
+        self._found.clear()
+        for unsubscribe in self._unsubscribe:
+            unsubscribe()
+        for timer in (self._lost_timer, self._tick_timer):
+            if timer is not None:
+                timer.cancel()
+        self.commands.close()
+
+    def _target(self) -> tuple[int, int] | None:
+        return None if self.system_id is None else (self.system_id, self.component_id)
+
+    def _tell(self, event: VehicleEvent) -> None:
+        logger.log(logging.WARNING if event in ("lost", "rebooted") else logging.INFO, "%s: %s", self.name, event)
+        for callback in tuple(self._watchers):
+            try:
+                callback(event)
+            except Exception:
+                logger.exception("a watcher failed on %r", event)
+
+    # --- heartbeats
+
+    def _on_heartbeat(self, message: mavlink.MAVLink_heartbeat_message, t_s: float) -> None:
+        if not is_aircraft(message):
+            return
+        if self.system_id is None and self._latch.takes(message, t_s):
+            self._take(message)
+        if not self.sent(message):
+            return
+        now_s = asyncio.get_running_loop().time()
+        armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        ours = self._is_ours(message) and self._is_on_our_link(message)
+        if ours or armed:
+            self._arming.heard(now_s, armed=armed)
+            self._log_contradiction(now_s)
+        if not ours:
+            return
+        was_lost = self._lost
+        self._heartbeat_s = now_s
+        self.system_status = message.system_status
+        self.signs = bool(message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
+        self._lost = False
+        self._found.set()
+        for heard in self._heartbeat_waiters:
+            heard.set()
+        self._watch_for_loss()
+        if was_lost:
+            self._ask_soon()
+            self._tell("found")
+        # A disarmed heartbeat within 3 s of an armed one is neither news yet.
+        believed = armed == self._arming.armed(now_s) and not self._arming.contradicts_itself(now_s)
+        if believed and armed is not self._armed_told:
+            self._armed_told = armed
+            self._tell("armed" if armed else "disarmed")
+
+    def _is_ours(self, message: mavlink.MAVLink_heartbeat_message) -> bool:
+        """Whether a heartbeat under our ids is our vehicle's; ArduPilot and PX4 both are system 1 out of the box."""
+        firmware = _FIRMWARES.get(message.autopilot, "other")
+        if firmware == self.firmware:
+            return True
+        if firmware == "other":
+            return False  # some device that pretends; whether it is armed means nothing
+        if not self._lost:
+            self._notice_conflict()
+            return False
+        # Another firmware has been flashed while we heard nothing.
+        self.firmware = firmware
+        self._boot_clock = BootClock()
+        self._restarted()
+        return True
+
+    def _is_on_our_link(self, message: mavlink.MAVLink_heartbeat_message) -> bool:
+        """Whether a heartbeat was signed on the link on which we hear the autopilot.
+
+        It signs each of its links apart: what was held back on another one is not news here. Unsigned heartbeats
+        (None) count until the first signed one.
+        """
+        link_id = self._link.signed_on(message)
+        if self._lost or self._heartbeat_link_id is None:
+            self._heartbeat_link_id = link_id
+        return link_id == self._heartbeat_link_id
+
+    def _log_contradiction(self, now_s: float) -> None:
+        contradicts = self._arming.contradicts_itself(now_s)
+        if contradicts and not self._contradiction_logged:
+            logger.error("%s: %s; nothing is written", self.name, self.conflict)
+        self._contradiction_logged = contradicts
+
+    def _notice_conflict(self) -> None:
+        now_s = asyncio.get_running_loop().time()
+        if now_s - self._conflict_s > _CONFLICT_S:
+            logger.error("%s: two autopilots have this system id; nothing is written to either", self.name)
+        self._conflict_s = now_s
+
+    def _take(self, message: mavlink.MAVLink_heartbeat_message) -> None:
+        self.system_id, self.component_id = message.get_srcSystem(), message.get_srcComponent()
+        self._link.join((self.system_id, self.component_id))
+        self.firmware = _FIRMWARES.get(message.autopilot, "other")
+        self._wanted.add(mavlink.MAVLink_system_time_message, 1.0)
+        self._wanted.add(mavlink.MAVLink_global_position_int_message, 1.0)
+        self._tick()
+
+    def _watch_for_loss(self) -> None:
+        loop = asyncio.get_running_loop()
+        if self._lost_timer is not None:
+            self._lost_timer.cancel()
+        self._lost_timer = loop.call_later(HEARTBEAT_TIMEOUT_S, self._lose)
+
+    def _lose(self) -> None:
+        self._lost = True
+        self._found.clear()
+        self._tell("lost")
+
+    # --- what is asked for
+
+    def _tick(self) -> None:
+        loop = asyncio.get_running_loop()
+        now_s = loop.time()
+        if now_s - self._tick_due_s > _STALL_S:
+            self._trusted_from_s = now_s + 0.1
+            logger.warning("the event loop stood still for %.1f s", now_s - self._tick_due_s)
+        if self._closed:
+            return
+        self._tick_due_s = now_s + _TICK_S
+        self._tick_timer = loop.call_at(self._tick_due_s, self._tick)
+        if not self._lost:
+            self._ask_for_missing(now_s)
+
+    def _ask_soon(self) -> None:
+        # What was streamed before a loss is gone if the autopilot restarted meanwhile.
+        self._wanted.forget_asking()
+        if self.firmware == "ardupilot":
+            heartbeat_id: int = mavlink.MAVLINK_MSG_ID_HEARTBEAT
+            self.commands.request_message_interval(heartbeat_id, HEARTBEAT_RATE_HZ)
+        self._ask_for_missing(asyncio.get_running_loop().time())
+
+    def _ask_for_missing(self, now_s: float) -> None:
+        overdue = self._heartbeat_s is not None and now_s - self._heartbeat_s > _OVERDUE_S
+        if overdue and self.firmware == "px4":
+            # Its heartbeat cannot be had faster than once a second, so that after a single one that is lost nobody
+            # would know whether it is armed.
+            heartbeat_id: int = mavlink.MAVLINK_MSG_ID_HEARTBEAT
+            self.commands.request_message(heartbeat_id)
+        self._wanted.ask_for_missing(now_s)
+        if self.version is None and now_s - self._version_asked_s > self._version_pause_s:
+            self._version_asked_s = now_s
+            self._version_pause_s = min(2 * self._version_pause_s, 60.0)
+            self.commands.request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+
+    # --- what the other messages tell
+
+    def _boot_time(self, boot_s: float, t_s: float) -> None:
+        restarted = self._boot_clock.rebooted(boot_s, t_s)
+        self._boot_time_heard.set()
+        if restarted:
+            now_s = asyncio.get_running_loop().time()
+            if now_s - self._restarted_s < _RESTARTS_S:
+                self._notice_conflict()
+            self._restarted_s = now_s
+            self._restarted()
+
+    def _restarted(self) -> None:
+        self.boots += 1
+        self._arming.restarted()
+        self._armed_told = None
+        self.place.restarted()
+        self.version = self.capabilities = None
+        self._version_asked_s, self._version_pause_s = -math.inf, 2.0
+        self._ask_soon()
+        self._tell("rebooted")
+
+    def _on_boot_ms(
+        self,
+        message: mavlink.MAVLink_attitude_message
+        | mavlink.MAVLink_scaled_imu_message
+        | mavlink.MAVLink_scaled_imu2_message
+        | mavlink.MAVLink_scaled_imu3_message,
+        t_s: float,
+    ) -> None:
+        if self.sent(message):
+            self._boot_time(message.time_boot_ms * 1e-3, t_s)
+
+    def _on_boot_us(
+        self, message: mavlink.MAVLink_raw_imu_message | mavlink.MAVLink_highres_imu_message, t_s: float
+    ) -> None:
+        # The field may carry UTC instead; no autopilot has been up since the nineteen-seventies.
+        if self.sent(message) and message.time_usec * 1e-6 < EARLIEST_S:
+            self._boot_time(message.time_usec * 1e-6, t_s)
+
+    def _on_system_time(self, message: mavlink.MAVLink_system_time_message, t_s: float) -> None:
+        if not self.sent(message):
+            return
+        self._wanted.heard(message, t_s)
+        self._boot_time(message.time_boot_ms * 1e-3, t_s)
+        self.place.hear_time(message, t_s)
+
+    def _on_version(self, message: mavlink.MAVLink_autopilot_version_message, _t_s: float) -> None:
+        if self.sent(message):
+            self.version = _version_text(message.flight_sw_version)
+            self.capabilities = message.capabilities
+
+    def _on_global_position(self, message: mavlink.MAVLink_global_position_int_message, t_s: float) -> None:
+        if not self.sent(message):
+            return
+        self._wanted.heard(message, t_s)
+        self._boot_time(message.time_boot_ms * 1e-3, t_s)
+        self.place.hear_estimate(message, t_s)
+
+    def _on_gps(self, message: mavlink.MAVLink_gps_raw_int_message, t_s: float) -> None:
+        if self.sent(message):
+            self.place.hear_receiver(message, t_s)
+
+
+def _version_text(packed: int) -> str:
+    """Major, minor, patch and kind of release from AUTOPILOT_VERSION.flight_sw_version, one byte each."""
+    major, minor, patch, kind = packed.to_bytes(4, "big")
+    suffix = "-dev" if kind < 64 else "-alpha" if kind < 128 else "-beta" if kind < 192 else "-rc" if kind < 255 else ""
+    return f"{major}.{minor}.{patch}{suffix}"

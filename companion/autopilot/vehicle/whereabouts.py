@@ -1,0 +1,167 @@
+"""What the autopilot says of time and place, as far as it can be believed.
+
+A place is believed when it may be one, and once it has been said again. While the aircraft stands still it does not
+change by more than matters: what is farther off is believed only after it has been said for half a minute without
+contradiction. Until then the old place stays, and `doubt` says what a calibration waits for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import logging
+import math
+from collections.abc import Callable
+from typing import Final
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.config.sections import HEIGHT_M, LATITUDE_DEG, LONGITUDE_DEG
+from companion.links.mavlink.signing import EARLIEST_S
+
+logger = logging.getLogger(__name__)
+
+LATEST_UNIX_TIME_S: Final = 4102444800.0
+"""2100: later is no time but a fault."""
+
+FAR_M: Final = 10_000.0
+"""Less changes gravity by 0.01 mg and the Earth's rate by 0.03 deg/h at most, and is more than GNSS wanders."""
+FAR_HEIGHT_M: Final = 300.0
+"""0.1 mg of gravity, half of what a calibration aims at; GNSS and barometer wander by less."""
+
+CONFIRMED_AFTER_S: Final = 2.5
+"""A first place, which is sent once a second: what one packet says is not enough."""
+SETTLED_AFTER_S: Final = 30.0
+SILENT_S: Final = 5.0
+"""After so long without word from a place nobody says any more that the aircraft is there."""
+
+_OR_SET: Final = "(or set vehicle.latitude_deg, longitude_deg, height_m)"
+_EARTH_RADIUS_M: Final = 6_371_000.0
+_ESTIMATE: Final = "autopilot GLOBAL_POSITION_INT"
+_RECEIVER: Final = "autopilot GPS_RAW_INT"
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Position:
+    """Where the autopilot believes to be; the height is above mean sea level."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    source: str
+
+
+@dataclasses.dataclass(slots=True)
+class _Claim:
+    """A place that is said and not believed yet; None: nowhere on Earth."""
+
+    place: Position | None
+    since_s: float
+    heard_s: float
+
+
+class TimeAndPlace:
+    """Takes the autopilot's messages; whoever calls has made sure that they are the autopilot's."""
+
+    def __init__(self) -> None:
+        self.position: Position | None = None
+        """The place that is believed."""
+        self.is_carried: Callable[[], bool] = lambda: False
+        """Whether the aircraft moves, or may fly: then its place changes rightly."""
+        self._anchor: Position | None = None
+        """What other places are compared with: it stays where it is while the aircraft stands still."""
+        self._claim: _Claim | None = None
+        self._unix_minus_loop_s: float | None = None
+
+    @property
+    def unix_time_s(self) -> float | None:
+        """UTC as the autopilot has it (from its GNSS), carried on by the loop's clock; None when it has none."""
+        if self._unix_minus_loop_s is None:
+            return None
+        return self._unix_minus_loop_s + asyncio.get_running_loop().time()
+
+    @property
+    def doubt(self) -> str | None:
+        """Why the place is not known for sure at this moment, and what helps; None while it is, or none is said."""
+        claim, now_s = self._claim, asyncio.get_running_loop().time()
+        if claim is None or now_s - claim.heard_s >= SILENT_S:
+            return None
+        if self._anchor is None:
+            return f"waiting for the position to be confirmed {_OR_SET}"
+        left_s = max(1.0, SETTLED_AFTER_S - (now_s - claim.since_s))
+        return f"{_apart(self._anchor, claim.place)} while still: waiting {left_s:.0f} s for it to stay {_OR_SET}"
+
+    def restarted(self) -> None:
+        """Forget what the autopilot has said; an aircraft that stands still is where it was."""
+        self.position = self._claim = self._unix_minus_loop_s = None
+
+    def hear_time(self, message: mavlink.MAVLink_system_time_message, t_s: float) -> None:
+        """Take the date, unless it cannot be one."""
+        unix_s = message.time_unix_usec * 1e-6
+        self._unix_minus_loop_s = unix_s - t_s if EARLIEST_S < unix_s < LATEST_UNIX_TIME_S else None
+
+    def hear_estimate(self, message: mavlink.MAVLink_global_position_int_message, t_s: float) -> None:
+        """Take the place that the autopilot flies by."""
+        place = _position(message.lat, message.lon, message.alt, _ESTIMATE)
+        said = (self.position, None if self._claim is None else self._claim.place)
+        if place is not None or any(each is not None and each.source == _ESTIMATE for each in said):
+            self._hear(place, t_s)
+
+    def hear_receiver(self, message: mavlink.MAVLink_gps_raw_int_message, t_s: float) -> None:
+        """Take the place of the GNSS receiver, as long as there is no better one."""
+        estimated = self.position is not None and self.position.source == _ESTIMATE
+        if message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX and not estimated:
+            self._hear(_position(message.lat, message.lon, message.alt, _RECEIVER), t_s)
+
+    def _hear(self, place: Position | None, t_s: float) -> None:
+        claim = self._claim
+        if _is_near(place, self._anchor):
+            self.position = place
+            if claim is not None:
+                claim.since_s = t_s  # who contradicts it begins anew
+        elif place is not None and _is_near(place, self.position) and self.is_carried():
+            self.position = self._anchor = place
+        elif claim is None or t_s - claim.heard_s >= SILENT_S or not _is_near(place, claim.place):
+            self._claim = _Claim(place, t_s, t_s)
+            if self._anchor is not None:
+                logger.warning("%s while the aircraft stands still: not believed yet", _apart(self._anchor, place))
+        else:
+            claim.heard_s = t_s
+            if t_s - claim.since_s >= (CONFIRMED_AFTER_S if self._anchor is None else SETTLED_AFTER_S):
+                self.position = self._anchor = place
+                self._claim = None
+
+
+def _position(latitude_1e7: int, longitude_1e7: int, height_mm: int, source: str) -> Position | None:
+    # (0, 0) is what ArduPilot sends while it knows no position.
+    if (latitude_1e7, longitude_1e7) == (0, 0):
+        return None
+    place = Position(latitude_1e7 * 1e-7, longitude_1e7 * 1e-7, height_mm * 1e-3, source)
+    bounds = ((place.latitude_deg, LATITUDE_DEG), (place.longitude_deg, LONGITUDE_DEG), (place.height_m, HEIGHT_M))
+    return place if all(least <= value <= most for value, (least, most) in bounds) else None
+
+
+def _is_near(one: Position | None, other: Position | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return _distance_m(one, other) <= FAR_M and abs(one.height_m - other.height_m) <= FAR_HEIGHT_M
+
+
+def _distance_m(one: Position, other: Position) -> float:
+    """Along the surface (haversine)."""
+    north, east = math.radians(other.latitude_deg), math.radians(other.longitude_deg)
+    from_north, from_east = math.radians(one.latitude_deg), math.radians(one.longitude_deg)
+    half = (
+        math.sin((north - from_north) / 2) ** 2
+        + math.cos(north) * math.cos(from_north) * math.sin((east - from_east) / 2) ** 2
+    )
+    return 2.0 * _EARTH_RADIUS_M * math.asin(math.sqrt(min(half, 1.0)))
+
+
+def _apart(before: Position, now: Position | None) -> str:
+    if now is None:
+        return "position gone or impossible"
+    distance_m = _distance_m(before, now)
+    if distance_m > FAR_M:
+        return f"position jumped {distance_m / 1000.0:.0f} km"
+    return f"height jumped {abs(now.height_m - before.height_m):.0f} m"

@@ -1,0 +1,1 @@
+"""Gradienter and accelerometers against the aircraft, from several stands."""

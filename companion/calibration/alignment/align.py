@@ -1,0 +1,290 @@
+"""From several still stands to the gradienter's zero, and to what else they tell (method section 3).
+
+One still pose cannot tell a zero offset of the gradienter from a bias of the accelerometers; the same spot seen twice,
+turned by 180 degrees, can. Further tilts tell bias from scale and how the gradienter sits against each IMU. Everything
+is estimated together, by Gauss-Newton with priors, so that what the stands do not determine keeps the sigma of what
+was known before: it is widened, never guessed.
+
+Readings that do not fit together are refused: every residual is set against what is left of its own sigma (Baarda's
+w-test), which names the stand that is off, and finds a spot that moved before any sum of squares does.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.alignment.align_model import DOWN, Ground, Model, Priors, Row, Stand, Unknowns
+from companion.errors import CalibrationRefusedError
+from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
+from companion.physics.gradienter import Law, up_in_sensor
+from companion.physics.units import DEG, MG
+
+MAX_ROUNDS: Final = 30
+_CONVERGED: Final = 1e-6
+"""Of the prior sigma of each parameter."""
+W_LIMIT: Final = 4.5
+"""|w| of one residual: passed by chance once in some thousand alignments of a hundred readings."""
+SPOT_W_LIMIT: Final = 3.9
+"""Of a placement, of which there are few: likewise once in some thousand."""
+DETERMINED: Final = 0.2
+"""A figure counts as determined where its sigma is below this share of what was known before."""
+_LEAST_REDUNDANCY: Final = 1e-3
+LEVEL: Final = -DOWN
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Figures:
+    """Three figures with their sigmas, shape (3,), and whether the stands determine each."""
+
+    value: Array
+    sigma: Array
+    determined: NDArray[np.bool_]
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class ImuAlignment:
+    """What was found of one IMU, vehicle FRD; of an autopilot's IMU, of its output as it comes."""
+
+    name: str
+    level_bias_m_s2: Array
+    """Effective bias when level: what a calibration there would find, scale and misalignment included; (3,)."""
+    level_covariance_m2_s4: Matrix
+    accel_bias_m_s2: Figures
+    """Without scale, shear and misalignment."""
+    scale: Figures
+    shear: Figures
+    """xy, xz, yz."""
+    misalignment_rad: Figures
+    """Small rotation from the gradienter's axes to this IMU's."""
+    gyro_bias_rad_s: Figures
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Complaint:
+    """The residual that fits worst: by how many of its own sigmas, and how much that is in SI units."""
+
+    row: Row
+    sigmas: float
+    size: float
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """The result of `align`."""
+
+    offset_deg: Array
+    """What the gradienter shows too much, on top of the configured offset; (2,)."""
+    offset_covariance_deg2: Matrix
+    imus: tuple[ImuAlignment, ...]
+    gravity_m_s2: float
+    slope_deg: float
+    """Of the spot; 0 without one."""
+    attitudes: tuple[Matrix, ...]
+    covariance: Matrix
+    """Of all parameters, in the order of `Model`; zero where nothing was sought."""
+    chi_square: float
+    freedom: int
+    checked: bool
+    """Whether a spot that moved between two stands could have been noticed."""
+    complaint: Complaint | None
+
+    @property
+    def offset_sigma_deg(self) -> Array:
+        """One sigma per axis, shape (2,)."""
+        return np.sqrt(np.diag(self.offset_covariance_deg2))
+
+
+def align(
+    law: Law, vehicle_from_sensor: Matrix, stands: Sequence[Stand], ground: Ground, priors: Priors | None = None
+) -> Alignment:
+    """Estimate everything from all stands together.
+
+    Args:
+        law: of the gradienter.
+        vehicle_from_sensor: its mounting, 3x3.
+        stands: at least one.
+        ground: gravity and the Earth's rate.
+        priors: what was known before.
+
+    Raises:
+        CalibrationRefusedError: the equations cannot be solved: readings that cannot belong together.
+    """
+    model = Model(law, vehicle_from_sensor, stands, ground, priors or Priors())
+    try:
+        at = model.begin([_first_attitude(law, vehicle_from_sensor, stand) for stand in stands])
+        at, residual, scaled, rows = _solve(model, at)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise CalibrationRefusedError(
+            f"the readings do not belong together ({error}): check the gradienter's law and mounting"
+        ) from None
+    sought = model.sigma > 0.0
+    inverse = np.linalg.inv(scaled.T @ scaled)
+    chi_square, freedom = float(residual @ residual), len(residual) - int(sought.sum()) - model.damped
+    complaint, checked = _worst(residual, scaled @ inverse, scaled, rows, model)
+    covariance = np.zeros((model.size, model.size))
+    # More scatter than chance makes of the sigmas widens them; less of it proves nothing.
+    spread = chi_square / freedom if freedom > 0 and chi_square > _by_chance(freedom) else 1.0
+    sigma = model.sigma[sought]
+    covariance[np.ix_(sought, sought)] = spread * inverse * np.outer(sigma, sigma)
+    return Alignment(
+        offset_deg=at.offset_rad / DEG,
+        offset_covariance_deg2=covariance[model.offset, model.offset] / DEG**2,
+        imus=tuple(_imu(model, at, covariance, k) for k in range(len(model.names))),
+        gravity_m_s2=at.gravity_m_s2,
+        slope_deg=float(np.hypot(*at.spot)) / DEG if any(stand.on_spot for stand in stands) else 0.0,
+        attitudes=tuple(at.attitudes),
+        covariance=covariance,
+        chi_square=chi_square,
+        freedom=freedom,
+        checked=checked,
+        complaint=complaint,
+    )
+
+
+def in_words(complaint: Complaint) -> str:
+    """Why the stands do not fit together, and what to do, in one line."""
+    row, size = complaint.row, complaint.size
+    by = f"{complaint.sigmas:.0f} sigma"
+    if row.group == "spot":
+        return (
+            f"stand {row.stand} is off by {size / DEG:.2f} deg from the others on this spot ({by}): the spot moved, or"
+            " the aircraft was not put back onto its marks; begin again on firm ground"
+        )
+    if row.group == "compass":
+        return f"stand {row.stand}: the heading is off by {size / DEG:.0f} deg ({by}): iron near by? Begin again"
+    if row.group == "zero":
+        return (
+            f"the gradienter's zero would be off by {size / DEG:.1f} deg, more than can be ({by}): does the aircraft"
+            " stand level on its base, and are law and mounting right?"
+        )
+    if row.group == "gradienter":
+        return f"stand {row.stand}: the gradienter is off by {size / DEG:.2f} deg ({by}): check its law and mounting"
+    if row.group == "accelerometer":
+        return (
+            f"stand {row.stand}: imu {row.name} and the gradienter differ by {size / MG:.1f} mg ({by}): check the"
+            " gradienter's law and mounting, and that nothing is loose"
+        )
+    if row.group == "gyro":
+        return f"stand {row.stand}: gyro {row.name} does not fit the other stands ({by}): still warming up? Begin again"
+    return f"the stands do not fit what is known of the sensors ({by}): begin again"
+
+
+def _by_chance(freedom: int) -> float:
+    """The 99 % point of chi square (Wilson and Hilferty, PNAS 17, 684, 1931)."""
+    part = 2.0 / (9.0 * freedom)
+    return float(freedom * (1.0 - part + 2.326 * math.sqrt(part)) ** 3)
+
+
+def _first_attitude(law: Law, mounting: Matrix, stand: Stand) -> Matrix:
+    if stand.tilt_deg is not None:
+        up = mounting @ up_in_sensor(law, *stand.tilt_deg)
+    else:
+        up = np.mean([imu.accel_m_s2 for imu in stand.imus], axis=0)
+        up = up / np.linalg.norm(up)
+    roll, pitch = roll_pitch_from_up(up)
+    return body_from_ned(roll, pitch, stand.heading_rad)
+
+
+def _solve(model: Model, at: Unknowns) -> tuple[Unknowns, Array, Matrix, list[Row]]:
+    """Gauss-Newton in units of the prior sigmas: the residuals at the end, and their derivatives in those units."""
+    sought = model.sigma > 0.0
+    sigma = model.sigma[sought]
+    for _ in range(MAX_ROUNDS):
+        residual, derivative, rows = model.linearise(at)
+        scaled = derivative[:, sought] * sigma
+        step = np.linalg.lstsq(scaled, residual, rcond=None)[0]
+        whole = np.zeros(model.size)
+        whole[sought] = step * sigma
+        model.step(at, whole)
+        if not np.isfinite(step).all():
+            break
+        if np.abs(step).max() < _CONVERGED:
+            residual, derivative, rows = model.linearise(at)
+            return at, residual, derivative[:, sought] * sigma, rows
+    raise ValueError("no solution was found")
+
+
+def _worst(
+    residual: Array, by_inverse: Matrix, scaled: Matrix, rows: Sequence[Row], model: Model
+) -> tuple[Complaint | None, bool]:
+    """The residual that is worst against its own sigma, if it is too bad; and whether the spot is checked at all."""
+    redundancy = 1.0 - np.einsum("ij,ij->i", by_inverse, scaled)
+    usable = redundancy > _LEAST_REDUNDANCY
+    w = np.where(usable, residual / np.sqrt(np.where(usable, redundancy, 1.0)), 0.0)
+    # A stand's placement is checked where the other stands foretell it: what they leave of it is its redundancy.
+    on_spot = np.array([row.group == "spot" for row in rows])
+    checked = bool((redundancy[on_spot] > 0.1).any())
+    beyond = np.abs(w) / np.where(on_spot, SPOT_W_LIMIT, W_LIMIT)
+    k = int(np.argmax(beyond))
+    if beyond[k] <= 1.0:
+        return None, checked
+    units = _units(model, rows[k])
+    # All axes of that reading together: what one axis says depends on how the aircraft is turned.
+    axes = [j for j, row in enumerate(rows) if row == rows[k] and usable[j] and row.group not in ("zero", "prior")] or [
+        k
+    ]
+    size = float(np.linalg.norm(residual[axes] / redundancy[axes])) * units
+    return Complaint(rows[k], abs(float(w[k])), size), checked
+
+
+def _units(model: Model, row: Row) -> float:
+    """Sigma of the residuals of that group, by which they were divided."""
+    if row.group == "spot":
+        return model.priors.placement_deg * DEG
+    if row.group == "zero":
+        return model.priors.offset_deg * DEG
+    if row.stand == 0:
+        return 1.0
+    stand = model.stands[row.stand - 1]
+    if row.group == "compass":
+        return stand.heading_sigma_rad
+    if row.group == "gradienter":
+        return math.hypot(*stand.tilt_sigma_deg) / math.sqrt(2.0) * DEG
+    imu = next(imu for imu in stand.imus if imu.name == row.name)
+    return float(np.mean(imu.accel_sigma_m_s2 if row.group == "accelerometer" else imu.gyro_sigma_rad_s))
+
+
+def _imu(model: Model, at: Unknowns, covariance: Matrix, k: int) -> ImuAlignment:
+    def figures(part: slice, value: Array) -> Figures:
+        sigma = np.sqrt(np.diag(covariance)[part])
+        before = model.sigma[part]
+        return Figures(value.copy(), sigma, (before > 0.0) & (sigma < DETERMINED * before))
+
+    level, by = _level_bias(model, at, k)
+    return ImuAlignment(
+        name=model.names[k],
+        level_bias_m_s2=level,
+        level_covariance_m2_s4=by @ covariance @ by.T,
+        accel_bias_m_s2=figures(model.accel_bias(k), at.accel_bias[k]),
+        scale=figures(model.scale(k), at.scale[k]),
+        shear=figures(model.shear(k), at.shear[k]),
+        misalignment_rad=figures(model.misalignment(k), at.misalignment_rad[k]),
+        gyro_bias_rad_s=figures(model.gyro_bias(k), at.gyro_bias[k]),
+    )
+
+
+def _level_bias(model: Model, at: Unknowns, k: int) -> tuple[Array, Matrix]:
+    """Reading minus gravity of a level aircraft, and its derivatives; to first order in scale, shear, misalignment.
+
+    Gravity is what the place says, as in a calibration: where it is off, so is that.
+    """
+    gravity, up = at.gravity_m_s2, LEVEL
+    by = np.zeros((3, model.size))
+    by[:, model.misalignment(k)] = gravity * np.array([[0.0, -up[2], up[1]], [up[2], 0.0, -up[0]], [-up[1], up[0], 0]])
+    by[:, model.scale(k)] = gravity * np.diag(up)
+    by[:, model.shear(k)] = gravity * np.array([[up[1], up[2], 0.0], [up[0], 0.0, up[2]], [0.0, up[0], up[1]]])
+    by[:, model.accel_bias(k)] = np.eye(3)
+    by[:, model.gravity] = up[:, None]
+    value = (
+        by[:, model.misalignment(k)] @ at.misalignment_rad[k]
+        + by[:, model.scale(k)] @ at.scale[k]
+        + by[:, model.shear(k)] @ at.shear[k]
+        + at.accel_bias[k]
+    )
+    return value, by

@@ -1,0 +1,1 @@
+"""The rolling collector: what comes in, what it waits for, when it has enough."""

@@ -1,0 +1,386 @@
+"""The rolling collector: every stream in, one still stretch out.
+
+It knows no clock: time comes in with the samples and with `now_s`. All sources share one 1 s grid; a second counts
+when every source was still in it. Method section 3, items 2, 3 and 7.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import msgspec
+
+from companion.calibration.collector.intake import Intake
+from companion.calibration.collector.measurement import Measurement, PoseSeconds
+from companion.calibration.collector.obstacles import is_moving, obstacle, settling
+from companion.calibration.collector.outlook import Glance, Status
+from companion.calibration.collector.sources import Source, SourceStatus
+from companion.calibration.collector.stop import Settings, expected_s, is_enough
+from companion.calibration.collector.trace import Snapshot, TraceLog
+from companion.calibration.means.estimates import Estimates, Found, Work
+from companion.calibration.means.pose_models import CompassModel, GradienterModel
+from companion.calibration.means.pose_windows import HeadingWindow, TiltWindow
+from companion.calibration.means.windows import ImuInput, ImuWindow, Window
+from companion.calibration.seconds.batches import Batch
+from companion.calibration.stillness.gates import ImuGate
+from companion.calibration.stillness.heading_watch import HeadingWatch
+from companion.calibration.stillness.settling import AT_ONCE, Lag
+from companion.calibration.stillness.stretch import Stretch
+from companion.errors import CalibrationRefusedError
+
+__all__ = [
+    "Glance",
+    "HeadingWindow",
+    "ImuInput",
+    "ImuWindow",
+    "RollingCollector",
+    "Settings",
+    "SourceStatus",
+    "Status",
+    "TiltWindow",
+    "Window",
+]
+
+MIN_BATCHES: Final = 5
+"""Of a window that was asked for with `since_s`: fewer say nothing about their own scatter."""
+
+_GRACE_S: Final = 1.0
+"""So long after its end a second waits for a source that has said nothing: the latency of a busy telemetry link."""
+_CLOSE_S: Final = 0.25
+_MARGIN: Final = 8
+
+
+class RollingCollector(Intake):
+    """Collects batches of all sources, judges stillness, and gives means of the still stretch.
+
+    Pure: no clock and no I/O. Nothing that a sample holds makes it raise; what is dropped is counted by reason.
+    Memory is bounded: `max_s` and a margin of one-second batches a source.
+
+    Args:
+        settings: how long and how good.
+        imus: in the order of the result; names are unique.
+        gradienter: whether a gradienter is expected.
+        compass: whether a compass is expected.
+        gradienter_lag: how the gradienter follows the truth.
+        compass_lag: likewise.
+        field_by: how to make a heading of the compass' field vector; None: fields are dropped.
+
+    Raises:
+        ValueError: two IMUs of one name.
+    """
+
+    _watch: HeadingWatch | None = None
+
+    def __init__(
+        self,
+        settings: Settings,
+        imus: Sequence[ImuInput],
+        *,
+        gradienter: bool,
+        compass: bool,
+        gradienter_lag: Lag = AT_ONCE,
+        compass_lag: Lag = AT_ONCE,
+        field_by: tuple[CompassModel, GradienterModel | None] | None = None,
+    ) -> None:
+        if len({imu.name for imu in imus}) != len(imus):
+            raise ValueError("two IMUs have one name")
+        self._settings = settings
+        self._min_good = settings.min_slots
+        self._max_slots = settings.max_slots
+        super().__init__(
+            self._max_slots + _MARGIN,
+            gradienter=gradienter,
+            compass=compass,
+            lags=(gradienter_lag, compass_lag),
+            field_by=field_by,
+        )
+        self._watch = HeadingWatch()
+        self._stretch = Stretch(self._min_good, self._max_slots)
+        self._next: int | None = None
+        self._now_s = -math.inf
+        self._good: dict[int, bool] = {}
+        self._best_progress = 0.0
+        self._estimates = Estimates()
+        self._trace = TraceLog()
+        self._restarted_because = ""
+        self._restarts = 0
+        for imu in imus:
+            self.set_imu(imu)
+
+    # ------------------------------------------------------------------------------------------------- what changes
+
+    def retarget(self, settings: Settings) -> None:
+        """Other targets from the next look on; the lengths (`min_still_s`, `max_s`) stay as they were."""
+        self._settings = msgspec.structs.replace(
+            self._settings,
+            target_gyro_sigma_rad_s=settings.target_gyro_sigma_rad_s,
+            target_accel_sigma_m_s2=settings.target_accel_sigma_m_s2,
+        )
+
+    def reset(self, why: str, imu: str | None = None) -> None:
+        """Forget what was measured, of one IMU or of everything: armed, offsets written, restarted.
+
+        The second under way is forgotten too. The stretch begins again; learned noise stays.
+        """
+        self._forget(why, imu)
+
+    # ------------------------------------------------------------------------------------------------- what is known
+
+    def glance(self, now_s: float) -> Glance:
+        """How still it is at `now_s`; costs a small part of what `status` does."""
+        self._advance(now_s)
+        return Glance(
+            obstacle=self._obstacle(now_s),
+            moving=is_moving(self._sources(), now_s, good_now=self._stretch.good_now),
+            still_s=float(self._stretch.good),
+            steady_s=float(self._stretch.steady),
+        )
+
+    def pending(self, now_s: float, *, since_s: float | None = None) -> Work | None:
+        """What `window` would have to work out now, for somebody who does it elsewhere; None when there is nothing.
+
+        It takes milliseconds, more on small boards, and what must be answered at once shall not wait for it.
+        """
+        self._advance(now_s)
+        if self._obstacle(now_s) is not None:
+            return None
+        slots = self._slots(since_s)
+        if not self._are_enough(slots, since_s) or self._estimates.known(slots[-1], since_s) is not None:
+            return None
+        return self._work(slots, since_s)
+
+    def accept(self, work: Work, found: Found) -> None:
+        """Take what a `Work` has found; too late, it is left."""
+        self._estimates.keep(work, found)
+
+    def status(self, now_s: float) -> Status:
+        """Where it stands at `now_s` (the samples' clock); closes seconds that are over.
+
+        Its figures may be those of the second before.
+        """
+        self._advance(now_s)
+        sources = self._sources()
+        waiting = self._waiting_for(now_s)
+        enough = False
+        progress = 0.0
+        if self._stretch.begun and waiting is None:
+            estimates = self._estimate(self._slots(None), late=1)
+            if isinstance(estimates, CalibrationRefusedError):
+                waiting = str(estimates)
+            else:
+                enough = self._stretch.full or is_enough(self._settings, estimates)
+                needed = max(expected_s(self._settings, estimates), self._stretch.good + 1)
+                progress = 1.0 if enough else self._stretch.good / needed
+        elif self._stretch.start is not None:
+            progress = min(self._stretch.good / self._max_slots, 0.99)
+        if self._stretch.start is None:
+            self._best_progress = 0.0
+        # The forecast moves with the noise seen so far; a bar that goes back and forth helps nobody.
+        self._best_progress = min(max(self._best_progress, progress), 1.0 if enough else 0.99)
+        return Status(
+            still_s=float(self._stretch.good),
+            waiting_for=waiting,
+            enough=enough,
+            progress=self._best_progress,
+            sources=tuple(source.status(now_s) for source in sources),
+            restarted_because=self._restarted_because,
+        )
+
+    def window(self, now_s: float, *, since_s: float | None = None) -> Window:
+        """Means over the still stretch that ends with the latest complete second, at most `max_s` long.
+
+        Args:
+            now_s: the samples' clock.
+            since_s: only seconds that lie wholly after this, for a look at what a write has done; then 5 good
+                seconds are enough, and `duration_s` says how many there were.
+
+        Raises:
+            CalibrationRefusedError: not still, not still for long enough, or a source fails its checks.
+        """
+        return self.measurement(now_s, since_s=since_s).window()
+
+    def measurement(self, now_s: float, *, since_s: float | None = None) -> Measurement:
+        """What `window` would give, not worked out yet; costs a small part of it.
+
+        Raises:
+            CalibrationRefusedError: not still, or not still for long enough.
+        """
+        self._advance(now_s)
+        if (reason := self._obstacle(now_s)) is not None:
+            raise CalibrationRefusedError(reason)
+        slots = self._slots(since_s)
+        if not self._are_enough(slots, since_s):
+            needed = self._min_good if since_s is None else min(MIN_BATCHES, self._min_good)
+            raise CalibrationRefusedError(f"still for {len(slots)} s only, needs {needed} s")
+        return Measurement(
+            slots=slots,
+            estimate=self._estimate_later(slots, since_s),
+            settling=self._settles(slots, 0),
+            tilt=_pose_seconds(self._tilt, slots),
+            heading=_pose_seconds(
+                self._heading,
+                slots,
+                from_field=self._field is not None and self._field.from_field,
+                wander_deg=None if self._watch is None else self._watch.wander_deg,
+            ),
+            field=self._field.window(slots) if self._field and self._heading else None,
+        )
+
+    def imu_seconds(self) -> dict[str, Batch]:
+        """The last whole second of each IMU that has one, still or not."""
+        newest = {name: next(reversed(source.batches.batches.values()), None) for name, source in self._imus.items()}
+        return {name: batch for name, batch in newest.items() if batch is not None}
+
+    def snapshot(self, started_s: float, measured_s: tuple[float, float] | None) -> Snapshot:
+        """What was seen since `started_s`, or since the window `measured_s` (start, end) began; cheap."""
+        return self._trace.snapshot(self._inputs, started_s, measured_s)
+
+    # ------------------------------------------------------------------------------------------------- inside
+
+    def _break(self) -> None:
+        self._stretch.clear()
+        self._good.clear()
+        self._estimates.clear()
+        self._best_progress = 0.0
+        for source in self._sources():
+            source.gate.new_stretch()
+
+    def _advance(self, now_s: float) -> None:
+        if math.isfinite(now_s):
+            self._now_s = now_s
+            for source in self._sources():
+                source.batches.close_before(now_s - _CLOSE_S)
+            if self._field is not None:
+                self._field.batches.close_before(now_s - _CLOSE_S)
+        self._evaluate()
+
+    def _evaluate(self) -> None:
+        """Judge every second that all sources have closed, or that has waited long enough for the missing ones."""
+        sources = self._sources()
+        restarts = sum(source.batches.restarts for source in sources)
+        if restarts > self._restarts:
+            # Seconds that were good have lost a share.
+            self._break()
+        self._restarts = restarts
+        through = [source.batches.closed_through for source in sources]
+        known = [slot for slot in through if slot is not None]
+        if not known:
+            return
+        ready = min(known) if len(known) == len(through) else -math.inf
+        if math.isfinite(self._now_s):
+            ready = max(ready, math.floor(self._now_s - _GRACE_S) - 1)
+        if not math.isfinite(ready):
+            return
+        last = int(ready)
+        if self._next is None or max(known) < self._next - self._keep:
+            # The beginning, or every clock went back.
+            self._break()
+            self._next = min(last, *known)
+        if last - self._next > self._keep:
+            # Nobody closed anything for so long that nothing of it is left.
+            self._break()
+            self._next = last - 1
+        for slot in range(self._next, last + 1):
+            self._judge(slot, sources)
+        self._next = max(self._next, last + 1)
+
+    def _judge(self, slot: int, sources: list[Source]) -> None:
+        # Every gate sees every second: one that is skipped learns nothing.
+        good, moved = True, False
+        for source in sources:  # the IMUs first: they say whether it moved
+            good = source.judge(slot, moved=moved) and good
+            moved = moved or (source.kind == "imu" and not source.verdict.still and not source.verdict.fault)
+        if self._watch is not None and self._heading is not None:
+            others = [source.verdict for source in sources if source is not self._heading]
+            self._watch.take(self._heading.batches.batches.get(slot), others)
+        self._trace.add(slot, sources, good=good)
+        if not self._stretch.add(slot, good=good):
+            self._break()
+        if not good and self._stretch.start is None:
+            return
+        self._good[slot] = good
+        while len(self._good) > self._keep:
+            del self._good[next(iter(self._good))]
+        if not good:
+            return
+        for source in sources:
+            batch = source.batches.batches.get(slot)
+            if batch is None:
+                continue
+            if isinstance(source.gate, ImuGate):
+                source.gate.accept(batch, settled=self._stretch.begun)
+            elif slot not in source.unsettled:
+                source.gate.accept(batch)
+
+    def _obstacle(self, now_s: float) -> str | None:
+        return obstacle(self._sources(), now_s, good_now=self._stretch.good_now, min_good=self._min_good)
+
+    def _waiting_for(self, now_s: float) -> str | None:
+        obstacle = self._obstacle(now_s)
+        if obstacle is not None:
+            return obstacle
+        left_s = 0 if self._stretch.begun else self._min_good - self._stretch.good
+        settles = self._settles(self._slots(None), left_s)
+        if settles is not None or not left_s:
+            return settles
+        return f"hold still {left_s} s more"
+
+    def _settles(self, slots: list[int], left_s: int) -> str | None:
+        return settling((self._tilt, self._heading), slots, min(MIN_BATCHES, self._min_good), left_s)
+
+    def _slots(self, since_s: float | None) -> list[int]:
+        start = self._stretch.start
+        if start is None or self._next is None:
+            return []
+        start = max(start, self._next - self._max_slots)
+        if since_s is not None:
+            start = max(start, math.ceil(since_s))
+        return [slot for slot in range(start, self._next) if self._good.get(slot, False)]
+
+    def _are_enough(self, slots: list[int], since_s: float | None) -> bool:
+        if since_s is not None:
+            return len(slots) >= min(MIN_BATCHES, self._min_good)
+        # A stretch that has begun may have had up to a fifth rejected since.
+        return len(slots) >= self._min_good or (self._stretch.begun and bool(slots))
+
+    def _estimate(self, slots: list[int], since_s: float | None = None, late: int = 0) -> Found:
+        """Computed once a second, however often it is asked for."""
+        found = self._estimates.known(slots[-1] - late, since_s)
+        if found is None:
+            work = self._work(slots, since_s)
+            found = work.run()
+            self._estimates.keep(work, found)
+        return found
+
+    def _work(self, slots: list[int], since_s: float | None) -> Work:
+        return self._estimates.work(
+            [self._inputs[name] for name in self._imus],
+            [[source.batches.batches[slot] for slot in slots] for source in self._imus.values()],
+            slots,
+            horizon_s=self._settings.horizon_s,
+            since_s=since_s,
+        )
+
+    def _estimate_later(self, slots: list[int], since_s: float | None) -> Callable[[], Found]:
+        """`_estimate`, worked out when it is asked for, of what is known now."""
+        found = self._estimates.known(slots[-1], since_s)
+        if found is not None:
+            return lambda: found
+        work = self._work(slots, since_s)
+
+        def estimate() -> Found:
+            found = work.run()
+            self._estimates.keep(work, found)
+            return found
+
+        return estimate
+
+
+def _pose_seconds(
+    source: Source | None, slots: list[int], *, from_field: bool = False, wander_deg: float | None = None
+) -> PoseSeconds | None:
+    if source is None:
+        return None
+    return PoseSeconds(source.label, source.settled(slots), len(slots), from_field, wander_deg)

@@ -1,0 +1,257 @@
+"""What was seen second by second during a calibration: kept beside its record, for whoever asks later.
+
+The record holds results only. Whether the aircraft really stood still, and what the Allan deviation of its readings
+says, can be looked at afterwards only if the one-second batches are kept. Means are what the sensor said (offsets that
+its owner subtracts are subtracted), in the vehicle's FRD like everything in the record.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.collector.sources import Kind, Source
+from companion.calibration.means.windows import ImuInput
+from companion.calibration.noise.allan import AllanModel
+
+FORMAT_VERSION: Final = 1
+
+MAX_SECONDS: Final = 600
+"""Kept; the oldest go first. Ten times the longest usual window;
+some 1 MB in memory, 100 kB on disk with three IMUs."""
+
+MAX_WORDS: Final = 100
+_FARTHEST: Final = 100_000_000
+_DIGITS: Final = 7
+"""Significant ones: 0.1 ug on 1 g."""
+
+Floats = NDArray[np.float64]
+Axes = tuple[float, float, float]
+
+
+class ImuTrace(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU; every tuple has one entry a second, None (0 samples) where it said nothing."""
+
+    name: str
+    profile: str
+    """Whose noise was assumed."""
+    gyro_noise: AllanModel
+    """Of that profile, rad/s."""
+    accel_noise: AllanModel
+    """m/s^2."""
+    gyro_step_rad_s: float
+    """Of a stream of integers; 0 for floats."""
+    accel_step_m_s2: float
+    samples: tuple[int, ...]
+    temperature_degc: tuple[float | None, ...]
+    gyro_rad_s: tuple[Axes | None, ...]
+    gyro_variance_rad2_s2: tuple[Axes | None, ...]
+    """Of one sample."""
+    accel_m_s2: tuple[Axes | None, ...]
+    accel_variance_m2_s4: tuple[Axes | None, ...]
+
+
+class VerdictTrace(msgspec.Struct, frozen=True, kw_only=True):
+    """What the gate of one source said, second by second."""
+
+    kind: Kind
+    name: str
+    words: tuple[str | None, ...]
+    """None: still. Else why not; empty while nothing was known yet."""
+    fault: tuple[bool, ...]
+    """Whether it was the device, not the aircraft."""
+
+
+class Trace(msgspec.Struct, frozen=True, kw_only=True):
+    """The seconds before and during one calibration."""
+
+    format_version: int = FORMAT_VERSION
+    started_at: str
+    """Of the record that it belongs to."""
+    second: tuple[int, ...]
+    """Since the calibration was asked for; negative before it. Ascending, with gaps where nothing was judged."""
+    good: tuple[bool, ...]
+    """Still for all sources."""
+    measured: tuple[int, int] | None
+    """The result is the mean of the good seconds from the first up to, without, the last; None: no result."""
+    cut: bool
+    """The calibration took longer than what is kept: its beginning is missing."""
+    verdicts: tuple[VerdictTrace, ...]
+    imus: tuple[ImuTrace, ...]
+
+
+def to_json(trace: Trace) -> bytes:
+    """The trace as JSON."""
+    return msgspec.json.encode(trace)
+
+
+def from_json(data: bytes) -> Trace:
+    """Read a trace back.
+
+    Raises:
+        msgspec.MsgspecError: not a trace of this format.
+    """
+    trace = msgspec.json.decode(data, type=Trace)
+    length = len(trace.second)
+    columns: list[Sequence[object]] = [trace.good]
+    for verdict in trace.verdicts:
+        columns += [verdict.words, verdict.fault]
+    for imu in trace.imus:
+        columns += [imu.samples, imu.temperature_degc, imu.gyro_rad_s, imu.gyro_variance_rad2_s2]
+        columns += [imu.accel_m_s2, imu.accel_variance_m2_s4]
+    if any(len(column) != length for column in columns):
+        raise msgspec.ValidationError(f"not every column has {length} seconds")
+    if length > MAX_SECONDS or any(abs(second) > _FARTHEST for second in (*trace.second, *(trace.measured or ()))):
+        raise msgspec.ValidationError(f"more than {MAX_SECONDS} seconds, or seconds farther than {_FARTHEST}")
+    if any(later <= earlier for earlier, later in zip(trace.second, trace.second[1:], strict=False)):
+        raise msgspec.ValidationError("seconds do not ascend")
+    return trace
+
+
+class _Seen(msgspec.Struct, frozen=True):
+    """One source in one second; the arrays are the batch's own."""
+
+    kind: Kind
+    name: str
+    still: bool
+    words: str
+    fault: bool
+    n: int
+    mean: Floats | None
+    variance: Floats | None
+    temperature_degc: float | None
+
+
+class Snapshot(msgspec.Struct, frozen=True):
+    """The seconds of one calibration, not packed yet; `trace` may run in another thread."""
+
+    seconds: tuple[tuple[int, bool, tuple[_Seen, ...]], ...]
+    inputs: Mapping[str, ImuInput]
+    started_s: float
+    measured_s: tuple[float, float] | None
+    cut: bool
+
+    def trace(self, started_at: str) -> Trace:
+        """Pack it; takes milliseconds.
+
+        Args:
+            started_at: of the record that it will lie beside.
+        """
+        origin = math.floor(self.started_s)
+        names: dict[tuple[Kind, str], None] = {}
+        for _, _, seen in self.seconds:
+            names.update({(one.kind, one.name): None for one in seen})
+        columns = {
+            key: [next((one for one in seen if (one.kind, one.name) == key), None) for _, _, seen in self.seconds]
+            for key in names
+        }
+        measured = self.measured_s
+        return Trace(
+            started_at=started_at,
+            second=tuple(slot - origin for slot, _, _ in self.seconds),
+            good=tuple(good for _, good, _ in self.seconds),
+            measured=None if measured is None else (round(measured[0]) - origin, round(measured[1]) - origin),
+            cut=self.cut,
+            verdicts=tuple(
+                VerdictTrace(
+                    kind=kind,
+                    name=name,
+                    words=tuple(_words(one) for one in column),
+                    fault=tuple(one is not None and one.fault for one in column),
+                )
+                for (kind, name), column in columns.items()
+            ),
+            imus=tuple(
+                _imu(self.inputs[name], column)
+                for (kind, name), column in columns.items()
+                if kind == "imu" and name in self.inputs
+            ),
+        )
+
+
+class TraceLog:
+    """The latest seconds as they were judged, whatever became of them."""
+
+    def __init__(self, keep: int = MAX_SECONDS) -> None:
+        self._seconds: deque[tuple[int, bool, tuple[_Seen, ...]]] = deque(maxlen=keep)
+
+    def add(self, slot: int, sources: Sequence[Source], *, good: bool) -> None:
+        """Take one second that has just been judged."""
+        if self._seconds and slot <= self._seconds[-1][0]:
+            # The clock went back: what was before cannot be set against what comes.
+            self._seconds.clear()
+        self._seconds.append((slot, good, tuple(_seen(source, slot) for source in sources)))
+
+    def snapshot(
+        self, inputs: Mapping[str, ImuInput], started_s: float, measured_s: tuple[float, float] | None
+    ) -> Snapshot:
+        """Everything since a calibration was asked for, or since its window began where that was earlier."""
+        since_s = min(started_s, measured_s[0]) if measured_s is not None else started_s
+        first = math.floor(since_s)
+        full = len(self._seconds) == self._seconds.maxlen
+        cut = full and self._seconds[0][0] > first
+        kept = tuple(second for second in self._seconds if second[0] >= first)
+        return Snapshot(kept, dict(inputs), started_s, measured_s, cut)
+
+
+def _seen(source: Source, slot: int) -> _Seen:
+    verdict, batch = source.verdict, source.batches.batches.get(slot)
+    if batch is None:
+        return _Seen(source.kind, source.name, verdict.still, verdict.words, verdict.fault, 0, None, None, None)
+    return _Seen(
+        source.kind,
+        source.name,
+        verdict.still,
+        verdict.words,
+        verdict.fault,
+        batch.n,
+        batch.mean,
+        batch.variance,
+        batch.temperature_degc,
+    )
+
+
+def _words(seen: _Seen | None) -> str | None:
+    if seen is None:
+        return ""
+    return None if seen.still else seen.words[:MAX_WORDS]
+
+
+def _imu(imu: ImuInput, column: Sequence[_Seen | None]) -> ImuTrace:
+    rotation = np.asarray(imu.rotation, dtype=np.float64)
+    means: list[Floats | None] = []
+    variances: list[Floats | None] = []
+    for seen in column:
+        known = seen is not None and seen.mean is not None and seen.variance is not None
+        means.append(seen.mean if seen is not None and known else None)
+        variances.append(seen.variance if seen is not None and known else None)
+    # Axes are taken as independent, as everywhere: only their variances turn.
+    turned = np.square(rotation)
+    return ImuTrace(
+        name=imu.name,
+        profile=imu.profile.name,
+        gyro_noise=imu.profile.gyro,
+        accel_noise=imu.profile.accel,
+        gyro_step_rad_s=imu.gyro_step_rad_s,
+        accel_step_m_s2=imu.accel_step_m_s2,
+        samples=tuple(seen.n if seen is not None else 0 for seen in column),
+        temperature_degc=tuple(
+            None if seen is None or seen.temperature_degc is None else round(seen.temperature_degc, 3)
+            for seen in column
+        ),
+        gyro_rad_s=tuple(None if mean is None else _axes(rotation @ mean[:3]) for mean in means),
+        gyro_variance_rad2_s2=tuple(None if one is None else _axes(turned @ one[:3]) for one in variances),
+        accel_m_s2=tuple(None if mean is None else _axes(rotation @ mean[3:]) for mean in means),
+        accel_variance_m2_s4=tuple(None if one is None else _axes(turned @ one[3:]) for one in variances),
+    )
+
+
+def _axes(values: Floats) -> Axes:
+    x, y, z = (float(f"{value:.{_DIGITS}g}") for value in values.tolist())
+    return x, y, z

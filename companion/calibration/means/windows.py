@@ -1,0 +1,409 @@
+"""From the batches of a still stretch to means with honest sigmas.
+
+Two sigmas a reading: `sigma_stat` is what averaging left, `sigma_use` what the next H seconds can expect of the
+sensor. Method sections 2.2, 2.4, 2.5 and 3.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.means.integers import integer_columns
+from companion.calibration.means.pose_windows import FieldWindow, HeadingWindow, TiltWindow
+from companion.calibration.means.quantised import EDGE_RMS
+from companion.calibration.means.ramps import RAMP_BATCHES, is_ramp
+from companion.calibration.noise.allan import (
+    FLOOR_OF_FLICKER,
+    PROFILES,
+    NoiseProfile,
+    allan_variance,
+    floor_variance,
+    slope_variance,
+    white_noise,
+)
+from companion.calibration.noise.robust import huber_line, median, robust_mean
+from companion.calibration.seconds.batches import Batch
+from companion.errors import CalibrationRefusedError
+from companion.physics.units import DEG_H, MG
+
+Floats = NDArray[np.float64]
+Axes = tuple[float, float, float]
+
+WHITE_SHARE: Final = 0.09
+"""White variance over floor variance below which more averaging buys nothing: white part 30 % of the floor."""
+_ALLAN_SPANS: Final = 5
+_ALLAN_SIGNIFICANT: Final = 3.0
+"""ADEV^2 at T/5 over what white noise explains: the upper 5 % point with its about four degrees of freedom."""
+_LOST_WARNING: Final = 0.01
+_LOST_REFUSAL: Final = 0.5
+_USUAL_SHARE: Final = 0.95
+"""A second that holds fewer samples than this share of the usual lost some; what is above is the grid's phase."""
+_TEMPERATURE_WARNING_K: Final = 3.0
+_AXIS: Final = "xyz"
+
+
+class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU as the collector needs to know it."""
+
+    name: str
+    rotation: NDArray[np.float64]
+    """3x3, sensor to vehicle FRD."""
+    profile: NoiseProfile
+    gyro_step_rad_s: float = 0.0
+    """Quantisation of the stream; 0 for floats."""
+    accel_step_m_s2: float = 0.0
+    truncates: bool = False
+    """Whether the stream truncates toward zero instead of rounding."""
+    gyro_grid_rad_s: float = 0.0
+    """Steps of its own that the sensor's readings had before they became integers of the stream; 0: much finer."""
+    accel_grid_m_s2: float = 0.0
+    gyro_prior_rad_s: Axes | None = None
+    """Bias known from before, in the sensor's axes and of this very stream; gates a steady turn at start."""
+
+
+def integer_steps(imu: ImuInput) -> Floats | None:
+    """(6,) steps of a stream of truncated integers, whose seconds must keep their counts; None for others."""
+    if not imu.truncates or imu.gyro_step_rad_s == imu.accel_step_m_s2 == 0.0:
+        return None
+    steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
+    return np.where(steps > 0.0, steps, 1.0)
+
+
+def _edges(imu: ImuInput) -> tuple[float, float]:
+    """Rms displacement of the integers' edges, in steps, by a grid below; each lies anywhere between two lines."""
+    pairs = ((imu.gyro_grid_rad_s, imu.gyro_step_rad_s), (imu.accel_grid_m_s2, imu.accel_step_m_s2))
+    gyro, accel = (grid / step / math.sqrt(12.0) if step > 0.0 else 0.0 for grid, step in pairs)
+    return gyro, accel
+
+
+class Hidden(msgspec.Struct, frozen=True):
+    """What the integer readings of one triad do not tell."""
+
+    words: str
+    useless: bool
+    """It is no measurement; else good to half a step."""
+
+
+class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
+    """Means of one IMU over one still stretch; axes are the vehicle's FRD."""
+
+    name: str
+    samples: int
+    duration_s: float
+    """Good seconds that went into the means."""
+    gyro_rad_s: Axes
+    accel_m_s2: Axes
+    gyro_sigma_stat_rad_s: Axes
+    accel_sigma_stat_m_s2: Axes
+    gyro_sigma_use_rad_s: Axes
+    """sqrt(V(T, H)) of the sensor alone; what the pose adds comes in `solve`."""
+    accel_sigma_use_m_s2: Axes
+    temperature_degc: float | None
+    warnings: tuple[str, ...]
+    hidden: dict[Literal["gyro", "accel"], Hidden] = {}
+    """By triad, where the noise spreads the integers too little for a mean."""
+
+    dithered: bool = False
+    """Its means come from a dither, in which the telemetry followed every step of the offsets."""
+
+    def refused(self, part: Literal["gyro", "accel"]) -> str | None:
+        """Why a triad's means are no measurement although they have a figure; None when they are one."""
+        found = self.hidden.get(part)
+        return found.words if found is not None and found.useless else None
+
+
+class Window(msgspec.Struct, frozen=True, kw_only=True):
+    """One still stretch: everything that a calibration is computed from."""
+
+    start_s: float
+    end_s: float
+    imus: tuple[ImuWindow, ...]
+    tilt: TiltWindow | None
+    heading: HeadingWindow | None
+    field: FieldWindow | None = None
+    """Of a compass that gives the field too; its seconds are those of the others, as far as it sent in them."""
+
+
+class Estimate(msgspec.Struct, frozen=True, kw_only=True):
+    """One triad in the sensor's own axes; arrays are (3,)."""
+
+    mean: Floats
+    stat_variance: Floats
+    use_variance: Floats
+    white_variance: Floats
+    """The part of `use_variance` that more seconds take away."""
+    white: Floats
+    """N in force: measured, or the profile's where that is larger."""
+    flicker: Floats
+    walk: Floats
+    ramp_per_s: Floats
+    """Zero where no ramp is significant."""
+    half_step: NDArray[np.bool_]
+    """Fewer than 3 distinct readings; of a stream of integers, too few outside the two commonest."""
+    undecided: NDArray[np.bool_]
+    """Integers whose mean is unknown yet: more seconds may bring the rare reading that tells."""
+    useless: NDArray[np.bool_]
+    """Integers around zero whose mean is unknown: it says no more than that it is less than a step."""
+    edge_rms: Floats
+    """Of integers: displacement of their edges, in steps, for which sigma allows (`quantised.shape_variance`)."""
+
+
+class ImuEstimate(msgspec.Struct, frozen=True, kw_only=True):
+    """Both triads of one IMU, and its window."""
+
+    gyro: Estimate
+    accel: Estimate
+    window: ImuWindow
+
+
+def estimates(
+    imus: Sequence[ImuInput], batches: Sequence[Sequence[Batch]], *, end_s: float, horizon_s: float
+) -> list[tuple[Estimate, Estimate]]:
+    """Gyro and accelerometer of every IMU over the same good seconds, each in its sensor's axes.
+
+    All columns of all IMUs go through each step at once: numpy's cost is by the call, not by the column.
+
+    Args:
+        imus: their noise and their steps.
+        batches: for every IMU its good batches, ascending, of the same at least 2 slots.
+        end_s: end of the window; a ramp is evaluated here and never later.
+        horizon_s: H of V(T, H).
+    """
+    gyros, accels = [imu.profile.gyro for imu in imus], [imu.profile.accel for imu in imus]
+    slots = np.array([batch.slot for batch in batches[0]], dtype=np.int64)
+    values = _columns([[batch.mean for batch in item] for item in batches])
+    seconds = float(len(slots))
+    steps = _per_axis([imu.gyro_step_rad_s for imu in imus], [imu.accel_step_m_s2 for imu in imus])
+    edges = np.repeat([_edges(imu) for imu in imus], 3)
+    whole = integer_columns(batches, steps, np.repeat([imu.truncates for imu in imus], 6), edges)
+    values = np.where(whole.of, whole.values, values)
+    flicker = _per_axis([m.flicker for m in gyros], [m.flicker for m in accels])
+    walk = _per_axis([m.walk for m in gyros], [m.walk for m in accels])
+    mean = robust_mean(values, whole.huber_c, whole.least)
+    leverage = np.full(values.shape[1], 1.0 / seconds)
+    slope = np.zeros(values.shape[1])
+    level: Floats = values
+    if len(values) >= RAMP_BATCHES:
+        times = slots.astype(np.float64) + 0.5
+        line = huber_line(times, values, end_s, whole.huber_c, whole.least)
+        # The profile of an unknown part has the floor of the worst, behind which every warm-up would hide.
+        named = np.repeat([imu.profile != PROFILES["unknown"] for imu in imus], 6)
+        ramps = is_ramp(line, len(values), np.where(named, slope_variance(flicker, walk, end_s - slots[0]), 0.0))
+        mean = np.where(ramps, line.end, mean)
+        leverage = np.where(ramps, line.end_leverage, leverage)
+        slope = np.where(ramps, line.slope, 0.0)
+        level = values - slope * (times - times.mean())[:, None]
+    measured = np.maximum(white_noise(slots, level), whole.least)
+    white = np.maximum(measured, _per_axis([m.white for m in gyros], [m.white for m in accels]))
+    flicker = _flicker(slots, level, measured, flicker)
+    quantum, half_step = _quantisation(
+        batches,
+        steps,
+    )
+    quantum, half_step = np.where(whole.of, whole.hidden, quantum), np.where(whole.of, whole.unknown, half_step)
+    # Where a ramp is seen, the next H seconds lie between "it ends now" and "it goes on": the mean over them is off
+    # by anything from nothing to slope * H / 2.
+    going_on = np.square(slope * horizon_s / 2.0) / 3.0
+    stat = np.square(measured) * leverage + np.square(quantum)
+    white_part = np.square(white) * leverage
+    use = white_part + floor_variance(flicker, walk, seconds, horizon_s) + np.square(quantum) + going_on
+
+    def triad(part: slice) -> Estimate:
+        return Estimate(
+            mean=mean[part],
+            stat_variance=stat[part],
+            use_variance=use[part],
+            white_variance=white_part[part],
+            white=white[part],
+            flicker=flicker[part],
+            walk=walk[part],
+            ramp_per_s=slope[part],
+            half_step=half_step[part],
+            undecided=whole.unknown[part],
+            useless=whole.useless[part],
+            edge_rms=whole.edge_rms[part],
+        )
+
+    return [(triad(slice(at, at + 3)), triad(slice(at + 3, at + 6))) for at in range(0, 6 * len(imus), 6)]
+
+
+def _columns(values: list[list[Floats]]) -> Floats:
+    """(imus, seconds, 6) as (seconds, 6 * imus)."""
+    stacked = np.array(values)
+    return np.asarray(stacked.transpose(1, 0, 2).reshape(stacked.shape[1], -1))
+
+
+def _per_axis(gyro: Sequence[float], accel: Sequence[float]) -> Floats:
+    """One figure a triad and IMU as one a column."""
+    return np.repeat(np.array([gyro, accel], dtype=np.float64).T.ravel(), 3)
+
+
+def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: Floats) -> Floats:
+    """B of every column: the profile's, or what the Allan deviation at T/5 says more than it and white noise."""
+    span = int(slots[-1] - slots[0] + 1) // _ALLAN_SPANS
+    if span < 2:
+        return profile
+    variance, _ = allan_variance(slots, values, span)
+    explained = np.square(white) / span
+    more = np.where(variance > _ALLAN_SIGNIFICANT * explained, variance - explained, 0.0)
+    return np.maximum(np.sqrt(more) / FLOOR_OF_FLICKER, profile)
+
+
+def _quantisation(batches: Sequence[Sequence[Batch]], steps: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """What a rounded reading's steps may hide, as one sigma a column, and where there are fewer than 3 distinct values.
+
+    Half a step for fewer than 3 distinct values; else the bound that noise of sigma leaves, (q / pi) exp(-2 pi^2
+    sigma^2 / q^2) (method sections 2.2 and 2.5).
+    """
+    low = _columns([[batch.low for batch in item] for item in batches]).min(axis=0)
+    high = _columns([[batch.high for batch in item] for item in batches]).max(axis=0)
+    distinct = np.array([[batch.distinct for batch in item] for item in batches]).max(axis=1).ravel()
+    known = steps > 0.0
+    few = np.where(known, high - low < 1.5 * steps, distinct < 3)
+    # A stream of floats may carry coarse steps all the same: then the step is what lies between its two values.
+    half = np.where(known, steps, high - low) / 2.0
+    variance = _columns([[batch.variance for batch in item] for item in batches]).mean(axis=0)
+    divisor = np.where(known, steps, 1.0)
+    bound = steps / math.pi * np.exp(-2.0 * math.pi**2 * variance / np.square(divisor))
+    return np.where(few, half, bound), few
+
+
+def imu_estimates(
+    imus: Sequence[ImuInput], batches: Sequence[Sequence[Batch]], *, end_s: float, horizon_s: float, rejected: int
+) -> list[ImuEstimate]:
+    """The windows of all IMUs from their good batches, which are of the same seconds.
+
+    Raises:
+        CalibrationRefusedError: an axis never changes, or most samples were lost.
+    """
+    if not imus:
+        return []
+    for imu, own in zip(imus, batches, strict=True):
+        _refuse_broken(imu, own)
+    triads = estimates(imus, batches, end_s=end_s, horizon_s=horizon_s)
+    return [
+        _imu_estimate(imu, own, gyro, accel, rejected)
+        for imu, own, (gyro, accel) in zip(imus, batches, triads, strict=True)
+    ]
+
+
+def _imu_estimate(
+    imu: ImuInput, batches: Sequence[Batch], gyro: Estimate, accel: Estimate, rejected: int
+) -> ImuEstimate:
+    temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
+    rotation = np.asarray(imu.rotation, dtype=np.float64)
+    window = ImuWindow(
+        name=imu.name,
+        samples=sum(batch.n for batch in batches),
+        duration_s=float(len(batches)),
+        gyro_rad_s=_axes(rotation @ gyro.mean),
+        accel_m_s2=_axes(rotation @ accel.mean),
+        gyro_sigma_stat_rad_s=_turned(rotation, gyro.stat_variance),
+        accel_sigma_stat_m_s2=_turned(rotation, accel.stat_variance),
+        gyro_sigma_use_rad_s=_turned(rotation, gyro.use_variance),
+        accel_sigma_use_m_s2=_turned(rotation, accel.use_variance),
+        temperature_degc=float(np.mean(temperatures)) if temperatures else None,
+        warnings=tuple(_warnings(imu, batches, gyro, accel, temperatures, rejected)),
+        hidden=_hidden(imu, gyro, accel),
+    )
+    return ImuEstimate(gyro=gyro, accel=accel, window=window)
+
+
+def _axes(values: Floats) -> Axes:
+    return float(values[0]), float(values[1]), float(values[2])
+
+
+def _turned(rotation: Floats, variance: Floats) -> Axes:
+    """Sigmas of independent axes after a rotation."""
+    return _axes(np.sqrt(np.square(rotation) @ variance))
+
+
+def _refuse_broken(imu: ImuInput, batches: Sequence[Batch]) -> None:
+    low = np.min([batch.low for batch in batches], axis=0)
+    high = np.max([batch.high for batch in batches], axis=0)
+    for triad, part, step in ((0, "gyro", imu.gyro_step_rad_s), (3, "accel", imu.accel_step_m_s2)):
+        for axis in range(3):
+            if step == 0.0 and low[triad + axis] == high[triad + axis]:
+                raise CalibrationRefusedError(
+                    f"{part} {imu.name} is stuck: axis {_AXIS[axis]} did not change in {len(batches)} s"
+                )
+    lost = _lost(batches)
+    if lost > _LOST_REFUSAL:
+        raise CalibrationRefusedError(f"imu {imu.name} lost {lost:.0%} of its samples, more than {_LOST_REFUSAL:.0%}")
+
+
+def _lost(batches: Sequence[Batch]) -> float:
+    """Share of the samples that never came: by the device's counter, else against the usual number in a second."""
+    usual = float(median([batch.n for batch in batches]))
+    missing = came = 0.0
+    for batch in batches:
+        came += batch.n
+        if batch.missing is not None:
+            missing += batch.missing
+        elif batch.n < _USUAL_SHARE * usual:
+            missing += usual - batch.n
+    return missing / (missing + came)
+
+
+def _hidden(imu: ImuInput, gyro: Estimate, accel: Estimate) -> dict[Literal["gyro", "accel"], Hidden]:
+    found: dict[Literal["gyro", "accel"], Hidden] = {}
+    part: Literal["gyro", "accel"]
+    for part, triad, size, grid, finer in (
+        ("gyro", gyro, f"{imu.gyro_step_rad_s / DEG_H:.0f} deg/h", imu.gyro_grid_rad_s, imu.gyro_grid_rad_s / DEG_H),
+        ("accel", accel, f"{imu.accel_step_m_s2 / MG:.1f} mg", imu.accel_grid_m_s2, imu.accel_grid_m_s2 / MG),
+    ):
+        if not triad.undecided.any():
+            if grid > 0.0 and (triad.edge_rms > EDGE_RMS).any():
+                found[part] = Hidden(
+                    f"{part} {imu.name}: the sensor has coarse steps of its own ({finer:.3g} {size.split()[1]}) below"
+                    " the integers, sigma widened; push.dither = true takes them away",
+                    useless=False,
+                )
+            continue
+        useless = bool(triad.useless.any())
+        axes = "".join(_AXIS[axis] for axis in range(3) if (triad.useless if useless else triad.undecided)[axis])
+        what = "around 0 the mean is not known" if useless else "up to half a step may be hidden, sigma widened"
+        found[part] = Hidden(
+            f"{part} {imu.name} {axes}: integer steps of {size} and too little noise for them, {what}; set"
+            " push.dither = true (or use IMU 1 where it sends HIGHRES_IMU)",
+            useless,
+        )
+    return found
+
+
+def _warnings(
+    imu: ImuInput,
+    batches: Sequence[Batch],
+    gyro: Estimate,
+    accel: Estimate,
+    temperatures: list[float],
+    rejected: int,
+) -> list[str]:
+    found: list[str] = []
+    if gyro.ramp_per_s.any():
+        rate = float(np.abs(gyro.ramp_per_s).max()) / DEG_H
+        found.append(f"warm-up: gyro {imu.name} drifts {rate:.1f} deg/h per second")
+    if accel.ramp_per_s.any():
+        rate = float(np.abs(accel.ramp_per_s).max()) / MG * 60.0
+        found.append(f"warm-up: accel {imu.name} drifts {rate:.2f} mg per minute")
+    for part, triad in (("gyro", gyro), ("accel", accel)):
+        axes = "".join(_AXIS[axis] for axis in range(3) if triad.half_step[axis] and not triad.undecided[axis])
+        if axes:
+            found.append(f"{part} {imu.name} {axes}: fewer than 3 distinct readings, half a step may be hidden")
+        axes = "".join(_AXIS[axis] for axis in range(3) if triad.edge_rms[axis] > EDGE_RMS)
+        if axes and not (imu.gyro_grid_rad_s if part == "gyro" else imu.accel_grid_m_s2):
+            why = "a coarser step inside the sensor?"
+            found.append(f"{part} {imu.name} {axes}: integers not spread like noise ({why}), sigma widened")
+    if (lost := _lost(batches)) > _LOST_WARNING:
+        found.append(f"imu {imu.name} lost {lost:.0%} of its samples")
+    if rejected:
+        found.append(f"{rejected} of {rejected + len(batches)} s were not still and are left out")
+    if temperatures and (span := max(temperatures) - min(temperatures)) > _TEMPERATURE_WARNING_K:
+        found.append(f"temperature of imu {imu.name} moved by {span:.1f} K")
+    return found

@@ -1,0 +1,1 @@
+"""How a sensor scatters and wanders: Allan models, robust means."""

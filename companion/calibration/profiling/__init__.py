@@ -1,0 +1,1 @@
+"""An IMU's noise profile from a long recording at rest."""

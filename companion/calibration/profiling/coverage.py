@@ -1,0 +1,205 @@
+"""Does a noise profile keep its word? Every window of a recording at rest predicts the minute after it.
+
+The windows go through the estimator that flies (`windows.estimates`): Huber's mean, the test for a ramp, the noise
+that the window itself shows, and V(T, H) of the profile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.means.windows import ImuInput, estimates
+from companion.calibration.noise.allan import NoiseProfile, allan_variance
+from companion.calibration.noise.robust import median
+from companion.calibration.profiling.profile_fit import LEAST_STILL_S, TRIADS, Triad, fit_profile
+from companion.calibration.profiling.rest import CHANNELS, MIN_SECONDS, Rest
+from companion.calibration.seconds.batches import Batch
+
+Floats = NDArray[np.float64]
+
+MEANS_S: Final = (10, 30, 60)
+NEXT_S: Final = 60
+MOST_WINDOWS: Final = 400
+"""Of one length and one recording: they overlap, so that more would only repeat what these say."""
+SIGMAS: Final = 2.0
+_AT_ONCE: Final = 100
+
+
+class Kept(msgspec.Struct, frozen=True, kw_only=True):
+    """How often the minute after a window of T seconds came out as one triad had said."""
+
+    triad: Triad
+    mean_s: int
+    windows: int
+    minutes: float
+    """So many windows beside one another there is room for: what the share is worth."""
+    rms: float
+    """Of the misses, rad/s or m/s^2."""
+    sigma_use: float
+    """Median of sqrt(V(T, H))."""
+    sigma_other: float
+    """Likewise, were the noise that of the profile it is compared with."""
+    share: float
+    """Within 2 sigma of the bias; that the minute's own white noise is in what is seen of it is allowed for."""
+    share_strict: float
+    """Within 2 sigma_use as it stands."""
+    share_other: float
+    """As `share`, by the profile it is compared with."""
+    share_naive: float
+    """Within 2 s / sqrt(n), of all samples of the window."""
+
+
+class _Misses(msgspec.Struct):
+    """One kind of window; (w, 6) each."""
+
+    miss: list[Floats]
+    use: list[Floats]
+    other: list[Floats]
+    seen: list[Floats]
+    """Variance of what is seen of the next minute, about its bias."""
+    naive: list[Floats]
+    minutes: float = 0.0
+
+
+def coverage(recordings: Sequence[Sequence[Rest]], fallback: NoiseProfile) -> list[Kept]:
+    """Fit on all recordings but one, predict in that one, in turn; of a single one, halves in the place of recordings.
+
+    Args:
+        recordings: the stretches of each.
+        fallback: as for `fit_profile`; and the one to compare with.
+
+    Returns:
+        A line for each triad and length of window; none where no recording has room for a window and its minute.
+    """
+    parts = [list(each) for each in recordings if each]
+    if len(parts) == 1:
+        parts = list(_halves(parts[0]))
+    tests = []
+    for number, part in enumerate(parts):
+        others = [rest for index, each in enumerate(parts) if index != number for rest in each]
+        if sum(len(rest.slots) for rest in others) >= LEAST_STILL_S:
+            tests.append((part, fit_profile("test", others, fallback).profile))
+    return keeps(tests, fallback)
+
+
+def keeps(
+    tests: Sequence[tuple[Sequence[Rest], NoiseProfile]],
+    other: NoiseProfile,
+    means_s: Sequence[int] = MEANS_S,
+    next_s: int = NEXT_S,
+) -> list[Kept]:
+    """How often the seconds after a window came out as profiles say.
+
+    Args:
+        tests: stretches, and the profile that is to hold in them.
+        other: a profile to compare with.
+        means_s: lengths of windows.
+        next_s: how much is predicted.
+    """
+    found = {mean_s: _Misses([], [], [], [], []) for mean_s in means_s}
+    for rests, profile in tests:
+        for mean_s, misses in found.items():
+            _predict(rests, profile, other, (mean_s, next_s), misses)
+    return [
+        _summary(triad, columns, mean_s, misses)
+        for triad, columns in TRIADS
+        for mean_s, misses in found.items()
+        if misses.miss
+    ]
+
+
+def _halves(rests: Sequence[Rest]) -> tuple[list[Rest], list[Rest]]:
+    """The first half of the seconds at rest, and the second."""
+    half = sum(len(rest.slots) for rest in rests) // 2
+    first: list[Rest] = []
+    second: list[Rest] = []
+    for rest in rests:
+        cut = min(max(half, 0), len(rest.slots))
+        half -= len(rest.slots)
+        for into, part in ((first, slice(0, cut)), (second, slice(cut, None))):
+            if len(rest.slots[part]) >= MIN_SECONDS:
+                into.append(Rest(rest.slots[part], rest.means[part], rest.temperature_degc[part], rest.batches[part]))
+    return first, second
+
+
+def _starts(rests: Sequence[Rest], mean_s: int, next_s: int) -> tuple[list[tuple[Rest, int]], float]:
+    """Places without a hole where a window and what it predicts begin, and for how many there is room side by side."""
+    length = mean_s + next_s
+    room = sum(max(len(rest.slots) - length, 0) for rest in rests)
+    stride = max(min(mean_s, next_s), room // MOST_WINDOWS)
+    places = [
+        (rest, at)
+        for rest in rests
+        for at in range(0, len(rest.slots) - length + 1, stride)
+        if rest.slots[at + length - 1] - rest.slots[at] == length - 1
+    ]
+    return places, sum(len(rest.slots) // length for rest in rests) if places else 0.0
+
+
+def _predict(
+    rests: Sequence[Rest], profile: NoiseProfile, other: NoiseProfile, lengths_s: tuple[int, int], misses: _Misses
+) -> None:
+    mean_s, next_s = lengths_s
+    places, minutes = _starts(rests, mean_s, next_s)
+    misses.minutes += minutes
+    for at in range(0, len(places), _AT_ONCE):
+        some = places[at : at + _AT_ONCE]
+        past = [rest.batches[start : start + mean_s] for rest, start in some]
+        mean, use = _estimated(past, profile, next_s)
+        coming = np.stack([rest.means[start + mean_s : start + mean_s + next_s] for rest, start in some], axis=1)
+        white = allan_variance(np.arange(next_s), coming.reshape(next_s, -1), 1)[0].reshape(-1, CHANNELS)
+        misses.miss.append(mean - coming.mean(axis=0))
+        misses.use.append(use)
+        misses.other.append(_estimated(past, other, next_s)[1])
+        misses.seen.append(white / next_s)
+        misses.naive.append(np.array([_naive(window) for window in past]))
+
+
+def _estimated(windows: Sequence[Sequence[Batch]], profile: NoiseProfile, next_s: int) -> tuple[Floats, Floats]:
+    """(w, 6) means and their use variances; every window goes in as if it were an IMU of its own."""
+    imu = ImuInput(name="", rotation=np.eye(3), profile=profile)
+    end_s = windows[0][-1].slot + 1.0
+    found = estimates([imu] * len(windows), windows, end_s=end_s, horizon_s=float(next_s))
+    mean = [np.concatenate([gyro.mean, accel.mean]) for gyro, accel in found]
+    use = [np.concatenate([gyro.use_variance, accel.use_variance]) for gyro, accel in found]
+    return np.array(mean), np.array(use)
+
+
+def _naive(window: Sequence[Batch]) -> Floats:
+    """Variance of a plain mean by the books, were all samples independent: s^2 / n."""
+    counts = np.array([batch.n for batch in window], dtype=np.float64)[:, None]
+    means = np.array([batch.mean for batch in window])
+    within = np.array([batch.variance for batch in window])
+    total = float(counts.sum())
+    middle = (counts * means).sum(axis=0) / total
+    squares = ((counts - 1.0) * within + counts * np.square(means - middle)).sum(axis=0)
+    return np.asarray(squares / (total - 1.0) / total)
+
+
+def _summary(triad: Triad, columns: slice, mean_s: int, misses: _Misses) -> Kept:
+    miss = np.square(np.concatenate(misses.miss)[:, columns])
+    use, other, seen, naive = (
+        np.concatenate(each)[:, columns] for each in (misses.use, misses.other, misses.seen, misses.naive)
+    )
+
+    def share(variance: Floats) -> float:
+        return float((miss <= SIGMAS**2 * variance).mean())
+
+    return Kept(
+        triad=triad,
+        mean_s=mean_s,
+        windows=len(miss),
+        minutes=misses.minutes,
+        rms=float(np.sqrt(miss.mean())),
+        sigma_use=float(np.sqrt(median(np.ravel(use)))),
+        sigma_other=float(np.sqrt(median(np.ravel(other)))),
+        share=share(use + seen),
+        share_strict=share(use),
+        share_other=share(other + seen),
+        share_naive=share(naive),
+    )

@@ -1,0 +1,192 @@
+"""A noise profile out of an IMU's own recordings at rest: six fits, one choice for each triad, and what to know of it.
+
+What the recordings are too short to tell keeps the figure of another profile (the part's from the catalogue, or the
+cautious one), as far as the recordings allow it. A drift (warm-up, temperature) is taken out before the fit and put
+back as what it costs over the minutes that a calibration is for: as random walk it would be worth ten times more than
+it is, or be hidden in it without a word.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.noise.allan import FLOOR_OF_FLICKER, AllanModel, NoiseProfile
+from companion.calibration.noise.allan_fit import AxisFit, Curve, curve, fit_axis
+from companion.calibration.profiling.rest import CHANNELS, Rest
+from companion.errors import CalibrationRefusedError
+
+Floats = NDArray[np.float64]
+Triad = Literal["gyro", "accel"]
+
+TRIADS: Final[tuple[tuple[Triad, slice], ...]] = (("gyro", slice(0, 3)), ("accel", slice(3, 6)))
+LEAST_STILL_S: Final = 60
+"""Less says nothing that a calibration does not measure itself."""
+DRIFT_T: Final = 5.0
+"""|t| of a slope against the noise found without it; random walk alone makes slopes of about one."""
+DRIFT_LEAST_S: Final = 300
+MEAN_S: Final = 60.0
+HORIZON_S: Final = 180.0
+"""The minutes for which a drift must be allowed for: a calibration's mean, and what it is used for."""
+_BLOCKS: Final = 64
+_TEMPERATURE_BLOCK_S: Final = 60
+_TEMPERATURE_LEAST_K: Final = 0.5
+_TEMPERATURE_BLOCKS: Final = 10
+_EXPLAINED: Final = 0.5
+_AXES: Final = "xyz"
+_NAMES: Final = ("N", "B", "K")
+
+
+class AxisFinding(msgspec.Struct, frozen=True, kw_only=True):
+    """One axis, in rad/s or m/s^2."""
+
+    fit: AxisFit
+    """Of the noise without the drift, where there is one."""
+    drift_per_s: float = 0.0
+    """Of the steepest stretch; zero where none is significant."""
+    per_kelvin: float | None = None
+    """How the slow part follows the temperature, where it does."""
+
+
+class Finding(msgspec.Struct, frozen=True, kw_only=True):
+    """What the recordings of one IMU tell."""
+
+    profile: NoiseProfile
+    axes: tuple[AxisFinding, ...]
+    """Gyro x y z, accelerometer x y z."""
+    kept: tuple[str, ...]
+    """Which figures are another profile's, because the recordings tell nothing of them: "gyro K"."""
+    still_s: int
+
+
+def stretch_curves(rests: Sequence[Rest]) -> list[Curve]:
+    """The Allan variances of all stretches that have any."""
+    return [found for rest in rests if (found := curve(rest.slots, rest.means)) is not None]
+
+
+def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Finding:
+    """The noise of one IMU from all its stretches at rest.
+
+    Args:
+        name: of the profile.
+        rests: of all recordings.
+        fallback: whose figures stand for those that the recordings do not tell.
+
+    Raises:
+        CalibrationRefusedError: too little at rest, or an axis that never changes.
+    """
+    still_s = sum(len(rest.slots) for rest in rests)
+    if still_s < LEAST_STILL_S:
+        raise CalibrationRefusedError(f"only {still_s} s at rest; a profile needs {LEAST_STILL_S} s, better an hour")
+    curves = stretch_curves(rests)
+    level = [_without_line(rest) for rest in rests]
+    level_curves = [
+        found
+        for rest, (values, _) in zip(rests, level, strict=True)
+        if (found := curve(rest.slots, values)) is not None
+    ]
+    axes: list[AxisFinding] = []
+    for column in range(CHANNELS):
+        if not any(each.variance[0, column] > 0.0 for each in curves):
+            raise CalibrationRefusedError(f"{_axis(column)} never changes: its noise is below its last digit")
+        fit, drift = fit_axis(curves, column), 0.0
+        without = fit_axis(level_curves, column)
+        for rest, (_, slopes) in zip(rests, level, strict=True):
+            if len(rest.slots) < DRIFT_LEAST_S:
+                continue
+            slope = float(slopes[column])
+            if abs(slope) > DRIFT_T * _slope_sigma(rest, without.figures) and abs(slope) > abs(drift):
+                drift = slope
+        kelvin = _per_kelvin(rests, column)
+        axes.append(AxisFinding(fit=without if drift else fit, drift_per_s=drift, per_kelvin=kelvin))
+    models, kept = [], []
+    for triad, part in TRIADS:
+        model, unknown = _triad(axes[part], fallback.gyro if triad == "gyro" else fallback.accel)
+        models.append(model)
+        kept += [f"{triad} {_NAMES[which]}" for which in unknown]
+    return Finding(
+        profile=NoiseProfile(name, models[0], models[1]), axes=tuple(axes), kept=tuple(kept), still_s=still_s
+    )
+
+
+def _axis(column: int) -> str:
+    return f"{'gyro' if column < 3 else 'accel'} {_AXES[column % 3]}"
+
+
+def _triad(axes: Sequence[AxisFinding], fallback: AllanModel) -> tuple[AllanModel, list[int]]:
+    """One model that promises too much for none of the three axes, and which figures are the fallback's."""
+    other = (fallback.white, fallback.flicker, fallback.walk)
+    chosen, unknown = [0.0, 0.0, 0.0], []
+    for which in range(3):
+        told = [axis.fit.figures[which] for axis in axes if axis.fit.known[which]]
+        # The axes of one part are alike: what one tells is a better guess for the others than another profile.
+        guess = max(told) if told else other[which]
+        for axis in axes:
+            figure = axis.fit.figures[which]
+            if not axis.fit.known[which]:
+                figure = min(max(figure, guess), axis.fit.upper[which])
+            chosen[which] = max(chosen[which], figure)
+        if not told:
+            unknown.append(which)
+    white, flicker, walk = chosen
+    drift = max(abs(axis.drift_per_s) for axis in axes)
+    # A drift d moves the next H seconds by d (T + H) / 2 from the mean; K is raised until V(T, H) has that in it.
+    walk = math.sqrt(walk**2 + 0.75 * drift**2 * (MEAN_S + HORIZON_S))
+    flicker = max(flicker, *(_flicker_over(axis.fit) for axis in axes))
+    return AllanModel(white, flicker, walk), unknown
+
+
+def _flicker_over(fit: AxisFit) -> float:
+    """B with which the Allan deviation lies nowhere above the model: noise of another kind counts as flicker."""
+    white, flicker, walk = fit.figures
+    if fit.excess is None:
+        return flicker
+    span, ratio = fit.excess
+    model = white**2 / span + AllanModel(white, flicker, walk).floor ** 2 + walk**2 * span / 3.0
+    return math.sqrt(flicker**2 + (ratio**2 - 1.0) * model / FLOOR_OF_FLICKER**2)
+
+
+def _without_line(rest: Rest) -> tuple[Floats, Floats]:
+    """Values without their straight line, and its slopes per second."""
+    times = rest.slots - rest.slots.mean()
+    slopes = (times[:, None] * rest.means).sum(axis=0) / max(float(np.square(times).sum()), 1.0)
+    return rest.means - slopes * times[:, None], slopes
+
+
+def _slope_sigma(rest: Rest, figures: tuple[float, float, float]) -> float:
+    """Standard error of a least squares slope over the stretch under such noise."""
+    span_s = float(rest.slots[-1] - rest.slots[0] + 1)
+    centres = (np.arange(_BLOCKS) + 0.5) * span_s / _BLOCKS
+    weights = (centres - centres.mean()) / float(np.square(centres - centres.mean()).sum())
+    lags = np.abs(centres[:, None] - centres[None, :])
+    block = span_s / _BLOCKS
+    white, flicker, walk = figures
+    # Generalised covariance of block averages; for lags of a block and more the averaging changes flicker by 1 %.
+    near = np.where(lags > 0.0, lags, block * math.exp(-1.5))
+    covariance = -(flicker**2 / math.pi) * np.log(near) - walk**2 / 2.0 * lags
+    covariance[np.diag_indices(_BLOCKS)] += white**2 / block
+    variance = float(weights @ covariance @ weights)
+    return math.sqrt(max(variance, white**2 * 12.0 / span_s**3))
+
+
+def _per_kelvin(rests: Sequence[Rest], column: int) -> float | None:
+    """Slope against temperature where it explains most of the slow part of the longest stretch; else None."""
+    rest = max(rests, key=lambda each: len(each.slots))
+    known = np.isfinite(rest.temperature_degc)
+    blocks = len(rest.slots) // _TEMPERATURE_BLOCK_S
+    if blocks < _TEMPERATURE_BLOCKS or not known.all():
+        return None
+    shape = (blocks, _TEMPERATURE_BLOCK_S)
+    kelvin = rest.temperature_degc[: blocks * _TEMPERATURE_BLOCK_S].reshape(shape).mean(axis=1)
+    values = rest.means[: blocks * _TEMPERATURE_BLOCK_S, column].reshape(shape).mean(axis=1)
+    if float(np.ptp(kelvin)) < _TEMPERATURE_LEAST_K:
+        return None
+    kelvin, values = kelvin - kelvin.mean(), values - values.mean()
+    slope = float((kelvin * values).sum() / np.square(kelvin).sum())
+    left = float(np.square(values - slope * kelvin).sum() / np.square(values).sum())
+    return slope if 1.0 - left > _EXPLAINED else None

@@ -1,0 +1,1 @@
+"""From a window to biases, sigmas and the record."""

@@ -1,0 +1,149 @@
+"""From estimates to the record."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from typing import Literal
+
+import numpy as np
+
+from companion.calibration.solution.doubt import Doubt
+from companion.calibration.solution.history import Point, Triad
+from companion.calibration.solution.record import (
+    AlignmentUsed,
+    Axes,
+    CrossCovariance,
+    ImuRecord,
+    Record,
+    WrittenParameter,
+)
+from companion.calibration.solution.solve import ImuSolution, Solution
+from companion.physics.frames import Array, Matrix
+from companion.physics.units import DEG_H, MG
+
+
+@dataclasses.dataclass(slots=True)
+class Draft:
+    """A record in the making: filled as the calibration proceeds, so that a failure keeps what was known."""
+
+    started_at: datetime.datetime
+    system_id: int | None = None
+    solution: Solution | None = None
+    whole: dict[str, tuple[Array | None, Array | None]] = dataclasses.field(default_factory=dict)
+    """By IMU: whole gyro and accelerometer bias, where the owner of the IMU subtracts offsets already."""
+    written: dict[str, dict[str, WrittenParameter]] = dataclasses.field(default_factory=dict)
+    """By IMU: parameters."""
+    warnings: list[str] = dataclasses.field(default_factory=list)
+    measured_s: tuple[float, float] | None = None
+    """Start and end of the window behind the solution, on the loop's clock."""
+    notes: list[str] = dataclasses.field(default_factory=list)
+    """What belongs into the reason besides the figures."""
+    alignment: AlignmentUsed | None = None
+    """What was in force of the gradienter's alignment."""
+    imu_warnings: dict[str, list[str]] = dataclasses.field(default_factory=dict)
+    points: dict[str, Point] = dataclasses.field(default_factory=dict)
+    """By IMU: what later calibrations may know of this one, once it has come to a good end."""
+
+    held_back: dict[tuple[str, Triad], Doubt] = dataclasses.field(default_factory=dict)
+    """By IMU and triad, what is not to be written, and why."""
+
+    def warn(self, imu: str, words: str) -> None:
+        """Add a warning to one IMU, once."""
+        warnings = self.imu_warnings.setdefault(imu, [])
+        if words not in warnings:
+            warnings.append(words)
+
+    def begin_again(self, why: str) -> None:
+        """Forget what was found and written, but not why."""
+        self.solution = self.measured_s = None
+        self.whole.clear()
+        self.written.clear()
+        self.imu_warnings.clear()
+        self.points.clear()
+        self.held_back.clear()
+        self.warnings.append(why)
+
+    def record(self, state: Literal["done", "failed", "cancelled"], reason: str, duration_s: float) -> Record:
+        """The finished record."""
+        solution = self.solution
+        return Record(
+            state=state,
+            reason=reason,
+            warnings=(*(solution.warnings if solution else ()), *self.warnings),
+            started_at=self.started_at.isoformat(timespec="milliseconds"),
+            duration_s=round(duration_s, 3),
+            pose=solution.pose if solution else None,
+            site=solution.site if solution else None,
+            system_id=self.system_id,
+            magnetic=solution.magnetic if solution else None,
+            alignment=self.alignment,
+            imus=tuple(self._imu(estimate) for estimate in solution.imus) if solution else (),
+            cross_covariance=_cross(solution) if solution else (),
+        )
+
+    def _imu(self, estimate: ImuSolution) -> ImuRecord:
+        owner_corrects = estimate.name in self.whole
+        gyro, accel = self.whole.get(estimate.name, (estimate.gyro_rad_s, estimate.accel_m_s2))
+        has_gyro, has_accel = estimate.gyro_rad_s is not None, estimate.accel_m_s2 is not None
+        return ImuRecord(
+            name=estimate.name,
+            samples=estimate.samples,
+            temperature_degc=estimate.temperature_degc,
+            gyro_bias_rad_s=_axes(gyro),
+            gyro_sigma_stat_rad_s=_axes(estimate.gyro_sigma_stat_rad_s if has_gyro else None),
+            gyro_sigma_use_rad_s=_axes(estimate.gyro_sigma_use_rad_s if has_gyro else None),
+            accel_bias_m_s2=_axes(accel),
+            accel_sigma_stat_m_s2=_axes(estimate.accel_sigma_stat_m_s2 if has_accel else None),
+            accel_sigma_use_m_s2=_axes(estimate.accel_sigma_use_m_s2 if has_accel else None),
+            covariance=_covariance(estimate.covariance, gyro=has_gyro, accel=has_accel),
+            residual_gyro_rad_s=_axes(estimate.gyro_rad_s if owner_corrects else None),
+            residual_accel_m_s2=_axes(estimate.accel_m_s2 if owner_corrects else None),
+            warnings=(*estimate.warnings, *self.imu_warnings.get(estimate.name, ())),
+            written=self.written.get(estimate.name, {}),
+            prior=estimate.prior,
+            effective=estimate.effective,
+            held_back=tuple(triad for name, triad in self.held_back if name == estimate.name),
+        )
+
+
+def _axes(vector: Array | None) -> Axes | None:
+    if vector is None:
+        return None
+    x, y, z = (float(value) for value in vector)
+    return x, y, z
+
+
+def _covariance(matrix: Matrix, *, gyro: bool, accel: bool) -> tuple[tuple[float | None, ...], ...] | None:
+    if not gyro and not accel:
+        return None
+    known = [gyro] * 3 + [accel] * 3
+    return _where_known(matrix, known, known)
+
+
+def _cross(solution: Solution) -> tuple[CrossCovariance, ...]:
+    known = {imu.name: [imu.gyro_rad_s is not None] * 3 + [imu.accel_m_s2 is not None] * 3 for imu in solution.imus}
+    return tuple(
+        CrossCovariance(imus=(one, other), covariance=_where_known(matrix, known[one], known[other]))
+        for (one, other), matrix in solution.cross.items()
+        if any(known[one]) and any(known[other])
+    )
+
+
+def _where_known(matrix: Matrix, rows: list[bool], columns: list[bool]) -> tuple[tuple[float | None, ...], ...]:
+    return tuple(tuple(float(matrix[i, j]) if rows[i] and columns[j] else None for j in range(6)) for i in range(6))
+
+
+def in_words(solution: Solution | None) -> str:
+    """The figures of a result: the largest sigma over axes and IMUs; short enough for one STATUSTEXT."""
+    if solution is None:
+        return "nothing measured"
+    parts: list[str] = []
+    gyros = [imu.gyro_sigma_use_rad_s for imu in solution.imus if imu.gyro_rad_s is not None]
+    accels = [imu.accel_sigma_use_m_s2 for imu in solution.imus if imu.accel_m_s2 is not None]
+    if gyros:
+        parts.append(f"{np.max(gyros) / DEG_H:.1f} deg/h")
+    if accels:
+        parts.append(f"{np.max(accels) / MG:.2f} mg")
+    unknown = f"; not known: {', '.join(solution.unknown)}" if solution.unknown else ""
+    return f"sigma {', '.join(parts)}{unknown}"

@@ -1,0 +1,388 @@
+"""What is known from before, and today's readings of all IMUs, as one estimate (method section 3, "prior / MAP").
+
+With d the biases by today's readings and p those expected, all IMUs together,
+
+    d = b + e_d     p = b + e_p     b_MAP = d + K (p - d)     K = cov(e_d, e_d - e_p) cov(e_d - e_p)^-1
+
+which for independent errors is (S_d^-1 + S_0^-1)^-1 (S_d^-1 d + S_0^-1 p). They are not independent: the error of the
+gradienter's zero is the same in all IMUs, and where the earlier calibrations were made with today's zero, in p as
+well, so that nothing averages it away. Where they were made with other zeros, several IMUs together tell today's tilt.
+
+A sigma_use that is too cautious would hand the estimate to the prior. So K counts as e_d only what is *known* to be
+noise: what averaging has left (sigma_stat), the gradienter's scatter, and the sigma of its zero if somebody vouches
+for it. K is then smaller than the best one, and with any K between zero and twice that the estimate is no worse than
+without a prior. The covariance is that of the K used, with the whole S_d.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from companion.calibration.solution.doubt import Doubt, Witness, doubts
+from companion.calibration.solution.history import Axes, Measured, Point, PowerUp, Triad
+from companion.calibration.solution.prior import Expectation, Expected, ExpectedImu
+from companion.calibration.solution.record import AccelPrior, GyroPrior, Prior
+from companion.calibration.solution.solve import ImuSolution, Shared, Solution
+from companion.physics.frames import Array, Matrix
+
+Whole = Mapping[str, tuple[Array | None, Array | None]]
+"""By IMU: whole gyro and accelerometer bias by the readings alone, (3,) each, vehicle FRD."""
+
+_TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
+AGREES: Final = 11.34
+"""Chi square of three axes that is passed by chance once in a hundred: beyond it nobody is warned yet, but what may
+well be of another sensor takes no part."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Weighed:
+    """A solution with what was known before."""
+
+    solution: Solution
+    doubts: tuple[Doubt, ...]
+
+    @property
+    def doubted(self) -> dict[tuple[str, Triad], Doubt]:
+        """By IMU and triad, what speaks against it; a tilt or a turn is in all, whether each shows it or not."""
+        return {
+            (name, doubt.triad): doubt
+            for doubt in reversed(self.doubts)
+            for name in ([imu.name for imu in self.solution.imus] if doubt.of_all else doubt.names)
+        }
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _Known:
+    """One triad that something is expected of."""
+
+    imu: int
+    triad: Triad
+    expected: Expected
+    difference: Array
+    """Measured less expected."""
+
+    @property
+    def rows(self) -> slice:
+        start = 6 * self.imu + (0 if self.triad == "gyro" else 3)
+        return slice(start, start + 3)
+
+
+def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed:
+    """Take in what was known from before: guard against it, and let it take part where it may.
+
+    Args:
+        solution: by the readings alone.
+        whole: likewise, of every IMU.
+        expectation: what earlier calibrations say of today.
+    """
+    shared = solution.shared
+    if shared is None:
+        return Weighed(solution, ())
+    expected = {each.name: each for each in expectation.imus}
+    solution = dataclasses.replace(
+        solution, imus=tuple(_with_effect(imu, expected.get(imu.name), shared) for imu in solution.imus)
+    )
+    found: list[Doubt] = []
+    for triad in _TRIADS:
+        # What was measured in this power-up says most; where it is content, nothing older has to be asked.
+        for today in (True, False):
+            known = _known(solution, whole, expected, triad, today=today)
+            witnesses = [_witness(solution, shared, one) for one in known]
+            said = doubts(triad, witnesses, shared.up, shared.by_reading, today=today)
+            if said or (today and len(known) == len(solution.imus)):
+                found += said
+                break
+    doubted = {(doubt.triad, name) for doubt in found for name in doubt.names}
+    known = [one for triad in _TRIADS for one in _known(solution, whole, expected, triad, today=False)]
+    # A tilt, a gravity or a turn that nobody expected is in all of them, whether or not each shows it.
+    shaken = {doubt.triad for doubt in found if doubt.of_all}
+    used = [
+        one
+        for one in known
+        if one.expected.weighs
+        and one.triad not in shaken
+        and (one.triad, solution.imus[one.imu].name) not in doubted
+        and _agrees(_witness(solution, shared, one))
+    ]
+    weighed = _estimate(solution, shared, used, zero_is_known=expectation.zero_is_known) if used else solution
+    imus = tuple(
+        dataclasses.replace(
+            imu,
+            prior=_prior(k, imu.name, solution, shared, known, used, whole),
+            warnings=(
+                *imu.warnings,
+                *(doubt.words for doubt in found if not doubt.of_all and imu.name in doubt.names),
+            ),
+        )
+        for k, imu in enumerate(weighed.imus)
+    )
+    common = [doubt.words for doubt in found if doubt.of_all]
+    return Weighed(dataclasses.replace(weighed, imus=imus, warnings=(*solution.warnings, *common)), tuple(found))
+
+
+def points(
+    solution: Solution,
+    whole: Whole,
+    found: Iterable[Doubt],
+    *,
+    started_at: str,
+    unix_s: float,
+    power_ups: Mapping[str, PowerUp],
+    zero: str | None,
+) -> dict[str, Point]:
+    """By IMU, what later calibrations may know of this one.
+
+    Args:
+        solution: by the readings alone.
+        whole: likewise.
+        found: what contradicted.
+        started_at: of the record.
+        unix_s: now.
+        power_ups: since when each IMU has been powered.
+        zero: which zero of the gradienter was in force.
+    """
+    shared = solution.shared
+    if shared is None:
+        return {}
+    doubted = {(doubt.triad, name) for doubt in found for name in doubt.names}
+    by_zero = _by_zero(shared)
+    gyro_shared = np.diag(shared.covariance)[:3]
+    accel_shared = np.maximum(np.diag(shared.covariance)[3:] - np.diag(by_zero @ by_zero.T), 0.0)
+    return {
+        imu.name: Point(
+            started_at=started_at,
+            unix_s=unix_s,
+            power_up=power_ups[imu.name],
+            temperature_degc=imu.temperature_degc,
+            up=_axes(shared.up),
+            zero=zero if whole[imu.name][1] is not None else None,
+            zero_sigma_rad=shared.zero_sigma_rad,
+            gyro=_measured(
+                whole[imu.name][0],
+                imu.gyro_sigma_stat_rad_s,
+                _own_variance(imu, shared)[:3],
+                gyro_shared,
+                suspect=("gyro", imu.name) in doubted,
+            ),
+            accel=_measured(
+                whole[imu.name][1],
+                imu.accel_sigma_stat_m_s2,
+                _own_variance(imu, shared)[3:],
+                accel_shared,
+                suspect=("accel", imu.name) in doubted,
+            ),
+        )
+        for imu in solution.imus
+        if imu.name in whole
+    }
+
+
+def _measured(bias: Array | None, stat: Array, use: Array, shared: Array, *, suspect: bool) -> Measured | None:
+    if bias is None:
+        return None
+    return Measured(
+        bias=_axes(bias),
+        sigma_stat=_axes(stat),
+        sigma_use=_axes(np.sqrt(use)),
+        sigma_shared=_axes(np.sqrt(shared)),
+        suspect=suspect,
+    )
+
+
+def _with_effect(imu: ImuSolution, expected: ExpectedImu | None, shared: Shared) -> ImuSolution:
+    """What the accelerometers' bias is worth at another attitude."""
+    effect = expected.effect if expected is not None else None
+    if imu.accel_m_s2 is None or effect is None:
+        return imu
+    warning = effect.warning(imu.name, shared.gravity_m_s2, shared.up, imu.accel_sigma_use_m_s2)
+    return dataclasses.replace(
+        imu,
+        effective=effect.effective(shared.gravity_m_s2, shared.up, imu.accel_sigma_use_m_s2),
+        warnings=imu.warnings if warning is None else (*imu.warnings, warning),
+    )
+
+
+def _known(
+    solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu], triad: Triad, *, today: bool
+) -> list[_Known]:
+    found: list[_Known] = []
+    for k, imu in enumerate(solution.imus):
+        measured = whole[imu.name][_TRIADS.index(triad)] if imu.name in whole else None
+        known = expected[imu.name].of(triad, today=today) if imu.name in expected else None
+        if measured is not None and known is not None:
+            found.append(_Known(k, triad, known, measured - np.array(known.value)))
+    return found
+
+
+def _agrees(witness: Witness) -> bool:
+    covariance = np.diag(witness.own_variance) + witness.common
+    return float(witness.difference @ np.linalg.solve(covariance, witness.difference)) < AGREES
+
+
+def _own_variance(imu: ImuSolution, shared: Shared) -> Array:
+    """Of the sensor alone, (6,)."""
+    return np.maximum(np.diag(imu.covariance) - np.diag(shared.covariance), 0.0)
+
+
+def _by_zero(shared: Shared) -> Matrix:
+    """Accelerometer bias by the gradienter's zero, in sigmas of that, (3, 2)."""
+    return np.zeros((3, 2)) if shared.by_reading is None else shared.by_reading * shared.zero_sigma_rad
+
+
+def _other_zero(shared: Shared, expected: Expected) -> Matrix:
+    """What is expected by the error of earlier zeros, (3, 2)."""
+    return np.zeros((3, 2)) if shared.by_reading is None else shared.by_reading * expected.other_zero_rad
+
+
+def _witness(solution: Solution, shared: Shared, known: _Known) -> Witness:
+    part = slice(0, 3) if known.triad == "gyro" else slice(3, 6)
+    imu, expected = solution.imus[known.imu], known.expected
+    common = shared.covariance[part, part]
+    if known.triad == "accel":
+        zero, other = _by_zero(shared), _other_zero(shared, expected)
+        common = common + (np.square(1.0 - expected.same_zero) - 1.0) * (zero @ zero.T) + other @ other.T
+    return Witness(
+        name=imu.name,
+        difference=known.difference,
+        own_variance=_own_variance(imu, shared)[part] + np.array(expected.variance),
+        common=common,
+        limit=expected.limit,
+        power_ups=expected.power_ups,
+        same_zero=expected.same_zero > 0.5,
+    )
+
+
+def _whole_covariance(solution: Solution) -> Matrix:
+    """Of all biases of all IMUs, (6 n, 6 n)."""
+    count = len(solution.imus)
+    matrix = np.zeros((6 * count, 6 * count))
+    for i, j in itertools.product(range(count), repeat=2):
+        one, other = solution.imus[i], solution.imus[j]
+        if i == j:
+            block = one.covariance
+        elif i < j:
+            block = solution.cross[one.name, other.name]
+        else:
+            block = solution.cross[other.name, one.name].T
+        matrix[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] = block
+    return matrix
+
+
+def _estimate(solution: Solution, shared: Shared, used: Sequence[_Known], *, zero_is_known: bool) -> Solution:
+    """The solution with what may take part; see the equations at the top."""
+    count = len(solution.imus)
+    index = np.concatenate([np.arange(one.rows.start, one.rows.stop) for one in used])
+    innovation = -np.concatenate([one.difference for one in used])
+    s_d = _whole_covariance(solution)
+    zero = _by_zero(shared)
+    noise = np.zeros((3, 2))
+    if shared.by_reading is not None:
+        noise = shared.by_reading * np.array(shared.reading_sigma_rad)
+    # Every accelerometer's share of the zero's error: in d it is whole, in p as far as that was measured with it.
+    zero_in_d = np.zeros((6 * count, 2))
+    noise_in_d = np.zeros((6 * count, 2))
+    for k in range(count):
+        zero_in_d[6 * k + 3 : 6 * k + 6] = zero
+        noise_in_d[6 * k + 3 : 6 * k + 6] = noise
+    zero_in_p = np.zeros((len(index), 2))
+    other_in_p = np.zeros((len(index), 2))
+    for k, one in enumerate(used):
+        if one.triad == "accel":
+            zero_in_p[3 * k : 3 * k + 3] = zero * one.expected.same_zero
+            other_in_p[3 * k : 3 * k + 3] = _other_zero(shared, one.expected)
+    s_p = np.diag(np.concatenate([one.expected.variance for one in used]))
+    s_p = s_p + zero_in_p @ zero_in_p.T + other_in_p @ other_in_p.T
+    both = zero_in_d @ zero_in_p.T
+    of_difference = s_d[np.ix_(index, index)] + s_p - both[index] - both[index].T
+    stat = np.concatenate(
+        [np.concatenate([imu.gyro_sigma_stat_rad_s, imu.accel_sigma_stat_m_s2]) for imu in solution.imus]
+    )
+    known = np.diag(np.minimum(np.square(stat), np.diag(s_d))) + noise_in_d @ noise_in_d.T
+    sure = known[:, index]
+    if zero_is_known:
+        sure = sure + zero_in_d @ zero_in_d[index].T - both
+    gain = np.linalg.solve(of_difference, sure.T).T
+    rest = np.eye(6 * count)
+    rest[:, index] -= gain
+    mixed = rest @ both @ gain.T
+    covariance = rest @ s_d @ rest.T + gain @ s_p @ gain.T + mixed + mixed.T
+    stat_covariance = rest @ np.diag(np.square(stat)) @ rest.T + gain @ s_p @ gain.T
+    shift = gain @ innovation
+    imus = tuple(
+        _shifted(
+            imu,
+            shift[6 * k : 6 * k + 6],
+            covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6],
+            np.sqrt(np.diag(stat_covariance)[6 * k : 6 * k + 6]),
+        )
+        for k, imu in enumerate(solution.imus)
+    )
+    cross = {
+        (one.name, other.name): covariance[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
+        for (i, one), (j, other) in itertools.combinations(enumerate(imus), 2)
+    }
+    return dataclasses.replace(solution, imus=imus, cross=cross)
+
+
+def _shifted(imu: ImuSolution, shift: Array, covariance: Matrix, stat: Array) -> ImuSolution:
+    return dataclasses.replace(
+        imu,
+        gyro_rad_s=None if imu.gyro_rad_s is None else imu.gyro_rad_s + shift[:3],
+        accel_m_s2=None if imu.accel_m_s2 is None else imu.accel_m_s2 + shift[3:],
+        covariance=covariance,
+        gyro_sigma_stat_rad_s=np.minimum(stat[:3], np.sqrt(np.diag(covariance)[:3])),
+        accel_sigma_stat_m_s2=np.minimum(stat[3:], np.sqrt(np.diag(covariance)[3:])),
+    )
+
+
+def _prior(
+    imu: int,
+    name: str,
+    solution: Solution,
+    shared: Shared,
+    known: Sequence[_Known],
+    used: Sequence[_Known],
+    whole: Whole,
+) -> Prior | None:
+    """What the record says of it."""
+    gyro: GyroPrior | None = None
+    accel: AccelPrior | None = None
+    for one in known:
+        if one.imu != imu:
+            continue
+        witness, expected = _witness(solution, shared, one), one.expected
+        sigma = _axes(np.sqrt(np.array(expected.variance)))
+        shift = _axes(witness.difference / witness.sigma)
+        measured = whole[name][_TRIADS.index(one.triad)]
+        assert measured is not None  # of nothing else something is known
+        if one.triad == "gyro":
+            gyro = GyroPrior(
+                used=one in used,
+                power_ups=expected.power_ups,
+                temperature_model=expected.by_temperature,
+                expected_rad_s=expected.value,
+                sigma_rad_s=sigma,
+                measured_rad_s=_axes(measured),
+                shift_sigma=shift,
+            )
+        else:
+            accel = AccelPrior(
+                used=one in used,
+                power_ups=expected.power_ups,
+                temperature_model=expected.by_temperature,
+                expected_m_s2=expected.value,
+                sigma_m_s2=sigma,
+                measured_m_s2=_axes(measured),
+                shift_sigma=shift,
+            )
+    return None if gyro is None and accel is None else Prior(gyro=gyro, accel=accel)
+
+
+def _axes(values: Array) -> Axes:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

@@ -1,0 +1,350 @@
+"""From the averages of one still stretch to biases with covariances.
+
+The gradienter gives the direction of up, the compass the heading, the site gravity and the Earth's rate; what each
+sensor should have read follows, and the rest is its bias. "Bias" is the effective one at this pose: a scale error
+times 1 g on the vertical axis cannot be told from a bias in one pose (method section 2.3) and is what the
+autopilot's offset has to carry here; it is not part of sigma.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+
+from companion.calibration.collector.rolling import ImuWindow, TiltWindow, Window
+from companion.calibration.means.pose_models import CompassModel, GradienterModel, up_in_vehicle, vehicle_heading_rad
+from companion.calibration.request import What
+from companion.calibration.solution import magnetic
+from companion.calibration.solution.bias import accelerometer_bias, attitude_error_jacobian, bias_covariance, gyro_bias
+from companion.calibration.solution.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site
+from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
+from companion.errors import CalibrationRefusedError
+from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
+from companion.physics.gradienter import up_jacobian
+from companion.physics.units import DEG
+
+__all__ = [
+    "CompassModel",
+    "GradienterModel",
+    "ImuSolution",
+    "Solution",
+    "Truth",
+    "solve",
+    "solve_at",
+    "up_in_vehicle",
+    "vehicle_heading_rad",
+]
+
+# Without a gradienter the accelerometers level the Earth's rate; a 50 mg bias tilts it by 3 degrees (0.8 deg/h).
+LEVEL_BY_ACCELEROMETER_SIGMA_DEG: Final = 3.0
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class ImuSolution:
+    """What is left in one IMU's output: mean minus truth, in vehicle FRD, shape (3,); None: not asked for or unknown.
+
+    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of the estimate as a prediction of the next
+    minutes: sigma_use is the root of its diagonal.
+    """
+
+    name: str
+    samples: int
+    temperature_degc: float | None
+    gyro_rad_s: Array | None
+    accel_m_s2: Array | None
+    gyro_sigma_stat_rad_s: Array
+    accel_sigma_stat_m_s2: Array
+    covariance: Matrix
+    warnings: tuple[str, ...]
+    dithered: bool = False
+    """The telemetry was seen to follow this IMU's offsets step by step."""
+    prior: Prior | None = None
+    """What was known from before, and what became of it."""
+    effective: Effective | None = None
+    """What the accelerometers' bias is worth at another attitude."""
+
+    @property
+    def gyro_sigma_use_rad_s(self) -> Array:
+        """One sigma per axis, shape (3,)."""
+        return np.sqrt(np.diag(self.covariance)[:3])
+
+    @property
+    def accel_sigma_use_m_s2(self) -> Array:
+        """One sigma per axis, shape (3,)."""
+        return np.sqrt(np.diag(self.covariance)[3:])
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What the sensors should have read, from everything but the sensors themselves."""
+
+    up: Array
+    attitude_covariance_rad2: Matrix
+    """(3, 3) in vehicle FRD."""
+    heading_rad: float | None
+    heading_sigma_rad: float | None
+    from_gradienter: bool
+    tilt_sigma_rad: tuple[float, float]
+    """Of theta and gamma."""
+    magnetic: Magnetic | None = None
+    """What the compass' field and steadiness say of the heading; None without a compass."""
+    up_by_reading: Matrix | None = None
+    """d up / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
+    reading_sigma_rad: tuple[float, float] = (0.0, 0.0)
+    """Of the gradienter's two means, without its zero."""
+
+    @property
+    def body_from_ned(self) -> Matrix:
+        """The attitude; with an unknown heading, that of heading north."""
+        gamma, theta = roll_pitch_from_up(self.up)
+        return body_from_ned(gamma, theta, self.heading_rad or 0.0)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Shared:
+    """The errors that all IMUs of one stretch have in common: one attitude, one gravity, one Earth's rate."""
+
+    up: Array
+    gravity_m_s2: float
+    covariance: Matrix
+    """6x6 (gyro rad/s, accelerometer m/s^2), part of every IMU's own and the cross-covariance of any two."""
+    by_reading: Matrix | None
+    """d (accelerometer bias) / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
+    reading_sigma_rad: tuple[float, float]
+    zero_sigma_rad: float
+    """Of the gradienter's zero, the same in every calibration."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """The biases of all IMUs from one still stretch."""
+
+    pose: Pose
+    site: Site
+    imus: tuple[ImuSolution, ...]
+    warnings: tuple[str, ...]
+    unknown: tuple[str, ...] = ()
+    """What was asked for and its readings do not tell, such as "gyro fc"; the IMU's warnings say why."""
+    magnetic: Magnetic | None = None
+    """How good the heading can be; None without a compass."""
+    shared: Shared | None = None
+    """None only where somebody has made a solution by hand."""
+    cross: Mapping[tuple[str, str], Matrix] = dataclasses.field(default_factory=dict)
+    """Cross-covariance (6x6) of every two IMUs, in their order."""
+
+
+def solve(
+    window: Window,
+    local: LocalEarth,
+    gradienter: GradienterModel | None,
+    compass: CompassModel | None,
+    what: What,
+) -> Solution:
+    """Work out the biases of every IMU of the window.
+
+    Raises:
+        CalibrationRefusedError: the readings cannot be right together, or accelerometers were asked for without
+            a gradienter.
+    """
+    warnings = list(local.warnings)
+    tilted = window.tilt if gradienter is not None else None
+    accelerometers = what.accelerometers and tilted is not None
+    if what.accelerometers and tilted is None:
+        if what is What.ACCELEROMETERS:
+            raise CalibrationRefusedError(
+                "accelerometers need a gradienter: without one the tilt is unknown; configure [gradienter] or"
+                " calibrate the gyros only"
+            )
+        warnings.append("no gradienter: gyros only, accelerometers not calibrated")
+    if compass is None or window.heading is None:
+        warnings.append("no compass: the horizontal part of the Earth's rate is unknown, gyro sigma widened")
+    truth = truth_of(window, gradienter if tilted is not None else None, compass, local, warnings)
+    imus = tuple(_estimate(imu, truth, local, gyros=what.gyros, accelerometers=accelerometers) for imu in window.imus)
+    if all(imu.gyro_rad_s is None and imu.accel_m_s2 is None for imu in imus):
+        refusals = [
+            words for imu in window.imus for words in _hidden(imu, gyros=what.gyros, accelerometers=accelerometers)
+        ]
+        if refusals:
+            raise CalibrationRefusedError("; ".join(refusals))
+    unknown = [f"gyro {imu.name}" for imu in window.imus if what.gyros and imu.refused("gyro")]
+    unknown += [f"accel {imu.name}" for imu in window.imus if accelerometers and imu.refused("accel")]
+    shared = _shared(truth, local, gradienter.sigma_deg * DEG if gradienter is not None and tilted is not None else 0.0)
+    return Solution(
+        pose=_pose(truth),
+        site=local.site,
+        imus=imus,
+        warnings=tuple(warnings),
+        unknown=tuple(unknown),
+        magnetic=truth.magnetic,
+        shared=shared,
+        cross=dict.fromkeys(itertools.combinations((imu.name for imu in imus), 2), shared.covariance),
+    )
+
+
+def solve_at(
+    window: Window,
+    where: Whereabouts,
+    gradienter: GradienterModel | None,
+    compass: CompassModel | None,
+    what: What,
+) -> Solution:
+    """`solve`, with all that the place is needed for (the magnetic model takes the longest), in one call for a thread.
+
+    Raises:
+        CalibrationRefusedError: as `solve`.
+    """
+    return solve(window, local_earth(where), gradienter, compass, what)
+
+
+def truth_of(
+    window: Window,
+    gradienter: GradienterModel | None,
+    compass: CompassModel | None,
+    local: LocalEarth,
+    warnings: list[str],
+) -> Truth:
+    """How the aircraft stood, from everything but its gyros; what is missing goes into `warnings`.
+
+    Raises:
+        CalibrationRefusedError: the readings cannot be right together.
+    """
+    by_reading: Matrix | None = None
+    reading_sigma = (0.0, 0.0)
+    if gradienter is not None and window.tilt is not None:
+        up, by_reading, up_covariance = _up(window.tilt, gradienter)
+        reading_sigma = (window.tilt.x_sigma_deg * DEG, window.tilt.y_sigma_deg * DEG)
+    else:
+        mean = np.mean([imu.accel_m_s2 for imu in window.imus], axis=0)
+        up = mean / np.linalg.norm(mean)
+        across = np.eye(3) - np.outer(up, up)
+        up_covariance = across * (LEVEL_BY_ACCELEROMETER_SIGMA_DEG * DEG) ** 2
+    if math.hypot(up[1], up[2]) < 0.1:
+        raise CalibrationRefusedError("the aircraft stands on its nose or tail (pitch beyond 84 deg): lay it down")
+    jacobian = attitude_error_jacobian(up)
+    covariance = jacobian @ up_covariance @ jacobian.T
+    gamma_variance = np.array([0.0, up[2], -up[1]]) / (up[1] ** 2 + up[2] ** 2)
+    tilt_sigma = (
+        math.sqrt(up_covariance[0, 0] / (1.0 - up[0] ** 2)),
+        math.sqrt(gamma_variance @ up_covariance @ gamma_variance),
+    )
+    without = Truth(
+        up,
+        covariance,
+        None,
+        None,
+        gradienter is not None,
+        tilt_sigma,
+        up_by_reading=by_reading,
+        reading_sigma_rad=reading_sigma,
+    )
+    if compass is None or window.heading is None:
+        return without
+    found = magnetic.assess(
+        window.heading,
+        window.field,
+        compass,
+        local,
+        up,
+        up_covariance if gradienter is not None else None,
+    )
+    warnings += found.warnings
+    if not found.is_usable:
+        return dataclasses.replace(without, magnetic=found.magnetic)
+    if compass.magnetic and local.site.declination_deg is None:
+        warnings.append("declination unknown (no position or date): magnetic heading used, sigma widened")
+    # A heading from the field takes part in the tilt's errors: one wrong tilt turns all three angles.
+    turned = jacobian - np.outer(up, found.heading_by_up)
+    covariance = turned @ up_covariance @ turned.T + np.outer(up, up) * found.sigma_rad**2
+    sigma = math.sqrt(found.sigma_rad**2 + found.heading_by_up @ up_covariance @ found.heading_by_up)
+    return dataclasses.replace(
+        without,
+        attitude_covariance_rad2=covariance,
+        heading_rad=found.heading_rad,
+        heading_sigma_rad=sigma,
+        magnetic=found.magnetic,
+    )
+
+
+def _up(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix, Matrix]:
+    """Up in the vehicle's axes, its derivatives by the readings (3x2), and its covariance (3x3, radian squared)."""
+    x_deg, y_deg = tilt.x_deg - model.offset_deg[0], tilt.y_deg - model.offset_deg[1]
+    try:
+        up = up_in_vehicle(model, tilt.x_deg, tilt.y_deg)
+        jacobian = model.vehicle_from_sensor @ up_jacobian(model.law, x_deg, y_deg)
+    except ValueError as error:
+        raise CalibrationRefusedError(str(error)) from None
+    variance = [(math.hypot(model.sigma_deg, sigma) * DEG) ** 2 for sigma in (tilt.x_sigma_deg, tilt.y_sigma_deg)]
+    return up, jacobian, jacobian @ np.diag(variance) @ jacobian.T
+
+
+def _pose(truth: Truth) -> Pose:
+    gamma, theta = roll_pitch_from_up(truth.up)
+    known, heading = truth.from_gradienter, truth.heading_rad
+    return Pose(
+        theta_deg=theta / DEG if known else None,
+        gamma_deg=gamma / DEG if known else None,
+        psi_deg=(heading / DEG) % 360.0 if heading is not None else None,
+        sigma_deg=PoseSigma(
+            theta=truth.tilt_sigma_rad[0] / DEG if known else None,
+            gamma=truth.tilt_sigma_rad[1] / DEG if known else None,
+            psi=truth.heading_sigma_rad / DEG if truth.heading_sigma_rad is not None else None,
+        ),
+    )
+
+
+def _shared(truth: Truth, local: LocalEarth, zero_sigma_rad: float) -> Shared:
+    by_up = truth.up_by_reading
+    return Shared(
+        up=truth.up,
+        gravity_m_s2=local.gravity_m_s2,
+        covariance=bias_covariance(
+            attitude_covariance_rad2=truth.attitude_covariance_rad2,
+            up=truth.up,
+            gravity_m_s2=local.gravity_m_s2,
+            gravity_sigma_m_s2=local.gravity_sigma_m_s2,
+            earth_rate_body=local.rate_in_body(truth.body_from_ned, heading_known=truth.heading_rad is not None),
+            gyro_variance=np.zeros(3),
+            accel_variance=np.zeros(3),
+        ),
+        by_reading=None if by_up is None else -local.gravity_m_s2 * by_up,
+        reading_sigma_rad=truth.reading_sigma_rad,
+        zero_sigma_rad=zero_sigma_rad,
+    )
+
+
+def _estimate(imu: ImuWindow, truth: Truth, local: LocalEarth, *, gyros: bool, accelerometers: bool) -> ImuSolution:
+    rate = local.rate_in_body(truth.body_from_ned, heading_known=truth.heading_rad is not None)
+    covariance = bias_covariance(
+        attitude_covariance_rad2=truth.attitude_covariance_rad2,
+        up=truth.up,
+        gravity_m_s2=local.gravity_m_s2,
+        gravity_sigma_m_s2=local.gravity_sigma_m_s2,
+        earth_rate_body=rate,
+        gyro_variance=np.square(imu.gyro_sigma_use_rad_s),
+        accel_variance=np.square(imu.accel_sigma_use_m_s2),
+    )
+    return ImuSolution(
+        name=imu.name,
+        samples=imu.samples,
+        temperature_degc=imu.temperature_degc,
+        gyro_rad_s=gyro_bias(np.array(imu.gyro_rad_s), rate.mean) if gyros and imu.refused("gyro") is None else None,
+        accel_m_s2=accelerometer_bias(np.array(imu.accel_m_s2), truth.up, local.gravity_m_s2)
+        if accelerometers and imu.refused("accel") is None
+        else None,
+        gyro_sigma_stat_rad_s=np.array(imu.gyro_sigma_stat_rad_s),
+        accel_sigma_stat_m_s2=np.array(imu.accel_sigma_stat_m_s2),
+        covariance=covariance,
+        warnings=(*imu.warnings, *_hidden(imu, gyros=gyros, accelerometers=accelerometers)),
+        dithered=imu.dithered,
+    )
+
+
+def _hidden(imu: ImuWindow, *, gyros: bool, accelerometers: bool) -> list[str]:
+    """What this IMU's readings do not tell, or not well, of what is asked for."""
+    asked = {"gyro": gyros, "accel": accelerometers}
+    return [hidden.words for part, hidden in imu.hidden.items() if asked[part]]

@@ -1,0 +1,192 @@
+"""Is the calibration in force still good?
+
+What was found right (written and seen, or measured to be right as it is) ages: the bias wanders, the temperature
+changes, somebody changes the offsets. All limits come from the error budget (method sections 2.2 and 3, item 8):
+
+- age: so long as the wandering expected of the sensor's Allan profile stays below `DRIFT_SIGMAS` sigma_use, and never
+  longer than the configured limit (30 minutes);
+- temperature: 3 K, configurable;
+- the rolling window: what is left in the output now may differ from what it must be by `RESIDUAL_SIGMAS` of what
+  both were known with.
+
+Age and temperature count from the last time that a still window agreed, so that an aircraft that stands about for an
+hour keeps its calibration without a single write.
+"""
+
+from __future__ import annotations
+
+import enum
+import functools
+import math
+from typing import Final, Literal
+
+import msgspec
+
+from companion.calibration.noise.allan import AllanModel, floor_variance
+from companion.physics.units import DEG_H, MG
+
+Axes = tuple[float, float, float]
+Triad = Literal["gyro", "accel"]
+
+DRIFT_SIGMAS: Final = 2.0
+RESIDUAL_SIGMAS: Final = 3.0
+WORTH_SIGMAS: Final = 2.0
+"""A new write must be worth more than this many sigma_use: below, it would mostly write the noise of today."""
+
+_LONGEST_S: Final = 24 * 3600.0
+_UNITS: Final = {"gyro": (DEG_H, "deg/h", ".0f"), "accel": (MG, "mg", ".2f")}
+
+
+class Why(enum.Enum):
+    """Why a calibration does not, or does no longer, count as good; the values are what people read."""
+
+    NEVER = "not calibrated yet"
+    UNDONE = "calibration was undone"
+    REBOOTED = "autopilot restarted"
+    REPLACED = "boot reset gyro offsets"
+    ALIGNED = "gradienter aligned since then"
+    CHANGED = "changed by someone else"
+    FAILED = "last calibration failed"
+    UNSEEN = "offsets written but not seen to work"
+    OLD = "calibration too old"
+    TEMPERATURE = "temperature changed"
+    RESIDUAL = "biases moved"
+
+
+class Limits(msgspec.Struct, frozen=True, kw_only=True):
+    """What a pilot may set."""
+
+    max_age_s: float
+    max_temperature_change_k: float
+
+
+class Held(msgspec.Struct, frozen=True, kw_only=True):
+    """The gyros or accelerometers of one IMU: what its output must show while the calibration is good."""
+
+    calibrated_s: float | None
+    """When it was calibrated; None where the offsets were only measured to be right as they are."""
+    confirmed_s: float
+    """When that was seen last."""
+    temperature_degc: float | None
+    """Then."""
+    sigma_use: Axes
+    """rad/s or m/s^2."""
+    expected: Axes
+    """Output minus truth while all is well: zero where the autopilot corrects, else the whole bias."""
+    seen: bool
+    """Whether its effect was seen in the telemetry."""
+    averaged_s: float
+    """T of V(T, H)."""
+
+
+class Present(msgspec.Struct, frozen=True, kw_only=True):
+    """What the rolling window says now: output minus truth at this pose (rad/s or m/s^2, vehicle FRD)."""
+
+    residual: Axes
+    sigma_use: Axes
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """One reason against the calibration; `words` fit one line at the flight line."""
+
+    why: Why
+    words: str
+
+
+@functools.lru_cache(maxsize=128)
+def age_limit_s(model: AllanModel, sigma_use: Axes, averaged_s: float) -> float:
+    """The horizon H at which the expected wandering, V(T, H) without its white part, reaches DRIFT_SIGMAS sigma_use.
+
+    Args:
+        model: of the sensor.
+        sigma_use: of the calibration, in the model's unit; the smallest axis counts.
+        averaged_s: T, the length of its window.
+
+    Returns:
+        Seconds, at most a day (method section 2.2).
+    """
+    allowed = (DRIFT_SIGMAS * min(sigma_use)) ** 2
+
+    def drift(horizon_s: float) -> float:
+        return float(floor_variance(model.flicker, model.walk, averaged_s, horizon_s))
+
+    low_s, high_s = 1.0, _LONGEST_S
+    if drift(high_s) <= allowed:
+        return high_s
+    if drift(low_s) >= allowed:
+        return low_s
+    while high_s / low_s > 1.01:
+        middle_s = math.sqrt(low_s * high_s)
+        low_s, high_s = (middle_s, high_s) if drift(middle_s) <= allowed else (low_s, middle_s)
+    return low_s
+
+
+def judge(
+    triad: Triad,
+    name: str,
+    held: Held,
+    model: AllanModel,
+    limits: Limits,
+    *,
+    now_s: float,
+    temperature_degc: float | None,
+    present: Present | None,
+) -> list[Finding]:
+    """Everything that speaks against one triad's calibration now; empty while it is good.
+
+    Args:
+        triad: which half of the IMU.
+        name: of the IMU.
+        held: what was found right.
+        model: the noise of this triad.
+        limits: of age and temperature.
+        now_s: the clock of `held`.
+        temperature_degc: of the IMU now, if known.
+        present: from a still window, if there is one.
+    """
+    found: list[Finding] = []
+    if not held.seen:
+        found.append(Finding(Why.UNSEEN, f"{triad} {name}: new offsets not seen to work"))
+    if present is not None and (worst := worst_axis(held, present)) is not None:
+        unit, words, form = _UNITS[triad]
+        found.append(Finding(Why.RESIDUAL, f"{triad} {name} is off by {worst / unit:{form}} {words}"))
+    if held.temperature_degc is not None and temperature_degc is not None:
+        change = temperature_degc - held.temperature_degc
+        if abs(change) > limits.max_temperature_change_k:
+            found.append(Finding(Why.TEMPERATURE, f"imu {name} is {abs(change):.0f} K {_warmer(change)} than then"))
+    limit_s = min(limits.max_age_s, age_limit_s(model, held.sigma_use, held.averaged_s))
+    if (age_s := now_s - held.confirmed_s) > limit_s:
+        found.append(Finding(Why.OLD, f"calibrated {age_s / 60:.0f} min ago, limit {limit_s / 60:.0f}"))
+    return found
+
+
+def _warmer(change: float) -> str:
+    return "warmer" if change > 0 else "colder"
+
+
+def worst_axis(held: Held, present: Present) -> float | None:
+    """The largest difference, signed, beyond RESIDUAL_SIGMAS of what both sides were known with; None: all agree."""
+    beyond = [
+        residual - expected
+        for residual, expected, then, now in zip(
+            present.residual, held.expected, held.sigma_use, present.sigma_use, strict=True
+        )
+        if abs(residual - expected) > RESIDUAL_SIGMAS * math.hypot(then, now)
+    ]
+    return max(beyond, key=abs, default=None)
+
+
+def worth_writing(present: Present, held: Held | None, floor: float) -> bool:
+    """Whether new offsets would better any axis by more than WORTH_SIGMAS of what is known, and more than the floor.
+
+    Args:
+        present: what the output shows.
+        held: the calibration in force, which was not known better than its own sigma; None: there is none.
+        floor: what nobody needs bettered, in the same unit.
+    """
+    expected = held.expected if held is not None else (0.0, 0.0, 0.0)
+    then = held.sigma_use if held is not None else (0.0, 0.0, 0.0)
+    return any(
+        abs(residual - wanted) > max(WORTH_SIGMAS * math.hypot(was, now), floor)
+        for residual, wanted, was, now in zip(present.residual, expected, then, present.sigma_use, strict=True)
+    )

@@ -1,0 +1,1 @@
+"""Whether the aircraft stands still, and since when."""

@@ -1,0 +1,389 @@
+"""Is the aircraft still? One verdict a second for every source, in words that name the device.
+
+The detector is the generalised likelihood ratio test of Skog, Haendel, Nilsson and Rantakokko (IEEE Trans. Biomed.
+Eng. 57(11), 2010) in its centred form: T = mean(sum((a - abar)^2 / s_a^2 + (w - wbar)^2 / s_w^2)), 6 (W - 1) / W when
+at rest, because before a calibration the biases are unknown. What the centred form cannot see, a slow steady turn,
+is left to gates on the means. Method section 3.
+
+One set of constants serves all sensors; nothing here is tuned to a recording. Three ideas make that possible:
+
+- Motion of an aircraft is slow against the sampling, sensor noise is mostly white. Half the mean square of
+  successive differences measures the white part in the batch itself, so an absolute gate on *the rest* of the
+  variance works on a sensor of any noise from its first second on.
+- The sigmas of the likelihood ratio are learned from batches that passed that gate (their lower quartile), never
+  from motion, and are floored by the profile's white noise.
+- Every gate is widened by what chance alone can do with the number of samples in the batch.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, insort
+from collections import deque
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.noise.allan import NoiseProfile
+from companion.calibration.noise.channels import (
+    beyond,
+    farthest,
+    lower_quartile,
+    mean_of,
+    mean_over,
+    scatter_of_difference,
+)
+from companion.calibration.seconds.batches import Batch
+from companion.physics.units import DEG, MG
+
+Floats = NDArray[np.float64]
+
+GYRO_MOTION_RAD_S: Final = 0.10 * DEG
+"""rms of the slow part of the rate in one second. A tenth of a degree a second over 10 s is an attitude error of the
+order of the gradienter's own; handling and walking are 10 to 1000 times more, sensors at rest below a half of it."""
+
+ACCEL_MOTION_M_S2: Final = 10.0 * MG
+"""The same for specific force: 10 mg is a tilt of half a degree within a second."""
+
+GYRO_VIBRATION_RAD_S: Final = 1.0 * DEG
+ACCEL_VIBRATION_M_S2: Final = 50.0 * MG
+"""rms of everything, what is slow being gated already: three times the noisiest common sensor at its full rate. More
+is a running motor, under which accelerometers rectify: their mean is no bias then."""
+
+GLRT_RATIO: Final = 2.0
+"""T over its value at rest. Noise at rest is stationary to some ten per cent; 2 is 40 % more amplitude."""
+
+GYRO_STEP_RAD_S: Final = 0.05 * DEG
+"""A second's mean against the last good ones. A sensor warming up at 3 (deg/h)/s, more than was ever seen, moves by
+0.004 deg/s in their mean age of 5 s."""
+
+ACCEL_STEP_M_S2: Final = 5.0 * MG
+"""A second's mean against the start of the stretch: a tilt of 0.3 deg. Warming by 10 K moves consumer parts 2 mg."""
+
+GYRO_REST_RAD_S: Final = 0.5 * DEG
+"""Against the level of the last still stretch: a bias does not move that far within minutes, a steady turn that is
+slower needs twelve minutes for a circle."""
+
+REST_HELD_S: Final = 30
+"""So long a steady reading off the old level is believed to be a new bias: without this a shock to the sensor
+would lock the gate until a restart."""
+
+GYRO_BIAS_RAD_S: Final = 10.0 * DEG
+"""With no prior at all: beyond any turn-on bias that a modern part specifies (typically 0.5 to 3 deg/s)."""
+
+GYRO_PRIOR_RAD_S: Final = 1.0 * DEG
+"""Against a prior given from outside: the worst common temperature coefficient (0.015 deg/s/K) times 65 K."""
+
+GRAVITY_M_S2: Final = 9.81
+GRAVITY_GATE_M_S2: Final = 1.5
+"""Uncalibrated parts miss by up to 0.1 g; a mean that is off by more is another unit, a dead axis or a centrifuge."""
+
+TILT_MOTION_DEG: Final = 0.10
+TILT_STEP_DEG: Final = 0.10
+"""Ten times a field gradienter's noise, and 1.7 mg on a horizontal accelerometer."""
+
+HEADING_MOTION_DEG: Final = 2.0
+HEADING_STEP_DEG: Final = 3.0
+"""The class of field compasses; 3 deg cost 0.6 deg/h on a horizontal gyro."""
+
+MIN_IMU_SAMPLES: Final = 4
+MAX_IMU_GAP_S: Final = 0.5
+STUCK_SAMPLES: Final = 10
+"""Fewer may well be equal by chance on a quiet sensor with coarse steps."""
+
+_TRIADS: Final = (
+    ("gyro", slice(0, 3), GYRO_MOTION_RAD_S, GYRO_VIBRATION_RAD_S, DEG, "deg/s"),
+    ("accel", slice(3, 6), ACCEL_MOTION_M_S2, ACCEL_VIBRATION_M_S2, MG, "mg"),
+)
+_LEARN_FROM: Final = 60
+_LEARNED_ENOUGH: Final = 3
+_RECENT: Final = 10
+_REFERENCE: Final = 5
+_CHANCE: Final = 3.0
+
+
+class Verdict(msgspec.Struct, frozen=True):
+    """What one source's gate says of one second; `words` name the device and are empty when still."""
+
+    still: bool
+    words: str = ""
+    fault: bool = False
+    """Whether it is the device, not the aircraft, that is in the way."""
+
+
+STILL: Final = Verdict(still=True)
+
+
+def _words(what: str, found: float, allowed: float, unit: str) -> Verdict:
+    """'gyro fc 0.31 deg/s > 0.10', with as many digits as it takes to see the difference."""
+    for digits in (2, 3, 4):
+        left, right = f"{found:.{digits}f}", f"{allowed:.{digits}f}"
+        if left != right:
+            break
+    return Verdict(still=False, words=f"{what} {left} {unit} > {right}")
+
+
+def _fault(words: str) -> Verdict:
+    return Verdict(still=False, words=words, fault=True)
+
+
+def _motion(
+    variance: list[float], white: list[float], n: int, gate: float, rest: tuple[float, float]
+) -> tuple[float, float]:
+    """Rms of the slow part over the channels, and what is allowed: the gate, and chance.
+
+    The difference of the two variance estimates of white noise has a variance of about sigma^4 / n a channel; that
+    sigma^2 is the batch's own white part within the bounds `rest`, for fast motion looks white in part.
+    """
+    noise = mean_over(white)
+    slow = mean_over(variance) - noise
+    least, most = rest
+    chance = _CHANCE * min(max(noise, least), most) / math.sqrt(n * len(white)) if n >= MIN_IMU_SAMPLES else 0.0
+    return math.sqrt(max(slow, 0.0)), math.sqrt(gate**2 + chance)
+
+
+def _lower_quartile(freedom: int) -> float:
+    """Lower quartile of a variance estimate over the variance (Wilson and Hilferty's chi-square)."""
+    spread = 2.0 / (9.0 * freedom)
+    return (1.0 - spread - 0.6745 * math.sqrt(spread)) ** 3
+
+
+class ImuGate:
+    """The gate of one IMU: six channels, gyro in rad/s, then accelerometer in m/s^2, in any fixed axes.
+
+    Args:
+        name: as the pilot knows it.
+        profile: its noise.
+        steps: quantisation of gyro and accelerometer, 0 for floats.
+        gyro_prior_rad_s: (3,) bias known from before, in the sensor's axes, where there is one.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        profile: NoiseProfile,
+        steps: tuple[float, float] = (0.0, 0.0),
+        gyro_prior_rad_s: Floats | None = None,
+    ) -> None:
+        self._name = name
+        self._white = np.repeat([profile.gyro.white, profile.accel.white], 3)
+        self._steps = np.repeat(np.asarray(steps, dtype=np.float64), 3)
+        self._prior = gyro_prior_rad_s
+        self._learned: deque[Floats] = deque(maxlen=_LEARN_FROM)
+        self._ordered: list[list[float]] | None = None
+        """The same, channel by channel in ascending order; None: to be made when it is needed."""
+        self._noise: Floats | None = None
+        self._rest: Floats | None = None
+        self._off_level = 0
+        self.new_stretch()
+
+    def new_stretch(self) -> None:
+        """The still stretch has ended: references start again. Noise and rest level stay known."""
+        self._recent: deque[Floats] = deque(maxlen=_RECENT)
+        self._start: list[Floats] = []
+        self._means: tuple[list[float], list[float]] | None = None
+        """Of both; None: to be worked out when they are needed."""
+
+    def forget_level(self) -> None:
+        """The readings are not comparable with earlier ones: an offset was written, the owner restarted."""
+        self._rest = None
+        self._off_level = 0
+        self.new_stretch()
+
+    def accept(self, batch: Batch, *, settled: bool) -> None:
+        """The second counts as still for all sources; `settled` when the stretch is long enough to be believed."""
+        self._recent.append(batch.mean[:3])
+        start = None if self._means is None else self._means[1]
+        if len(self._start) < _REFERENCE:
+            self._start.append(batch.mean[3:])
+            start = None
+        self._means = mean_of(self._recent), start or mean_of(self._start)
+        if settled:
+            self._rest = np.array(self._means[0])
+            self._off_level = 0
+
+    def judge(self, batch: Batch) -> Verdict:
+        """Whether this second was still for this IMU; learns its noise on the way."""
+        return self._broken(batch) or self._moving(batch) or self._displaced(batch) or STILL
+
+    def _broken(self, batch: Batch) -> Verdict | None:
+        name = self._name
+        if batch.n < MIN_IMU_SAMPLES:
+            return _fault(f"imu {name} sends {batch.n} Hz, needs {MIN_IMU_SAMPLES}")
+        if batch.largest_gap_s > MAX_IMU_GAP_S:
+            return _fault(f"imu {name} was silent for {batch.largest_gap_s:.1f} s > {MAX_IMU_GAP_S}")
+        if batch.clipped:
+            return _fault(f"imu {name} hits the end of its range")
+        distinct = batch.distinct.tolist()
+        if batch.n >= STUCK_SAMPLES and 1 in distinct:
+            same = [count == 1 and step == 0.0 for count, step in zip(distinct, self._steps.tolist(), strict=True)]
+            if all(same[:3]) or all(same[3:]):
+                part = "gyro" if all(same[:3]) else "accel"
+                return _fault(f"{part} {name} is stuck: {batch.n} equal readings")
+        return None
+
+    def _moving(self, batch: Batch) -> Verdict | None:
+        n, name = batch.n, self._name
+        # What unfiltered white noise of the profile's density makes of one sample at this rate.
+        floor = [noise * noise * n for noise in self._white.tolist()]
+        sigma2 = self._sigma2(floor, n)
+        self._noise = None if sigma2 is None else np.array(sigma2)
+        variance, white = batch.variance.tolist(), batch.white.tolist()
+        for part, triad, motion, vibration, unit, unit_name in _TRIADS:
+            noise = math.sqrt(floor[triad.start])
+            shaking = max(vibration, 1.5 * noise)
+            rest = (0.0, shaking**2)
+            if sigma2 is not None:
+                known = mean_over(sigma2[triad])
+                rest = (known, GLRT_RATIO * known)
+            # A known noisy sensor behind a low-pass looks like slow motion, hence the profile's noise here too.
+            found, allowed = _motion(variance[triad], white[triad], n, max(motion, noise), rest)
+            if found > allowed:
+                return _words(f"{part} {name}", found / unit, allowed / unit, unit_name)
+            found = math.sqrt(mean_over(variance[triad]))
+            if found > shaking:
+                return _words(f"{part} {name} shakes", found / unit, shaking / unit, unit_name)
+        self._learn(batch.variance)
+        return None if sigma2 is None else self._likelihood(variance, n, sigma2)
+
+    def _learn(self, variance: Floats) -> None:
+        learned = self._learned
+        if self._ordered is not None:
+            if len(learned) == learned.maxlen:
+                for column, value in zip(self._ordered, learned[0].tolist(), strict=True):
+                    del column[bisect_left(column, value)]
+            for column, value in zip(self._ordered, variance.tolist(), strict=True):
+                insort(column, value)
+        learned.append(variance)
+
+    def _sigma2(self, floor: list[float], n: int) -> list[float] | None:
+        """Variance of one sample at rest, learned; None until there is enough to learn from."""
+        if len(self._learned) < _LEARNED_ENOUGH:
+            return None
+        if self._ordered is None:
+            rows = [variance.tolist() for variance in self._learned]
+            self._ordered = [sorted(column) for column in zip(*rows, strict=True)]
+        least = _lower_quartile(n - 1)
+        # A truncated reading that toggles between two steps has up to a quarter of a step squared.
+        return [
+            max(lower_quartile(ordered) / least, known + step * step / 4.0)
+            for ordered, known, step in zip(self._ordered, floor, self._steps.tolist(), strict=True)
+        ]
+
+    def _likelihood(self, variance: list[float], n: int, sigma2: list[float]) -> Verdict | None:
+        ratio = [found / known for found, known in zip(variance, sigma2, strict=True)]
+        allowed = GLRT_RATIO * (1.0 + _CHANCE * math.sqrt(2.0 / (6.0 * n)))
+        # T / (6 (W - 1) / W), the variances having n - 1 in their denominators.
+        if mean_over(ratio) <= allowed:
+            return None
+        gyro, accel = mean_over(ratio[:3]), mean_over(ratio[3:])
+        if gyro >= accel:
+            found = math.sqrt(mean_over(variance[:3])) / DEG
+            return _words(f"gyro {self._name}", found, found * math.sqrt(allowed / gyro), "deg/s")
+        found = math.sqrt(mean_over(variance[3:])) / MG
+        return _words(f"accel {self._name}", found, found * math.sqrt(allowed / accel), "mg")
+
+    def _displaced(self, batch: Batch) -> Verdict | None:
+        name, mean = self._name, batch.mean.tolist()
+        rate, force = mean[:3], mean[3:]
+        size = math.sqrt(sum(each * each for each in force))
+        if not abs(size - GRAVITY_M_S2) <= GRAVITY_GATE_M_S2:
+            return _fault(f"accel {name} reads {size:.1f} m/s^2, not gravity")
+        level, allowed = (
+            ([0.0] * 3, GYRO_BIAS_RAD_S) if self._prior is None else (self._prior.tolist(), GYRO_PRIOR_RAD_S)
+        )
+        found = farthest(rate, level)
+        if found > allowed:
+            return _words(f"gyro {name} turns or is biased by", found / DEG, allowed / DEG, "deg/s")
+        # A few samples say little about their own scatter; what was learned says more.
+        noise = batch.variance.tolist()
+        if self._noise is not None:
+            noise = list(map(max, noise, self._noise.tolist()))
+        chance = [_CHANCE * math.sqrt(each / batch.n) for each in noise]
+        if self._recent and self._means is None:
+            self._means = mean_of(self._recent), mean_of(self._start)
+        if self._means is not None:
+            both = scatter_of_difference(self._recent)
+            found = beyond(rate, self._means[0], [each * both for each in chance[:3]])
+            if found > GYRO_STEP_RAD_S:
+                return _words(f"gyro {name} moved by", found / DEG, GYRO_STEP_RAD_S / DEG, "deg/s")
+            both = scatter_of_difference(self._start)
+            found = beyond(force, self._means[1], [each * both for each in chance[3:]])
+            if found > ACCEL_STEP_M_S2:
+                return _words(f"accel {name} tilted by", found / MG, ACCEL_STEP_M_S2 / MG, "mg")
+        return self._off_rest(rate)
+
+    def _off_rest(self, rate: list[float]) -> Verdict | None:
+        if self._rest is None:
+            return None
+        found = farthest(rate, self._rest.tolist())
+        if found <= GYRO_REST_RAD_S:
+            self._off_level = 0
+            return None
+        self._off_level += 1
+        if self._off_level >= REST_HELD_S:
+            self._rest = None
+            self._off_level = 0
+            return None
+        return _words(f"gyro {self._name} turns by", found / DEG, GYRO_REST_RAD_S / DEG, "deg/s")
+
+
+class PoseGate:
+    """The gate of the gradienter (two channels, deg) or of the compass (one channel on the circle, deg)."""
+
+    def __init__(self, name: str, motion_deg: float, step_deg: float, *, circle: bool = False) -> None:
+        self._name = name
+        self._motion_deg = motion_deg
+        self._step_deg = step_deg
+        self._circle = circle
+        self.new_stretch()
+
+    def new_stretch(self) -> None:
+        """The still stretch has ended: the reference pose starts again."""
+        self._start: list[Floats] = []
+        self._refined: list[float] | None = None
+        """What the others add to the first; None: to be worked out when it is needed."""
+
+    def accept(self, batch: Batch) -> None:
+        """The second counts as still for all sources."""
+        if len(self._start) < _REFERENCE:
+            self._start.append(batch.mean)
+            self._refined = None
+
+    def judge(self, batch: Batch) -> Verdict:
+        """Whether this second was still for this sensor."""
+        if batch.n > 1:
+            variance, white = batch.variance.tolist(), batch.white.tolist()
+            found, allowed = _motion(variance, white, batch.n, self._motion_deg, (0.0, self._motion_deg**2))
+            if found > allowed:
+                return _words(self._name, found, allowed, "deg")
+        if self._start:
+            # Against the first good second, so that averaging on the circle needs no care; the others refine it.
+            first = self._start[0].tolist()
+            if self._refined is None:
+                turns = [self._deviations(each.tolist(), first) for each in self._start]
+                self._refined = [sum(of_one) / len(turns) for of_one in zip(*turns, strict=True)]
+            turned = self._deviations(batch.mean.tolist(), first)
+            off = [
+                abs(turn - refined) - _CHANCE * math.sqrt(white / batch.n)
+                for turn, refined, white in zip(turned, self._refined, batch.white.tolist(), strict=True)
+            ]
+            if max(off) > self._step_deg:
+                return _words(f"{self._name} moved by", max(off), self._step_deg, "deg")
+        return STILL
+
+    def _deviations(self, values: list[float], first: list[float]) -> list[float]:
+        differences = [value - begin for value, begin in zip(values, first, strict=True)]
+        return [(each + 180.0) % 360.0 - 180.0 for each in differences] if self._circle else differences
+
+
+def gradienter_gate() -> PoseGate:
+    """The gate of the gradienter."""
+    return PoseGate("gradienter", TILT_MOTION_DEG, TILT_STEP_DEG)
+
+
+def compass_gate() -> PoseGate:
+    """The gate of the compass."""
+    return PoseGate("compass", HEADING_MOTION_DEG, HEADING_STEP_DEG, circle=True)

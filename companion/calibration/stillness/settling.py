@@ -1,0 +1,99 @@
+"""Has the fluid come to rest? A gradienter, or a compass that averages, goes on moving after the aircraft has stopped.
+
+Both follow the truth with a time constant: the fluid of a field gradienter is left with a tenth of what is missing
+after every second (BEI INC manual; sensors.md 2.2 and 2.7). The gate on its movement sees only the steep beginning of
+that. So whenever the IMUs say that a second was not still, what the sensor is off by at its end is taken from its own
+readings, and its seconds count again once that has died away to a tenth of its sigma. The IMUs' own seconds count
+meanwhile: nobody who stands still waits longer.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.calibration.seconds.batches import Batch
+
+Floats = NDArray[np.float64]
+
+UNKNOWN_DEG: Final = 5.0
+"""What it may be off by after a movement during which nothing was heard of it."""
+_SHARE: Final = 0.1
+_CHANCE: Final = 4.0
+"""Standard deviations that the lowest or highest of a second's readings may lie off by chance."""
+
+
+class Lag(msgspec.Struct, frozen=True):
+    """How a pose sensor follows the truth."""
+
+    lag_s: float
+    """Time constant; 0: at once."""
+    sigma_deg: float
+    """What it is trusted to; a tenth of that may be left."""
+
+
+AT_ONCE: Final = Lag(0.0, 1.0)
+
+
+class Settling:
+    """Knows which of a pose sensor's seconds are still the tail of a movement."""
+
+    def __init__(self, lag: Lag, *, circle: bool = False) -> None:
+        self.left_s = 0
+        """Seconds until its readings count again, as of the last second judged."""
+        self._lag = lag
+        self._circle = circle
+        self._moved: int | None = None
+        """The last second in which the aircraft moved, while its tail may last."""
+        self._before: tuple[Floats, Floats, float] | None = None
+        """Of that second: lowest and highest reading, and by how much less they may show than there was at its end."""
+        self._after: tuple[Floats, Floats, float] | None = None
+        """Of the second after it."""
+
+    def judge(self, slot: int, batch: Batch | None, *, moved: bool) -> bool:
+        """Whether what the sensor said in that second counts.
+
+        Args:
+            slot: seconds come in ascending order.
+            batch: of this very second; None where it said nothing.
+            moved: the IMUs say that the aircraft was not still.
+        """
+        if self._lag.lag_s <= 0.0:
+            return True
+        if moved:
+            self._moved, self._after = slot, None
+            self._before = None if batch is None else (batch.low, batch.high, 1.0)
+            self.left_s = self._seconds(UNKNOWN_DEG)
+            return False
+        if self._moved is None:
+            return True
+        if slot == self._moved + 1 and batch is not None:
+            # What its first reading shows had a pause between two readings to decay.
+            self._after = (batch.low, batch.high, math.exp(min(1.0 / (batch.n * self._lag.lag_s), 50.0)))
+        self.left_s = max(self._seconds(self._off_deg(batch)) - (slot - self._moved - 1), 0)
+        if self.left_s == 0 and batch is not None:
+            self._moved = None
+        return self._moved is None
+
+    def _seconds(self, off_deg: float) -> int:
+        """Whole seconds until so much has died away."""
+        remains = off_deg / (_SHARE * self._lag.sigma_deg)
+        return math.ceil(self._lag.lag_s * math.log(remains)) if remains > 1.0 else 0
+
+    def _off_deg(self, batch: Batch | None) -> float:
+        """What it was off by when the aircraft stopped, from where it is now; beyond its own noise."""
+        if batch is None or self._before is None:
+            return UNKNOWN_DEG
+        noise = _CHANCE * np.sqrt(batch.white)
+        found = 0.0
+        for low, high, faded in filter(None, (self._before, self._after)):
+            excursion = np.maximum(np.abs(self._turn(low - batch.mean)), np.abs(self._turn(high - batch.mean)))
+            found = max(found, float((excursion - noise).max()) * faded)
+        return found
+
+    def _turn(self, difference: Floats) -> Floats:
+        return np.asarray(np.mod(difference + 180.0, 360.0) - 180.0) if self._circle else difference

@@ -1,0 +1,1 @@
+"""From the configuration to the devices and models that daemon and replay work with."""

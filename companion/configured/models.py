@@ -1,0 +1,246 @@
+"""From the configuration to the models that the lower rooms work with."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from typing import Final, Literal
+
+from companion.autopilot.telemetry.imu_stream import StreamKind
+from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.calibration.collector.rolling import ImuInput, Settings
+from companion.calibration.noise.allan import noise_profile
+from companion.calibration.solution.record import AlignmentUsed
+from companion.calibration.solution.site import Whereabouts
+from companion.calibration.solution.solve import CompassModel, GradienterModel
+from companion.calibration.stillness.settling import AT_ONCE, Lag
+from companion.config import Compass, Config, Gradienter, Imu, Noise
+from companion.config.sections import GradienterProtocol
+from companion.physics.frames import rotation_matrix
+from companion.physics.units import DEG_H, MG
+from companion.protocols.registry import PROTOCOLS
+from companion.storage.profiles import ProfileStore
+
+IMU_RATE_HZ: Final = 100.0
+"""Asked of the autopilot for each IMU where the connection does not limit it; its own filters pass 20 Hz."""
+LEAST_IMU_RATE_HZ: Final = 10.0
+LINE_SHARE: Final = 0.5
+BITS_PER_BYTE: Final = 10.0
+"""8N1: a start bit, eight bits of data, a stop bit."""
+HIGHRES_BYTES: Final = 75.0
+"""HIGHRES_IMU in MAVLink 2: 63 bytes and 12 around them."""
+VISION_BYTES: Final = 129.0
+"""VISION_POSITION_ESTIMATE likewise: 117 and 12."""
+SCALED_BYTES: Final = 36.0
+"""SCALED_IMU2 or 3 likewise: 24 and 12."""
+
+TILT_SIGMA_DEG: Final = 0.05
+"""Of a gradienter whose protocol names no device that is known to be worse: cell and mounting."""
+TILT_BY_THE_WAY_SIGMA_DEG: Final = 0.65
+"""Of the tilt that a compass or an IMU tells as well, where no document gives a figure: the HMR3300's."""
+HEADING_SIGMA_DEG: Final = 3.0
+"""Of a compass likewise: the aircraft's own iron and currents."""
+
+
+def settings(config: Config) -> Settings:
+    """How long and how good."""
+    wanted = config.calibration
+    return Settings(
+        min_still_s=wanted.min_still_s,
+        max_s=wanted.max_s,
+        target_gyro_sigma_rad_s=wanted.target_gyro_sigma_deg_h * DEG_H,
+        target_accel_sigma_m_s2=wanted.target_accel_sigma_mg * MG,
+        dither=config.push.dither and config.push.parameters,
+    )
+
+
+def profile_in_words(profile: str | Noise | None) -> str:
+    """Whose noise figures an IMU's sigmas are made of."""
+    if isinstance(profile, Noise):
+        return f"{profile.name}, {profile.origin}"
+    return "none: sigmas are those of the worst common parts" if profile is None else f"{profile}, of the catalogue"
+
+
+def profiles(config: Config) -> list[dict[str, object]]:
+    """Whose noise figures the sigmas of each IMU are made of, for `companion status`."""
+    store = ProfileStore(config.storage.path)
+    found: list[dict[str, object]] = []
+    for imu in config.imu:
+        fitted = isinstance(imu.profile, Noise)
+        name = imu.profile.name if isinstance(imu.profile, Noise) else imu.profile
+        found.append(
+            {
+                "imu": imu.name,
+                "name": name,
+                "fitted": fitted,
+                "file": str(store.path(imu.profile.name)) if isinstance(imu.profile, Noise) else None,
+                "summary": profile_in_words(imu.profile),
+            }
+        )
+    return found
+
+
+def imu_rate_hz(config: Config) -> float:
+    """How often each autopilot IMU may send without filling a serial line: half of it stays free for everything else.
+
+    An autopilot whose line is full drops what does not fit, and answers late (57600 baud: 38 Hz for one IMU).
+    """
+    kind, _, rest = config.mavlink.url.partition(":")
+    if kind != "serial":
+        return IMU_RATE_HZ
+    bytes_per_s = int(rest.rpartition(":")[2]) / BITS_PER_BYTE
+    instances = [imu.instance or 1 for imu in config.imu if imu.source == "autopilot"]
+    each_time = sum(HIGHRES_BYTES if instance == 1 else SCALED_BYTES for instance in instances)
+    if not each_time:
+        return IMU_RATE_HZ
+    return max(LEAST_IMU_RATE_HZ, min(IMU_RATE_HZ, LINE_SHARE * bytes_per_s / each_time))
+
+
+def attitude_rate_hz(config: Config) -> float:
+    """How often the attitude may be sent without filling a serial line (57600 baud: 22 Hz)."""
+    wanted = config.push.attitude_rate_hz
+    kind, _, rest = config.mavlink.url.partition(":")
+    if kind != "serial":
+        return wanted
+    return min(wanted, LINE_SHARE * int(rest.rpartition(":")[2]) / BITS_PER_BYTE / VISION_BYTES)
+
+
+def cannot_work(config: Config) -> list[str]:
+    """What the configuration asks for and cannot come about: said at start, never silently ignored."""
+    found = []
+    if config.push.attitude != "off" and config.compass is None:
+        found.append(f'push.attitude = "{config.push.attitude}" needs [compass]: without one no heading is known')
+    return found
+
+
+def doubtful(config: Config) -> list[str]:
+    """What in the configuration is taken as it stands, and is probably not meant."""
+    return [*_unused_key(config), *_other_law(config)]
+
+
+def _unused_key(config: Config) -> list[str]:
+    if config.mavlink.signing_mode != "off" or config.mavlink.signing_key_file is None:
+        return []
+    return ['mavlink.signing_key_file is named, but signing = "off": nothing is signed or checked']
+
+
+def _other_law(config: Config) -> list[str]:
+    gradienter = config.gradienter
+    if gradienter is None:
+        return []
+    law = PROTOCOLS["gradienter"][gradienter.protocol].law
+    if law is None or law == gradienter.law:
+        return []
+    return [
+        f'gradienter.law: found "{gradienter.law}"; protocol "{gradienter.protocol}" gives "{law}" angles: say that'
+    ]
+
+
+def imu_input(imu: Imu, kind: StreamKind | None, grid: tuple[float, float] = (0.0, 0.0)) -> ImuInput:
+    """One IMU as the collector takes it; an autopilot's telemetry is in the vehicle's axes already.
+
+    Args:
+        imu: its configuration.
+        kind: of an autopilot's telemetry.
+        grid: the sensor's own steps behind that, rad/s and m/s^2, where they are known to be coarse.
+    """
+    integers = kind is not None and kind.truncates
+    return ImuInput(
+        name=imu.name,
+        rotation=rotation_matrix(imu.mounting if imu.source == "serial" else "ROTATION_NONE"),
+        profile=noise_profile(imu.profile),
+        gyro_step_rad_s=kind.gyro_step_rad_s if kind else 0.0,
+        accel_step_m_s2=kind.accel_step_m_s2 if kind else 0.0,
+        truncates=integers,
+        gyro_grid_rad_s=grid[0] if integers else 0.0,
+        accel_grid_m_s2=grid[1] if integers else 0.0,
+    )
+
+
+def gradienter_model(gradienter: Gradienter | None) -> GradienterModel | None:
+    """How the gradienter's readings become the direction of up."""
+    if gradienter is None:
+        return None
+    return GradienterModel(
+        law=gradienter.law,
+        vehicle_from_sensor=rotation_matrix(gradienter.mounting),
+        offset_deg=gradienter.offset_deg,
+        sigma_deg=gradienter.sigma_deg or tilt_sigma_deg(gradienter.protocol),
+    )
+
+
+def tilt_sigma_deg(protocol: GradienterProtocol) -> float:
+    """How well the tilt of a device with this protocol is known where nobody says better."""
+    known = PROTOCOLS["gradienter"][protocol].sigma_deg
+    by_the_way = protocol in PROTOCOLS["compass"] or protocol in PROTOCOLS["imu"]
+    return known or (TILT_BY_THE_WAY_SIGMA_DEG if by_the_way else TILT_SIGMA_DEG)
+
+
+def compass_model(compass: Compass | None) -> CompassModel | None:
+    """How the compass' readings become a true heading."""
+    if compass is None:
+        return None
+    info = PROTOCOLS["compass"][compass.protocol]
+    said_deg = compass.sigma_deg
+    return CompassModel(
+        magnetic=compass.reference == "magnetic",
+        vehicle_from_sensor=rotation_matrix(compass.mounting),
+        offset_deg=compass.offset_deg,
+        sigma_deg=said_deg or info.sigma_deg or HEADING_SIGMA_DEG,
+        tilted_sigma_deg=info.tilted_sigma_deg if said_deg is None else None,
+        counts_per_gauss=compass.counts_per_gauss,
+        prefers_field=compass.heading == "field",
+    )
+
+
+def lag(kind: Literal["gradienter", "compass"], device: Gradienter | Compass | None) -> Lag:
+    """How a pose sensor follows the truth: as configured, else as its protocol's device does."""
+    model = gradienter_model(device) if isinstance(device, Gradienter) else compass_model(device)
+    if device is None or model is None:
+        return AT_ONCE
+    lag_s = PROTOCOLS[kind][device.protocol].lag_s if device.lag_s is None else device.lag_s
+    return Lag(lag_s, model.sigma_deg)
+
+
+def field_by(config: Config) -> tuple[CompassModel, GradienterModel | None] | None:
+    """How a heading comes of the compass' field vector, if there is a compass."""
+    compass = compass_model(config.compass)
+    return None if compass is None else (compass, gradienter_model(config.gradienter))
+
+
+def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:
+    """Place and date: the configuration's where it says so, else the autopilot's.
+
+    The date is the autopilot's (from its GNSS), else the host's; it only picks the year of the magnetic model.
+    """
+    if vehicle.unix_time_s is not None:
+        date = datetime.datetime.fromtimestamp(vehicle.unix_time_s, tz=datetime.UTC).date()
+    else:
+        date = datetime.datetime.now(tz=datetime.UTC).date()
+    place, position = config.vehicle, vehicle.position
+    if place.latitude_deg is not None:
+        height_m, source = place.height_m, "configuration"
+        if height_m is None and position is not None:
+            height_m, source = position.height_m, f"configuration; height: {position.source}"
+        return Whereabouts(place.latitude_deg, place.longitude_deg, height_m, source, date)
+    if position is not None:
+        height_m = position.height_m if place.height_m is None else place.height_m
+        source = position.source if place.height_m is None else f"{position.source}; height: configuration"
+        return Whereabouts(position.latitude_deg, position.longitude_deg, height_m, source, date)
+    return Whereabouts(height_m=place.height_m, source=None, date=date)
+
+
+def place_doubt(config: Config, vehicle: Vehicle) -> str | None:
+    """What a calibration waits for: the autopilot contradicts itself about what the configuration leaves open."""
+    place = config.vehicle
+    return None if place.latitude_deg is not None and place.height_m is not None else vehicle.place.doubt
+
+
+def aligned(model: GradienterModel | None, used: AlignmentUsed | None) -> GradienterModel | None:
+    """The configured model with the measured zero on top, and its sigma in the place of the configured one."""
+    if model is None or used is None:
+        return model
+    x_deg, y_deg = model.offset_deg
+    return dataclasses.replace(
+        model, offset_deg=(x_deg + used.offset_deg[0], y_deg + used.offset_deg[1]), sigma_deg=used.sigma_deg
+    )

@@ -1,0 +1,1 @@
+"""What is in force, whether it may arm, and what happens at arming."""

@@ -1,0 +1,448 @@
+"""What calibration is in force in each IMU, since when, and what speaks against it.
+
+Three things are watched: the calibrations that end, the offsets that the autopilot says it has, and what the rolling
+window says of the present output. Offsets that change while nobody here writes were changed by somebody else, or by
+a boot that measured the gyros itself (INS_GYR_CAL = 1, autopilots 1.5).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.noise.allan import noise_profile
+from companion.calibration.request import What
+from companion.calibration.solution.doubt import Doubt
+from companion.calibration.solution.record import ImuRecord, Record
+from companion.calibration.solution.solve import GradienterModel, Solution, solve_at
+from companion.calibration.solution.validity import (
+    Axes,
+    Finding,
+    Held,
+    Limits,
+    Present,
+    Triad,
+    Why,
+    judge,
+    worst_axis,
+    worth_writing,
+)
+from companion.component.service import JobResult
+from companion.config import Config, Imu
+from companion.configured import models
+from companion.daemon import offload as estimating
+from companion.daemon.calibrating.held_back import HeldBack, Key
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.job import ALIGNMENT, Job
+from companion.daemon.offload import Offload
+from companion.errors import CalibrationRefusedError
+
+logger = logging.getLogger(__name__)
+
+_ZERO: Final[Axes] = (0.0, 0.0, 0.0)
+# Causes that a measurement settles. What the pilot undid and what somebody else chose is theirs until asked for, and
+# what a boot replaced is pushed again.
+_SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED})
+SETTLED_EVERY_S: Final = 5
+"""So often the output is looked at while nothing speaks against what is in force; else every second."""
+
+
+class _Known(msgspec.Struct, frozen=True):
+    """The offsets that the autopilot had when they were looked at last."""
+
+    gyro: Axes
+    accel: Axes
+    boots: int
+
+
+class InForce:
+    """The calibration in force; `poll` often, `measure` whenever there may be a new window.
+
+    Args:
+        config: which IMUs, which limits.
+        vehicle: whether it restarted.
+        collector: gives the rolling window.
+        imus: the autopilot's IMUs by name.
+        offload: for the arithmetic, which would hold up an answer at arming.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        vehicle: Vehicle,
+        collector: RollingCollector,
+        imus: Mapping[str, AutopilotImu],
+        offload: Offload,
+    ) -> None:
+        self._config, self._vehicle, self._collector = config, vehicle, collector
+        self._imus, self._offload = imus, offload
+        self.gradienter: Callable[[], GradienterModel | None] = lambda: models.gradienter_model(config.gradienter)
+        """The gradienter's model as it is in force."""
+        wanted = config.calibration
+        self._limits = Limits(
+            max_age_s=60.0 * wanted.max_age_min, max_temperature_change_k=wanted.max_temperature_change_degc
+        )
+        settings = models.settings(config)
+        self._floors: dict[Triad, float] = {
+            "gyro": settings.target_gyro_sigma_rad_s,
+            "accel": settings.target_accel_sigma_m_s2,
+        }
+        self._sources = {imu.name: imu for imu in _judged(config)}
+        triads: tuple[Triad, ...] = ("gyro", "accel") if config.gradienter is not None else ("gyro",)
+        self._held: dict[Key, Held | Why] = {(name, triad): Why.NEVER for name in self._sources for triad in triads}
+        self._left_out: set[Key] = set()
+        """What no calibration can settle, and is not judged."""
+        self._shelved: dict[Key, Held] = {}
+        """What was in force before a restart that kept the offsets: it counts again once a window agrees."""
+        self._held_back = HeldBack()
+        self._present: dict[Key, Present] = {}
+        self._temperatures: dict[str, float] = {}
+        self._measured_s = self._looked_s = -1.0
+        self._worth_since_s: float | None = None
+        self._known: dict[str, _Known] = {}
+        self._before: dict[str, _Known] = {}
+        self._failed = False
+        self._written: dict[str, dict[str, float]] = {}
+        """By IMU: what a calibration has just left there, until that is looked at."""
+        self._asked_restart = False
+        self.foreign: str | None = None
+        """What somebody else has changed since the last request, in few words."""
+        self.calibration: Record | None = None
+        """The last finished calibration of this run, while at least one of its values is in force."""
+        self.undone = False
+
+    # --- what is known
+
+    @property
+    def what(self) -> What:
+        """What a calibration by itself determines."""
+        return What.BOTH if self._config.gradienter is not None else What.GYROS
+
+    def findings(self, now_s: float) -> list[Finding]:
+        """Everything that speaks against what is in force; empty while it is good. Computes little."""
+        found: list[Finding] = []
+        for (name, triad), held in self._held.items():
+            if isinstance(held, Why):
+                if not any(finding.why is held for finding in found):
+                    found += self._held_back.left_of((name, triad), [Finding(held, held.value)])
+                continue
+            profile = noise_profile(self._sources[name].profile)
+            against = judge(
+                triad,
+                name,
+                held,
+                profile.gyro if triad == "gyro" else profile.accel,
+                self._limits,
+                now_s=now_s,
+                temperature_degc=self._temperatures.get(name),
+                present=self._present.get((name, triad)),
+            )
+            found += self._held_back.left_of((name, triad), against)
+        return found
+
+    @property
+    def held_back(self) -> str | None:
+        """What was measured and not written, and why, in one short line; None when nothing was."""
+        return self._held_back.words
+
+    @property
+    def worth_writing_s(self) -> float:
+        """For how many seconds in a row the window has said that better offsets are to be had than those in force.
+
+        One look in a hundred says so by chance, and there is one every second.
+        """
+        return 0.0 if self._worth_since_s is None else self._measured_s - self._worth_since_s
+
+    @property
+    def measured(self) -> bool:
+        """Whether a still window is there now."""
+        return bool(self._present)
+
+    @property
+    def calibrated_s(self) -> float | None:
+        """When the oldest part of what is in force was calibrated; None where it was only measured to be right."""
+        times = [held.calibrated_s for held in self._held.values() if isinstance(held, Held)]
+        known = [time_s for time_s in times if time_s is not None]
+        return min(known) if times and len(known) == len(times) else None
+
+    @property
+    def confirmed_s(self) -> float | None:
+        """When everything in force was last seen to be right; None while something was never."""
+        times = [held.confirmed_s if isinstance(held, Held) else None for held in self._held.values()]
+        known = [time_s for time_s in times if time_s is not None]
+        return min(known) if known and len(known) == len(times) else None
+
+    def sigma(self, triad: Triad) -> float | None:
+        """The largest sigma_use of what is in force, rad/s or m/s^2; None where nothing is."""
+        sigmas = [max(held.sigma_use) for (_, of), held in self._held.items() if of == triad and isinstance(held, Held)]
+        return max(sigmas, default=None)
+
+    def record_of(self, name: str) -> ImuRecord | None:
+        """What the last calibration found in one IMU; None when nothing did, or something has replaced it."""
+        keys: list[Key] = [(name, "gyro"), (name, "accel")]
+        if self.calibration is None or any(
+            isinstance(self._held.get(key), Why) or key in self._held_back for key in keys
+        ):
+            return None
+        return next((imu for imu in self.calibration.imus if imu.name == name), None)
+
+    def temperature_degc(self, name: str) -> float | None:
+        """The temperature of an IMU when its output was last looked at; None where it tells none."""
+        return self._temperatures.get(name)
+
+    def reading(self) -> str | None:
+        """An autopilot IMU whose offsets are not known at this moment, and why, in one line."""
+        for name, imu in self._imus.items():
+            if imu.stream.problem or imu.calibration is None:
+                return f"imu {name}: {imu.stream.problem or imu.problem}"
+        return None
+
+    # --- what happens
+
+    def on_ended(self, job: Job, result: JobResult) -> None:
+        """A calibration or an undo has come to its end: what the autopilot has now is of our doing."""
+        self._let_go()
+        self._written = {}
+        done = result.outcome == "done"
+        self._failed = not done
+        if job.kind == "undo":
+            if done:
+                self.undone, self.calibration = True, None
+                self._held_back.let_go()
+                self._held = dict.fromkeys(self._held, Why.UNDONE)
+            return
+        if not job.automatic and job.kind != ALIGNMENT:
+            self.foreign = None
+        if done and job.record is not None:
+            self.undone = False
+            self.calibration = job.record
+            self._asked_restart = job.reboot
+            for imu in job.record.imus:
+                if imu.name in self._sources:
+                    self._take(imu, asyncio.get_running_loop().time(), job.held_back)
+                    self._written[imu.name] = {name: one.after for name, one in imu.written.items()}
+
+    def realigned(self) -> None:
+        """The gradienter has another zero from now on: accelerometers calibrated with the old one must be seen anew."""
+        for key, held in self._held.items():
+            if key[1] == "accel" and isinstance(held, Held):
+                self._held[key] = Why.ALIGNED
+        self._held_back.let_go(triad="accel")
+        self._forget()
+
+    def _take(self, imu: ImuRecord, now_s: float, held_back: Mapping[Key, Doubt]) -> None:
+        """Hold what a calibration has found in one IMU, save what it has not written for doubt."""
+        corrected = imu.name in self._imus
+        for triad, sigma, bias in (
+            ("gyro", imu.gyro_sigma_use_rad_s, imu.gyro_bias_rad_s),
+            ("accel", imu.accel_sigma_use_m_s2, imu.accel_bias_m_s2),
+        ):
+            key: Key = (imu.name, "gyro" if triad == "gyro" else "accel")
+            if key not in self._held or sigma is None or bias is None:
+                continue
+            mark = "GYR" if triad == "gyro" else "ACC"
+            outcomes = {one.outcome for name, one in imu.written.items() if mark in name}
+            found = Held(
+                calibrated_s=now_s,
+                confirmed_s=now_s,
+                temperature_degc=imu.temperature_degc,
+                sigma_use=sigma,
+                expected=_ZERO if corrected else bias,
+                # Of an IMU that is not in the autopilot's telemetry "stored" is all that can ever be known.
+                seen=outcomes <= {"verified"} or not corrected,
+                averaged_s=self._config.calibration.min_still_s,
+            )
+            doubt = held_back.get(key)
+            if doubt is None:
+                self._held[key] = found
+                self._held_back.let_go(name=imu.name, triad=triad)
+                continue
+            residual = imu.residual_gyro_rad_s if triad == "gyro" else imu.residual_accel_m_s2
+            seen = msgspec.structs.replace(found, expected=residual if corrected and residual is not None else bias)
+            self._held_back.hold(key, doubt, seen)
+
+    def poll(self, *, writing: bool) -> None:
+        """Compare the autopilot's offsets with those that were there before.
+
+        Args:
+            writing: whether we may be changing them ourselves just now.
+        """
+        if writing:
+            self._let_go()
+            return
+        for name, imu in self._imus.items():
+            calibration = imu.calibration
+            if calibration is None:
+                continue
+            now = _Known(calibration.gyro_offset_rad_s, calibration.accel_offset_m_s2, self._vehicle.boots)
+            known = self._known.get(name)
+            self._known[name] = now
+            if known is None:
+                self._look_after_job(name, self._before.pop(name, now), now, calibration)
+            elif known.boots != now.boots:
+                replaced = (known.gyro, known.accel) != (now.gyro, now.accel)
+                self._lose(name, Why.REPLACED if replaced else Why.REBOOTED)
+            elif known != now:
+                self._changed_by_others(name)
+
+    def _look_after_job(self, name: str, before: _Known, now: _Known, calibration: ImuCalibration) -> None:
+        """What a job has left is compared with what there is: between the two the EKF may have settled for minutes."""
+        written = self._written.pop(name, {})
+        restarted = before.boots != now.boots and not self._asked_restart
+        if self._failed and (before.gyro, before.accel) != (now.gyro, now.accel):
+            # What was ours has been put back by now; what a restart has not replaced is somebody else's.
+            if before.boots == now.boots:
+                self._changed_by_others(name)
+            else:
+                self._lose(name, Why.FAILED)
+        elif written and calibration.contradicts(written):
+            if restarted:
+                self._lose(name, Why.REPLACED)
+            else:
+                self._changed_by_others(name)
+        elif restarted:
+            self._lose(name, Why.REBOOTED)
+
+    def _changed_by_others(self, name: str) -> None:
+        self.foreign = f"{name} was changed"
+        logger.warning("imu %s: somebody else changed its offsets; they are left alone", name)
+        self._lose(name, Why.CHANGED)
+
+    def _let_go(self) -> None:
+        """What the autopilot has from now on is our own doing, until it is looked at again."""
+        self._before, self._known = dict(self._known) or self._before, {}
+        self._forget()
+
+    def _lose(self, name: str, why: Why) -> None:
+        if why is not Why.REBOOTED:  # which has kept them
+            self._held_back.let_go(name=name)
+        for triad in ("gyro", "accel"):
+            key: Key = (name, "gyro" if triad == "gyro" else "accel")
+            held = self._held.get(key)
+            # What was never there, or was taken back on purpose, is not lost again by a restart.
+            if held is not None and (isinstance(held, Held) or why in (Why.CHANGED, Why.FAILED)):
+                if isinstance(held, Held) and why is Why.REBOOTED:
+                    self._shelved[key] = held
+                self._held[key] = why
+                self._present.pop(key, None)
+
+    def _forget(self) -> None:
+        """There is no window now."""
+        self._present.clear()
+        self._worth_since_s = None
+
+    async def measure(self, now_s: float) -> bool:
+        """Look at the present output when it is time to and the aircraft stands still; whether it was."""
+        second = math.floor(now_s)  # the collector's seconds end with the clock's
+        settled = not self.findings(now_s) and self._worth_since_s is None
+        if second == self._looked_s or (settled and self._present and second - self._looked_s < SETTLED_EVERY_S):
+            return False
+        self._looked_s = second
+        try:
+            window = await estimating.window(self._collector, self._offload) if self.reading() is None else None
+        except CalibrationRefusedError:
+            window = None
+        if window is None:
+            self._forget()
+            return True
+        if window.end_s == self._measured_s:
+            return False
+        self._measured_s = window.end_s
+        known = dict(self._known)
+        try:
+            solution: Solution = await self._offload(
+                solve_at,
+                window,
+                models.whereabouts(self._config, self._vehicle),
+                self.gradienter(),
+                models.compass_model(self._config.compass),
+                self.what,
+            )
+        except CalibrationRefusedError:
+            self._forget()
+            return True
+        if known == self._known:  # else the offsets have changed while it was worked out
+            self._note(solution, window.end_s, window.end_s - window.start_s)
+        return True
+
+    def _note(self, solution: Solution, end_s: float, averaged_s: float) -> None:
+        worth = False
+        for imu in solution.imus:
+            if imu.temperature_degc is not None:
+                self._temperatures[imu.name] = imu.temperature_degc
+            for triad, residual, sigma in (
+                ("gyro", imu.gyro_rad_s, imu.gyro_sigma_use_rad_s),
+                ("accel", imu.accel_m_s2, imu.accel_sigma_use_m_s2),
+            ):
+                key: Key = (imu.name, "gyro" if triad == "gyro" else "accel")
+                if f"{triad} {imu.name}" in solution.unknown:
+                    self._leave_out(key)
+                    continue
+                if residual is not None and key in self._left_out:
+                    self._left_out.discard(key)
+                    self._held[key] = Why.NEVER
+                if residual is None or key not in self._held:
+                    continue
+                present = Present(residual=_axes(residual), sigma_use=_axes(sigma))
+                self._present[key] = present
+                self._confirm(key, present, imu.temperature_degc, end_s, averaged_s)
+                held = self._held[key]
+                if self._held_back.still(key, held, present, end_s, self._limits.max_age_s):
+                    continue
+                worth |= worth_writing(present, held if isinstance(held, Held) else None, self._floors[key[1]])
+        if not worth:
+            self._worth_since_s = None
+        elif self._worth_since_s is None:
+            self._worth_since_s = end_s
+
+    def _leave_out(self, key: Key) -> None:
+        """Integer readings that tell nothing, and may not be dithered: no calibration could ever settle them."""
+        self._present.pop(key, None)
+        if not self._config.push.dither and self._held.get(key) is Why.NEVER and len(self._held) > 1:
+            logger.warning("%s %s cannot be known from its integer readings and is not judged", key[1], key[0])
+            del self._held[key]
+            self._left_out.add(key)
+
+    def _confirm(
+        self, key: Key, present: Present, temperature_degc: float | None, end_s: float, averaged_s: float
+    ) -> None:
+        """What the window agrees with counts as right from now on."""
+        held = self._held[key]
+        if held is Why.REBOOTED:
+            held = self._shelved.get(key, held)
+        if isinstance(held, Why):
+            right = key[0] in self._imus and not worth_writing(present, None, self._floors[key[1]])
+            if right and held in _SETTLED_BY_MEASURING:
+                self._held[key] = Held(
+                    calibrated_s=None,
+                    confirmed_s=end_s,
+                    temperature_degc=temperature_degc,
+                    sigma_use=present.sigma_use,
+                    expected=_ZERO,
+                    seen=True,
+                    averaged_s=averaged_s,
+                )
+        elif worst_axis(held, present) is None and end_s > held.confirmed_s:
+            self._held[key] = msgspec.structs.replace(
+                held, confirmed_s=end_s, temperature_degc=temperature_degc, seen=True
+            )
+
+
+def _judged(config: Config) -> list[Imu]:
+    """The IMUs that the autopilot flies with; where it has none of them, all."""
+    flown = [imu for imu in config.imu if imu.source == "autopilot" or imu.autopilot_instance is not None]
+    return flown or list(config.imu)
+
+
+def _axes(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Axes:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

@@ -1,0 +1,223 @@
+"""May it arm? The answer is always ready: worked out several times a second, given in microseconds.
+
+PX4 waits for it with its commander thread stopped (autopilots 5.2), so that nothing may be computed, read or awaited
+once the question is there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Callable
+from typing import Final, Literal
+
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.solution.validity import Why
+from companion.component.service import ArmAnswer
+from companion.config import AtArm
+from companion.daemon.arming.forecast import Forecast
+from companion.daemon.arming.in_force import InForce
+from companion.daemon.calibrating.conductor import Conductor
+from companion.daemon.calibrating.course import Stage
+from companion.daemon.offsets.mend import Mender
+from companion.physics.units import DEG_H, MG
+
+logger = logging.getLogger(__name__)
+
+POLL_S: Final = 0.25
+STEADY_S: Final = 2.0
+"""So long it must have been still when somebody arms: whoever arms has just let go of it."""
+OLDEST_ANSWER_S: Final = 1.5
+"""An answer that was not renewed for so long (the loop stood still) is none."""
+
+_IN_THE_MIDDLE: Final[dict[Stage, str]] = {
+    "dithering": "offsets are being dithered",
+    "writing": "in the middle of writing new offsets",
+    "checking": "new offsets written, not checked yet",
+    "restarting": "autopilot is being restarted",
+    "settling": "new offsets, EKF still settling",
+    "putting back": "old offsets are being put back",
+}
+
+
+class Readiness:
+    """The arm gate's answer, and what goes with it: `run` keeps it fresh.
+
+    Args:
+        vehicle: armed or not, which autopilot.
+        collector: whether it stands still.
+        conductor: what runs, and what is set for arming.
+        mender: whether something has to be put in order first.
+        in_force: what is in force, and what speaks against it.
+    """
+
+    def __init__(
+        self, vehicle: Vehicle, collector: RollingCollector, conductor: Conductor, mender: Mender, in_force: InForce
+    ) -> None:
+        self._vehicle, self._collector, self._conductor = vehicle, collector, conductor
+        self._mender, self.in_force = mender, in_force
+        self._forecast = Forecast(vehicle, collector, conductor)
+        self.why_not_by_itself: Callable[[], str | None] = lambda: "calibrate first"
+        """Why no calibration will start by itself, and what to do, or None when one will."""
+        self.reboot_owed: Callable[[], str | None] = lambda: None
+        """Why the autopilot must be restarted first although its offsets are right; None when it need not."""
+        self._answer = ArmAnswer("wait", "companion is starting")
+        self._answered_s = -math.inf
+        self._has_gated = False
+        self._woken = asyncio.Event()
+        self.on_beat: Callable[[], None] = lambda: None
+        """Called after every look that came to its end."""
+
+    @property
+    def at_arm(self) -> AtArm:
+        """What is to happen at arming; may change at the flight line."""
+        return self._conductor.at_arm
+
+    @property
+    def asks_script(self) -> bool:
+        """Whether ArduPilot's script has to be told: while this gates, and to let go when it does no longer."""
+        self._has_gated |= self.at_arm == "gate"
+        return self._has_gated and self._vehicle.firmware == "ardupilot"
+
+    def answer(self) -> ArmAnswer:
+        """The answer as of the last fraction of a second; what can change at once is looked at again."""
+        if asyncio.get_running_loop().time() - self._answered_s > OLDEST_ANSWER_S:
+            return ArmAnswer("wait", "companion is busy: try again")
+        if self._conductor.is_writing and self._answer.verdict == "accept":
+            return ArmAnswer("wait", "writing new offsets: wait")
+        return self._answer
+
+    async def run(self) -> None:
+        """Keep the answer fresh until cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                self.look()
+                await asyncio.sleep(0)  # a question that has come meanwhile is answered in between
+                # What a write under way makes of the output says nothing about what will be in force after it.
+                if not self._writing and await self.in_force.measure(loop.time()):
+                    self.look()
+                self.on_beat()
+            except Exception:
+                # Without a renewed answer the gate closes by itself.
+                logger.exception("looking whether it may arm failed")
+            await asyncio.sleep(POLL_S)
+
+    def look(self) -> None:
+        """Work out the answer anew."""
+        now_s = asyncio.get_running_loop().time()
+        self.in_force.poll(writing=self._writing)
+        if self.at_arm == "gate":
+            self._answer = self._judge(now_s)
+        else:
+            # Nothing is held back; what is said is the state that it would arm in.
+            state, words = self.state(now_s)
+            self._answer = ArmAnswer("wait" if state == "uncalibrated" else "accept", words)
+        self._answered_s = now_s
+
+    @property
+    def _writing(self) -> bool:
+        """Whether a job that may write runs, or one that was interrupted is being put in order."""
+        job = self._conductor.job
+        return (job is not None and not job.finished.done()) or self._mender.pending
+
+    def _judge(self, now_s: float) -> ArmAnswer:
+        if self._mender.fault is not None:
+            return ArmAnswer("refuse", self._mender.fault)
+        if (conflict := self._vehicle.conflict) is not None:
+            return ArmAnswer("refuse", conflict)
+        if self._vehicle.arm_state is ArmState.UNKNOWN:
+            return ArmAnswer("wait", "no heartbeat from the autopilot")
+        if self._mender.pending:
+            return ArmAnswer("wait", "old offsets are being put back: wait")
+        if not self._conductor.push_parameters:
+            return ArmAnswer("refuse", "writing is off (CMP_PUSH): no gate")
+        glance = self._collector.glance(now_s)
+        if self._conductor.is_writing:
+            return ArmAnswer("wait", self._forecast.words(now_s))
+        if glance.obstacle is not None and not glance.moving:
+            return ArmAnswer("refuse", glance.obstacle)
+        if (reading := self.in_force.reading()) is not None:
+            return ArmAnswer("wait", f"reading {reading}")
+        findings = self.in_force.findings(now_s)
+        if all(finding.why is Why.REBOOTED for finding in findings) and findings and not self.in_force.measured:
+            left_s = max(1.0, self._conductor.settings.min_still_s + 1.0 - glance.still_s)
+            return ArmAnswer("wait", f"hold still {left_s:.0f} s: checking after restart")
+        if findings:
+            why_not = self.why_not_by_itself()
+            if why_not is None:
+                return ArmAnswer("wait", f"hold still {self.until_calibrated_s(now_s):.0f} s")
+            return ArmAnswer("refuse", f"{findings[0].words}: {why_not}")
+        if (owed := self.reboot_owed()) is not None:
+            return ArmAnswer("refuse", owed)
+        if glance.moving or glance.steady_s < STEADY_S:
+            return ArmAnswer("wait", f"hold still {max(1.0, STEADY_S - glance.steady_s):.0f} s")
+        return ArmAnswer("accept", self.in_words(now_s))
+
+    def until_calibrated_s(self, now_s: float) -> float:
+        """Seconds of holding still until a calibration by itself would be in force."""
+        status = self._collector.status(now_s)
+        if status.enough:
+            return math.ceil(self._forecast.whole_s)
+        # Before anything is known of the noise this is the longest there is: waiting may only get shorter.
+        whole_s = status.still_s / status.progress if status.progress > 0.0 else self._conductor.settings.max_s
+        return max(1.0, math.ceil(whole_s - status.still_s)) + math.ceil(self._forecast.whole_s)
+
+    # --- in words, for arming, status and history
+
+    def state(self, now_s: float) -> tuple[Literal["calibrated", "checked", "uncalibrated"], str]:
+        """In which state it would arm now, in a word and in one short line."""
+        state, words = self._state(now_s)
+        held_back = self.in_force.held_back
+        if held_back is None or self._conductor.stage is not None:
+            return state, words
+        return state, f"{words}; {held_back}; calibrate to write it" if words else f"{held_back}; calibrate to write it"
+
+    def _state(self, now_s: float) -> tuple[Literal["calibrated", "checked", "uncalibrated"], str]:
+        stage = self._conductor.stage
+        if stage is not None:
+            return "uncalibrated", _IN_THE_MIDDLE[stage]
+        if (reading := self.in_force.reading()) is not None:
+            return "uncalibrated", reading
+        findings = self.in_force.findings(now_s)
+        if findings:
+            return "uncalibrated", findings[0].words
+        sigmas = ", ".join(self._sigmas())
+        calibrated_s, confirmed_s = self.in_force.calibrated_s, self.in_force.confirmed_s
+        if calibrated_s is not None:
+            return "calibrated", f"calibrated {_ago(now_s - calibrated_s)} ago, {sigmas}"
+        if confirmed_s is not None:
+            return "checked", f"offsets checked {_ago(now_s - confirmed_s)} ago, {sigmas}"
+        return "uncalibrated", "not calibrated yet" if self.in_force.held_back is None else ""
+
+    def in_words(self, now_s: float) -> str:
+        """The state in one short line."""
+        return self.state(now_s)[1]
+
+    def _sigmas(self) -> list[str]:
+        gyro, accel = self.in_force.sigma("gyro"), self.in_force.sigma("accel")
+        return [
+            *([f"{gyro / DEG_H:.1f} deg/h"] if gyro is not None else []),
+            *([f"{accel / MG:.2f} mg"] if accel is not None else []),
+        ]
+
+    def status(self) -> dict[str, object]:
+        """For `companion status`."""
+        now_s = asyncio.get_running_loop().time()
+        state, words = self.state(now_s)
+        answer = self.answer()
+        return {
+            "at_arm": self.at_arm,
+            "verdict": answer.verdict,
+            "words": answer.words,
+            "state": state,
+            "in_force": words,
+            "held_back": self.in_force.held_back,
+            "against": [finding.words for finding in self.in_force.findings(now_s)],
+        }
+
+
+def _ago(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 99.5 else f"{seconds / 60:.0f} min"

@@ -1,0 +1,1 @@
+"""One calibration or alignment from request to record."""

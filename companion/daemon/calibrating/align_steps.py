@@ -1,0 +1,132 @@
+"""Which stands an alignment asks for, and whether the way the aircraft stands is the one asked for.
+
+Pure: what the next stand should be, in words, from the stands so far.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from companion.calibration.alignment.align_record import Kind
+from companion.physics.frames import Array
+from companion.physics.units import DEG
+
+TURN_TOLERANCE_DEG: Final = 30.0
+QUARTER_DEG: Final = 90.0
+LEAST_TILT_DEG: Final = 15.0
+"""A tilt tells scale and misalignment from bias by what a cosine loses: little, below this."""
+APART_DEG: Final = 45.0
+"""Two tilts to sides less apart than this tell the same."""
+TILTS: Final = 4
+HEADINGS: Final = 4
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Plan:
+    """What was asked for."""
+
+    kind: Kind
+    headings: int = 2
+    """2: there, turned by 180 degrees, and back; 4: every quarter turn."""
+    quick: bool = False
+    """Without the way back: a spot that moves goes unnoticed."""
+
+    @property
+    def on_spot(self) -> int:
+        """How many stands share the spot."""
+        if self.kind == "tilts" or self.headings == HEADINGS:
+            return HEADINGS
+        return 2 if self.quick else 3
+
+    @property
+    def total(self) -> int:
+        """How many stands there are."""
+        return self.on_spot + (TILTS if self.kind == "tilts" else 0)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """How the aircraft stood: up in its axes, shape (3,), and its heading, in degrees from the first stand's north."""
+
+    up: Array
+    heading_deg: float
+
+
+def request(plan: Plan, taken: Sequence[Seen]) -> str:
+    """What the person at the aircraft should do now."""
+    number = len(taken)
+    if number == 0:
+        return "stand it on a firm, marked spot, hands off"
+    if number >= plan.on_spot:
+        done = [_side(taken[0].up, seen.up) for seen in taken[plan.on_spot :]]
+        already = f", not {' or '.join(done)} again" if done else ": nose up, nose down, left or right side down"
+        return f"tilt it 20 to 28 deg and prop it up{already}"
+    if plan.on_spot == HEADINGS:
+        return "turn it by 90 deg on its spot"
+    if number == 1:
+        return "turn it by 180 deg, onto its marks"
+    return "turn it back onto its first marks"
+
+
+def objection(plan: Plan, taken: Sequence[Seen], now: Seen) -> str | None:
+    """Why this is not the stand that was asked for, and what to do; None when it is."""
+    number = len(taken)
+    if number == 0:
+        return None
+    first = taken[0]
+    if number < plan.on_spot:
+        turned = _wrapped(now.heading_deg - first.heading_deg)
+        if plan.on_spot == HEADINGS:
+            return _quarter(taken, turned)
+        wanted = 180.0 if number == 1 else 0.0
+        off = _wrapped(turned - wanted)
+        if abs(off) > TURN_TOLERANCE_DEG:
+            return (
+                f"it stands {abs(turned):.0f} deg from where it stood first, should be {wanted:.0f}: turn it by"
+                f" {abs(off):.0f} deg more"
+            )
+        return None
+    tilt_deg = math.degrees(math.acos(float(np.clip(now.up @ first.up, -1.0, 1.0))))
+    if tilt_deg < LEAST_TILT_DEG:
+        return f"tilted by {tilt_deg:.0f} deg only: make it 20 to 28"
+    for seen in taken[plan.on_spot :]:
+        apart = abs(_wrapped(_azimuth(first.up, seen.up) - _azimuth(first.up, now.up)))
+        if apart < APART_DEG:
+            return f"{_side(first.up, now.up)} was measured already: tilt it to another side"
+    return None
+
+
+def _quarter(taken: Sequence[Seen], turned_deg: float) -> str | None:
+    near = round(turned_deg / QUARTER_DEG) * QUARTER_DEG
+    if abs(_wrapped(turned_deg - near)) > TURN_TOLERANCE_DEG:
+        return f"it stands {turned_deg % 360.0:.0f} deg from where it stood first: make it 90, 180 or 270"
+    for seen in taken:
+        if abs(_wrapped(seen.heading_deg - taken[0].heading_deg - near)) <= APART_DEG:
+            return f"{near % 360.0:.0f} deg from the first was measured already: turn it on by 90 deg"
+    return None
+
+
+def _azimuth(level: Array, up: Array) -> float:
+    """Towards which side it leans, degrees from the nose, right positive; `level` is up while it stood level."""
+    lean = up - level
+    return math.degrees(math.atan2(-lean[1], -lean[0]))
+
+
+def _side(level: Array, up: Array) -> str:
+    """The side that is down."""
+    sides = ("nose down", "right side down", "nose up", "left side down")
+    return sides[round(_azimuth(level, up) / QUARTER_DEG) % 4]
+
+
+def _wrapped(angle_deg: float) -> float:
+    return (angle_deg + 180.0) % 360.0 - 180.0
+
+
+def turned_deg(rates_down_rad_s: Sequence[float], bias_rad_s: float) -> float:
+    """By how much the aircraft was turned, clockwise, from mean rates about down, one a second."""
+    return float(np.sum(np.asarray(rates_down_rad_s) - bias_rad_s)) / DEG

@@ -1,0 +1,113 @@
+"""The alignment in force: the gradienter's measured zero, and whether it still belongs to this configuration."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+from companion.calibration.alignment.align_record import AlignmentRecord, GradienterSettings
+from companion.calibration.solution.record import AlignmentUsed
+from companion.calibration.solution.solve import GradienterModel
+from companion.config import Config
+from companion.configured import models
+from companion.daemon.offload import Offload
+from companion.storage.alignment import AlignmentStore
+
+logger = logging.getLogger(__name__)
+
+
+class AlignmentInForce:
+    """Keeps the alignment on disk, and gives the gradienter's model with it."""
+
+    def __init__(self, config: Config, offload: Offload) -> None:
+        self._gradienter, self._offload = config.gradienter, offload
+        self._store = AlignmentStore(config.storage.path)
+        self.record: AlignmentRecord | None = None
+        """What is kept, whether or not it is used."""
+        self.unused: str | None = None
+        """Why what is kept is not used, in one line; None while it is used, or nothing is kept."""
+        self.on_change: Callable[[], None] = lambda: None
+        """Told when another zero is in force."""
+
+    def load(self) -> None:
+        """Read what was kept before this start; blocking. What cannot be used is set aside and said."""
+        self._take(self._store.take())
+        if self._store.unusable is not None:
+            self.unused = self._store.unusable
+        elif self.unused is not None:
+            logger.warning("alignment not used: %s", self.unused)
+
+    async def keep(self, record: AlignmentRecord) -> None:
+        """Put a new alignment in force, now and after every restart.
+
+        Raises:
+            StorageError: it could not be kept; the one before stays in force.
+        """
+        await self._offload(self._store.write, record)
+        self._take(record)
+        self.on_change()
+
+    async def forget(self) -> bool:
+        """Go back to what the configuration says; whether there was anything to forget.
+
+        Raises:
+            StorageError: the file could not be removed.
+        """
+        was = self.record is not None or self.unused is not None
+        await self._offload(self._store.clear)
+        self._take(None)
+        if was:
+            self.on_change()
+        return was
+
+    def settings(self) -> GradienterSettings | None:
+        """What an alignment belongs to; None without a gradienter."""
+        if self._gradienter is None:
+            return None
+        return GradienterSettings(
+            port=self._gradienter.port,
+            protocol=self._gradienter.protocol,
+            law=self._gradienter.law,
+            mounting=self._gradienter.mounting,
+            offset_deg=self._gradienter.offset_deg,
+        )
+
+    @property
+    def used(self) -> AlignmentUsed | None:
+        """For the record of a calibration: what of it is in force; None where nothing is."""
+        if self.record is None or self.unused is not None:
+            return None
+        return AlignmentUsed(
+            measured_at=self.record.measured_at, offset_deg=self.record.offset_deg, sigma_deg=self.record.sigma_deg
+        )
+
+    def model(self) -> GradienterModel | None:
+        """The gradienter's model as it is in force."""
+        return models.aligned(models.gradienter_model(self._gradienter), self.used)
+
+    def status(self) -> dict[str, object] | None:
+        """For `companion status`; None where nothing is kept."""
+        if self.record is None and self.unused is None:
+            return None
+        record = self.record
+        return {
+            "in_force": self.used is not None,
+            "unused_because": self.unused,
+            "kind": record.kind if record is not None else None,
+            "measured_at": record.measured_at if record is not None else None,
+            "offset_deg": record.offset_deg if record is not None else None,
+            "sigma_deg": record.sigma_deg if record is not None else None,
+        }
+
+    def _take(self, record: AlignmentRecord | None) -> None:
+        self.record, self.unused = record, None
+        now = self.settings()
+        if record is None:
+            return
+        if now is None:
+            self.unused = "no gradienter is configured"
+            return
+        different = [key for key in now.__struct_fields__ if getattr(record.gradienter, key) != getattr(now, key)]
+        if different:
+            names = ", ".join(f"gradienter.{key}" for key in different)
+            self.unused = f"measured with another {names}: companion align zero, or companion align --forget"

@@ -1,0 +1,303 @@
+"""Earlier biases of each IMU: whose they are, what they say of today, and what today adds.
+
+A change of sensor, profile or mounting forgets them. What was calibrated in this run of the daemon, with the sensor
+powered all the while, is remembered besides: it says most.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
+from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.calibration.alignment.align_record import ImuAlignmentRecord
+from companion.calibration.noise.allan import noise_profile
+from companion.calibration.solution.doubt import Doubt
+from companion.calibration.solution.history import Axes, Point, PowerUp, Triad
+from companion.calibration.solution.joint import Whole, points
+from companion.calibration.solution.pose_effect import pose_effect
+from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, expect, expect_today
+from companion.calibration.solution.solve import ImuSolution, Shared, Solution
+from companion.config import Config, Noise
+from companion.daemon.calibrating.alignment import AlignmentInForce
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.devices.sensors import SerialSensor
+from companion.daemon.offload import Offload
+from companion.errors import StorageError
+from companion.storage.biases import KEEP_POINTS, BiasStore, KnownImu
+
+logger = logging.getLogger(__name__)
+
+_BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
+_TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
+_IN_WORDS: Final = {
+    "source": "source",
+    "profile": "profile",
+    "protocol": "protocol",
+    "mounting": "mounting",
+    "instance": "instance",
+    "system": "vehicle",
+    "firmware": "firmware",
+    "gyro": "gyro (device id)",
+    "accel": "accelerometer (device id)",
+    "orientation": "orientation",
+    "scale": "accelerometer scale",
+    "tcal": "temperature calibration",
+}
+
+
+class _Reference(msgspec.Struct):
+    """The last good calibration of one triad in this power-up."""
+
+    session: str
+    point: Point
+    contradicted: int = 0
+
+
+class BiasMemory:
+    """Asked before a result is used, and told of it afterwards.
+
+    Args:
+        config: which IMUs.
+        vehicle: since when the autopilot has been up.
+        imus: the autopilot's IMUs by name.
+        sensors: the serial devices.
+        alignment: the gradienter's zero in force, and what tilts have told of the IMUs.
+        offload: for the disk.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        vehicle: Vehicle,
+        imus: Mapping[str, AutopilotImu],
+        sensors: Sequence[SerialSensor],
+        alignment: AlignmentInForce,
+        offload: Offload,
+    ) -> None:
+        self._config, self._vehicle, self._imus = config, vehicle, imus
+        self._alignment, self._offload = alignment, offload
+        self._sensors = {role.name: sensor for sensor in sensors for role in sensor.roles if role.kind == "imu"}
+        self._sources = {imu.name: imu for imu in config.imu}
+        self._store = BiasStore(config.storage.path)
+        self._known: dict[str, KnownImu] = {}
+        self._today: dict[tuple[str, Triad], _Reference] = {}
+        self._host = _host()
+        self.power_up: Callable[[str, float], PowerUp] = self._power_up
+        """Since when the sensor of an IMU has been powered, at a wall clock time."""
+
+    def load(self) -> None:
+        """Read what was kept before this start; blocking."""
+        self._known = self._store.read()
+
+    # --- before a result is used
+
+    def whole(self, solution: Solution) -> Whole:
+        """Whole biases by the readings alone.
+
+        Raises:
+            AutopilotError: the offsets in force are not known at the moment.
+        """
+        return {
+            found.name: whole_of(self._imus[found.name].in_force, found)
+            if found.name in self._imus
+            else (found.gyro_rad_s, found.accel_m_s2)
+            for found in solution.imus
+        }
+
+    def forgotten(self) -> dict[str, str]:
+        """Forget what belongs to another sensor than there is now; by IMU, why, in one line."""
+        found: dict[str, str] = {}
+        for name in self._sources:
+            known, now = self._known.get(name), self._identity(name)
+            if known is None or known.identity == now:
+                continue
+            changed = sorted(key for key in {*known.identity, *now} if known.identity.get(key) != now.get(key))
+            what = ", ".join(_IN_WORDS.get(key, key) for key in changed)
+            del self._known[name]
+            for triad in _TRIADS:
+                self._today.pop((name, triad), None)
+            if known.points:
+                found[name] = f"imu {name}: {what} changed since then: its earlier biases are forgotten"
+                logger.info("%s", found[name])
+        return found
+
+    def expectation(self, solution: Solution, unix_s: float) -> Expectation:
+        """What earlier calibrations say of these IMUs today."""
+        shared = solution.shared
+        if shared is None:
+            return Expectation()
+        wanted = self._config.calibration.prior
+        return Expectation(
+            imus=tuple(self._expected(imu, shared, unix_s, wanted=wanted) for imu in solution.imus),
+            zero_is_known=self._alignment.used is not None
+            or (self._config.gradienter is not None and self._config.gradienter.sigma_deg is not None),
+        )
+
+    def _expected(self, imu: ImuSolution, shared: Shared, unix_s: float, *, wanted: bool) -> ExpectedImu:
+        name = imu.name
+        effect = pose_effect(self._aligned(name))
+        if not wanted:
+            return ExpectedImu(name=name, effect=effect)
+        now = Now(
+            unix_s=unix_s,
+            power_up=self.power_up(name, unix_s),
+            temperature_degc=imu.temperature_degc,
+            up=_axes(shared.up),
+            gravity_m_s2=shared.gravity_m_s2,
+            zero=self._zero(),
+        )
+        earlier = self._known[name].points if name in self._known else ()
+        profile = noise_profile(self._sources[name].profile)
+        gyro, accel = self._reference(name, "gyro"), self._reference(name, "accel")
+        return ExpectedImu(
+            name=name,
+            gyro=expect(earlier, "gyro", now, effect),
+            accel=expect(earlier, "accel", now, effect),
+            gyro_today=expect_today(gyro, "gyro", now, effect, profile.gyro) if gyro is not None else None,
+            accel_today=expect_today(accel, "accel", now, effect, profile.accel) if accel is not None else None,
+            effect=effect,
+        )
+
+    # --- and afterwards
+
+    def measured(
+        self, solution: Solution, whole: Whole, doubts: Sequence[Doubt], started_at: str, unix_s: float
+    ) -> dict[str, Point]:
+        """What later calibrations may know of this one; `solution` by the readings alone."""
+        return points(
+            solution,
+            whole,
+            doubts,
+            started_at=started_at,
+            unix_s=unix_s,
+            power_ups={imu.name: self.power_up(imu.name, unix_s) for imu in solution.imus},
+            zero=self._zero(),
+        )
+
+    async def keep(self, found: Mapping[str, Point]) -> None:
+        """Remember a calibration that has come to a good end; that it cannot be kept on disk is only logged."""
+        for name, point in found.items():
+            known = self._known.get(name) or KnownImu(identity=self._identity(name))
+            # As many as the disk keeps: what is asked must not depend on when the daemon was started.
+            self._known[name] = msgspec.structs.replace(known, points=(*known.points, point)[-KEEP_POINTS:])
+            for triad in _TRIADS:
+                self._refer(name, triad, point)
+        await self._write()
+
+    async def forget(self, started_at: str) -> None:
+        """Forget a calibration that was undone."""
+        if not any(point.started_at == started_at for known in self._known.values() for point in known.points):
+            return
+        self._known = {
+            name: msgspec.structs.replace(
+                known, points=tuple(point for point in known.points if point.started_at != started_at)
+            )
+            for name, known in self._known.items()
+        }
+        self._today = {key: ref for key, ref in self._today.items() if ref.point.started_at != started_at}
+        await self._write()
+
+    async def _write(self) -> None:
+        try:
+            await self._offload(self._store.write, dict(self._known))
+        except StorageError as error:
+            logger.warning("%s; later calibrations will not know of this one", error)
+
+    def _refer(self, name: str, triad: Triad, point: Point) -> None:
+        """The reference of this power-up is the last calibration that was believed, or that has become a habit."""
+        found = point.of(triad)
+        if found is None:
+            return
+        session = self._session(name)
+        before = self._today.get((name, triad))
+        same = before is not None and before.session == session and before.point.zero == point.zero
+        if before is not None and same and found.is_outlier and before.contradicted < 2:
+            before.contradicted += 1
+            return
+        self._today[name, triad] = _Reference(session, point)
+
+    def _reference(self, name: str, triad: Triad) -> Point | None:
+        found = self._today.get((name, triad))
+        return found.point if found is not None and found.session == self._session(name) else None
+
+    # --- whose it is
+
+    def _power_up(self, name: str, unix_s: float) -> PowerUp:
+        boot_s = self._vehicle.boot_s if name in self._imus else None
+        return PowerUp(host=self._host, since_unix_s=None if boot_s is None else round(unix_s - boot_s, 1))
+
+    def _session(self, name: str) -> str:
+        """Another one as soon as the sensor may have been without power."""
+        if name in self._imus:
+            return f"boot {self._vehicle.boots}"
+        sensor = self._sensors.get(name)
+        if sensor is None:
+            return ""
+        return f"{sensor.link.reconnects} {sensor.decoder.times.clock.breaks} {sorted(sensor.health.counts.items())}"
+
+    def _zero(self) -> str | None:
+        """Which zero of the gradienter is in force: another one has another error."""
+        gradienter, used = self._config.gradienter, self._alignment.used
+        if gradienter is None:
+            return None
+        at = used.measured_at if used is not None else "configured"
+        mounting = _plain(gradienter.mounting)
+        return f"{gradienter.protocol} {gradienter.law} {mounting} {_plain(gradienter.offset_deg)} {at}"
+
+    def _identity(self, name: str) -> dict[str, str]:
+        source = self._sources[name]
+        profile = source.profile.name if isinstance(source.profile, Noise) else source.profile
+        found: dict[str, str] = {"source": source.source, "profile": profile or "unknown"}
+        if source.source == "serial":
+            return {**found, "protocol": source.protocol or "", "mounting": _plain(source.mounting)}
+        calibration = self._imus[name].calibration if name in self._imus else None
+        known = self._known.get(name)
+        found |= {
+            "instance": str(source.instance or 1),
+            "system": str(self._vehicle.system_id),
+            "firmware": str(self._vehicle.firmware),
+        }
+        if calibration is not None:
+            return found | _of_autopilot(calibration)
+        # What is not known at the moment is no change.
+        return {**(known.identity if known is not None else {}), **found}
+
+    def _aligned(self, name: str) -> ImuAlignmentRecord | None:
+        record = self._alignment.record
+        if record is None or self._alignment.unused is not None:
+            return None
+        return next((imu for imu in record.imus if imu.name == name), None)
+
+
+def _of_autopilot(calibration: ImuCalibration) -> dict[str, str]:
+    return {
+        "gyro": str(calibration.gyro_id),
+        "accel": str(calibration.accel_id),
+        "orientation": _plain((np.round(calibration.orientation, 4) + 0.0).ravel().tolist()),
+        "scale": _plain(calibration.accel_scale),
+        "tcal": str(calibration.tcal_enable),
+    }
+
+
+def _plain(value: object) -> str:
+    return " ".join(f"{each:.6g}" for each in value) if isinstance(value, list | tuple) else str(value)
+
+
+def _host() -> str:
+    try:
+        return _BOOT_ID.read_text(encoding="ascii").strip()
+    except (OSError, ValueError):
+        return os.urandom(8).hex()
+
+
+def _axes(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Axes:
+    x, y, z = (float(value) for value in values)
+    return x, y, z

@@ -1,0 +1,274 @@
+"""One IMU of the autopilot: its telemetry, and the offsets that were in force while that was sent.
+
+The telemetry has the autopilot's offsets subtracted already. So samples count only while these offsets are known, and
+when anybody changes one of them (a ground station, another companion, a reboot), what was collected before is void.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from companion.autopilot.firmware.firmwares import read_calibration
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.firmware.px4_slots import SlotMemory
+from companion.autopilot.firmware.rivals import rivals_of
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.telemetry.imu_stream import ImuStream, StreamKind
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
+from companion.errors import AutopilotError
+from companion.links.mavlink.link import MavlinkLink
+from companion.samples import ImuSample
+
+logger = logging.getLogger(__name__)
+
+RETRY_S: Final = 3.0
+REREAD_EVERY_S: Final = 0.5
+"""What is announced again and again must not fill the line with our questions."""
+CONFIRMED_WITHIN_S: Final = 3.0
+"""A reading that comes later does not tell what was in force in between."""
+
+
+class _Announced(NamedTuple):
+    """A value that is not the one in force as far as we know; who says so is not known."""
+
+    name: str
+    value: float
+    t_s: float
+
+
+class AutopilotImu:
+    """Samples of one autopilot IMU to `take`, while the offsets behind them are known.
+
+    Args:
+        name: the IMU's name in the configuration.
+        instance: 1 to 3.
+        take: gets every sample that counts.
+        void: called with a reason when everything taken so far is no longer valid.
+        kind_changed: called when the telemetry changes its message or resolution, and when the sensor's own steps
+            behind it (rad/s, m/s^2; 0 where they do not matter) turn out to be other ones.
+        rate_hz: asked of the autopilot.
+        memory: what is known about PX4's slots.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        instance: int,
+        link: MavlinkLink,
+        vehicle: Vehicle,
+        parameters: ParameterClient,
+        *,
+        take: Callable[[ImuSample], None],
+        void: Callable[[str], None],
+        kind_changed: Callable[[StreamKind | None, tuple[float, float]], None],
+        rate_hz: float,
+        memory: SlotMemory | None = None,
+    ) -> None:
+        self.name, self.instance = name, instance
+        self.calibration: ImuCalibration | None = None
+        """What the autopilot subtracts, as read; None while that is not known."""
+        self.problem = "not read yet"
+        """Why the offsets are not known, in one line."""
+        self.failures = 0
+        """How often reading the offsets has failed in a row."""
+        self.upsets = 0
+        """How often the autopilot has restarted or other offsets have come into force, not by us."""
+        self.upset = ""
+        """The latest of these, in a few words."""
+        self.tap: Callable[[ImuSample], None] | None = None
+        """Gets every sample, whatever the offsets behind it."""
+        self.also: Callable[[ImuSample], None] | None = None
+        """Gets every sample that counts, before `take`: for what must not wait."""
+        self._vehicle, self._parameters = vehicle, parameters
+        self._memory = memory or SlotMemory()
+        self._take, self._void = take, void
+        self.on_read: Callable[[ImuCalibration | None, ImuCalibration], None] = lambda before, after: None
+        """Told of every reading: what was read before, unless we have written since, and what is in force now."""
+        self._known: ImuCalibration | None = None
+        """What was read last, unless we have written since."""
+        self._ours = 0
+        self._announced: _Announced | None = None
+        self._pause_s = 0.0
+        self._stale = asyncio.Event()
+        self._stale.set()
+        self._kind_changed, self._grid = kind_changed, (0.0, 0.0)
+        self.stream = ImuStream(
+            link,
+            vehicle,
+            instance,
+            self._on_sample,
+            rate_hz=rate_hz,
+            on_kind_change=lambda k: kind_changed(k, self._grid),
+        )
+        self._unsubscribe = (parameters.watch(self._on_parameter), vehicle.watch(self._on_event))
+
+    async def run(self) -> None:
+        """Ask for the telemetry and follow the offsets until cancelled."""
+        try:
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self.stream.run(), name=f"{self.name} telemetry")
+                group.create_task(self._follow(), name=f"{self.name} offsets")
+        finally:
+            for unsubscribe in self._unsubscribe:
+                unsubscribe()
+
+    @contextlib.contextmanager
+    def changing(self) -> Iterator[None]:
+        """While we write its offsets ourselves: no samples count, and nobody reads in between."""
+        self._ours += 1
+        self.calibration = self._known = None
+        try:
+            yield
+        finally:
+            self._ours -= 1
+            self._invalidate("offsets written")
+
+    @property
+    def in_force(self) -> ImuCalibration:
+        """What the autopilot subtracts.
+
+        Raises:
+            AutopilotError: not known at the moment.
+        """
+        if self.calibration is None:
+            raise AutopilotError(f"imu {self.name}: {self.problem}")
+        return self.calibration
+
+    async def refresh(self) -> bool:
+        """Read the offsets afresh; False, and what was collected is void, if they are not those assumed.
+
+        Raises:
+            AutopilotError: they cannot be read, or this IMU cannot be calibrated.
+        """
+        assumed, announced, self._announced = self.calibration, self._announced, None
+        why = "the autopilot's offsets were read anew" if announced is None else f"{announced.name} was changed"
+        try:
+            fresh = await self._read()
+        except AutopilotError:
+            if announced is not None and not self._ours:
+                self._upset(why)
+            raise
+        if self._ours:
+            return False  # we have begun to write meanwhile: nobody knows which of them this still is
+        known, self._known = self._known, fresh
+        self.calibration, self.problem, self.failures = fresh, "", 0
+        if self._grid != (grid := (fresh.gyro_grid_rad_s, fresh.accel_grid_m_s2)):
+            self._grid = grid
+            self._kind_changed(self.stream.kind, grid)
+        self.on_read(known, fresh)
+        now_s = asyncio.get_running_loop().time()
+        holds = assumed is not None and _same(assumed, fresh)
+        if announced is not None and holds:
+            logger.warning(
+                "%s: %s = %.6g was announced and is not in force", self.name, announced.name, announced.value
+            )
+            holds = now_s - announced.t_s <= CONFIRMED_WITHIN_S
+        elif announced is not None:
+            logger.warning("%s: somebody set %s to %.6g; measuring afresh", self.name, announced.name, announced.value)
+        if not holds:
+            if assumed is not None:
+                self.upsets, self.upset = self.upsets + 1, why
+            self._void(why)
+        return holds
+
+    async def _read(self) -> ImuCalibration:
+        return await read_calibration(self._parameters, self.instance, self._memory)
+
+    def _on_sample(self, sample: ImuSample) -> None:
+        if self.tap is not None:
+            self.tap(sample)
+        if self.calibration is not None:
+            if self.also is not None:
+                self.also(sample)
+            self._take(sample)
+
+    def _invalidate(self, why: str) -> None:
+        self.calibration = None
+        self.problem = f"offsets being read again: {why}"
+        self._void(why)
+        self._stale.set()
+
+    def _upset(self, why: str) -> None:
+        self.upsets, self.upset = self.upsets + 1, why
+        self._invalidate(why)
+
+    def _on_parameter(self, name: str, value: float) -> None:
+        known = self.calibration
+        if known is None or self._ours:
+            return
+        if known.contradicts({name: value}):
+            # Anybody can say so; `refresh` asks the autopilot, and voids what was collected if it is true.
+            self._announced = self._announced or _Announced(name, value, asyncio.get_running_loop().time())
+        elif not self._rival_changed(known, name, value):
+            return  # else what is in force is the same, but not what will become of it
+        self._pause_s = REREAD_EVERY_S
+        self._stale.set()
+
+    def _rival_changed(self, calibration: ImuCalibration, name: str, value: float) -> bool:
+        known = {rival.parameter: rival.value for rival in calibration.rivals}
+        return name in rivals_of(self._vehicle.firmware) and known.get(name, 0) != value
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        if event == "rebooted":
+            self._upset("the autopilot rebooted")
+        elif event == "found":
+            # Somebody may have changed them while we heard nothing; if so, `refresh` voids what was collected.
+            self._stale.set()
+
+    async def _follow(self) -> None:
+        while True:
+            await self._stale.wait()
+            self._stale.clear()
+            await self._vehicle.wait_found()
+            if self._ours:
+                continue
+            try:
+                await self.refresh()
+            except AutopilotError as error:
+                self.problem = str(error)
+                self.failures += 1
+                logger.warning("%s: %s", self.name, error)
+                self._stale.set()
+                await asyncio.sleep(RETRY_S)
+            else:
+                pause_s, self._pause_s = self._pause_s, 0.0
+                await asyncio.sleep(pause_s)
+
+    def status(self) -> dict[str, object]:
+        """For `companion status` and `check`."""
+        problem = self.stream.problem or self.problem
+        kind = self.stream.kind
+        return {
+            "name": self.name,
+            "kind": "autopilot imu",
+            "good": not problem,
+            "summary": problem or f"autopilot IMU {self.instance}, {kind.message if kind else 'no message'}",
+            "frames": self.stream.samples,
+        }
+
+
+def not_ready(vehicle: Vehicle, imus: Mapping[str, AutopilotImu]) -> str | None:
+    """What of the autopilot is missing for a measurement, in one line."""
+    if (conflict := vehicle.conflict) is not None:
+        return f"waiting: {conflict}"
+    if vehicle.arm_state is ArmState.UNKNOWN:
+        return "waiting for the autopilot's heartbeat"
+    for imu in imus.values():
+        if imu.stream.problem or imu.calibration is None:
+            return f"waiting for imu {imu.name}: {imu.stream.problem or imu.problem}"
+    return None
+
+
+def _same(one: ImuCalibration, other: ImuCalibration) -> bool:
+    return (
+        one.corrections == other.corrections
+        and one.tcal_enable == other.tcal_enable
+        and (one.gyro_id, one.accel_id) == (other.gyro_id, other.accel_id)
+        and np.array_equal(one.orientation, other.orientation)
+    )

@@ -1,0 +1,128 @@
+"""Can ground stations reach the companion? If not: why, and what to do, in words.
+
+A ground station's command to component 191 passes through the autopilot. Both firmwares forward it only to a link on
+which they have heard a heartbeat of that component; ours goes out from the first second on. PX4 besides forwards only
+between links that both have MAV_n_FORWARD = 1, which is 0 by default on all but MAV_0, and it takes effect at a start.
+No MAVLink message tells which MAV_n our own link is (autopilots 5.4).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from typing import Final
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.values import read_integer
+from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
+from companion.errors import AutopilotError
+from companion.links.mavlink.link import MavlinkLink
+
+logger = logging.getLogger(__name__)
+
+PX4_LINKS: Final = 3
+SILENT_S: Final = 5.0
+"""Without a heartbeat for so long a ground station is not there, or not to be heard."""
+RETRY_S: Final = 10.0
+
+
+class Reach:
+    """Listens for ground stations and reads what the autopilot says about forwarding."""
+
+    def __init__(self, link: MavlinkLink, vehicle: Vehicle, parameters: ParameterClient) -> None:
+        self._vehicle, self._parameters = vehicle, parameters
+        self._link = link
+        self._heard_s = -math.inf
+        self._forwards: dict[int, bool] | None = None
+        self._stale = asyncio.Event()
+        self._stale.set()
+        self._unsubscribe = (
+            link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat),
+            vehicle.watch(self._on_event),
+        )
+
+    @property
+    def heard(self) -> bool:
+        """Whether a ground station is being heard."""
+        return asyncio.get_running_loop().time() - self._heard_s < SILENT_S
+
+    @property
+    def answered(self) -> bool:
+        """Whether the autopilot has answered anything, so that it hears us."""
+        results = self._vehicle.commands.results
+        return self._parameters.answering or any(count for word, count in results.items() if word != "no answer")
+
+    def words(self) -> tuple[bool, str]:
+        """For `companion check`: whether all is well, and the facts with the fix."""
+        if not self._vehicle.alive:
+            return True, "not known: no autopilot"
+        if not self.answered:
+            return False, (
+                "the autopilot is heard but does not answer: it does not hear our heartbeat, so nobody can reach the"
+                " companion through it; check the wire to the autopilot's RX, the baud rate and the port's protocol"
+                f"{self._vehicle.why_silent}"
+            )
+        if self.heard:
+            return True, "a ground station is heard; it reaches the companion as component 191 of this vehicle"
+        if self._vehicle.firmware == "px4":
+            return self._px4_words()
+        if self._vehicle.firmware == "ardupilot":
+            return True, (
+                "none heard (none connected?). ArduPilot lets one reach the companion once it has heard our heartbeat,"
+                " unless the options of either link say not to forward (MAVn_OPTIONS bit 1; before 4.7"
+                " SERIALn_OPTIONS bit 10)"
+            )
+        return True, "none heard"
+
+    def _px4_words(self) -> tuple[bool, str]:
+        closed = [f"MAV_{n}" for n, forwards in (self._forwards or {}).items() if not forwards]
+        if not closed:
+            return True, "none heard (none connected?); PX4 forwards between all its links"
+        example = closed[0]
+        return False, (
+            f"none heard. PX4 does not forward to or from {', '.join(closed)}: if the companion or the ground station"
+            f" is on {'it' if len(closed) == 1 else 'one of them'}, ground stations can't reach the companion: set"
+            f" {example}_FORWARD=1 and reboot (no message tells which MAV_n the companion is on; TELEM2 usually is"
+            " MAV_1)"
+        )
+
+    async def run(self) -> None:
+        """Read what there is to know, again after every restart, until cancelled."""
+        try:
+            while True:
+                await self._stale.wait()
+                self._stale.clear()
+                await self._vehicle.wait_found()
+                try:
+                    await self._read()
+                except AutopilotError as error:
+                    logger.debug("forwarding is not known yet: %s", error)
+                    await asyncio.sleep(RETRY_S)
+                    self._stale.set()
+        finally:
+            for unsubscribe in self._unsubscribe:
+                unsubscribe()
+
+    async def _read(self) -> None:
+        if self._vehicle.firmware != "px4":
+            self._forwards = None
+            return
+        found: dict[int, bool] = {}
+        for n in range(PX4_LINKS):
+            # MAV_n_CONFIG = 0: there is no such link.
+            if await read_integer(self._parameters, f"MAV_{n}_CONFIG") != 0:
+                forwards = await read_integer(self._parameters, f"MAV_{n}_FORWARD")
+                if forwards is not None:
+                    found[n] = bool(forwards)
+        self._forwards = found
+
+    def _on_heartbeat(self, message: mavlink.MAVLink_heartbeat_message, t_s: float) -> None:
+        if message.type == mavlink.MAV_TYPE_GCS:
+            self._heard_s = t_s
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        if event in ("found", "rebooted"):
+            self._stale.set()

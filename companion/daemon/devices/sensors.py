@@ -1,0 +1,275 @@
+"""The companion's own devices: a port, a decoder, what is said to it, and where the samples go."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import os
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from companion.configured.devices import Role, SerialDevice, parts_of
+from companion.daemon.devices.sensor_health import SensorHealth
+from companion.daemon.offload import Offload
+from companion.links.serial.bytestream import ByteLink, PortSettings
+from companion.links.serial.ports import find_holders
+from companion.links.system.budget import Budget
+from companion.links.system.together import Together
+from companion.protocols.registry import Kind
+from companion.protocols.roles import Part
+from companion.protocols.stream_health import SILENT_AFTER_S
+from companion.samples import CompassSample, Sample
+
+logger = logging.getLogger(__name__)
+
+RATE_SPAN_S: Final = 2.0
+TICK_S: Final = 0.02
+"""Between two things that are said, and between two looks while a conversation goes on."""
+COARSE_S: Final = 0.25
+"""Between two looks otherwise."""
+LIVELY_S: Final = 1.0
+"""So long after something was said a conversation counts as going on."""
+LOOK_AGAIN_S: Final = 60.0
+"""So long a look at who else has the port open holds."""
+HELD_AGAIN_S: Final = 5.0
+MOST_WORDS: Final = 20
+"""Different things said to one device that are told in the log."""
+
+_WANTED: Final[dict[Kind, str]] = {"imu": "rates", "gradienter": "tilt", "compass": "heading"}
+
+
+class SensorRole:
+    """What a device is used as, as `companion status` shows it."""
+
+    def __init__(self, sensor: SerialSensor, role: Role) -> None:
+        self.name, self.kind, self.role = role.name, role.kind, role
+        self._sensor = sensor
+        self._samples = 0
+        self._last_s: float | None = None
+        self._counted = (0.0, 0)
+        self._rate_hz = 0.0
+
+    def count(self, t_s: float) -> None:
+        """A sample has been taken from bytes that were read at `t_s`."""
+        self._samples += 1
+        self._last_s = t_s
+        since_s, before = self._counted
+        if t_s - since_s >= RATE_SPAN_S:
+            self._rate_hz = (self._samples - before) / (t_s - since_s) if before else 0.0
+            self._counted = (t_s, self._samples)
+
+    @property
+    def problem(self) -> str | None:
+        """What is wrong with it in one line, or None while samples come."""
+        sensor = self._sensor
+        if (problem := sensor.problem) is not None:
+            return problem
+        now_s = asyncio.get_running_loop().time()
+        if self._last_s is not None and now_s - self._last_s < SILENT_AFTER_S:
+            return None
+        if self.kind == "compass" and (north := sensor.other_north) is not None:
+            return f'{sensor.line}: its headings are {north}, compass.reference is another; set reference = "{north}"'
+        return f"{sensor.line}: {sensor.protocol} frames come, but none with {_WANTED[self.kind]}; is it set so?"
+
+    def status(self) -> dict[str, object]:
+        """For `companion status` and `check`."""
+        sensor = self._sensor
+        problem, words = self.problem, sensor.words
+        summary = problem or f"{sensor.protocol} on {sensor.link.settings.url}, {self._rate_hz:.0f} frames/s"
+        if problem is None and sensor.health.counts:
+            summary += f"; so far {', '.join(f'{count} {key}' for key, count in sensor.health.counts.items())}"
+        others = [role.name for role in sensor.roles if role is not self]
+        if others:
+            summary += f" (shared with {', '.join(others)})"
+        return {
+            "name": self.name,
+            "kind": self.kind,
+            "good": problem is None,
+            "summary": f"{summary}; {words}" if problem is not None and words else summary,
+            "frames": self._samples,
+            "rejected": dict(sensor.decoder.rejected),
+            "warned": dict(sensor.decoder.warned),
+            "reconnects": sensor.link.reconnects,
+            "words": words,
+            "shared_with": others,
+            **sensor.decoder.times.status(),
+            **sensor.health.status(),
+        }
+
+
+class SerialSensor:
+    """One serial device: read once, decoded once, for all its roles.
+
+    Args:
+        device: which, and how its line is set.
+        take: gets what each role takes of each sample.
+        offload: runs a blocking call elsewhere.
+        together: waits for the reads of an IMU that is read at intervals.
+    """
+
+    def __init__(
+        self,
+        device: SerialDevice,
+        take: Callable[[Role, Part], None],
+        offload: Offload = asyncio.to_thread,
+        together: Together | None = None,
+    ) -> None:
+        settings = PortSettings(device.port, device.baud, device.parity)
+        self.device = device
+        self.name, self.protocol = device.name, device.info.name
+        self.roles = [SensorRole(self, role) for role in device.roles]
+        self.decoder = device.info.decoder(settings.seconds_per_byte)
+        # Whoever is only read is not even thought about: without a dialogue there is nothing that could be sent.
+        self.dialogue = None if device.read_only or device.info.dialogue is None else device.info.dialogue()
+        name = ", ".join(role.name for role in device.roles)
+        self.kinds = frozenset(role.kind for role in device.roles)
+        # Only an IMU: where none of our own is fast, the autopilot's may be what the attitude is carried with.
+        driven = together if "imu" in self.kinds else None
+        self.link = ByteLink(
+            settings, self._arrived, name=name, on_state=self._on_state, budget=Budget(), together=driven
+        )
+        self.link.on_gap = self._on_gap
+        self._together = Together() if together is None else together
+        self.health = SensorHealth(
+            self.link, device.roles[0].kind, self.protocol, self.decoder, polled=self.dialogue is not None
+        )
+        self.tap: Callable[[str, bytes | None, float], object] | None = None
+        """Called with (name, bytes, time) before they are decoded; without bytes: some are missing."""
+        self.on_samples: Callable[[Sequence[Sample], float], object] | None = None
+        """Called with all samples of a read, and its time, before anybody else gets them: for what must not wait."""
+        self._take, self._offload = take, offload
+        self._by_role = dict(zip(device.roles, self.roles, strict=True))
+        self.other_north: str | None = None
+        """The north of headings that were refused because another one is configured."""
+        self._spoke_s = -math.inf
+        self._alone = False
+        """Nobody else has the port open, as far as can be seen."""
+        self._look_at_s = -math.inf
+        self._held_by = ""
+        self._openings = 0
+        self._breaks = 0
+        self._told: set[str] = set()
+
+    async def run(self) -> None:
+        """Read, and say what has to be said, until cancelled."""
+        if self.dialogue is None:
+            await self.link.run()
+            return
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._converse(), name=f"{self.name} dialogue")
+            await self.link.run()
+
+    def _on_state(self, connected: bool, reason: str) -> None:  # noqa: FBT001 - ByteLink's signature
+        del reason
+        self._together.take()
+        if connected:
+            now_s = asyncio.get_running_loop().time()
+            if self.tap is not None:
+                self.tap(self.name, None, now_s)
+            self.decoder.interrupted()
+            self.health.opened()
+            self._openings += 1
+            self._alone, self._look_at_s = False, -math.inf
+            if self.dialogue is not None:
+                self.dialogue.opened(now_s)
+
+    def _on_gap(self) -> None:
+        """Bytes are missing from here on."""
+        self._together.take()
+        if self.tap is not None:
+            self.tap(self.name, None, asyncio.get_running_loop().time())
+        self.decoder.interrupted()
+
+    def _arrived(self, data: bytes, t_s: float) -> None:
+        """Take bytes that were read at `t_s`: with the next read of a fast stream, unless it is this one's."""
+        if self.link.collecting:
+            self.receive(data, t_s)
+        elif self._is_lively(t_s):
+            self._together.take()
+            self.receive(data, t_s)
+        else:
+            self._together.put(self.receive, data, t_s)
+
+    def _is_lively(self, t_s: float) -> bool:
+        """Whether a conversation with it goes on, in which the answer to each word is waited for."""
+        return t_s - self._spoke_s < LIVELY_S
+
+    def receive(self, data: bytes, t_s: float) -> None:
+        """Take bytes that were read at `t_s`."""
+        if self.tap is not None:
+            self.tap(self.name, data, t_s)
+        samples = self.decoder.receive(data, t_s)
+        if samples and self.on_samples is not None:
+            self.on_samples(samples, t_s)
+        if (breaks := self.decoder.times.clock.breaks) != self._breaks:
+            self._breaks = breaks
+            logger.warning("%s: the device restarted, or its clock jumped; measuring afresh", self.link.name)
+        self.health.stream.took(data, samples, t_s)
+        for sample in samples:
+            if isinstance(sample, CompassSample) and any(role.refuses(sample) for role in self.device.roles):
+                self.other_north = sample.north
+            for role, part in parts_of(sample, self.device.roles):
+                self._by_role[role].count(t_s)
+                self._take(role, part)
+        if self.dialogue is not None and self._openings:
+            self.dialogue.heard(data, len(samples), t_s)
+            self._speak(t_s)
+
+    # --- what is said to it
+
+    async def _converse(self) -> None:
+        """Ask what is due: often while a conversation goes on, seldom otherwise, so that a stream costs no ticks."""
+        loop = asyncio.get_running_loop()
+        while True:
+            await asyncio.sleep(TICK_S if self._is_lively(loop.time()) else COARSE_S)
+            if self.link.connected and loop.time() >= self._look_at_s:
+                await self._look_for_others()
+            self._speak(loop.time())
+
+    async def _look_for_others(self) -> None:
+        """Two that speak to one device, or to one that is no sensor at all (a login, a modem), do harm."""
+        opening, port = self._openings, self.link.settings
+        holders = () if port.is_tcp else await self._offload(find_holders, port.url)
+        if opening != self._openings:
+            return
+        self._held_by = ", ".join(f"{other.name} {other.pid}" for other in holders if other.pid != os.getpid())
+        self._alone = not self._held_by
+        self._look_at_s = asyncio.get_running_loop().time() + (LOOK_AGAIN_S if self._alone else HELD_AGAIN_S)
+        if self._held_by:
+            self._tell(self.words)
+
+    def _speak(self, t_s: float) -> None:
+        if self.dialogue is None or not self._alone or not self.link.connected or t_s - self._spoke_s < TICK_S:
+            return
+        data = self.dialogue.due(t_s)
+        if data:
+            self._spoke_s = t_s
+            self.link.write(data)
+            self._tell(self.words)
+
+    def _tell(self, words: str) -> None:
+        """In the log, once: a device that is not there is asked again for the whole day."""
+        if words and words not in self._told and len(self._told) < MOST_WORDS:
+            self._told.add(words)
+            logger.info("%s: %s", self.link.name, words)
+
+    @property
+    def words(self) -> str:
+        """What was last said to the device, or why nothing is; empty where there was no occasion."""
+        if self._held_by:
+            return f"nothing is said to it: {self._held_by} has the port open too"
+        return self.dialogue.words if self.dialogue is not None else ""
+
+    # --- how it is
+
+    @property
+    def line(self) -> str:
+        """The port and how it is set, for people."""
+        port = self.link.settings
+        return port.url if port.is_tcp else f"{port.url} at {port.baud} baud, parity {port.parity}"
+
+    @property
+    def problem(self) -> str | None:
+        """What is wrong with the device in one line, or None while samples come."""
+        return self.health.words(asyncio.get_running_loop().time())

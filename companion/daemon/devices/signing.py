@@ -1,0 +1,223 @@
+"""Signing in the daemon: the key, the time that outlives restarts, and words for people about who is not believed.
+
+The key is read again and again until it can be: what was mended is found without a restart. Until then nothing is
+believed where a signature is required.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.component.statustext import Severity, Weight
+from companion.config import Config
+from companion.daemon.devices.signature_watch import SignatureWatch
+from companion.daemon.offload import Offload
+from companion.errors import LinkError, StorageError
+from companion.links.mavlink.keys import read_key
+from companion.links.mavlink.link import MavlinkLink
+from companion.links.mavlink.signing import TICKS_PER_S, Reason, Signing, SigningClock, uptime_s
+from companion.storage import signing_time
+from companion.storage.signing_time import SigningTime, this_boot
+
+logger = logging.getLogger(__name__)
+
+LOOK_S: Final = 1.0
+AHEAD_S: Final = 30.0
+"""So much time is reserved at once: one write in nearly that time, and so far ahead after a power cut. Senders more
+than a minute behind are not believed at first (specification), so it stays well below that."""
+RESERVE_BEFORE_S: Final = 5.0
+KEY_AGAIN_S: Final = 10.0
+
+_WHY: Final[dict[Reason, str]] = {
+    "unsigned": "does not sign",
+    "other key": "signs with another key",
+    "old": "sends what is older than before",
+    "no key": "cannot be checked without the key",
+}
+
+
+class LinkSigning:
+    """Looks after the signing of one link; `run` it where `signing` is not None.
+
+    Args:
+        config: what is wanted.
+        link: what is signed and judged.
+        vehicle: the autopilot, for words.
+        say: tells people at the ground stations.
+        offload: for the disk.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        link: MavlinkLink,
+        vehicle: Vehicle,
+        say: Callable[[Severity, str, Weight], object],
+        offload: Offload,
+    ) -> None:
+        self._config, self._vehicle, self._say, self._offload = config, vehicle, say, offload
+        self.mode = config.mavlink.signing_mode
+        self.signing: Signing | None = None
+        self.trouble = ""
+        """Why there is no key; empty when there is one."""
+        self._reserved = 0
+        self._unwritable = self._setup_told = False
+        self._told: set[tuple[Reason, int, int]] = set()
+        if self.mode != "off":
+            # From the first byte on: what comes before the key is read is not believed either.
+            self.signing = link.signing = Signing(required=self.mode == "require")
+        self._watch = SignatureWatch(link, vehicle, self.signing, say)
+        link.subscribe(mavlink.MAVLink_setup_signing_message, self._on_setup)
+
+    def load(self) -> None:
+        """Read time and key, before anything is sent; a key that cannot be read is tried again in `run`."""
+        if self.signing is not None:
+            kept = signing_time.load(self._config.storage.path)
+            self.signing.clock = SigningClock(_go_on_from(kept, uptime_s(), this_boot()))
+            self._take_key(self.signing)
+
+    async def run(self) -> None:
+        """Keep the time and tell of strangers, until cancelled."""
+        signing = self.signing
+        if signing is None:
+            while True:
+                await asyncio.sleep(LOOK_S)
+                self._watch.look(asyncio.get_running_loop().time())
+        while signing.key is None:
+            await asyncio.sleep(KEY_AGAIN_S)
+            self._take_key(signing)
+        try:
+            while True:
+                if signing.clock.now() > self._reserved - int(RESERVE_BEFORE_S * TICKS_PER_S):
+                    await self._keep(signing, AHEAD_S)
+                self._tell(signing)
+                self._watch.look(asyncio.get_running_loop().time())
+                await asyncio.sleep(LOOK_S)
+        finally:
+            # An orderly end reserves nothing: the next start goes on from here.
+            await asyncio.shield(self._keep(signing, 0.0))
+
+    def _take_key(self, signing: Signing) -> None:
+        path = self._config.mavlink.signing_key_path
+        assert path is not None  # the configuration's rules
+        try:
+            signing.key = read_key(path)
+        except LinkError as error:
+            if str(error) != self.trouble:
+                logger.warning("mavlink: no signing: %s", error)
+            self.trouble = str(error)
+            return
+        self.trouble = ""
+        signing.doubted.clear()
+        signing.strangers.clear()
+        logger.info("mavlink: what is sent is signed, what comes unsigned is %s", self._fate)
+
+    @property
+    def _fate(self) -> str:
+        return "dropped" if self.mode == "require" else "taken all the same"
+
+    def _on_setup(self, message: mavlink.MAVLink_setup_signing_message, _t_s: float) -> None:
+        """Nobody gives us a key over the wire; that somebody tries is worth a line."""
+        if not self._setup_told:
+            self._setup_told = True
+            sender = f"{message.get_srcSystem()}/{message.get_srcComponent()}"
+            logger.warning(
+                "mavlink: %s sends a signing key over this link in the clear; it is ignored here. Set keys over USB",
+                sender,
+            )
+
+    async def _keep(self, signing: Signing, ahead_s: float) -> None:
+        now = signing.clock.now()
+        reserved = now + int(ahead_s * TICKS_PER_S)
+        try:
+            await self._offload(
+                signing_time.save, self._config.storage.path, SigningTime(now, reserved, uptime_s(), this_boot())
+            )
+            self._unwritable = False
+        except StorageError as error:
+            level = logging.DEBUG if self._unwritable else logging.WARNING
+            logger.log(level, "mavlink signing: after a restart its time may go back: %s", error)
+            self._unwritable = True
+        self._reserved = reserved
+
+    def _tell(self, signing: Signing) -> None:
+        """In the log and to the ground stations, once of each who is not believed."""
+        for stranger in signing.strangers.keys() - self._told:
+            self._told.add(stranger)
+            reason, system, component = stranger
+            logger.warning("mavlink: %d/%d %s: its messages are %s", system, component, _WHY[reason], self._fate)
+            if signing.required:
+                self._say(Severity.WARNING, f"{system}/{component} {_WHY[reason]}: ignored", Weight.NEWS)
+
+    # --- words
+
+    @property
+    def deaf(self) -> str | None:
+        """Why the autopilot is not heard although something comes; None when signing is not why."""
+        signing = self.signing
+        if signing is None or not signing.required:
+            return None
+        if self.trouble:
+            return self.trouble
+        # Only who claims to be an autopilot explains why none is heard.
+        ((reason, number),) = self._watch.dropped().most_common(1) or [("unsigned", 0)]
+        if number == 0 or self._vehicle.alive:
+            return None
+        return {
+            "unsigned": f"{number} unsigned messages dropped: the autopilot does not sign on this link",
+            "other key": f"{number} messages dropped: the autopilot signs with another key",
+            "old": f"{number} messages dropped: older than ones before, or the autopilot's clock is behind",
+            "no key": f"{number} messages dropped: the signing key is still being read",
+        }[reason]
+
+    @property
+    def worry(self) -> str | None:
+        """That the autopilot and we do not believe each other, and what to do; None where they do."""
+        return self._watch.worry
+
+    def status(self) -> dict[str, Any] | None:
+        """For `companion status`; None while signing is off and nothing asks for it."""
+        signing = self.signing
+        if signing is None:
+            if self.worry is None:
+                return None
+            return {
+                "good": False,
+                "mode": self.mode,
+                "summary": self.worry,
+                "verified": 0,
+                "doubted": {},
+                "strangers": [],
+            }
+        doubted = sum(signing.doubted.values())
+        summary = self.deaf or self.trouble or self.worry
+        if not summary:
+            summary = f"{signing.verified} messages checked"
+            if doubted:
+                summary += f", {doubted} {'dropped' if signing.required else 'not signed with our key'}"
+        return {
+            "good": self.deaf is None and not self.trouble and self.worry is None,
+            "mode": self.mode,
+            "summary": summary,
+            "verified": signing.verified,
+            "doubted": dict(signing.doubted),
+            "strangers": [
+                {"sender": f"{system}/{component}", "why": _WHY[reason], "messages": number}
+                for (reason, system, component), number in signing.strangers.items()
+            ],
+        }
+
+
+def _go_on_from(kept: SigningTime | None, now_s: float, boot_id: str) -> int:
+    """Ticks later than any that was used: exactly where that can be told, else behind what was reserved."""
+    if kept is None:
+        return 0
+    if boot_id and boot_id == kept.boot_id and now_s >= kept.uptime_s:
+        return kept.ticks + int((now_s - kept.uptime_s) * TICKS_PER_S) + 1
+    return kept.reserved + 1

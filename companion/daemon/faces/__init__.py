@@ -1,0 +1,1 @@
+"""How people and programs ask: control socket, own parameters, MQTT."""

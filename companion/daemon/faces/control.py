@@ -1,0 +1,286 @@
+"""The control socket: how the command line talks to the running daemon.
+
+A Unix stream socket, for the daemon's own user alone (mode 0600) or for a group too (0660). One request a connection,
+one JSON object a line: the client sends {"command": ..., ...}; the daemon answers with any number of
+{"kind": "progress", ...} and one last line {"kind": "result", ...} or {"kind": "error", "reason": ...}. A client that
+goes away stops nothing: what it started goes on, and another client can watch or cancel it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import grp
+import json
+import logging
+import os
+import socket
+import stat
+import struct
+from collections import Counter
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Final, Self
+
+import msgspec
+
+from companion.errors import CompanionError, DaemonDeniedError, DaemonUnreachableError, LinkError
+from companion.links.system.request import Object, parse_request
+
+logger = logging.getLogger(__name__)
+
+Handler = Callable[[Object], AsyncIterator[Object]]
+
+# A request is below 1 kB, the longest answer (a history of 1000 records) below 8 MB.
+REQUEST_LIMIT: Final = 64 * 1024
+ANSWER_LIMIT: Final = 32 * 1024 * 1024
+REQUEST_TIMEOUT_S: Final = 5.0
+ANSWER_TIMEOUT_S: Final = 10.0
+"""So long a client may take to read before it is given up."""
+KERNEL_BYTES: Final = 16 * 1024
+MAX_CLIENTS: Final = 16
+"""Of each kind: those that have not asked yet, those with urgent commands, and all others."""
+URGENT: Final = ("cancel", "status")
+"""Commands that no crowd of others keeps out."""
+
+
+class ControlServer:
+    """Serves the control socket; `async with` it."""
+
+    def __init__(self, path: Path, handler: Handler, *, group: str | None = None) -> None:
+        self._path, self._group = path, group
+        self._handler = handler
+        self._server: asyncio.Server | None = None
+        self._clients: set[asyncio.Task[None]] = set()
+        self._silent: dict[asyncio.Task[None], None] = {}
+        """Clients that have not asked yet, the oldest first."""
+        self._served: Counter[bool] = Counter()
+        """How many are served, urgent or not."""
+
+    async def __aenter__(self) -> Self:
+        """Bind the socket, replacing a stale one.
+
+        Raises:
+            LinkError: another daemon answers there, or the path cannot be bound.
+        """
+        listener = _bind(self._path)
+        if self._group is not None:
+            _open_to(self._path, self._group)
+        self._server = await asyncio.start_unix_server(self._accept, sock=listener, limit=REQUEST_LIMIT)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        if self._server is not None:
+            self._server.close()
+        for client in list(self._clients):
+            client.cancel()
+        await asyncio.gather(*self._clients, return_exceptions=True)
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+
+    def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if len(self._silent) >= MAX_CLIENTS:
+            # A client of ours asks at once: the oldest one that has not makes way.
+            oldest = next(iter(self._silent))
+            oldest.cancel()
+            del self._silent[oldest]
+        # One that does not read is soon noticed.
+        writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, KERNEL_BYTES)
+        writer.transport.set_write_buffer_limits(0)
+        client = asyncio.get_running_loop().create_task(self._serve(reader, writer), name="control client")
+        self._clients.add(client)
+        self._silent[client] = None
+        client.add_done_callback(self._forget)
+
+    def _forget(self, client: asyncio.Task[None]) -> None:
+        self._clients.discard(client)
+        self._silent.pop(client, None)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            request = await self._request(reader, writer)
+            if request is not None:
+                await self._take(request, writer)
+        except (ConnectionError, TimeoutError):
+            pass  # the client went away, or is deaf; what it asked for goes on
+        finally:
+            writer.transport.abort()
+
+    async def _request(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Object | None:
+        """What a client asks; None: nothing that can be understood, which it has been told.
+
+        Raises:
+            TimeoutError: it does not ask in time.
+        """
+        try:
+            async with asyncio.timeout(REQUEST_TIMEOUT_S):
+                line = await reader.readline()
+            return parse_request(line)
+        except ValueError as error:
+            await _write(writer, {"kind": "error", "reason": f"request not understood: {error}"})
+            await _finish(writer)
+            return None
+
+    async def _take(self, request: Object, writer: asyncio.StreamWriter) -> None:
+        """Answer a request if there is a place for one of its kind."""
+        if (client := asyncio.current_task()) is not None:
+            self._silent.pop(client, None)
+        urgent = request.get("command") in URGENT
+        if self._served[urgent] >= MAX_CLIENTS:
+            await _write(writer, {"kind": "error", "reason": "the daemon has too many clients at once; try again"})
+            await _finish(writer)
+            return
+        self._served[urgent] += 1
+        try:
+            await self._answer(request, writer)
+            await _finish(writer)
+        finally:
+            self._served[urgent] -= 1
+
+    async def _answer(self, request: Object, writer: asyncio.StreamWriter) -> None:
+        try:
+            async for reply in self._handler(request):
+                await _write(writer, reply)
+        except CompanionError as error:
+            await _write(writer, {"kind": "error", "reason": str(error)})
+        except ConnectionError:
+            raise
+        except Exception:
+            logger.exception("control request %r failed", request.get("command"))
+            await _write(writer, {"kind": "error", "reason": "internal error of the daemon; its log has the details"})
+
+
+async def _write(writer: asyncio.StreamWriter, reply: Object) -> None:
+    """Send one line.
+
+    Raises:
+        ConnectionError: the other side is gone, or does not read.
+    """
+    writer.write(msgspec.json.encode(reply) + b"\n")
+    try:
+        async with asyncio.timeout(ANSWER_TIMEOUT_S):
+            await writer.drain()
+    except TimeoutError:
+        raise ConnectionAbortedError from None
+
+
+async def _finish(writer: asyncio.StreamWriter) -> None:
+    """Close when the other side has everything.
+
+    Raises:
+        OSError: it is gone, or does not read; of which a `TimeoutError` is one.
+    """
+    writer.close()
+    async with asyncio.timeout(ANSWER_TIMEOUT_S):
+        await writer.wait_closed()
+
+
+def _bind(path: Path) -> socket.socket:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _remove_stale(path)
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        # The mode must be right before anyone can connect: bind makes the file with the umask's mode.
+        old_mask = os.umask(0o177)
+        try:
+            listener.bind(str(path))
+        except BaseException:
+            listener.close()
+            raise
+        finally:
+            os.umask(old_mask)
+    except OSError as error:
+        raise LinkError(f"control socket {path}: cannot be opened: {error.strerror or error}") from error
+    return listener
+
+
+def _open_to(path: Path, group: str) -> None:
+    """Let the members of a group use the socket; where that is not to be had it stays closed to them, and it is said.
+
+    No privilege is needed: one may give a file of one's own to any group that one is a member of.
+    """
+    try:
+        os.chown(path, -1, grp.getgrnam(group).gr_gid)
+        path.chmod(0o660)
+    except (KeyError, OSError) as error:
+        why = "there is no such group" if isinstance(error, KeyError) else error.strerror or str(error)
+        logger.warning("control socket: group %s may not use it: %s", group, why)
+
+
+def _who_may(path: Path) -> str:
+    """Who may use a socket that refused us."""
+    try:
+        found = path.stat()
+        if found.st_mode & stat.S_IWGRP:
+            return f"only group {grp.getgrgid(found.st_gid).gr_name} and root may: usermod -aG, log in again; or sudo"
+    except (OSError, KeyError):
+        pass
+    return "permission denied, try with sudo"
+
+
+def _remove_stale(path: Path) -> None:
+    """Remove a socket that nobody listens on any more.
+
+    Raises:
+        LinkError: somebody answers there, or what is there is no socket.
+    """
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        return
+    if not stat.S_ISSOCK(mode):
+        raise LinkError(f"control socket {path}: a file that is not a socket is in the way; remove it")
+    probe = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        probe.connect(str(path))
+    except ConnectionRefusedError:
+        path.unlink()
+    else:
+        raise LinkError(f"control socket {path}: another companion is running (see: companion status)")
+    finally:
+        probe.close()
+
+
+def process_behind(path: Path) -> set[int]:
+    """The process that listens on a control socket; empty where nobody does, or it is not ours to ask."""
+    try:
+        with socket.socket(socket.AF_UNIX) as asking:
+            asking.settimeout(1.0)
+            asking.connect(str(path))
+            credentials = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    except OSError:
+        return set()
+    return {struct.unpack("3i", credentials)[0]}
+
+
+async def ask(path: Path, request: Object) -> AsyncIterator[Object]:
+    """Send one request to the daemon and yield its replies; the last has kind "result" or "error".
+
+    Raises:
+        DaemonUnreachableError: nobody answers at the socket, or the daemon went away in the middle.
+    """
+    try:
+        reader, writer = await asyncio.open_unix_connection(str(path), limit=ANSWER_LIMIT)
+    except OSError as error:
+        why = {
+            errno.ENOENT: "no such socket",
+            errno.ECONNREFUSED: "nobody listens there",
+        }.get(error.errno or 0, str(error))
+        if error.errno == errno.EACCES:
+            raise DaemonDeniedError(f"the daemon at {path} may not be asked: {_who_may(path)}") from None
+        raise DaemonUnreachableError(f"no daemon answers at {path} ({why}); start it with: companion run") from None
+    try:
+        await _write(writer, request)
+        while line := await reader.readline():
+            reply: Object = json.loads(line)
+            yield reply
+            if reply.get("kind") in ("result", "error"):
+                return
+        raise DaemonUnreachableError(f"the daemon at {path} went away in the middle of the answer")
+    except ConnectionError:
+        raise DaemonUnreachableError(f"the daemon at {path} went away in the middle of the answer") from None
+    finally:
+        writer.close()
+        with contextlib.suppress(ConnectionError):
+            await writer.wait_closed()

@@ -1,0 +1,173 @@
+"""The state as one big word with its reason: what the page and the monitor show first, readable from two steps away.
+
+Worked out here once, so that everybody who looks sees the same word.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+from collections.abc import Callable
+from typing import Final, Literal
+
+import msgspec
+
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.machine import State
+from companion.daemon.arming.automatic import Automatic
+from companion.daemon.arming.readiness import Readiness
+from companion.daemon.calibrating.conductor import Conductor
+from companion.daemon.calibrating.course import Stage
+from companion.daemon.job import Job
+from companion.daemon.offsets.mend import Mender
+
+Tone = Literal["good", "wait", "busy", "bad"]
+"""good: may fly. wait: the pilot's patience. busy: the companion works. bad: somebody has to do something."""
+
+_STAGES: Final[dict[Stage, str]] = {
+    "dithering": "DITHERING",
+    "writing": "WRITING",
+    "checking": "CHECKING",
+    "restarting": "RESTARTING AUTOPILOT",
+    "settling": "SETTLING",
+    "putting back": "PUTTING BACK",
+}
+_HOLD_STILL: Final = re.compile(r"hold still (\d+) s(?: more)?(?:: )?")
+
+
+class Headline(msgspec.Struct, frozen=True):
+    """One word, or three at most; why, in one line; and how it looks."""
+
+    word: str
+    reason: str
+    tone: Tone
+
+
+class Headlines:
+    """Works out the headline from those who know; computes little."""
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        collector: RollingCollector,
+        conductor: Conductor,
+        mender: Mender,
+        readiness: Readiness,
+        automatic: Automatic,
+        mavlink_url: str,
+        trouble: Callable[[], str | None],
+    ) -> None:
+        self._vehicle, self._collector, self._conductor, self._mender = vehicle, collector, conductor, mender
+        self._readiness, self._automatic, self._mavlink_url = readiness, automatic, mavlink_url
+        self._trouble = trouble
+        """What is wrong with one of our own sensors, and with which; None while all do well."""
+        self.deaf: Callable[[], str | None] = lambda: None
+        """Why what comes from the autopilot is not believed; None when it is."""
+        self.concern: Callable[[], str | None] = lambda: None
+        """What else the pilot should know of at once, where the rest is well."""
+
+    def why_deaf(self) -> str:
+        """To be said behind "not heard yet on ...": why, where that is known."""
+        return f": {why}" if (why := self.deaf()) else ""
+
+    def now(self) -> Headline:
+        """The headline of this moment."""
+        headline = self._now()
+        concern = self.concern() if headline.tone == "good" else None
+        return headline if concern is None else Headline(headline.word, f"{concern}; {headline.reason}", "wait")
+
+    def _now(self) -> Headline:
+        now_s = asyncio.get_running_loop().time()
+        if self._mender.fault is not None:
+            return Headline("FAULT", self._mender.fault, "bad")
+        if (conflict := self._vehicle.conflict) is not None:
+            return Headline("TWO AUTOPILOTS", conflict, "bad")
+        job = self._conductor.job
+        if job is not None and not job.finished.done():
+            return self._working(job, now_s)
+        if self._vehicle.arm_state is ArmState.UNKNOWN:
+            return self._no_autopilot()
+        if self._mender.pending:
+            return Headline("PUTTING BACK", "an interrupted write is being put back", "busy")
+        state, words = self._readiness.state(now_s)
+        if self._vehicle.arm_state is ArmState.ARMED:
+            if state == "uncalibrated":
+                return Headline("ARMED", f"not calibrated: {words}", "bad")
+            return Headline("ARMED", words, "good")
+        if self._readiness.at_arm == "gate":
+            return self._gate()
+        if state != "uncalibrated":
+            return Headline("READY", words, "good")
+        return self._uncalibrated(words, now_s)
+
+    def _no_autopilot(self) -> Headline:
+        age_s = self._vehicle.heartbeat_age_s
+        if age_s is None:
+            return Headline("NO AUTOPILOT", f"not heard yet on {self._mavlink_url}{self.why_deaf()}", "bad")
+        why = self.deaf() or "power? cable?"
+        return Headline("NO AUTOPILOT", f"no heartbeat for {age_s:.0f} s: {why}", "bad")
+
+    def _working(self, job: Job, now_s: float) -> Headline:
+        words, percent = job.words or self._conductor.state.value, job.progress_percent
+        if job.cancelled:
+            return Headline("CANCELLING", words, "busy")
+        stage = self._conductor.stage
+        if stage == "settling":
+            reason = "new offsets are in; the autopilot's EKF settles, at most so long"
+            return Headline(f"SETTLING {math.ceil(self._conductor.settling_s)} s", reason, "busy")
+        if stage == "putting back":
+            return Headline("PUTTING BACK", "the old values are being written", "busy")
+        if stage is not None:
+            return Headline(f"{_STAGES[stage]} {percent} %", words, "busy")
+        if self._conductor.state in (State.COLLECTING, State.SOLVING):
+            return Headline(f"MEASURING {percent} %", words, "busy")
+        if self._vehicle.arm_state is ArmState.UNKNOWN:
+            return self._no_autopilot()
+        if (held := _hold_still(words)) is not None:
+            return held
+        if self._collector.glance(now_s).moving:
+            return Headline("HOLD STILL", words, "wait")
+        return Headline("WAITING", words, "wait")
+
+    def _gate(self) -> Headline:
+        """Where arming is held back, what the autopilot is answered."""
+        answer = self._readiness.answer()
+        if answer.verdict == "accept":
+            return Headline("READY", answer.words, "good")
+        if (held := _hold_still(answer.words)) is not None:
+            return held
+        if answer.verdict == "wait":
+            return Headline("WAIT", answer.words, "wait")
+        return self._failed() or Headline("NOT READY", answer.words, "bad")
+
+    def _uncalibrated(self, words: str, now_s: float) -> Headline:
+        if (reading := self._readiness.in_force.reading()) is not None:
+            return Headline("WAIT", f"reading {reading}", "wait")
+        if self._readiness.in_force.held_back is not None:
+            return self._failed() or Headline("NOT CALIBRATED", words, "bad")
+        todo = self._automatic.why_not()
+        if todo is not None:
+            return self._failed() or Headline("NOT CALIBRATED", f"{words}: {todo}" if todo != words else words, "bad")
+        glance = self._collector.glance(now_s)
+        if glance.obstacle is not None and not glance.moving:
+            # The sensor's own trouble says what to do; that nothing comes from it is only what follows.
+            return Headline("NOT CALIBRATED", self._trouble() or glance.obstacle, "bad")
+        if glance.obstacle is not None:
+            return _hold_still(glance.obstacle) or Headline("HOLD STILL", glance.obstacle, "wait")
+        left_s = self._readiness.until_calibrated_s(now_s)
+        return Headline(f"HOLD STILL {left_s:.0f} s", f"{words}: it calibrates by itself", "wait")
+
+    def _failed(self) -> Headline | None:
+        if self._conductor.state is not State.FAILED:
+            return None
+        return Headline("FAILED", self._conductor.reason, "bad")
+
+
+def _hold_still(words: str) -> Headline | None:
+    """Of "hold still 6 s more" and the like, with the seconds in the big word; None for other words."""
+    match = _HOLD_STILL.match(words)
+    if match is None:
+        return None
+    return Headline(f"HOLD STILL {match[1]} s", words[match.end() :] or "measuring begins then", "wait")

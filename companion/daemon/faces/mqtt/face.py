@@ -1,0 +1,233 @@
+"""The daemon on MQTT: its state out, requests in.
+
+It looks at the daemon a few times a second and puts what has changed into the outbox; it holds nobody up, and nothing
+that happens here, in aiomqtt or at the broker, ends anything but itself.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Awaitable, Callable
+from typing import Any, Final
+
+import msgspec
+
+from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.calibration.solution.record import to_json
+from companion.config import Mqtt
+from companion.daemon.calibrating.conductor import Conductor
+from companion.daemon.faces.answers import Answers
+from companion.daemon.faces.mqtt.discovery import discovery_message, discovery_topic
+from companion.daemon.faces.mqtt.requests import Requests
+from companion.daemon.faces.mqtt.summary import Pace, summary
+from companion.daemon.faces.mqtt.topics import OFFLINE, ONLINE, Topics, base_of, client_id_of
+from companion.daemon.offload import Offload
+from companion.links.mqtt.client import Incoming, MqttLink
+
+logger = logging.getLogger(__name__)
+
+Object = dict[str, Any]
+
+LOOK_S: Final = 0.2
+"""The attitude goes out at every look: at most 5 a second."""
+PROGRESS_S: Final = 0.5
+FOUND_WITHIN_S: Final = 3.0
+"""So long the autopilot's system id is waited for; without it the vehicle is number 1, as on MAVLink."""
+AFTER_FAULT_S: Final = 30.0
+STATE_S: Final = 0.5
+ANSWER_AT_END_S: Final = 0.5
+FLUSH_S: Final = 1.0
+
+
+class MqttFace:
+    """One broker's view of the daemon; `run` it.
+
+    Args:
+        settings: which broker, which topics.
+        answers: the same that the command line gets.
+        conductor: what runs.
+        vehicle: whose system id names the topics.
+        pose: the attitude, or None while there is none.
+        offload: runs a blocking call elsewhere.
+    """
+
+    def __init__(
+        self,
+        settings: Mqtt,
+        answers: Answers,
+        conductor: Conductor,
+        vehicle: Vehicle,
+        pose: Callable[[], Awaitable[Object | None]],
+        offload: Offload,
+        *,
+        system_id: int | None = None,
+    ) -> None:
+        self._settings, self._answers, self._conductor, self._vehicle = settings, answers, conductor, vehicle
+        self._pose, self._offload, self._system_id = pose, offload, system_id
+        self._faulty = False
+        self.link: MqttLink | None = None
+        self.topics: Topics | None = None
+        self.only_listening = False
+        """Reach the broker and do nothing there; for `companion check`."""
+
+    def status(self) -> Object:
+        """For `companion status` and `check`."""
+        if self.link is None or self.topics is None:
+            return {"good": False, "summary": "waiting for the autopilot's system id", "connected": False}
+        return {**self.link.status(), "base_topic": self.topics.base}
+
+    async def run(self) -> None:
+        """Speak to the broker until cancelled; never raises anything else."""
+        await self._wait_for_vehicle()
+        while True:
+            try:
+                await self._speak_as(self._base())
+            except Exception:
+                logger.exception("MQTT met a fault of the program; it begins again in %.0f s", AFTER_FAULT_S)
+                await asyncio.sleep(AFTER_FAULT_S)
+
+    async def _wait_for_vehicle(self) -> None:
+        deadline_s = asyncio.get_running_loop().time() + FOUND_WITHIN_S
+        named = self._settings.base_topic is not None or self.only_listening
+        while not named and self._known_system_id is None and asyncio.get_running_loop().time() < deadline_s:
+            await asyncio.sleep(LOOK_S)
+
+    @property
+    def _known_system_id(self) -> int | None:
+        return self._vehicle.system_id or self._system_id
+
+    def _base(self) -> str:
+        return base_of(self._settings, self._known_system_id or 1)
+
+    async def _speak_as(self, base: str) -> None:
+        """Serve under a base topic until it is another one."""
+        self.topics = topics = Topics(base)
+        client_id = client_id_of(self._settings, base)
+        if self.only_listening:
+            self.link = link = MqttLink(self._settings, client_id=f"{client_id}-check", offload=self._offload)
+            await link.run()
+        self.link = link = MqttLink(
+            self._settings,
+            client_id=client_id,
+            will=(topics.status, OFFLINE),
+            subscriptions=(topics.requests, topics.status),
+            on_message=self._on_message,
+            offload=self._offload,
+        )
+        self._requests = Requests(self._answers.answer, self._respond)
+        self._requests.on_retained = self._on_retained
+        self._pace, self._state_s, self._state = Pace(), -math.inf, ""
+        self._progress, self._progress_s = b"", -math.inf
+        link.outbox.keep(topics.status, ONLINE)
+        running = asyncio.get_running_loop().create_task(link.run(), name="mqtt link")
+        try:
+            while self._base() == base:
+                await self._try_to_look(link, topics)
+                await asyncio.sleep(LOOK_S)
+            logger.info("mqtt: the vehicle is %s, no longer %s", self._base(), base)
+        finally:
+            await self._requests.close(ANSWER_AT_END_S)
+            if self._base() == base:
+                await self._try_to_look(link, topics)
+                link.outbox.keep(topics.status, OFFLINE)
+            else:
+                self._withdraw(link, topics)
+            await link.flush(FLUSH_S)
+            running.cancel()
+            await asyncio.wait([running])
+
+    def _withdraw(self, link: MqttLink, topics: Topics) -> None:
+        """Have the broker forget everything under a topic that is ours no longer."""
+        for topic in topics.kept:
+            link.outbox.keep(topic, b"")
+        if self._settings.discovery is not None:
+            link.outbox.keep(discovery_topic(self._settings.discovery, topics), b"")
+
+    async def _try_to_look(self, link: MqttLink, topics: Topics) -> None:
+        try:
+            await self._look(link, topics)
+            self._faulty = False
+        except Exception:
+            # A fault here must not cost the calibration; said once, not five times a second.
+            logger.log(logging.DEBUG if self._faulty else logging.ERROR, "the state for MQTT", exc_info=True)
+            self._faulty = True
+
+    async def _look(self, link: MqttLink, topics: Topics) -> None:
+        """Put what has changed into the outbox."""
+        now_s = asyncio.get_running_loop().time()
+        state = self._conductor.state.value
+        if state != self._state or now_s - self._state_s >= STATE_S:
+            self._state, self._state_s = state, now_s
+            self._look_rarely(link, topics, now_s)
+        if not link.connected:
+            return
+        progress = self._progress_now()
+        if progress != self._progress and (now_s - self._progress_s >= PROGRESS_S or not self._is_busy):
+            link.outbox.pass_on(topics.progress, progress)
+            self._progress, self._progress_s = progress, now_s
+        pose = await self._pose()
+        if pose is not None:
+            link.outbox.pass_on(topics.attitude, _json(pose))
+
+    def _look_rarely(self, link: MqttLink, topics: Topics, now_s: float) -> None:
+        """What costs more than a glance."""
+        if self._conductor.last is not None:
+            link.outbox.keep(topics.record, to_json(self._conductor.last))
+        if (prefix := self._settings.discovery) is not None:
+            message = discovery_message(topics, self._known_system_id)
+            link.outbox.keep(discovery_topic(prefix, topics), _json(message))
+        said = summary(self._answers.status())
+        if self._pace.is_due(said, now_s):
+            link.outbox.keep(topics.state, _json(said))
+
+    @property
+    def _is_busy(self) -> bool:
+        job = self._conductor.job
+        return job is not None and not job.finished.done()
+
+    def _progress_now(self) -> bytes:
+        """How the latest job does; empty before the first."""
+        job = self._conductor.job
+        if job is None:
+            return b""
+        return _json(
+            {
+                "kind": job.kind,
+                "what": job.what.name.lower(),
+                "requester": job.requester,
+                "state": self._conductor.state.value,
+                "percent": self._conductor.progress_percent,
+                "text": job.words if self._is_busy else self._conductor.reason,
+            }
+        )
+
+    # --- what comes
+
+    def _on_message(self, message: Incoming) -> None:
+        if self.topics is None or self.link is None:
+            return
+        if message.topic == self.topics.status:
+            if message.payload != ONLINE and self.link.outbox.kept(message.topic) == ONLINE:
+                # The last will of an earlier connection, come late.
+                self.link.outbox.send_again(message.topic)
+            return
+        command = self.topics.command_in(message.topic)
+        if command is not None:
+            self._requests.take(command, message.payload, retained=message.retained)
+
+    def _on_retained(self, command: str) -> None:
+        if self.topics is not None:
+            topic = self.topics.request(command)
+            logger.warning(
+                "mqtt: the retained request at %s is not obeyed; delete it: mosquitto_pub -r -n -t %s", topic, topic
+            )
+
+    def _respond(self, command: str, response: Object, *, droppable: bool) -> None:
+        if self.topics is not None and self.link is not None:
+            self.link.outbox.answer(self.topics.response(command), _json(response), droppable=droppable)
+
+
+def _json(value: object) -> bytes:
+    return msgspec.json.encode(value)

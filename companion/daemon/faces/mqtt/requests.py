@@ -1,0 +1,179 @@
+"""Requests over MQTT: each is answered, none is obeyed twice, and no flood of them grows into anything.
+
+An answer repeats the request's transaction. A calibration is answered twice: "accepted" at once, and how it ended;
+everything else once. What is asked goes through the same door as the command line's (`Answers.answer`), so refusals
+are the same too.
+
+Three kinds of request are not what somebody wants now:
+- a retained one comes back at every connection, for ever: it is never obeyed, and the log says so once;
+- the empty payload that deletes a retained one looks like a request (on MQTT 3.1.1): it is let pass;
+- a repeat of a transaction (QoS 1 delivers at least once) gets the same answer again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Callable
+from typing import Any, Final, Protocol
+
+from companion.daemon.faces.mqtt.payloads import Misfit, Request, Transaction, parse
+from companion.errors import CompanionError
+
+logger = logging.getLogger(__name__)
+
+Object = dict[str, Any]
+
+MAX_PENDING: Final = 8
+"""Requests that wait for their end, such as cancels of a calibration in the middle of a write."""
+REMEMBERED: Final = 32
+REMEMBER_S: Final = 600.0
+_COMMAND = re.compile(r"[A-Za-z0-9_-]{1,32}")
+
+
+class Ask(Protocol):
+    """The daemon's answers, as `Answers.answer`."""
+
+    def __call__(self, request: Object, face: str) -> AsyncIterator[Object]:
+        """Answer one request."""
+
+
+class Respond(Protocol):
+    """Somewhere to put responses."""
+
+    def __call__(self, command: str, response: Object, *, droppable: bool) -> None:
+        """Send one."""
+
+
+class _Known:
+    """A request that came with a transaction."""
+
+    def __init__(self, request: Request, at_s: float) -> None:
+        self.request, self.at_s = request, at_s
+        self.response: Object | None = None
+        """What was answered last; None: nothing yet."""
+
+
+class Requests:
+    """Takes requests and answers them.
+
+    Args:
+        ask: who knows.
+        respond: where responses go; those that may be dropped are refusals.
+    """
+
+    def __init__(self, ask: Ask, respond: Respond) -> None:
+        self._ask, self._respond = ask, respond
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._known: OrderedDict[tuple[str, Transaction], _Known] = OrderedDict()
+        self._retained: set[str] = set()
+        self.on_retained: Callable[[str], None] = lambda command: None
+        """Told once of each command of which a retained request lies at the broker."""
+
+    def take(self, command: str, payload: bytes, *, retained: bool) -> None:
+        """Take one request; its answer comes later."""
+        if _COMMAND.fullmatch(command) is None:
+            logger.debug("mqtt: a request %.60r is ignored", command)
+            return
+        if self._is_leftover(command, payload, retained=retained):
+            return
+        request = parse(command, payload)
+        if retained:
+            reason = "a retained request is never obeyed; send it again without retain"
+            self._refuse(command, request.transaction, "request", reason)
+        elif isinstance(request, Misfit):
+            self._refuse(command, request.transaction, "request", request.reason)
+        elif not self._is_repeat(request):
+            self._start(request)
+
+    async def close(self, within_s: float) -> None:
+        """Let what waits be answered for so long, then drop it."""
+        if self._tasks:
+            await asyncio.wait(self._tasks, timeout=within_s)
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    def _is_leftover(self, command: str, payload: bytes, *, retained: bool) -> bool:
+        """Whether this only deletes a retained request; a retained one itself is reported."""
+        if retained and payload:
+            if command not in self._retained:
+                self._retained.add(command)
+                self.on_retained(command)
+            return False
+        if payload or not (retained or command in self._retained):
+            return False
+        self._retained.discard(command)
+        return True
+
+    def _is_repeat(self, request: Request) -> bool:
+        """Whether this transaction is known already; then it is answered as before."""
+        if request.transaction is None:
+            return False
+        now_s = asyncio.get_running_loop().time()
+        while self._known and now_s - next(iter(self._known.values())).at_s > REMEMBER_S:
+            self._known.popitem(last=False)
+        known = self._known.get((request.command, request.transaction))
+        if known is None:
+            return False
+        if known.request.content != request.content:
+            reason = f"transaction {request.transaction!r} was another {request.command}; give each one of its own"
+            self._refuse(request.command, request.transaction, "request", reason)
+        elif known.response is not None:
+            self._respond(request.command, {**known.response, "repeated": True}, droppable=True)
+        return True
+
+    def _start(self, request: Request) -> None:
+        if len(self._tasks) >= MAX_PENDING:
+            reason = f"{MAX_PENDING} requests are waiting for their end already"
+            self._refuse(request.command, request.transaction, "busy", reason)
+            return
+        key = (request.command, request.transaction)
+        if request.transaction is not None:
+            self._known[key] = _Known(request, asyncio.get_running_loop().time())
+            if len(self._known) > REMEMBERED:
+                self._known.popitem(last=False)
+        task = asyncio.get_running_loop().create_task(self._run(request), name=f"mqtt {request.command}")
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _run(self, request: Request) -> None:
+        question = {**request.question, "wait": True} if request.command == "calibrate" else request.question
+        accepted = False
+        try:
+            async for reply in self._ask(question, "mqtt"):
+                if reply["kind"] != "progress":
+                    self._answer(request, _final(reply))
+                elif not accepted:
+                    accepted = True
+                    self._answer(request, {"state": "accepted", "reason": "calibration started"})
+        except CompanionError as error:
+            # What was refused is not remembered: the same request may be taken a moment later.
+            self._known.pop((request.command, request.transaction), None)
+            self._refuse(request.command, request.transaction, getattr(error, "kind", "other"), str(error))
+        except Exception:
+            logger.exception("mqtt request %s failed", request.command)
+            self._answer(
+                request, {"state": "failed", "reason": "internal error of the daemon; its log has the details"}
+            )
+
+    def _answer(self, request: Request, answer: Object) -> None:
+        response = {"transaction": request.transaction, **answer}
+        known = self._known.get((request.command, request.transaction))
+        if known is not None:
+            known.response = response
+        self._respond(request.command, response, droppable=False)
+
+    def _refuse(self, command: str, transaction: Transaction, refusal: str, reason: str) -> None:
+        response = {"transaction": transaction, "state": "refused", "refusal": refusal, "reason": reason}
+        self._respond(command, response, droppable=True)
+
+
+def _final(reply: Object) -> Object:
+    """The end of a request, with its state and reason in front whatever it was."""
+    record = reply.get("record")
+    if record is not None:
+        return {"state": record["state"], "reason": record["reason"], "record": record}
+    return {key: value for key, value in reply.items() if key != "kind"}

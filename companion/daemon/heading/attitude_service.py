@@ -1,0 +1,318 @@
+"""Attitude in the daemon: wiring, rhythm, and what people are told."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.autopilot.vehicle.standing_requests import StandingRequests
+from companion.autopilot.vehicle.timesync import TimesyncResponder
+from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.calibration.collector.rolling import RollingCollector
+from companion.component.statustext import Severity, Weight
+from companion.config import Config
+from companion.configured import models
+from companion.daemon.arming.in_force import InForce
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.devices.sensors import SerialSensor
+from companion.daemon.heading.carrier import SLOWEST_AIRSPEED_M_S, Carrier
+from companion.daemon.heading.difference import Difference
+from companion.daemon.heading.external_estimate import ExternalEstimate
+from companion.daemon.heading.health import Health
+from companion.daemon.heading.sender import Sender, is_sane
+from companion.daemon.heading.source import carrying_imu, without_truncation
+from companion.daemon.offload import Offload
+from companion.links.mavlink.link import MavlinkLink
+from companion.physics.units import DEG
+from companion.samples import ImuSample, Sample
+
+logger = logging.getLogger(__name__)
+
+Object = dict[str, Any]
+Say = Callable[[Severity, str, Weight], object]
+
+TICK_S: Final = 0.1
+LOOK_S: Final = 0.5
+ATTITUDE_RATE_HZ: Final = 10.0
+"""Asked of the autopilot, for comparison."""
+VFR_HUD_RATE_HZ: Final = 5.0
+AIRSPEED_OLD_S: Final = 1.0
+INTERNAL: Final = "internal error; the log has the details"
+SAID_AGAIN_S: Final = 30.0
+"""The same stop is not told more often."""
+
+
+class AttitudeService:
+    """Carries, pushes and watches the attitude; `run` it.
+
+    Args:
+        config: with `push.attitude` "yaw" or "full".
+        link: the connection.
+        vehicle: to whom it is pushed.
+        collector: how still it is.
+        in_force: what the last calibration found.
+        imus: the autopilot's.
+        sensors: our own, which hand over what they read at once.
+        say: STATUSTEXT.
+        offload: for what takes milliseconds.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        link: MavlinkLink,
+        vehicle: Vehicle,
+        collector: RollingCollector,
+        in_force: InForce,
+        imus: Mapping[str, AutopilotImu],
+        sensors: Sequence[SerialSensor],
+        say: Say,
+        offload: Offload,
+    ) -> None:
+        self.on_beat: Callable[[], None] = lambda: None
+        self._config, self._vehicle, self._say = config, vehicle, say
+        self.carrier = Carrier(config, carrying_imu(config), vehicle, collector, in_force, offload)
+        self.difference = Difference(link, vehicle, self.carrier.now, self.carrier.kept_at)
+        self.health = Health(self.carrier, self.difference, vehicle)
+        self.sender = Sender(link, models.attitude_rate_hz(config), full=config.push.attitude == "full")
+        self.timesync = TimesyncResponder(link, vehicle)
+        self.external = ExternalEstimate(vehicle, self.difference)
+        self.external.on_outcome = lambda words: logger.info("attitude: %s", words)
+        self._wanted = StandingRequests(vehicle.commands)
+        self._wanted.add(mavlink.MAVLink_attitude_message, ATTITUDE_RATE_HZ)
+        self._unsubscribe = [
+            link.subscribe(mavlink.MAVLink_attitude_message, self._on_attitude),
+            link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat),
+            link.subscribe(mavlink.MAVLink_vfr_hud_message, self._on_vfr_hud),
+        ]
+        self._fixed_wing = False
+        self._airspeed_s = -math.inf
+        self._looked_s = -math.inf
+        self._was_pushing = False
+        self._told = 0
+        self._said: tuple[str, float] = ("", -math.inf)
+        self._warned: str | None = None
+        self._telling: asyncio.Task[None] | None = None
+        self._running = False
+        self._autopilot_imu = imus.get(self.carrier.imu.name)
+        if self._autopilot_imu is not None:
+            take = self._guarded(self._on_autopilot_samples)
+            self._autopilot_imu.also = lambda sample: take((sample,), sample.t_s)
+        for sensor in sensors:
+            if any(role.name == self.carrier.imu.name for role in sensor.roles):
+                sensor.on_samples = self._guarded(self._on_imu)
+            elif "compass" in sensor.kinds:
+                sensor.on_samples = self._guarded(lambda samples, _read_s: self.carrier.take_compass(samples))
+
+    # --- what arrives
+
+    def _guarded(self, take: Callable[[Sequence[Sample], float], None]) -> Callable[[Sequence[Sample], float], None]:
+        """A fault in here must cost neither the calibration its samples nor the autopilot its truth."""
+
+        def guarded(samples: Sequence[Sample], read_s: float) -> None:
+            try:
+                take(samples, read_s)
+            except Exception:
+                logger.exception("attitude met a fault of the program; it begins anew")
+                self.health.stop(INTERNAL)
+                self.carrier.forget()
+
+        return guarded
+
+    def _on_imu(self, samples: Sequence[Sample], read_s: float) -> None:
+        found = [sample for sample in samples if isinstance(sample, ImuSample)]
+        if not found:
+            return
+        self.carrier.take(found)
+        self._push(read_s)
+
+    def _on_autopilot_samples(self, samples: Sequence[Sample], read_s: float) -> None:
+        step = self.carrier.gyro_step_rad_s
+        found = [sample for sample in samples if isinstance(sample, ImuSample)]
+        self.carrier.take([without_truncation(sample, step) for sample in found] if step else found)
+        self._push(read_s)
+
+    def _push(self, read_s: float) -> None:
+        """Send what is due, in the turn of the loop that brought the samples.
+
+        Its rhythm is that of the reads: by when each turn has got here, every other one would now and then come too
+        soon, and be left out.
+        """
+        firmware = self._vehicle.firmware
+        if not self.health.pushing or firmware is None:
+            return
+        if not self.sender.is_due(self.carrier.heard_s, read_s):
+            return
+        attitude = self.carrier.now()
+        if attitude is None or not is_sane(attitude):
+            self.health.stop("attitude lost: samples were missing for too long")
+            return
+        self.sender.send(firmware, attitude, self.carrier.reset_counter, read_s)
+
+    def _on_attitude(self, message: mavlink.MAVLink_attitude_message, t_s: float) -> None:
+        if self._vehicle.sent(message):
+            self._wanted.heard(message, t_s)
+
+    def _on_heartbeat(self, message: mavlink.MAVLink_heartbeat_message, _t_s: float) -> None:
+        if self._vehicle.sent(message) and not self._fixed_wing and message.type == mavlink.MAV_TYPE_FIXED_WING:
+            self._fixed_wing = True
+            self._wanted.add(mavlink.MAVLink_vfr_hud_message, VFR_HUD_RATE_HZ)
+
+    def _on_vfr_hud(self, message: mavlink.MAVLink_vfr_hud_message, t_s: float) -> None:
+        """Of a fixed wing only: of others ArduPilot says the speed over ground here."""
+        if not self._vehicle.sent(message):
+            return
+        self._wanted.heard(message, t_s)
+        flies = self._fixed_wing and self.carrier.phase == "flight"
+        good = flies and math.isfinite(message.airspeed) and message.airspeed > SLOWEST_AIRSPEED_M_S
+        self.carrier.airspeed_m_s = message.airspeed if good else None
+        self._airspeed_s = t_s
+
+    # --- the rhythm
+
+    async def run(self) -> None:
+        """Look after everything that is not as urgent as a sample, until cancelled."""
+        loop = asyncio.get_running_loop()
+        self._running = True
+        try:
+            while True:
+                self.on_beat()
+                try:
+                    await self._turn(loop.time())
+                except Exception:
+                    # What is pushed to an EKF in flight must be in order, or not be at all.
+                    logger.exception("attitude met a fault of the program")
+                    self.health.stop(INTERNAL)
+                    await asyncio.sleep(1.0)
+                await asyncio.sleep(TICK_S)
+        finally:
+            self._running = False
+            self.health.stop("the companion ends")
+            for unsubscribe in (*self._unsubscribe, self.difference.close, self.timesync.close, self.carrier.close):
+                unsubscribe()
+            if self._telling is not None:
+                self._telling.cancel()
+
+    async def _turn(self, now_s: float) -> None:
+        if now_s - self._airspeed_s > AIRSPEED_OLD_S:
+            self.carrier.airspeed_m_s = None
+        if self._autopilot_imu is not None:
+            kind = self._autopilot_imu.stream.kind
+            self.carrier.gyro_step_rad_s = kind.gyro_step_rad_s if kind is not None and kind.truncates else 0.0
+        if self._vehicle.alive:
+            self._wanted.ask_for_missing(now_s)
+        self.health.judge(now_s)
+        if now_s - self._looked_s >= LOOK_S:
+            self._looked_s = now_s
+            await self.carrier.look(now_s)
+        self.sender.count(now_s)
+        self._tell(now_s)
+        self._tell_px4()
+
+    def _tell(self, now_s: float) -> None:
+        if self.health.pushing != self._was_pushing:
+            self._was_pushing = self.health.pushing
+            if self._was_pushing:
+                self._say_once(Severity.NOTICE, "Attitude: heading pushed to the autopilot", now_s)
+            else:
+                self._say_once(Severity.WARNING, f"Attitude push stopped: {self.health.why_not}", now_s)
+        warning = self.health.warning
+        if warning is not None and self._warned is None:
+            logger.warning("%s", warning)
+            self._say(Severity.WARNING, warning.capitalize(), Weight.NEWS)
+        self._warned = warning
+
+    def _say_once(self, severity: Severity, words: str, now_s: float) -> None:
+        logger.log(logging.WARNING if severity is Severity.WARNING else logging.INFO, "%s", words)
+        if self._said[0] != words or now_s - self._said[1] >= SAID_AGAIN_S:
+            self._said = (words, now_s)
+            self._say(severity, words, Weight.NEWS)
+
+    def _tell_px4(self) -> None:
+        """The heading by command, once at each alignment."""
+        attitude = self.carrier.now()
+        if self._told == self.carrier.alignments or attitude is None or not self.health.pushing:
+            return
+        self._told = self.carrier.alignments
+        if self._telling is not None:
+            self._telling.cancel()
+        self._telling = asyncio.get_running_loop().create_task(self.external.tell(attitude), name="attitude estimate")
+
+    # --- what is known
+
+    @property
+    def warnings(self) -> list[str]:
+        """For everybody who shows warnings."""
+        return [self.health.warning] if self.health.warning is not None else []
+
+    @property
+    def concern(self) -> str | None:
+        """What the pilot of an armed aircraft should know at once."""
+        if self.carrier.phase == "flight" and not self.health.pushing and self.carrier.alignments:
+            return f"attitude push stopped: {self.health.why_not}"
+        return self.health.warning
+
+    def status(self) -> Object:
+        """For `companion status` and `check`: one line among the devices."""
+        if not self._running:
+            return {"name": "attitude", "kind": "attitude", "good": True, "summary": "starts with companion run"}
+        # That nothing has been calibrated yet is no fault of a device.
+        good = self.health.pushing or self.carrier.alignments == 0
+        return {"name": "attitude", "kind": "attitude", "good": good, "summary": self._summary()}
+
+    def _summary(self) -> str:
+        if not self.health.pushing:
+            return f"not pushed: {self.health.why_not}"
+        seen = self.view()
+        difference = seen["difference_deg"]
+        differs = f", the autopilot's differs by {difference['heading']:.1f} deg" if difference is not None else ""
+        return f"heading {seen['heading_deg']:.1f} +- {seen['sigma_deg']['heading']:.1f} deg pushed{differs}"
+
+    def view(self) -> Object:
+        """The attitude as JSON can hold it."""
+        now_s = asyncio.get_running_loop().time()
+        attitude, difference = self.carrier.now(), self.difference
+        known = attitude is not None and difference.is_known(now_s)
+        return {
+            "mode": self._config.push.attitude,
+            "imu": self.carrier.imu.name,
+            "pushing": self.health.pushing,
+            "why_not": self.health.why_not or None,
+            "rate_hz": round(self.sender.rate_hz, 1),
+            "sent": self.sender.sent,
+            "alignments": self.carrier.alignments,
+            "reset_counter": self.carrier.reset_counter % 256,
+            "timesync_answers": self.timesync.answered,
+            "heading_by_command": self.external.outcome,
+            "roll_deg": None if attitude is None else round(attitude.roll_rad / DEG, 3),
+            "pitch_deg": None if attitude is None else round(attitude.pitch_rad / DEG, 3),
+            "heading_deg": None if attitude is None else round(attitude.yaw_rad / DEG % 360.0, 2) % 360.0,
+            "sigma_deg": None
+            if attitude is None
+            else dict(zip(("roll", "pitch", "heading"), (round(s / DEG, 3) for s in attitude.sigma_rad), strict=True)),
+            "difference_deg": {
+                "tilt": round(difference.tilt_rad / DEG, 2),
+                "heading": round(difference.heading_rad / DEG, 2),
+            }
+            if known
+            else None,
+        }
+
+    def pose(self) -> Object | None:
+        """What is pushed, in the words of the pose; None while nothing is."""
+        attitude = self.carrier.now() if self.health.pushing else None
+        if attitude is None:
+            return None
+        return {
+            "roll_deg": round(attitude.roll_rad / DEG, 3),
+            "pitch_deg": round(attitude.pitch_rad / DEG, 3),
+            "heading_deg": round(attitude.yaw_rad / DEG % 360.0, 2) % 360.0,
+            "north": "true",
+            "source": "attitude",
+            "still": self.carrier.still,
+        }

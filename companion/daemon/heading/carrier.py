@@ -1,0 +1,275 @@
+"""The estimator in the daemon: what feeds it, when it is aligned, and with what.
+
+Samples go through at once, in the turn of the loop in which they were read. Everything else (a new calibration, an
+alignment, the phase of flight) is looked at a few times a second.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+
+from companion.attitude.estimator import Attitude, AttitudeEstimator, Phase
+from companion.attitude.quaternion import Quaternion, conjugate, from_matrix, rotate
+from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
+from companion.calibration.collector.rolling import RollingCollector, Window
+from companion.calibration.solution.record import ImuRecord
+from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
+from companion.calibration.solution.solve import CompassModel, GradienterModel, truth_of, vehicle_heading_rad
+from companion.config import Config, Imu
+from companion.configured import models
+from companion.daemon import offload as estimating
+from companion.daemon.arming.in_force import InForce
+from companion.daemon.heading.difference import turn_between
+from companion.daemon.heading.source import settings_of
+from companion.daemon.offload import Offload
+from companion.errors import CalibrationRefusedError
+from companion.physics.frames import Matrix
+from companion.physics.units import DEG
+from companion.samples import CompassSample, ImuSample, Sample
+
+logger = logging.getLogger(__name__)
+
+KEPT_S: Final = 5.0
+"""A still window ends up to two seconds ago; with what came since the alignment is carried on to now."""
+STOOD_S: Final = 7.0
+"""How far back the seconds of an alignment may lie; five good ones are enough."""
+CHECK_EVERY_S: Final = 10.0
+"""So often what is carried is compared with how the aircraft stands."""
+TILT_FLOOR_RAD: Final = 0.5 * DEG
+HEADING_FLOOR_RAD: Final = 3.0 * DEG
+DISAGREES_SIGMAS: Final = 3.0
+JUMP_RAD: Final = 1.0 * DEG
+"""A heading that changes by more at an alignment is told to the autopilot as a reset."""
+SLOWEST_AIRSPEED_M_S: Final = 5.0
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Stand:
+    """How the aircraft stood at the end of a window."""
+
+    t_s: float
+    body_from_ned: Matrix
+    covariance: Matrix
+    """(3, 3) in NED, rad^2."""
+    heading_known: bool
+    local: LocalEarth
+
+
+def stand_of(
+    window: Window, where: Whereabouts, gradienter: GradienterModel | None, compass: CompassModel | None
+) -> Stand:
+    """Work it out; for a thread.
+
+    Raises:
+        CalibrationRefusedError: the readings cannot be right together.
+    """
+    local = local_earth(where)
+    truth = truth_of(window, gradienter if window.tilt is not None else None, compass, local, [])
+    turn = truth.body_from_ned
+    covariance = turn.T @ truth.attitude_covariance_rad2 @ turn
+    if truth.heading_rad is None:
+        covariance[2, 2] += HEADING_UNKNOWN_RAD**2
+    return Stand(window.end_s, turn, covariance, truth.heading_rad is not None, local)
+
+
+class Carrier:
+    """Carries the attitude of one IMU.
+
+    Args:
+        config: sensors and how they are mounted.
+        imu: which one carries.
+        vehicle: whether it is armed, where it is.
+        collector: whether it stands still, and how.
+        in_force: what the last calibration found.
+        offload: for what takes milliseconds.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        imu: Imu,
+        vehicle: Vehicle,
+        collector: RollingCollector,
+        in_force: InForce,
+        offload: Offload,
+    ) -> None:
+        self.imu = imu
+        self.estimator: AttitudeEstimator | None = None
+        self.heard_s = -math.inf
+        """When the last sample was taken."""
+        self.phase: Phase = "ground"
+        self.still = False
+        self.alignments = 0
+        self.reset_counter = 0
+        """Counts the alignments at which the heading jumped."""
+        self.airspeed_m_s: float | None = None
+        """Forward, of a fixed wing in the air; None elsewhere, and where nobody says it."""
+        self.gyro_step_rad_s = 0.0
+        """Of a stream of truncated integers."""
+        self.waiting_for = "waiting for a calibration"
+        """What an alignment needs."""
+        self._config, self._vehicle, self._collector = config, vehicle, collector
+        self._in_force, self._offload = in_force, offload
+        self.gradienter: Callable[[], GradienterModel | None] = lambda: models.gradienter_model(config.gradienter)
+        """As it is in force, with a zero that was measured."""
+        self._compass = models.compass_model(config.compass)
+        self._local: LocalEarth | None = None
+        self._record: ImuRecord | None = None
+        self._recent: deque[Sequence[ImuSample]] = deque()
+        """What came on the ground within `KEPT_S`, read by read."""
+        self._wanted = False
+        self._checked_s = -math.inf
+        self.close = vehicle.watch(self._on_event)
+
+    # --- what comes in, in the turn of the loop in which it was read
+
+    def take(self, samples: Sequence[ImuSample]) -> None:
+        """Take the samples of one read."""
+        self.heard_s = samples[-1].t_s
+        if self.phase == "ground":
+            recent = self._recent
+            recent.append(samples)
+            while recent[0][-1].t_s < self.heard_s - KEPT_S:
+                recent.popleft()
+        if self.estimator is not None:
+            self.estimator.update(samples, phase=self.phase, still=self.still, airspeed_m_s=self.airspeed_m_s)
+
+    def take_compass(self, samples: Sequence[Sample]) -> None:
+        """Take headings."""
+        estimator, compass, local = self.estimator, self._compass, self._local
+        if estimator is None or compass is None or local is None:
+            return
+        for sample in samples:
+            if not isinstance(sample, CompassSample):
+                continue
+            if sample.north not in (None, "magnetic" if compass.magnetic else "true"):
+                continue
+            now = estimator.attitude()
+            if now is None:
+                return
+            up = np.array(rotate(conjugate(now.quaternion), (0.0, 0.0, -1.0)))
+            heading, sigma_deg = vehicle_heading_rad(compass, sample.heading_deg, up), compass.sigma_at(up)
+            if compass.magnetic:
+                heading += local.declination_deg * DEG
+                sigma_deg = math.hypot(sigma_deg, local.declination_sigma_deg)
+            estimator.add_heading(sample.t_s, heading, sigma_deg * DEG)
+
+    def forget(self) -> None:
+        """Begin anew: on the ground, with the calibration in force."""
+        self.estimator = self._record = None
+        self._recent.clear()
+
+    def now(self) -> Attitude | None:
+        """The attitude at the last sample; None while there is none."""
+        return None if self.estimator is None else self.estimator.attitude()
+
+    def kept_at(self, t_s: float) -> tuple[float, Quaternion] | None:
+        """What is remembered of the attitude then: the instant and the turn from body to NED; None: nothing."""
+        return None if self.estimator is None else self.estimator.kept_at(t_s)
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        if event == "armed":
+            self.phase, self.still = "flight", False
+            self._recent.clear()
+        elif event == "disarmed":
+            self.phase = "ground"
+
+    # --- what is looked at now and then
+
+    async def look(self, now_s: float) -> None:
+        """Follow arming, calibrations and stillness; align when it is time to."""
+        disarmed = self._vehicle.arm_state is ArmState.DISARMED
+        # While nobody knows, what flight demands is right on the ground too; not so the other way round.
+        self.phase = "ground" if disarmed else "flight"
+        self.still = disarmed and self._collector.glance(now_s).obstacle is None
+        if not disarmed:
+            self._recent.clear()
+            return
+        await self._follow_calibration()
+        if self.estimator is None or not self.still:
+            if self.estimator is not None and not self.estimator.aligned:
+                self.waiting_for = "waiting for an alignment: hold still"
+            return
+        lost = not self.estimator.aligned
+        if self._wanted or lost or now_s - self._checked_s >= CHECK_EVERY_S:
+            self._checked_s = now_s
+            stand = await self._stand(now_s)
+            if stand is not None and self._vehicle.arm_state is ArmState.DISARMED:
+                self._local = stand.local
+                if self._wanted or lost or self._disagrees(stand):
+                    self._align(stand)
+
+    async def _follow_calibration(self) -> None:
+        """Take the biases of a new calibration; forget those that are in force no longer."""
+        found = self._in_force.record_of(self.imu.name)
+        if found is None and self.imu.source == "serial":
+            found = self._record  # what was undone or replaced is the autopilot's; this bias is still the sensor's
+        if found is self._record:
+            return
+        self._record = found
+        self.estimator = self.estimator if found is not None else None
+        if found is None:
+            self.waiting_for = "waiting for a calibration"
+            return
+        local = self._local = await self._offload(local_earth, models.whereabouts(self._config, self._vehicle))
+        settings = settings_of(self.imu, found, local, self.gyro_step_rad_s)
+        if settings is None:
+            self.estimator, self.waiting_for = None, "waiting for a calibration of the gyros"
+        elif self.estimator is None:
+            self.estimator, self._wanted = AttitudeEstimator(settings), True
+        else:
+            self.estimator.settle(settings)
+            self._wanted = True
+
+    async def _stand(self, now_s: float) -> Stand | None:
+        try:
+            window = await estimating.window(self._collector, self._offload, since_s=now_s - STOOD_S)
+            where = models.whereabouts(self._config, self._vehicle)
+            stand: Stand = await self._offload(stand_of, window, where, self.gradienter(), self._compass)
+        except CalibrationRefusedError as error:
+            self.waiting_for = f"waiting for an alignment: {error}"
+            return None
+        return stand
+
+    def _disagrees(self, stand: Stand) -> bool:
+        now = self.now()
+        if now is None:
+            return True
+        north, east, down = turn_between(now.quaternion, from_matrix(stand.body_from_ned.T))
+        tilt = math.hypot(north, east)
+        own = max(now.sigma_rad[0], now.sigma_rad[1])
+        tilt_sigma = math.hypot(own, math.sqrt(max(stand.covariance[0, 0], stand.covariance[1, 1])))
+        heading_sigma = math.hypot(now.sigma_rad[2], math.sqrt(stand.covariance[2, 2]))
+        if tilt > max(TILT_FLOOR_RAD, DISAGREES_SIGMAS * tilt_sigma):
+            return True
+        return stand.heading_known and abs(down) > max(HEADING_FLOOR_RAD, DISAGREES_SIGMAS * heading_sigma)
+
+    def _align(self, stand: Stand) -> None:
+        assert self.estimator is not None
+        before = self.now()
+        since = [sample for read in self._recent for sample in read if sample.t_s > stand.t_s]
+        self.estimator.align(stand.t_s if since else None, stand.body_from_ned, stand.covariance)
+        self.estimator.update(since, phase="ground")
+        after = self.now()
+        self._wanted = False
+        if after is None:
+            return
+        jump = math.inf if before is None else abs(math.remainder(after.yaw_rad - before.yaw_rad, 2.0 * math.pi))
+        if self.alignments and jump > JUMP_RAD:
+            self.reset_counter += 1
+        self.alignments += 1
+        roll, pitch, yaw = (angle / DEG for angle in (after.roll_rad, after.pitch_rad, after.yaw_rad))
+        logger.info("attitude aligned: roll %.2f, pitch %.2f, heading %.1f deg", roll, pitch, yaw % 360.0)
+
+    @property
+    def compass_refused_s(self) -> float:
+        """For how long the compass has disagreed."""
+        return 0.0 if self.estimator is None else self.estimator.compass.refused_for_s(self.heard_s)

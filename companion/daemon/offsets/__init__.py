@@ -1,0 +1,1 @@
+"""Writing to the autopilot: the plan, the ledger, what is put back, what else writes there."""

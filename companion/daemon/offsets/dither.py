@@ -1,0 +1,305 @@
+"""Offset dither: steps the autopilot's offsets below the last digit of an integer stream, and puts them back.
+
+The old values and all that may stand in their place are kept on disk before the first write, and the mender puts them
+back after whatever ends the dither too early: a cancel, arming, a reboot, a lost link, the daemon's death.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.pace import has_passed, moment
+from companion.autopilot.parameters.writer import Change, ParameterWriter
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.calibration.collector.rolling import RollingCollector, Window
+from companion.calibration.collector.sources import integer_batches
+from companion.calibration.means.dither import SECONDS, STEPS, Dithered, Step, combine, shifts_lsb, why_void
+from companion.calibration.means.windows import ImuWindow
+from companion.calibration.noise.allan import noise_profile
+from companion.calibration.seconds.batches import Batch
+from companion.calibration.solution.draft import Draft
+from companion.config import Config
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.job import Job, JobCancelledError
+from companion.daemon.offsets.ledger import Ledger
+from companion.errors import AutopilotError, CalibrationRefusedError, CompanionError
+from companion.physics.frames import Array
+from companion.samples import ImuSample
+from companion.storage.changes import Changed, ChangeSet
+
+logger = logging.getLogger(__name__)
+
+SETTLE_S: Final = {"ardupilot": 1.0, "px4": 2.5}
+"""Until the telemetry shows a written offset: ArduPilot's filter 60 ms, PX4's parameter updates a second (9.3)."""
+WRITE_S: Final = 0.5
+POLL_S: Final = 0.2
+SLACK_S: Final = 6.0
+"""Beyond its seconds a step may take so much longer when readings are lost."""
+MOST_VOID: Final = 6
+"""Steps that may be void in one dither before it is given up."""
+BACK_WITHIN_S: Final = 20.0
+"""The mender is waited for so long before the job ends without it."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Job:
+    """One IMU's dither."""
+
+    name: str
+    imu: AutopilotImu
+    calibration: ImuCalibration
+    steps_si: Array
+    values: tuple[dict[str, float], ...]
+    """Parameters by step."""
+    boots: int
+
+    @property
+    def before(self) -> dict[str, float]:
+        """The parameters as they were and must be again."""
+        return _in_force(self.calibration)
+
+
+class Ditherer:
+    """Replaces the means of IMUs whose integers do not tell, where the user has allowed it."""
+
+    def __init__(
+        self,
+        config: Config,
+        vehicle: Vehicle,
+        parameters: ParameterClient,
+        imus: Mapping[str, AutopilotImu],
+        collector: RollingCollector,
+        writer: ParameterWriter,
+        ledger: Ledger,
+    ) -> None:
+        self.enabled = config.push.dither and config.push.parameters
+        self.active = False
+        """Offsets are stepped at this moment, so nobody should arm."""
+        self.left_s = 0.0
+        """How long it will take yet, about; each IMU that needs it has a dither of its own."""
+        self._vehicle, self._parameters, self._imus = vehicle, parameters, imus
+        self._collector, self._writer, self._ledger = collector, writer, ledger
+        self._profiles = {imu.name: noise_profile(imu.profile) for imu in config.imu}
+        self._horizon_s = 180.0
+
+    async def refine(self, window: Window, job: Job, draft: Draft, progress: Callable[[str], None]) -> Window:
+        """Dither every IMU of the window that needs it; returns the window with their means in place.
+
+        Raises:
+            AutopilotError: moved too often, armed, out of time, a write failed or the autopilot restarted; the old
+                values are back, or it is said that they will be.
+            JobCancelledError: cancelled; likewise.
+            StorageError: the old values could not be kept; nothing was written.
+        """
+        if not self.enabled:
+            return window
+        found: list[ImuWindow] = []
+        for each in window.imus:
+            imu = self._imus.get(each.name)
+            if imu is None or not each.hidden:
+                found.append(each)
+                continue
+            # PX4's own calibration would take a far offset for a bias in the middle of it.
+            rivals = [rival.words for rival in imu.in_force.rivals if rival.parameter == "IMU_GYRO_CAL_EN"]
+            if rivals:
+                draft.warn(each.name, f"imu {each.name}: offsets not dithered: {rivals[0]}")
+                found.append(each)
+                continue
+            writes = self._parameters.writes
+            self.active = True
+            try:
+                result = await self._dither(each, imu, job, progress)
+            finally:
+                self.active = False
+            writes = self._parameters.writes - writes
+            draft.warn(each.name, f"imu {each.name}: offsets dithered and put back, {writes} parameter writes")
+            found.append(_with(each, result))
+        return msgspec.structs.replace(window, imus=tuple(found))
+
+    async def _dither(
+        self, window: ImuWindow, imu: AutopilotImu, job: Job, progress: Callable[[str], None]
+    ) -> Dithered:
+        work = self._prepare(window, imu)
+        with imu.changing():
+            try:
+                async with self._ledger.transaction(self._journal(work), stepwise=True):
+                    done = await self._steps(work, job, progress)
+                    await self._ledger.undone()
+            except (CompanionError, JobCancelledError) as error:
+                if not self._ledger.pending:
+                    raise  # the old values could not be kept, so nothing was written
+                words = f"{error}; {await self._put_back()}"
+                kind = JobCancelledError if isinstance(error, JobCancelledError) else AutopilotError
+                raise kind(words) from error
+        await imu.refresh()
+        if _in_force(imu.in_force) != work.before:
+            raise AutopilotError(f"imu {work.name}: somebody changed its offsets while they were dithered")
+        return combine(done, work.steps_si, self._profiles[window.name], self._horizon_s)
+
+    async def _steps(self, work: _Job, job: Job, progress: Callable[[str], None]) -> list[Step]:
+        """All steps, and the old values again."""
+        in_force = work.before
+        done: list[Step] = []
+        voids = 0
+        while len(done) < STEPS:
+            progress(f"dithering IMU {work.imu.instance}: step {len(done) + 1}/{STEPS}")
+            self.left_s = (STEPS - len(done)) * self._step_s()
+            self._check(job, work)
+            wanted = work.values[len(done)]
+            await self._writer.apply([Change(name, in_force[name], wanted[name]) for name in wanted])
+            in_force = wanted
+            step, moved = await self._collect(work, wanted, job)
+            why = moved or why_void(done, step, work.steps_si)
+            if why is None:
+                done.append(step)
+                continue
+            voids += 1
+            logger.info("dithering %s: step %d is void: %s", work.name, len(done) + 1, why)
+            if voids > MOST_VOID:
+                raise CalibrationRefusedError(f"imu {work.name}: not still while its offsets dithered: {why}")
+        progress(f"dithering IMU {work.imu.instance}: putting its offsets back")
+        await self._writer.restore([Change(name, before, in_force[name]) for name, before in work.before.items()])
+        return done
+
+    def _step_s(self) -> float:
+        """What a step takes: writing it, the telemetry showing it, whole seconds of it, the last of them complete."""
+        return WRITE_S + SETTLE_S.get(self._vehicle.firmware or "", 2.5) + SECONDS + 1.0
+
+    def _prepare(self, window: ImuWindow, imu: AutopilotImu) -> _Job:
+        calibration, kind = imu.in_force, imu.stream.kind
+        if kind is None or not kind.truncates:
+            raise AutopilotError(f"imu {window.name}: its integer telemetry has gone")
+        px4 = self._vehicle.firmware == "px4"
+        steps_si = np.repeat([kind.gyro_step_rad_s, kind.accel_step_m_s2], 3)
+        reading = np.array([*window.gyro_rad_s, *window.accel_m_s2]) / steps_si
+        shifts = shifts_lsb(reading, alternate=px4)
+        values = tuple(_offsets(calibration, shift * steps_si) for shift in shifts)
+        return _Job(window.name, imu, calibration, steps_si, values, self._vehicle.boots)
+
+    def _journal(self, work: _Job) -> ChangeSet:
+        return ChangeSet(
+            system_id=self._vehicle.system_id or 0,
+            changes=tuple(
+                Changed(
+                    name, before, after=work.values[0][name], also=tuple(values[name] for values in work.values[1:])
+                )
+                for name, before in work.before.items()
+            ),
+        )
+
+    def _check(self, job: Job, work: _Job) -> None:
+        job.check_cancelled()
+        if self._vehicle.arm_state is ArmState.ARMED:
+            raise CalibrationRefusedError("armed while the offsets dithered")
+        if self._vehicle.boots != work.boots:
+            raise AutopilotError("the autopilot rebooted while the offsets dithered")
+        if job.deadline_s is not None and asyncio.get_running_loop().time() >= job.deadline_s:
+            raise CalibrationRefusedError(f"not finished in the time given: {job.words}")
+
+    async def _collect(self, work: _Job, values: Mapping[str, float], job: Job) -> tuple[Step, str | None]:
+        """The seconds of one step, after the telemetry has had time to show it, and who says that it moved."""
+        loop = asyncio.get_running_loop()
+        written = moment(self._vehicle)
+        while not has_passed(self._vehicle, written, SETTLE_S.get(self._vehicle.firmware or "", 2.5)):
+            await job.pause(POLL_S)
+            self._check(job, work)
+        settled_s = loop.time()
+        source = integer_batches(work.steps_si, SECONDS + 2)
+        deadline_s = settled_s + SECONDS + 1.0 + SLACK_S
+        moved: str | None = None
+
+        def take(sample: ImuSample) -> None:
+            if sample.t_s >= settled_s and len(source.batches) < SECONDS:
+                source.add(sample.t_s, sample.gyro_rad_s + sample.accel_m_s2, None, sample.t_device_s)
+
+        with _tapped(work.imu, take):
+            while len(source.batches) < SECONDS and loop.time() < deadline_s:
+                await job.pause(POLL_S)
+                self._check(job, work)
+                if self._vehicle.arm_state is ArmState.UNKNOWN:
+                    raise AutopilotError("no heartbeat while the offsets dithered")
+                source.close_before(loop.time() - 0.5)
+                moved = moved or self._moving(work.name)
+        batches: Sequence[Batch] = list(source.batches.values())[:SECONDS]
+        return Step(_shift_of(work.calibration, values) / work.steps_si, batches), moved
+
+    def _moving(self, own: str) -> str | None:
+        """What another device says of the aircraft; the dithered IMU itself takes no part at present."""
+        for source in self._collector.status(asyncio.get_running_loop().time()).sources:
+            if source.name != own and not source.still and source.words:
+                return source.words
+        return None
+
+    async def _put_back(self) -> str:
+        """Let the mender put the old offsets back, and say what became of it."""
+        loop = asyncio.get_running_loop()
+        deadline_s = loop.time() + BACK_WITHIN_S
+        while loop.time() < deadline_s and self._vehicle.arm_state is not ArmState.ARMED:
+            if not self._ledger.pending:
+                return "old offsets put back"
+            await asyncio.sleep(POLL_S)
+        return "old offsets NOT back yet: will be once disarmed and heard"
+
+
+def _in_force(calibration: ImuCalibration) -> dict[str, float]:
+    names = calibration.parameters
+    return {
+        **dict(zip(names.gyro_offset, calibration.gyro_offset_rad_s, strict=True)),
+        **dict(zip(names.accel_offset, calibration.accel_offset_m_s2, strict=True)),
+    }
+
+
+def _offsets(calibration: ImuCalibration, shift: Array) -> dict[str, float]:
+    """The parameters that shift the output (6, vehicle FRD) by so much: off - R^-1 shift, accelerometer over scale."""
+    names, rotation = calibration.parameters, calibration.orientation
+    gyro = np.asarray(calibration.gyro_offset_rad_s) - rotation.T @ shift[:3]
+    accel = np.asarray(calibration.accel_offset_m_s2) - (rotation.T @ shift[3:]) / np.asarray(calibration.accel_scale)
+    pairs = [*zip(names.gyro_offset, gyro, strict=True), *zip(names.accel_offset, accel, strict=True)]
+    # As the autopilot keeps them: the shift that is taken off again is that of the rounded values.
+    return {name: float(np.float32(value)) for name, value in pairs}
+
+
+def _shift_of(calibration: ImuCalibration, values: Mapping[str, float]) -> Array:
+    """By how much these parameters shift the output, (6,) vehicle FRD."""
+    names, rotation = calibration.parameters, calibration.orientation
+    gyro = np.asarray(calibration.gyro_offset_rad_s) - [values[name] for name in names.gyro_offset]
+    accel = np.asarray(calibration.accel_offset_m_s2) - [values[name] for name in names.accel_offset]
+    return np.concatenate([rotation @ gyro, rotation @ (np.asarray(calibration.accel_scale) * accel)])
+
+
+@contextlib.contextmanager
+def _tapped(imu: AutopilotImu, take: Callable[[ImuSample], None]) -> Iterator[None]:
+    imu.tap = take
+    try:
+        yield
+    finally:
+        imu.tap = None
+
+
+def _with(window: ImuWindow, found: Dithered) -> ImuWindow:
+    """The window with the dithered means in place of those that do not tell."""
+    result = window
+    for part, triad in (("gyro", slice(0, 3)), ("accel", slice(3, 6))):
+        if part not in window.hidden:
+            continue
+        mean, stat, use = (
+            tuple(float(value) for value in each[triad]) for each in (found.mean, found.sigma_stat, found.sigma_use)
+        )
+        unit = "rad_s" if part == "gyro" else "m_s2"
+        changes = {
+            f"{part}_{unit}": mean,
+            f"{part}_sigma_stat_{unit}": stat,
+            f"{part}_sigma_use_{unit}": use,
+        }
+        result = msgspec.structs.replace(result, **changes)
+    return msgspec.structs.replace(result, hidden={}, dithered=True)

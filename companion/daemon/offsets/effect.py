@@ -1,0 +1,186 @@
+"""Did the autopilot take the new offsets? Its telemetry before and after the write, against what must have changed.
+
+What the last digit of integer telemetry hides is in the windows' sigmas; only the short look at far values on the way
+is of plain means.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
+from companion.autopilot.firmware.px4_slots import Sensor
+from companion.autopilot.parameters.verify import Observation, Verdict, judge
+from companion.autopilot.parameters.writer import Change
+from companion.autopilot.telemetry.imu_stream import StreamKind
+from companion.calibration.collector.rolling import MIN_BATCHES, ImuWindow
+from companion.calibration.noise.allan import AllanModel, floor_variance, noise_profile
+from companion.config import Noise
+from companion.daemon.offsets.far_step import FarMean
+from companion.physics.frames import Array
+from companion.physics.units import DEG_H, MG
+from companion.samples import Vector
+
+# Between two neighbouring windows of some ten seconds an unnamed part is taken for an ordinary one (floors of 8 deg/h
+# and 50 micro-g), not for the worst there is as over the minutes of sigma_use: else no step could ever be seen.
+ORDINARY_FLICKER: Final = (8.0 / 0.664 * DEG_H, 0.05 / 0.664 * MG)
+TOLERANCE_SIGMAS: Final = 2.0
+"""What may remain besides noise: nobody claims the bias better than by its sigma_use."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Sides:
+    """One IMU's telemetry before and after the write, and what it had to read before (vehicle FRD)."""
+
+    before: ImuWindow
+    after: ImuWindow
+    gyro_residual: Array | None
+    accel_residual: Array | None
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class OnTheWay:
+    """What was seen between: the output while far values were in force, and the step from there to the new ones."""
+
+    far: Mapping[Sensor, FarMean]
+    gyro_step: Vector
+    accel_step: Vector
+
+
+class _Triad(NamedTuple):
+    """Gyros or accelerometers of one window."""
+
+    mean: Vector
+    sigma_stat: Vector
+    sigma_use: Vector
+
+
+def _gyros(window: ImuWindow) -> _Triad:
+    return _Triad(window.gyro_rad_s, window.gyro_sigma_stat_rad_s, window.gyro_sigma_use_rad_s)
+
+
+def _accelerometers(window: ImuWindow) -> _Triad:
+    return _Triad(window.accel_m_s2, window.accel_sigma_stat_m_s2, window.accel_sigma_use_m_s2)
+
+
+def judge_vectors(
+    sides: Sides,
+    calibration: ImuCalibration,
+    changes: list[Change],
+    kind: StreamKind | None,
+    profile: str | Noise | None,
+    on_the_way: OnTheWay | None = None,
+) -> list[Verdict]:
+    """Judge the vectors that were written: accelerometers, gyros, or both.
+
+    Where the output was seen to follow a far value and then to leave it as it had to, the new one is in use, however
+    small the change as a whole.
+    """
+    gyro_step, accel_step = output_step(calibration, changes)
+    names, noise = calibration.parameters, noise_profile(profile)
+    spans_s = (sides.before.duration_s, sides.after.duration_s)
+    ordinary = (math.inf, math.inf) if profile is not None else ORDINARY_FLICKER
+
+    def observe(triad: Callable[[ImuWindow], _Triad], residual: Array, drift: float, rest: _Rest) -> Verdict:
+        before, after = triad(sides.before), triad(sides.after)
+        observation = Observation(
+            parameters=rest.parameters,
+            unit=rest.unit,
+            before=before.mean,
+            before_sigma=before.sigma_stat,
+            after=after.mean,
+            after_sigma=_hypot(_no_calmer(after.sigma_stat, before.sigma_stat, spans_s), drift),
+            expected_step=rest.step,
+            truth=_minus(before.mean, residual),
+            tolerance=TOLERANCE_SIGMAS * max(before.sigma_use),
+            orientation=calibration.orientation,
+        )
+        verdict = judge(observation)
+        far = on_the_way.far.get(rest.sensor) if on_the_way is not None else None
+        if not verdict.ok or on_the_way is None or far is None:
+            return verdict
+        return judge(
+            dataclasses.replace(
+                observation,
+                before=_vector(far.mean),
+                before_sigma=_vector(far.sigma),
+                expected_step=on_the_way.gyro_step if rest.sensor == "gyro" else on_the_way.accel_step,
+                resolution=rest.resolution,
+            )
+        )
+
+    result = []
+    if sides.accel_residual is not None:
+        rest = _Rest("accel", names.accel_offset, "m/s^2", accel_step, kind.accel_step_m_s2 if kind else 0.0)
+        drift = _drift_sigma(noise.accel, ordinary[1], spans_s)
+        result.append(observe(_accelerometers, sides.accel_residual, drift, rest))
+    if sides.gyro_residual is not None:
+        rest = _Rest("gyro", names.gyro_offset, "rad/s", gyro_step, kind.gyro_step_rad_s if kind else 0.0)
+        drift = _drift_sigma(noise.gyro, ordinary[0], spans_s)
+        result.append(observe(_gyros, sides.gyro_residual, drift, rest))
+    return result
+
+
+class _Rest(NamedTuple):
+    """What else an observation needs."""
+
+    sensor: Sensor
+    parameters: tuple[str, str, str]
+    unit: str
+    step: Vector
+    resolution: float
+
+
+def in_short(verdict: Verdict) -> str:
+    """What is wrong in one short line for people; `verdict.problems` has the figures."""
+    unused = [axis.parameter for axis in verdict.axes if axis.word == "not seen"]
+    if unused:
+        return f"the autopilot stored {', '.join(unused)} but does not use {'it' if len(unused) == 1 else 'them'}"
+    wrong = [axis.parameter for axis in verdict.axes if axis.word == "wrong"]
+    if wrong:
+        return f"the output did not follow {', '.join(wrong)} (orientation, sign or scale not as believed, or it moved)"
+    return "; ".join(verdict.problems)
+
+
+def nearly_visible(verdict: Verdict) -> bool:
+    """Whether a step that could not be seen might be with a longer look: at least 3 of the 8 sigmas it needs."""
+    sigma = verdict.fraction_sigma
+    return verdict.ok and bool(verdict.warnings) and sigma is not None and sigma < 1 / 3
+
+
+def _drift_sigma(model: AllanModel, most_flicker: float, spans_s: tuple[float, float]) -> float:
+    """How far the bias itself wanders between two neighbouring windows (method section 2.2, V less its white part)."""
+    return float(np.sqrt(floor_variance(min(model.flicker, most_flicker), model.walk, *spans_s)))
+
+
+def _hypot(sigmas: Vector, drift: float) -> Vector:
+    x, y, z = (float(np.hypot(sigma, drift)) for sigma in sigmas)
+    return x, y, z
+
+
+def _no_calmer(after: Vector, before: Vector, spans_s: tuple[float, float]) -> Vector:
+    """The sigmas of the later mean, but none below what the noise before the write makes of so many seconds.
+
+    A write changes no noise; but the scatter of a few seconds is, by chance, now and then a tenth of what it should be.
+    Where the seconds before are few as well, the three axes together count: simulated, 2 s against 2 s, each axis by
+    itself refuses 2 % of the writes that are in order, and the triad 0.1 %. From 5 s before on it is 0.2 % by itself.
+    """
+    longer = float(np.sqrt(spans_s[0] / spans_s[1])) if spans_s[1] > 0.0 else 1.0
+    triad = float(np.sqrt(np.mean(np.square(before)))) if spans_s[0] < MIN_BATCHES else 0.0
+    x, y, z = (max(sigma, longer * usual, longer * triad) for sigma, usual in zip(after, before, strict=True))
+    return x, y, z
+
+
+def _vector(values: Array) -> Vector:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _minus(mean: Vector, residual: Array) -> Vector:
+    x, y, z = (float(a - b) for a, b in zip(mean, residual, strict=True))
+    return x, y, z

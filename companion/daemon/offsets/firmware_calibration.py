@@ -1,0 +1,219 @@
+"""The firmware's own gyro calibration between the two halves of a write, so that its EKF is right afterwards.
+
+The order that leaves ArduPilot's EKF right (autopilots 9.3.1): accelerometer offsets, the firmware's gyro calibration,
+which alone resets the EKF's gyro bias, then our fine gyro offsets over its coarse ones. Ours are written before it as
+well: what the autopilot refuses is known while all can still be put back, and if the one command that is sent gets
+lost, nothing else is missing than the reset.
+
+The fine offsets are known beforehand: per sample the output is R (raw - offset), so the whole bias in board axes,
+offset + R^-1 residual, does not depend on the offset in force. With a temperature calibration it would: the firmware's
+calibration sets CALTEMP too, and with it what is taken off `raw`. There it is left out and the EKF settles by itself.
+
+The calibration also overwrites gyro offsets that nobody asked us to change. All of them are kept before and come back
+with every roll-back and undo.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from companion.autopilot.firmware.gyro_calibration import (
+    GyroParameters,
+    Outcome,
+    calibrate_gyros,
+    changed,
+    read_gyro_parameters,
+)
+from companion.autopilot.parameters.change import Change, FailureKind, WriteFailedError
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.vehicle.ekf import SETTLED_RAD_S, EkfWatch
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.calibration.solution.record import WrittenParameter
+from companion.daemon.offsets.ledger import Ledger
+from companion.errors import AutopilotError, AutopilotRebootedError, CompanionError, NotDisarmedError
+from companion.physics.units import DEG_H
+from companion.storage.changes import ChangeSet
+
+logger = logging.getLogger(__name__)
+
+WORTH_RAD_S: Final = 20.0 * DEG_H
+"""A step on any axis beyond this: a stale EKF bias turns the heading by the step times some 40 s (9.3.1), here 0.2 deg;
+and the firmware's calibration rewrites the flash of all instances."""
+
+SETTLE_RESET_S: Final = 60.0
+"""After the reset what is left is the tilt error of the old accelerometer offsets: while it fades the EKF takes a part
+of it for gyro bias (a step of 30 mg: 850 deg/h for a moment, settled after 26 s on the real firmware)."""
+
+SETTLE_ALONE_S: Final = 150.0
+"""By itself EKF3 takes about two minutes (9.3.1: 140 s)."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Done:
+    """What a write with the firmware's calibration in it has done."""
+
+    written: dict[str, WrittenParameter]
+    collateral: tuple[Change, ...]
+    """What the firmware changed besides: gyro offsets, calibration temperatures and ids that we do not calibrate."""
+    outcome: Outcome
+    warnings: tuple[str, ...]
+
+
+class FirmwareCalibration:
+    """Decides whether the firmware's gyro calibration is wanted, and writes around it."""
+
+    def __init__(
+        self, vehicle: Vehicle, parameters: ParameterClient, writer: ParameterWriter, ledger: Ledger, ekf: EkfWatch
+    ) -> None:
+        self._vehicle, self._parameters = vehicle, parameters
+        self._writer, self._ledger, self._ekf = writer, ledger, ekf
+
+    async def prepare(self, gyros: Sequence[Change], warn: Callable[[str], None]) -> GyroParameters | None:
+        """What it would overwrite, or None when it is not worth it or not allowed (then `warn` is told).
+
+        Raises:
+            AutopilotError: the autopilot does not answer.
+        """
+        if self._vehicle.firmware != "ardupilot" or not gyros:
+            return None
+        step = max(abs(change.after - change.before) for change in gyros)
+        if step <= WORTH_RAD_S and (await self._ekf.bias_rad_s() or 0.0) <= SETTLED_RAD_S:
+            return None
+        before = await read_gyro_parameters(self._parameters)
+        if before.tcal:
+            warn(
+                f"{', '.join(before.tcal)} is on: the firmware's own gyro calibration, which would reset its EKF, would"
+                " also change what the offsets mean, so it was left out; the EKF settles by itself"
+            )
+            return None
+        return before
+
+    async def write(
+        self, changes: Sequence[Change], gyros: Sequence[Change], before: GyroParameters, go_on: Callable[[str], None]
+    ) -> Done:
+        """All offsets, the firmware's calibration, the gyro offsets again: all, or all the old values are back.
+
+        In a transaction of these changes, which grows with what the firmware may change besides.
+
+        Args:
+            changes: all that is wanted.
+            gyros: the gyros' part of it.
+            before: from `prepare`.
+            go_on: told what is going on.
+
+        Raises:
+            NothingWrittenError: as `ParameterWriter.apply`.
+            WriteFailedError: as `ParameterWriter.apply`.
+        """
+        boots = self._vehicle.boots
+        written = await self._writer.apply(changes)
+        wanted = {change.parameter: change.after for change in changes}
+        now = dataclasses.replace(before, values={n: wanted.get(n, value) for n, value in before.values.items()})
+        try:
+            ours = [change for change in changes if change.parameter not in before.values]
+            await self._ledger.widen(ChangeSet.of(self._vehicle.system_id, ours, before.values))
+            calibration = await calibrate_gyros(self._parameters, now, go_on)
+            go_on(f"writing {len(gyros)} fine gyro offsets")
+            coarse = calibration.after.values
+            fine = await self._writer.apply([Change(c.parameter, coarse[c.parameter], c.after) for c in gyros])
+            collateral = tuple(
+                Change(name, old, new)
+                for name, (old, new) in changed(before, calibration.after).items()
+                if name not in wanted
+            )
+            await self._ledger.widen(ChangeSet.of(self._vehicle.system_id, (*changes, *collateral)))
+        except CompanionError as error:
+            await self._put_back(changes, before, boots, error)
+            raise
+        # What was in force before all this is what the record says, not the firmware's coarse value in between.
+        written |= {c.parameter: _with_before(fine[c.parameter], c.before) for c in gyros}
+        warnings = [calibration.words] if calibration.words else []
+        if collateral:
+            warnings.append(
+                "to reset its EKF the firmware calibrated all its gyros; besides ours that changed"
+                f" {', '.join(f'{c.parameter} ({c.before:.6g} -> {c.after:.6g})' for c in collateral)};"
+                " undo puts these back too"
+            )
+        return Done(written, collateral, calibration.outcome, tuple(warnings))
+
+    async def settle(
+        self, gyros: Sequence[Change], outcome: Outcome | None, go_on: Callable[[str], None]
+    ) -> str | None:
+        """After new gyro offsets: wait until the EKF agrees with them.
+
+        Args:
+            gyros: what was written.
+            outcome: of the firmware's calibration, None where there was none.
+            go_on: told how far it is; what it raises ends the waiting.
+
+        Returns:
+            What a pilot should know when it has not settled; None when it has, or when nothing is to settle.
+        """
+        if self._vehicle.firmware != "ardupilot" or not gyros:
+            return None
+        try:
+            return await self._ekf.settle(settles_within_s(outcome), go_on)
+        finally:
+            self._ekf.stop()
+
+    async def _put_back(
+        self, changes: Sequence[Change], before: GyroParameters, boots: int, error: CompanionError
+    ) -> None:
+        """Our old values, and everything that the firmware's calibration may have changed.
+
+        Raises:
+            WriteFailedError: always; what went wrong, and what could not be put back.
+        """
+        logger.warning("writing around the firmware's gyro calibration: %s; putting everything back", error)
+        reason = error.reason if isinstance(error, WriteFailedError) else str(error)
+        back = [change for change in changes if change.parameter not in before.values]
+        left: tuple[str, ...]
+        try:
+            if self._vehicle.boots != boots and await self._parameters.read_optional("INS_GYR_CAL"):
+                reason += "; the restart has measured the gyros anew (INS_GYR_CAL), so those stay"
+            else:
+                now = await read_gyro_parameters(self._parameters)
+                back += [Change(name, old, new) for name, (old, new) in changed(before, now).items()]
+            await self._writer.restore(back)
+            left = ()
+        except WriteFailedError as failure:
+            left = failure.left_changed
+        except AutopilotError:
+            left = tuple(dict.fromkeys((*(change.parameter for change in back), *before.values)))
+        raise WriteFailedError(self._kind(error, boots), reason, _outcomes(changes, left), left) from error
+
+    def _kind(self, error: CompanionError, boots: int) -> FailureKind:
+        if self._vehicle.boots != boots or isinstance(error, AutopilotRebootedError):
+            return "rebooted in the middle"
+        if isinstance(error, WriteFailedError):
+            return error.kind
+        if isinstance(error, NotDisarmedError):
+            armed = self._vehicle.arm_state is ArmState.ARMED
+            return "armed in the middle" if armed else "arm state unknown"
+        return "no answer"
+
+
+def settles_within_s(outcome: Outcome | None) -> float:
+    """How long the EKF is waited for after a write, at most, by what became of the firmware's calibration."""
+    return SETTLE_RESET_S if outcome == "reset" else SETTLE_ALONE_S
+
+
+def _with_before(written: WrittenParameter, before: float) -> WrittenParameter:
+    return WrittenParameter(before=before, after=written.after, read_back=written.read_back, outcome=written.outcome)
+
+
+def _outcomes(changes: Sequence[Change], left: Sequence[str]) -> dict[str, WrittenParameter]:
+    """After everything was put back, but for what is left."""
+    return {
+        change.parameter: WrittenParameter(
+            before=change.before,
+            after=change.after,
+            read_back=None if change.parameter in left else change.before,
+            outcome="failed" if change.parameter in left else "rolled_back",
+        )
+        for change in changes
+    }

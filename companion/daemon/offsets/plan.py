@@ -1,0 +1,190 @@
+"""What is to be written: from biases to parameters and their new values."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from companion.autopilot.firmware.firmwares import read_calibration, warnings_about
+from companion.autopilot.firmware.gyro_calibration import Outcome as FirmwareOutcome
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for, whole_of
+from companion.autopilot.firmware.px4_slots import SlotMemory
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.parameters.writer import Change
+from companion.autopilot.telemetry.imu_stream import StreamKind
+from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.calibration.solution.draft import Draft
+from companion.calibration.solution.solve import ImuSolution, Solution
+from companion.config import Config
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.offsets.rivalry import Rivalry
+from companion.errors import AutopilotError
+from companion.physics.frames import Array
+from companion.physics.units import MG
+from companion.samples import Vector
+
+COARSE_ACCEL_MG: Final = 5.0
+"""What the autopilots' own calibrations reach on a level table; a new offset known worse than that is worth a word."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Target:
+    """One autopilot IMU that gets new offsets."""
+
+    name: str
+    calibration: ImuCalibration
+    changes: tuple[Change, ...]
+    solution: ImuSolution
+    kind: StreamKind | None
+    watched: bool
+    """Whether its output is in the telemetry that we collect."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Plan:
+    """What is to be changed."""
+
+    targets: tuple[Target, ...]
+    boots: int
+    """How often the autopilot had rebooted when this was made."""
+    collateral: tuple[Change, ...] = ()
+    """What the firmware's own gyro calibration has changed besides."""
+    firmware: FirmwareOutcome | None = None
+    """How that ended; None where it was not used."""
+
+    @property
+    def changes(self) -> tuple[Change, ...]:
+        """All that we calibrate, in the order of writing."""
+        return tuple(change for target in self.targets for change in target.changes)
+
+    @property
+    def gyros(self) -> tuple[Change, ...]:
+        """The gyros' part of it."""
+        return tuple(
+            change
+            for target in self.targets
+            for change in target.changes
+            if change.parameter in target.calibration.parameters.gyro_offset
+        )
+
+    @property
+    def everything(self) -> tuple[Change, ...]:
+        """All that has changed, in the order in which it did."""
+        return (*self.collateral, *self.changes)
+
+
+class Planner:
+    """Works out what a solution means for the parameters of the autopilot."""
+
+    def __init__(
+        self,
+        config: Config,
+        vehicle: Vehicle,
+        parameters: ParameterClient,
+        imus: Mapping[str, AutopilotImu],
+        memory: SlotMemory,
+        rivalry: Rivalry,
+    ) -> None:
+        self._vehicle, self._parameters, self._imus = vehicle, parameters, imus
+        self._memory, self._rivalry = memory, rivalry
+        self._sources = {imu.name: imu for imu in config.imu}
+
+    async def plan(self, solution: Solution, draft: Draft, *, push: bool) -> Plan:
+        """Work out which parameter gets which value; fills the draft's whole biases and warnings.
+
+        Args:
+            solution: what was found.
+            draft: gets the whole biases and what a pilot should know; what it holds back is not planned.
+            push: whether anything is to be written at all.
+
+        Raises:
+            AutopilotError: a parameter cannot be read, or the autopilot cannot be calibrated as it is.
+            CalibrationRefusedError: what was found is no bias.
+        """
+        targets: list[Target] = []
+        for found in solution.imus:
+            imu, source = self._imus.get(found.name), self._sources[found.name]
+            whole, found = found, _to_be_written(found, draft)
+            if imu is not None:
+                calibration = imu.in_force
+                draft.whole[found.name] = whole_of(calibration, whole)
+                gyro, accel = found.gyro_rad_s, found.accel_m_s2
+            elif source.autopilot_instance is not None:
+                calibration = await read_calibration(self._parameters, source.autopilot_instance, self._memory)
+                gyro, accel = _residual_of_consumer(calibration, found)
+            else:
+                continue
+            for warning in self._rivalry.left_of(calibration):
+                draft.warn(found.name, warning)
+            changes = changes_for(calibration, _vector(gyro), _vector(accel))
+            if push:
+                coarse_mg = float(found.accel_sigma_use_m_s2.max()) / MG if accel is not None else 0.0
+                if coarse_mg > COARSE_ACCEL_MG:
+                    draft.warn(
+                        found.name,
+                        f"accel {found.name} is known to {coarse_mg:.0f} mg only: the gradienter is too coarse for it"
+                        " (companion align, or calibrate --gyros)",
+                    )
+                for warning in warnings_about(calibration, changes):
+                    draft.warn(found.name, warning)
+                kind = imu.stream.kind if imu is not None else None
+                targets.append(Target(found.name, calibration, tuple(changes), found, kind, watched=imu is not None))
+        self._refuse_shared(targets)
+        if targets:
+            stops = self._rivalry.changes([target.calibration for target in targets])
+            # First of all, so that nobody acts between it and the biases; undone last.
+            targets[0] = dataclasses.replace(targets[0], changes=(*stops, *targets[0].changes))
+            for change in stops:
+                draft.warn(targets[0].name, f"{change.parameter} is switched off; companion undo switches it on again")
+        return Plan(tuple(targets), self._vehicle.boots)
+
+    def _refuse_shared(self, targets: Sequence[Target]) -> None:
+        """Two IMUs in one of PX4's slots: what was learned of the slots cannot be right.
+
+        Raises:
+            AutopilotError: so it is; what was learned is forgotten.
+        """
+        owners: dict[str, str] = {}
+        for target in targets:
+            for name in (*target.calibration.parameters.gyro_offset, *target.calibration.parameters.accel_offset):
+                other = owners.setdefault(name, target.name)
+                if other != target.name:
+                    self._memory.forget()
+                    raise AutopilotError(
+                        f"imu {other} and imu {target.name} seem to share {name}, which cannot be; what was learned"
+                        " about PX4's slots is forgotten; calibrate again"
+                    )
+
+
+def _to_be_written(found: ImuSolution, draft: Draft) -> ImuSolution:
+    """What was found in one IMU, less what is held back."""
+    return dataclasses.replace(
+        found,
+        gyro_rad_s=None if (found.name, "gyro") in draft.held_back else found.gyro_rad_s,
+        accel_m_s2=None if (found.name, "accel") in draft.held_back else found.accel_m_s2,
+    )
+
+
+def _residual_of_consumer(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:
+    """What is left in the output of an autopilot that consumes our own IMU, from the IMU's whole bias."""
+    rotation, scale = calibration.orientation, np.asarray(calibration.accel_scale)
+    gyro = accel = None
+    if found.gyro_rad_s is not None:
+        gyro = found.gyro_rad_s - rotation @ np.asarray(calibration.gyro_offset_rad_s)
+    if found.accel_m_s2 is not None:
+        board = rotation.T @ found.accel_m_s2
+        accel = rotation @ (scale * (board - np.asarray(calibration.accel_offset_m_s2)))
+    return gyro, accel
+
+
+_ZERO: Final[Vector] = (0.0, 0.0, 0.0)
+
+
+def _vector(values: Array | None) -> Vector | None:
+    if values is None:
+        return None
+    x, y, z = (float(value) for value in values)
+    return x, y, z

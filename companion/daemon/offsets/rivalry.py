@@ -1,0 +1,121 @@
+"""Tells people what in the autopilot overwrites our biases: that it will, that it did, that it was switched off."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.firmware.rivals import Rival, stop
+from companion.autopilot.parameters.change import Change
+from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
+from companion.component.statustext import Severity, Weight
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+
+logger = logging.getLogger(__name__)
+
+Say = Callable[[Severity, str, Weight], object]
+
+JUST_NOW_S: Final = 20.0
+"""So long after a landing or a start a rewritten offset is taken for the work of who acts then."""
+
+
+class Rivalry:
+    """Watches over the autopilot's IMUs.
+
+    Args:
+        vehicle: the autopilot.
+        imus: by name.
+        say: words for the ground stations.
+        stop_rivals: whether they are to be switched off with the next write.
+    """
+
+    def __init__(self, vehicle: Vehicle, imus: Mapping[str, AutopilotImu], say: Say, *, stop_rivals: bool) -> None:
+        self._vehicle, self._imus, self._say = vehicle, imus, say
+        self.stop_rivals = stop_rivals
+        self._told: set[str] = set()
+        self._disarmed_s = self._rebooted_s = -math.inf
+        self._was_armed = False
+        self._unsubscribe = vehicle.watch(self._on_event)
+        for name, imu in imus.items():
+            imu.on_read = functools.partial(self._on_read, name)
+
+    @property
+    def rivals(self) -> tuple[Rival, ...]:
+        """Those that are switched on, as far as it is known at the moment."""
+        found = {r.parameter: r for imu in self._imus.values() if imu.calibration for r in imu.calibration.rivals}
+        return tuple(found.values())
+
+    @property
+    def warnings(self) -> list[str]:
+        """For `companion status` and `check`."""
+        return [rival.words for rival in self.rivals]
+
+    def changes(self, calibrations: Sequence[ImuCalibration]) -> list[Change]:
+        """What to write, before the biases, so that they stay; nothing unless that is configured."""
+        if not self.stop_rivals:
+            return []
+        rivals = {rival.parameter: rival for calibration in calibrations for rival in calibration.rivals}
+        return stop(tuple(rivals.values()))
+
+    def left_of(self, calibration: ImuCalibration) -> list[str]:
+        """The warnings about a calibration, without those of rivals that are about to be switched off."""
+        stopped = {r.words for r in calibration.rivals if not r.until_boot} if self.stop_rivals else set()
+        return [warning for warning in calibration.warnings if warning not in stopped]
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._unsubscribe()
+
+    def _on_event(self, event: VehicleEvent) -> None:
+        now_s = asyncio.get_running_loop().time()
+        if event == "armed":
+            self._was_armed = True
+        elif event == "disarmed":
+            self._disarmed_s = now_s if self._was_armed else self._disarmed_s
+            self._was_armed = False
+        elif event == "rebooted":
+            self._rebooted_s, self._was_armed = now_s, False
+            self._told.clear()
+
+    def _on_read(self, name: str, before: ImuCalibration | None, after: ImuCalibration) -> None:
+        for rival in after.rivals:
+            if rival.name not in self._told and (rival.until_boot or not self.stop_rivals):
+                self._told.add(rival.name)
+                what = "gyro+accel" if rival.accelerometers else "gyro"
+                words = f"{rival.name} may overwrite {what} biases"
+                if rival.until_boot:
+                    words = "Reboot PX4: its gyro calibration still runs"
+                self._say(Severity.WARNING, words, Weight.NEWS)
+        if before is not None and before.parameters == after.parameters:
+            self._compare(name, before, after)
+
+    def _compare(self, name: str, before: ImuCalibration, after: ImuCalibration) -> None:
+        gyros = before.gyro_offset_rad_s != after.gyro_offset_rad_s
+        accelerometers = before.accel_offset_m_s2 != after.accel_offset_m_s2
+        what = " and ".join(w for w, changed in (("gyro", gyros), ("accelerometer", accelerometers)) if changed)
+        if not what:
+            return
+        rival = self._culprit(after.rivals, accelerometers=accelerometers)
+        if rival is not None:
+            logger.warning("imu %s: %s offsets rewritten by the autopilot itself (%s)", name, what, rival.words)
+            words = f"{rival.name} rewrote {what} biases of {name}"
+        else:
+            logger.warning("imu %s: %s offsets rewritten by somebody else", name, what)
+            words = f"Somebody rewrote the {what} biases of {name}"
+        self._say(Severity.WARNING, words, Weight.NEWS)
+
+    def _culprit(self, rivals: Sequence[Rival], *, accelerometers: bool) -> Rival | None:
+        """Which of the rivals it was, by the time at which each acts."""
+        now_s = asyncio.get_running_loop().time()
+        acting = {
+            "at a start": now_s - self._rebooted_s < JUST_NOW_S,
+            "after a flight": now_s - self._disarmed_s < JUST_NOW_S,
+            "while still": not accelerometers,
+        }
+        able = [rival for rival in rivals if acting[rival.acts] and (rival.accelerometers or not accelerometers)]
+        return min(able, key=lambda rival: rival.acts == "while still", default=None)

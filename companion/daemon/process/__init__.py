@@ -1,0 +1,1 @@
+"""The process: what runs, who watches it, reload, and the check without running."""

@@ -1,0 +1,130 @@
+"""SIGHUP: the configuration file is read again, and what can change in flight-line use changes at once.
+
+Only keys that the file itself has changed count: what a ground station has set meanwhile (CMP_*) stays. What cannot
+change while the daemon runs is named, and stays what it was until a restart. A file with a mistake changes nothing.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from companion.component.own_parameters import OwnParameters
+from companion.config import Config, load
+from companion.config.senders import Senders
+from companion.config.words import shown
+from companion.daemon.faces.flight_line import AT_ARM
+from companion.daemon.offload import Offload
+from companion.daemon.process.service import Service
+from companion.errors import ConfigError
+from companion.physics.units import DEG_H, MG
+from companion.storage.profiles import ProfileStore
+
+logger = logging.getLogger(__name__)
+
+Apply = Callable[[Service, Any], None]
+
+
+def _gyro_target(service: Service, deg_h: float) -> None:
+    service.conductor.retarget(gyro_sigma_rad_s=deg_h * DEG_H)
+    _show(service.component.parameters, "CMP_GYR_TGT", deg_h)
+
+
+def _accel_target(service: Service, mg: float) -> None:
+    service.conductor.retarget(accel_sigma_m_s2=mg * MG)
+    _show(service.component.parameters, "CMP_ACC_TGT", mg)
+
+
+def _at_arm(service: Service, value: Any) -> None:
+    service.conductor.at_arm = value
+    _show(service.component.parameters, "CMP_AT_ARM", float(AT_ARM.index(value)))
+
+
+def _push(service: Service, value: bool) -> None:  # noqa: FBT001 - as all in the table
+    service.conductor.push_parameters = value
+    _show(service.component.parameters, "CMP_PUSH", float(value))
+
+
+def _stop_rivals(service: Service, value: bool) -> None:  # noqa: FBT001 - as all in the table
+    service.rivalry.stop_rivals = value
+
+
+def _allow(service: Service, value: tuple[str, ...]) -> None:
+    service.component.permission.senders = Senders(value)
+
+
+def _log_level(_service: Service, value: str) -> None:
+    logging.getLogger().setLevel(value.upper())
+
+
+RELOADABLE: Final[Mapping[str, Apply]] = {
+    "calibration.target_gyro_sigma_deg_h": _gyro_target,
+    "calibration.target_accel_sigma_mg": _accel_target,
+    "calibration.at_arm": _at_arm,
+    "push.parameters": _push,
+    "push.stop_rivals": _stop_rivals,
+    "mavlink.allow": _allow,
+    "log.level": _log_level,
+}
+"""What can change without a restart, and how."""
+
+
+def _show(parameters: OwnParameters, name: str, value: float) -> None:
+    try:
+        parameters.set(name, value)
+    except ValueError as error:
+        logger.warning("%s; ground stations see the old value", error)
+
+
+class Reloader:
+    """Reads the file again and applies it.
+
+    Args:
+        service: the running daemon.
+        path: of the configuration file.
+        offload: for the disk.
+    """
+
+    def __init__(self, service: Service, path: Path, offload: Offload) -> None:
+        self._service, self._path, self._offload = service, path, offload
+        self._in_force = flat(service.config)
+
+    async def reload(self) -> str:
+        """Apply what the file says now; what came of it in one line, empty when all of it is in force."""
+        try:
+            new = flat(await self._offload(load, self._path, ProfileStore))
+        except ConfigError as error:
+            logger.error("reload refused, the old configuration stays in force: %s", error)  # noqa: TRY400 - one line
+            return f"reload refused: {error}"
+        missing = object()
+        old = self._in_force
+        changed = [key for key in {**old, **new} if old.get(key, missing) != new.get(key, missing)]
+        applied = [key for key in changed if key in RELOADABLE]
+        for key in applied:
+            RELOADABLE[key](self._service, new[key])
+            logger.info("reloaded %s: %s = %s (was %s)", self._path, key, shown(new[key]), shown(old[key]))
+            old[key] = new[key]
+        rest = [key for key in changed if key not in RELOADABLE]
+        if rest:
+            words = f"restart to change {', '.join(rest)}"
+            logger.warning("reloaded %s: %s (systemctl restart companion)", self._path, words)
+            return words
+        if not applied:
+            logger.info("reloaded %s: nothing has changed", self._path)
+        return ""
+
+
+def flat(config: Config) -> dict[str, Any]:
+    """Every setting by its key: `section.key`; a list of tables, or a section that is absent, is one setting."""
+    found: dict[str, Any] = {}
+    for section in config.__struct_fields__:
+        value = getattr(config, section)
+        if isinstance(value, msgspec.Struct):
+            found.update({f"{section}.{key}": getattr(value, key) for key in value.__struct_fields__})
+        elif value is not None:
+            found[section] = value
+    return found

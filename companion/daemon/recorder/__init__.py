@@ -1,0 +1,1 @@
+"""The recording of everything a calibration is made of."""

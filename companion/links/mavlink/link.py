@@ -1,0 +1,241 @@
+"""MAVLink on one link: packing, parsing, sequence numbers, and who wants to hear which message.
+
+pymavlink's generated dialect class is the codec; `mavutil` is not used (it blocks, prints, and weighs 41 MiB).
+No socket is opened here: a transport (links.mavlink_transport, or a test's) hands received bytes to `receive` and
+gives `attach` a function that sends.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Literal, TypeVar
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.links.mavlink.frames import Codec, goes_ahead, kind_at, may_wait, read
+from companion.links.mavlink.signing import NEVER_SIGNED, Signing
+from companion.links.system.together import Take, Together
+
+logger = logging.getLogger(__name__)
+
+Message = mavlink.MAVLink_message
+M = TypeVar("M", bound=mavlink.MAVLink_message)
+Handler = Callable[[M, float], None]
+Unsubscribe = Callable[[], None]
+Direction = Literal["in", "out"]
+Sender = tuple[int, int]
+"""System and component."""
+
+_COMPACT_BYTES = 4096
+_ANYBODYS = frozenset(mavlink.mavlink_map[number].msgname for number in NEVER_SIGNED)
+
+
+class MavlinkLink:
+    """One MAVLink connection as one component sees it.
+
+    `system_id` may be changed while running: it is latched from the autopilot's heartbeat. All calls are made on
+    the event loop's thread; handlers must not block.
+    """
+
+    def __init__(self, *, system_id: int = 1, component_id: int = 191) -> None:
+        self.component_id = component_id
+        self.on_beat: Callable[[], None] = lambda: None
+        """Called again and again by whatever carries the link's bytes, as long as it works."""
+        self.received: Counter[str] = Counter()
+        """Messages by type, plus "bad" (failed checks), "unknown" (not in the dialect) and "handler error"."""
+        self.sent = 0
+        self.dropped = 0
+        """Messages that could not be sent: no transport was attached, or its buffer was full."""
+        self.last_received_s: float | None = None
+        self.tap: Callable[[Direction, bytes | None, float | None], object] | None = None
+        """Called with (direction, bytes, time of arrival); without bytes: some are missing here."""
+        self.signing: Signing | None = None
+        """Signs what is sent and judges what comes; None: nobody does."""
+        self.together = Together()
+        """Where datagrams of telemetry wait for the next read of a fast stream, while there is one."""
+        self.autopilot: Sender | None = None
+        """The autopilot that this link is for; None while it is not known."""
+        self._codec: Codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+        self._codec.robust_parsing = True
+        self._transmit: Callable[[bytes], object] | None = None
+        self._attached = 0
+        self._handlers: dict[str, list[Handler[mavlink.MAVLink_message]]] = {}
+
+    @property
+    def system_id(self) -> int:
+        """The system id under which we send."""
+        return self._codec.srcSystem
+
+    @system_id.setter
+    def system_id(self, value: int) -> None:
+        self._codec.srcSystem = value
+
+    def join(self, autopilot: Sender) -> None:
+        """Belong to this autopilot's vehicle from here on: we send under its system id."""
+        self.autopilot = autopilot
+        self.system_id = autopilot[0]
+
+    @property
+    def half_received(self) -> bytes:
+        """What may be the beginning of a message."""
+        return bytes(self._codec.buf[self._codec.buf_index :])
+
+    @property
+    def connected(self) -> bool:
+        """Whether a transport is attached; says nothing of a peer behind it."""
+        return self._transmit is not None
+
+    def attach(self, transmit: Callable[[bytes], object] | None) -> None:
+        """Give the function that sends bytes, or None while there is none. What was half received is forgotten.
+
+        A `transmit` that returns False has dropped the bytes because its buffer is full.
+        """
+        self.together.take()  # what came over the transport before this one
+        self._transmit = transmit
+        self._attached += 1
+        self._forget_received()
+        if self.tap is not None:
+            self.tap("in", None, None)
+
+    def send(self, message: mavlink.MAVLink_message) -> bool:
+        """Send a message now; False (and counted) when no transport is attached or its buffer is full."""
+        if self._transmit is None:
+            self.dropped += 1
+            return False
+        data = message.pack(self._codec)
+        if self.signing is not None:
+            data = self.signing.sign(data, message.crc_extra)
+        self._codec.seq = (self._codec.seq + 1) % 256
+        if self.tap is not None:
+            self.tap("out", data, None)
+        if self._transmit(data) is False:
+            self.dropped += 1
+            return False
+        self.sent += 1
+        return True
+
+    def subscribe(self, kind: type[M], handler: Handler[M]) -> Unsubscribe:
+        """Call `handler(message, t_s)` for every message of a kind, whoever sent it; returns how to stop that."""
+        handlers = self._handlers.setdefault(kind.msgname, [])
+        handlers.append(handler)  # type: ignore[arg-type]
+
+        def unsubscribe() -> None:
+            if handler in handlers:
+                handlers.remove(handler)
+
+        return unsubscribe
+
+    def arrived(self, datagram: bytes, t_s: float, take: Take) -> None:
+        """Have a datagram taken by `take(datagram, t_s)`: streams of telemetry with the next read of a fast stream.
+
+        Whatever else comes is taken at once, behind what waits; some of what is asked of us ahead of it.
+        """
+        together = self.together
+        if together.driven and may_wait(datagram):
+            together.put(take, datagram, t_s)
+            return
+        if not (together.driven and goes_ahead(datagram)):
+            together.take()
+        take(datagram, t_s)
+
+    def receive(self, data: bytes, t_s: float) -> None:
+        """Take bytes of a stream that arrived at `t_s` (monotonic); never raises, whatever they are."""
+        if self.tap is not None:
+            self.tap("in", data, t_s)
+        attached = self._attached
+        for name, _, message in self._frames(data):
+            self._dispatch(name, message, t_s)
+            if self._attached != attached:
+                return  # what came over another transport ends here
+        # The codec frees its buffer only when a read happens to end on a frame's end; a busy serial link may not
+        # do that for hours.
+        if self._codec.buf_index > _COMPACT_BYTES:
+            del self._codec.buf[: self._codec.buf_index]
+            self._codec.buf_index = 0
+
+    def receive_datagram(self, datagram: bytes, t_s: float, admit: Callable[[Sender], None]) -> None:
+        """Take a datagram, which holds whole messages: of one that is cut off nothing is carried into the next.
+
+        `admit` is told who sent each message that may have an effect, before it has any; not of a radio's own, which
+        anybody may send without a signature.
+        """
+        if self.tap is not None:
+            self.tap("in", datagram, t_s)
+        frames = list(self._frames(datagram))
+        if self.half_received:
+            self.received["bad"] += 1
+            if self.tap is not None:
+                self.tap("in", None, None)
+        self._forget_received()
+        for name, sender, message in frames:
+            if name not in _ANYBODYS:
+                admit(sender)
+            self._dispatch(name, message, t_s)
+
+    def _frames(self, data: bytes) -> Iterator[tuple[str, Sender, Message | None]]:
+        """Name, sender and message of what is whole and admitted; no message where nobody wants it.
+
+        The good frames at the front are read here. The codec, which knows everything and takes several times as long,
+        gets the rest from the first frame on that is anything special: signed, of version 1, with text or arrays in it
+        for somebody, damaged, cut off.
+        """
+        if self._codec.buf:
+            data = self.half_received + data
+            self._forget_received()
+        at = 0
+        while self.signing is None and (found := kind_at(data, at)) is not None:
+            kind, end = found
+            message = None
+            if self._handlers.get(kind.msgname):
+                message = read(kind, data, at, end)
+                if message is None:
+                    break
+            yield kind.msgname, (data[at + 5], data[at + 6]), message
+            at = end
+        if at == len(data):
+            return
+        message = self._next_message(data[at:])
+        while message is not None:
+            if self._admits(message):
+                yield message.get_type(), (message.get_srcSystem(), message.get_srcComponent()), message
+            message = self._next_message(b"")
+
+    def _admits(self, message: Message) -> bool:
+        if message.get_type() == "BAD_DATA":
+            self.received["bad"] += 1
+            return False
+        if isinstance(message, mavlink.MAVLink_unknown):
+            # One counter for all: noise can look like any of 16 million message ids.
+            self.received["unknown"] += 1
+            return False
+        return self.signing is None or self.signing.admits(message.get_msgbuf())
+
+    def signed_on(self, message: Message) -> int | None:
+        """The sender's link id in a message that is signed with our key; None where it is not, or nobody judges."""
+        return None if self.signing is None else self.signing.link_id_of(message.get_msgbuf())
+
+    def _next_message(self, data: bytes) -> mavlink.MAVLink_message | None:
+        try:
+            return self._codec.parse_char(data)
+        except Exception:  # noqa: BLE001 - the generated parser's own faults must not reach the loop
+            self.received["bad"] += 1
+            self._forget_received()
+            return None
+
+    def _forget_received(self) -> None:
+        self._codec.buf = bytearray()
+        self._codec.buf_index = 0
+
+    def _dispatch(self, name: str, message: Message | None, t_s: float) -> None:
+        self.received[name] += 1
+        self.last_received_s = t_s
+        if message is None:
+            return
+        for handler in tuple(self._handlers.get(name, ())):
+            try:
+                handler(message, t_s)
+            except Exception:
+                self.received["handler error"] += 1
+                logger.exception("handling %s failed", name)

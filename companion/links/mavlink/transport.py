@@ -1,0 +1,254 @@
+"""Carries a MAVLink link's bytes: UDP, TCP or a serial line, for as long as it takes.
+
+Urls as in the configuration: `udpin:HOST:PORT` (listen, answer whoever speaks), `udpout:HOST:PORT` (speak first),
+`tcp:HOST:PORT` (connect) and `serial:PATH:BAUD`. All come back by themselves; the link is attached only while there
+is somebody, or at least somewhere, to send to.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import functools
+import logging
+import re
+from collections.abc import Callable
+from typing import Any, Protocol, cast
+
+from companion.errors import LinkError
+from companion.links.mavlink.link import MavlinkLink, Sender
+from companion.links.serial.bytestream import ByteLink, PortSettings
+from companion.links.system.backoff import Backoff
+
+logger = logging.getLogger(__name__)
+
+PEER_SILENCE_S = 10.0
+MAX_PEERS = 8
+"""Newcomers beyond these are heard but not answered; only the autopilot's own address gets the place of another."""
+OUT_BUFFER_BYTES = 65536
+MOST_DATAGRAM_BYTES = 65536
+"""UDP carries no more; asyncio makes room for four times that, afresh for every datagram, which costs more than all the
+rest of its reading: so much memory is got from the kernel, and given back, page by page."""
+RESOLVE_DEADLINE_S = 5.0
+"""For the host's name; without a network a resolver takes its time."""
+_TURN_S = 1.0
+_URL = re.compile(r"(?P<kind>udpin|udpout|tcp|serial):(?P<where>.+):(?P<number>\d+)")
+# The target's host is up but nobody listens yet (or it restarts): keep sending, it will come.
+_PASSING_ERRORS = frozenset({errno.ECONNREFUSED, errno.ENOBUFS, errno.EAGAIN})
+
+OnState = Callable[[bool, str], None]
+Peer = tuple[Any, ...]
+"""An address as the socket gives it."""
+
+
+async def run_transport(link: MavlinkLink, url: str, *, on_state: OnState | None = None) -> None:
+    """Keep `link` connected through `url` until cancelled.
+
+    `on_state(connected, words)` tells of every change; for UDP the words hold the local address.
+
+    Raises:
+        LinkError: the url is none of ours. A peer that is not there is no error.
+    """
+    kind, where, number = parse_url(url)
+    if kind in ("udpin", "udpout"):
+        await _run_udp(link, url, (where, number), listen=kind == "udpin", on_state=on_state)
+        return
+    settings = PortSettings(f"tcp://{where}:{number}", 0) if kind == "tcp" else PortSettings(where, number)
+
+    def state(connected: bool, words: str) -> None:  # noqa: FBT001 - ByteLink's own signature
+        link.attach(stream.write if connected else None)
+        if on_state is not None:
+            on_state(connected, words)
+
+    stream = ByteLink(settings, link.receive, name="mavlink", on_state=state)
+    stream.on_beat = link.on_beat
+    await stream.run()
+
+
+def parse_url(url: str) -> tuple[str, str, int]:
+    """Kind ("udpin", "udpout", "tcp", "serial"), host or path, and port or baud rate of a MAVLink url.
+
+    Raises:
+        LinkError: it is none; says what is allowed.
+    """
+    match = _URL.fullmatch(url)
+    if match is None or (match["kind"] != "serial" and int(match["number"]) > 65535):
+        raise LinkError(
+            f"MAVLink url {url!r}: allowed are udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT and serial:PATH:BAUD"
+        )
+    return match["kind"], match["where"], int(match["number"])
+
+
+async def _run_udp(
+    link: MavlinkLink, url: str, address: tuple[str, int], *, listen: bool, on_state: OnState | None
+) -> None:
+    """Open the socket again with back-off whenever it fails or its local address is gone."""
+    loop = asyncio.get_running_loop()
+    backoff = Backoff()
+    warned = False
+    said: tuple[bool, str] | None = None
+
+    def say(words: str, *, connected: bool) -> None:
+        nonlocal said
+        if on_state is not None and (connected, words) != said:
+            said = (connected, words)
+            on_state(connected, words)
+
+    def factory() -> _Udp:
+        return _Listener(link) if listen else _Speaker(link)
+
+    while True:
+        link.on_beat()
+        try:
+            async with asyncio.timeout(RESOLVE_DEADLINE_S):
+                if listen:
+                    transport, udp = await loop.create_datagram_endpoint(factory, local_addr=address)
+                else:
+                    transport, udp = await loop.create_datagram_endpoint(factory, remote_addr=address)
+        except TimeoutError:
+            reason = f"{url}: the name is not resolved within {RESOLVE_DEADLINE_S:g} s"
+        except (OSError, UnicodeError) as error:
+            reason = f"{url}: {getattr(error, 'strerror', None) or error}"
+        else:
+            host, port = transport.get_extra_info("sockname")[:2]
+            logger.info("mavlink: %s is open at %s:%s", url, host, port)
+            say(f"{url} is open at {host}:{port}", connected=True)
+            warned = False
+            since_s = loop.time()
+            try:
+                reason = f"{url}: {await udp.run()}"
+            finally:
+                transport.abort()
+                link.attach(None)
+                await udp.closed
+            if loop.time() - since_s > _TURN_S:
+                backoff.reset()
+        logger.log(logging.DEBUG if warned else logging.WARNING, "mavlink: %s", reason)
+        warned = True
+        say(reason, connected=False)
+        await asyncio.sleep(backoff.next_s())
+
+
+class _DatagramOut(Protocol):
+    """What every event loop's datagram transport can, though asyncio's own type does not say so."""
+
+    def sendto(self, data: bytes, addr: tuple[Any, ...] | None = None) -> None: ...
+
+    def get_write_buffer_size(self) -> int: ...
+
+
+class _Udp(asyncio.DatagramProtocol):
+    """What both kinds of UDP share: receiving, a bounded way out, and an end."""
+
+    def __init__(self, link: MavlinkLink) -> None:
+        self.link = link
+        loop = asyncio.get_running_loop()
+        self.now_s = loop.time
+        self.closed: asyncio.Future[None] = loop.create_future()
+        self._failed: asyncio.Future[str] = loop.create_future()
+        self._transport: _DatagramOut | None = None
+
+    async def run(self) -> str:
+        """Serve until the socket fails; returns why."""
+        while not self._failed.done():
+            self.link.on_beat()
+            await asyncio.wait([self._failed], timeout=_TURN_S)
+            self._turn()
+        return self._failed.result()
+
+    def _turn(self) -> None:
+        """What is due once a second."""
+
+    def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
+        self._transport = cast("_DatagramOut", transport)
+        if hasattr(transport, "max_size"):
+            transport.max_size = MOST_DATAGRAM_BYTES
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._transport = None
+        if not self.closed.done():
+            self.closed.set_result(None)
+        self._fail(exc)
+
+    def error_received(self, exc: Exception) -> None:
+        # Anything else (the network is down, our address is gone) may be for ever for a socket that is bound to it.
+        if not (isinstance(exc, OSError) and exc.errno in _PASSING_ERRORS):
+            self._fail(exc)
+
+    def send_to(self, data: bytes, peer: Peer | None) -> bool:
+        """Send one datagram; False when the socket is gone or its buffer full (then the newest is what is dropped)."""
+        transport = self._transport
+        if transport is None or transport.get_write_buffer_size() + len(data) > OUT_BUFFER_BYTES:
+            return False
+        transport.sendto(data, peer)
+        return True
+
+    def _fail(self, error: Exception | None) -> None:
+        if not self._failed.done():
+            self._failed.set_result(str(getattr(error, "strerror", None) or error or "closed"))
+
+
+class _Speaker(_Udp):
+    """udpout: one target, from which alone we hear."""
+
+    def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self.link.attach(lambda data: self.send_to(data, None))
+
+    def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
+        self.link.arrived(data, self.now_s(), self._take)
+
+    def _take(self, datagram: bytes, t_s: float) -> None:
+        self.link.receive_datagram(datagram, t_s, lambda sender: None)
+
+
+class _Listener(_Udp):
+    """udpin: sends to every peer that has a place; with no such peer the link counts as not connected.
+
+    A place is for who has sent a message that may have an effect, not for any bytes.
+    """
+
+    def __init__(self, link: MavlinkLink) -> None:
+        super().__init__(link)
+        self._heard_s: dict[Peer, float] = {}
+        self._autopilots: set[Peer] = set()
+        """Those of them that have spoken for the autopilot."""
+
+    def datagram_received(self, data: bytes, addr: Peer) -> None:
+        self.link.arrived(data, self.now_s(), functools.partial(self._take, addr))
+
+    def _take(self, peer: Peer, datagram: bytes, t_s: float) -> None:
+        self.link.receive_datagram(datagram, t_s, lambda sender: self._hear(peer, sender, t_s))
+
+    def _hear(self, peer: Peer, sender: Sender, t_s: float) -> None:
+        autopilot = sender == self.link.autopilot
+        if peer not in self._heard_s and len(self._heard_s) >= MAX_PEERS and not (autopilot and self._make_room()):
+            return
+        if autopilot:
+            self._autopilots.add(peer)
+        self._heard_s[peer] = t_s
+        if not self.link.connected:
+            self.link.attach(self._send_to_all)
+
+    def _make_room(self) -> bool:
+        """Let the autopilot's own address have the place of somebody else, the one who has been silent for longest."""
+        others = self._heard_s.keys() - self._autopilots
+        if not others:
+            return False
+        del self._heard_s[min(others, key=self._heard_s.__getitem__)]
+        return True
+
+    def error_received(self, exc: Exception) -> None:
+        # One peer that cannot be reached is its own trouble; it is forgotten once silent.
+        return
+
+    def _send_to_all(self, data: bytes) -> bool:
+        sent = [self.send_to(data, peer) for peer in self._heard_s]
+        return any(sent)
+
+    def _turn(self) -> None:
+        now_s = self.now_s()
+        self._heard_s = {peer: heard_s for peer, heard_s in self._heard_s.items() if now_s - heard_s <= PEER_SILENCE_S}
+        self._autopilots &= self._heard_s.keys()
+        if not self._heard_s:
+            self.link.attach(None)

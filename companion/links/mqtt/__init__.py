@@ -1,0 +1,1 @@
+"""MQTT: the client, what it lets in, what it keeps for later."""

@@ -1,0 +1,380 @@
+"""The connection to an MQTT broker, for as long as it takes.
+
+aiomqtt speaks MQTT (paho below): asyncio without a thread of ours, typed, and its version 2 speaks MQTT 3.1.1 and 5.
+All that knows aiomqtt is in this module, as its version 3 will be another library; what it gets of the broker has
+passed `mqtt_filter`. MQTT 5 is tried first: only there can a message say that it was published to be retained, and
+only there is the broker told how large a message may be.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import datetime
+import importlib
+import importlib.util
+import logging
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from companion.config import Mqtt
+from companion.links.mqtt.credentials import is_open_to_all, read_password, tls_context
+from companion.links.mqtt.filter import LEAVE_DEADLINE_S, MAX_PACKET_BYTES, BrokerFaultError, MqttFilter
+from companion.links.mqtt.outbox import Outbox
+from companion.links.mqtt.words import causes, explain, is_of_protocol
+from companion.links.system.backoff import Backoff
+
+if TYPE_CHECKING:
+    import aiomqtt
+
+logger = logging.getLogger(__name__)
+_quiet = logging.getLogger(f"{__name__}.aiomqtt")
+# What goes wrong there reaches us as an exception, and is said once, in words for people.
+_quiet.setLevel(logging.CRITICAL)
+
+INSTALL: Final = "pip install 'aiomqtt>=2.5,<3' where the companion is installed"
+GREETING_DEADLINE_S: Final = 5.0
+"""For the broker's first words; until then MQTT 3.1.1 is not tried on one that is silent to MQTT 5."""
+ANSWER_DEADLINE_S: Final = 5.0
+FIRST_WAIT_S: Final = 0.5
+LONGEST_WAIT_S: Final = 30.0
+WORTH_S: Final = 10.0
+"""A connection that lasted so long was worth one: the next attempts begin with short waits again."""
+MANY: Final = 3
+"""So many connections in a row that were not worth one are more than bad luck."""
+MQTT_3_1_1: Final = 4
+MQTT_5: Final = 5
+"""The numbers of the two protocols on the wire."""
+_REFUSED: Final = 128
+
+Offload = Callable[..., Awaitable[Any]]
+
+
+class Incoming(NamedTuple):
+    """A message from the broker."""
+
+    topic: str
+    payload: bytes
+    retained: bool
+    """Kept by the broker from earlier, or (seen in MQTT 5 only) published now to be kept."""
+
+
+class MqttLink:
+    """Keeps a connection to the broker, sends what is in `outbox`, hands over what comes.
+
+    Args:
+        settings: which broker.
+        client_id: who we are to it; a second client of that name takes over from the first.
+        will: topic and payload that the broker publishes, retained, when we are gone without a word.
+        subscriptions: topics to hear; the will's should be among them, to know that what we say there comes through.
+        on_message: told of each message; must not block.
+        offload: runs a blocking call elsewhere.
+    """
+
+    def __init__(
+        self,
+        settings: Mqtt,
+        *,
+        client_id: str,
+        will: tuple[str, bytes] | None = None,
+        subscriptions: Sequence[str] = (),
+        on_message: Callable[[Incoming], None] = lambda message: None,
+        offload: Offload = asyncio.to_thread,
+    ) -> None:
+        self.settings, self.client_id = settings, client_id
+        self.outbox = Outbox()
+        self.last_error: str | None = None
+        """Why there is, or last was, no connection; one line for people."""
+        self.connections = 0
+        """How often the broker was reached."""
+        self._will, self._subscriptions, self._on_message = will, tuple(subscriptions), on_message
+        self._offload = offload
+        self._backoff = Backoff(FIRST_WAIT_S, LONGEST_WAIT_S)
+        self._protocol: int = MQTT_5
+        self._connected_s: float | None = None
+        self._since = datetime.datetime.now(tz=datetime.UTC)
+        self._retry_s: float | None = None
+        self._refused: list[str] = []
+        self._warned: str | None = None
+        self._warned_open = False
+        self._short = 0
+        self._echoed = will is None
+
+    @property
+    def connected(self) -> bool:
+        """Whether the broker has accepted us."""
+        return self._connected_s is not None
+
+    @property
+    def where(self) -> str:
+        """The broker's address."""
+        return f"{self.settings.host}:{self.settings.broker_port}"
+
+    def status(self) -> dict[str, object]:
+        """For `companion status` and `check`."""
+        now_s = asyncio.get_running_loop().time()
+        since_s = None if self._connected_s is None else now_s - self._connected_s
+        retry_s = None if self._retry_s is None else max(0.0, self._retry_s - now_s)
+        refused_now = [*self._refused]
+        if since_s is not None and since_s > ANSWER_DEADLINE_S and not self._echoed:
+            # Few brokers tell a client that they let it neither speak nor hear.
+            refused_now.append("our own messages do not come back (the broker's access list?)")
+        if since_s is not None:
+            words = f"connected to {self.where} since {self._since:%H:%M:%S} UTC"
+            words += "".join(f"; {refused}" for refused in refused_now)
+        else:
+            words = self.last_error or f"{self.where}: not connected yet"
+            words += "" if retry_s is None else f"; next attempt in {retry_s:.0f} s"
+        if self.outbox.dropped:
+            words += f"; {self.outbox.dropped} answers dropped in a flood of requests"
+        return {
+            "good": since_s is not None and not refused_now,
+            "summary": words,
+            "connected": since_s is not None,
+            "connected_since": None if since_s is None else self._since.isoformat(timespec="seconds"),
+            "connected_s": None if since_s is None else round(since_s, 1),
+            "connections": self.connections,
+            "last_error": self.last_error,
+            "retry_in_s": None if retry_s is None else round(retry_s, 1),
+            "dropped": self.outbox.dropped,
+        }
+
+    async def run(self) -> None:
+        """Keep the connection until cancelled; a loss is an event to report, never an exception."""
+        loop = asyncio.get_running_loop()
+        problem = await self._offload(_load_library)
+        if problem is not None:
+            self._down(problem)
+            await loop.create_future()
+        while True:
+            began_s, protocol, before = loop.time(), self._protocol, self.connections
+            try:
+                await self._serve()
+            except* Exception as group:  # noqa: BLE001 - whatever it is, it costs the connection and nothing else
+                self._lost(group, began_s, reached=self.connections > before)
+            if (protocol, self._protocol) == (MQTT_5, MQTT_3_1_1):
+                continue
+            if loop.time() - began_s >= WORTH_S:
+                self._backoff.reset()
+            delay_s = self._backoff.next_s()
+            self._retry_s = loop.time() + delay_s
+            await asyncio.sleep(delay_s)
+            self._retry_s = None
+
+    def _lost(self, error: BaseException, began_s: float, *, reached: bool) -> None:
+        """Say why there is no connection, unless the older protocol has to be tried first."""
+        logger.debug("mqtt", exc_info=error)
+        if is_of_protocol(error) and not reached:
+            # A broker that is too old for MQTT 5 says so, or says nothing, or closes the connection.
+            self._protocol = MQTT_3_1_1 if self._protocol == MQTT_5 else MQTT_5
+            if self._protocol == MQTT_3_1_1:
+                return
+        why = explain(error, self.settings, self.client_id, reached=reached)
+        # Who was thrown out by another client did nothing wrong before.
+        is_fault = isinstance(causes(error)[0], BrokerFaultError)
+        is_short = reached and not is_fault and asyncio.get_running_loop().time() - began_s < WORTH_S
+        self._short = self._short + 1 if is_short else 0
+        if self._short >= MANY:
+            # Two clients of one name throw each other out for ever, and few brokers say so.
+            why += f"; again and again: is another client called {self.client_id!r}, too?"
+        self._down(f"{self.where}: {why}")
+
+    async def flush(self, within_s: float) -> None:
+        """Wait until everything was sent, if there is a connection, and for so long at most."""
+        if self.connected:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(within_s):
+                    await self.outbox.empty()
+
+    async def _serve(self) -> None:
+        """One connection, to its end.
+
+        Raises:
+            LinkError: password or certificates cannot be used, or the broker sends what is not taken.
+            OSError: no broker is reached.
+            aiomqtt.MqttError: it refuses, or the connection is lost.
+        """
+        import aiomqtt
+
+        password = await self._offload(read_password, self.settings)
+        if not self._warned_open and is_open_to_all(self.settings):
+            self._warned_open = True
+            path = self.settings.password_path
+            logger.warning("mqtt: password file %s: everybody on this computer can read it (chmod o-r)", path)
+        context = await self._offload(tls_context, self.settings)
+        lost: Exception | None = None
+        async with MqttFilter(self.settings.host, self.settings.broker_port, context, self._protocol) as broker:
+            try:
+                await self._talk(broker, password)
+            except aiomqtt.MqttError as error:
+                lost = error
+        # What is wrong with the broker is the better reason: the library knows only that the connection is gone.
+        if (reason := broker.fault or lost) is not None:
+            raise reason
+
+    async def _talk(self, broker: MqttFilter, password: str | None) -> None:
+        client = self._client(broker.address, password)
+        await _enter(client, broker)
+        try:
+            await _both(self._speak(client), self._receive(client))
+        finally:
+            self._connected_s = None
+            self.outbox.closed()
+            await _leave(client)
+
+    def _client(self, address: str, password: str | None) -> aiomqtt.Client:
+        import aiomqtt
+        from paho.mqtt.packettypes import PacketTypes
+        from paho.mqtt.properties import Properties
+
+        properties = None
+        if self._protocol == MQTT_5:
+            properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+            properties.MaximumPacketSize = MAX_PACKET_BYTES
+        return aiomqtt.Client(
+            address,
+            transport="unix",
+            username=self.settings.username,
+            password=password,
+            identifier=self.client_id,
+            protocol=aiomqtt.ProtocolVersion(self._protocol),
+            will=aiomqtt.Will(self._will[0], self._will[1], qos=1, retain=True) if self._will else None,
+            clean_session=True if properties is None else None,
+            keepalive=self.settings.keepalive_s,
+            properties=properties,
+            timeout=GREETING_DEADLINE_S,
+            queue_type=_inbox(self._take),
+            logger=_quiet,
+        )
+
+    async def _speak(self, client: aiomqtt.Client) -> None:
+        await self._subscribe(client)
+        self._up()
+        await self._send(client)
+
+    async def _subscribe(self, client: aiomqtt.Client) -> None:
+        from paho.mqtt.subscribeoptions import SubscribeOptions
+
+        self._refused = []
+        for topic in self._subscriptions:
+            if self._protocol == MQTT_5:
+                options = SubscribeOptions(qos=1, retainAsPublished=True)
+                granted = await client.subscribe(topic, options=options, timeout=ANSWER_DEADLINE_S)
+            else:
+                granted = await client.subscribe(topic, qos=1, timeout=ANSWER_DEADLINE_S)
+            if any(getattr(code, "value", code) >= _REFUSED for code in granted):
+                self._refused.append(f"the broker does not let us hear {topic} (its access list?)")
+                logger.warning("mqtt: %s: %s", self.where, self._refused[-1])
+
+    async def _send(self, client: aiomqtt.Client) -> None:
+        while True:
+            parcel = await self.outbox.next()
+            await client.publish(
+                parcel.topic, parcel.payload, qos=parcel.qos, retain=parcel.retain, timeout=ANSWER_DEADLINE_S
+            )
+            self.outbox.sent(parcel)
+
+    async def _receive(self, client: aiomqtt.Client) -> None:
+        """Wait for the end of the connection; what comes is dealt with as it comes (`_inbox`)."""
+        async for message in client.messages:
+            self._take(message)
+
+    def _take(self, message: aiomqtt.Message) -> None:
+        topic = message.topic.value
+        self._echoed |= self._will is not None and topic == self._will[0]
+        try:
+            self._on_message(Incoming(topic, message.payload, bool(message.retain)))
+        except Exception:
+            logger.exception("an MQTT message could not be dealt with")
+
+    def _up(self) -> None:
+        self._connected_s = asyncio.get_running_loop().time()
+        self._since = datetime.datetime.now(tz=datetime.UTC)
+        self._echoed = self._will is None
+        self.connections += 1
+        self.outbox.opened()
+        protocol = {MQTT_5: "MQTT 5", MQTT_3_1_1: "MQTT 3.1.1"}[self._protocol]
+        logger.info("mqtt: %s to %s (%s)", "connected again" if self._warned else "connected", self.where, protocol)
+        self._warned = None
+
+    def _down(self, reason: str) -> None:
+        self.last_error = reason
+        logger.log(logging.DEBUG if self._warned == reason else logging.WARNING, "mqtt: %s", reason)
+        self._warned = reason
+
+
+async def _both(sending: Coroutine[Any, Any, None], receiving: Coroutine[Any, Any, None]) -> None:
+    """Run both until one fails; raises what it raised.
+
+    No task group: one that has an error to tell forgets that it was cancelled meanwhile (CPython before 3.13), and
+    whoever is stopped at the moment of a loss would go on for ever.
+    """
+    loop = asyncio.get_running_loop()
+    tasks = [loop.create_task(sending, name="mqtt sender"), loop.create_task(receiving, name="mqtt receiver")]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+    finally:
+        for task in tasks:
+            task.cancel()
+        ended = await asyncio.gather(*tasks, return_exceptions=True)
+    for end in ended:
+        if isinstance(end, Exception):
+            raise end
+
+
+def _load_library() -> str | None:
+    """Import aiomqtt, in a thread as it takes a while; returns what is wrong with it, in words."""
+    try:
+        if importlib.util.find_spec("aiomqtt") is None:
+            return f"MQTT needs aiomqtt, which is not installed ({INSTALL}); the companion goes on without MQTT"
+        importlib.import_module("aiomqtt")
+        # Imported here: it takes as long as all of the links.
+        from importlib.metadata import version
+
+        found = version("aiomqtt")
+    except Exception as error:  # noqa: BLE001 - whatever a broken installation raises
+        return f"aiomqtt cannot be loaded: {error} ({INSTALL}); the companion goes on without MQTT"
+    if not found.startswith("2."):
+        return f"aiomqtt {found} is of another make ({INSTALL}); the companion goes on without MQTT"
+    return None
+
+
+def _inbox(take: Callable[[aiomqtt.Message], None]) -> type[asyncio.Queue[aiomqtt.Message]]:
+    """A queue that never holds anything: it hands over at once.
+
+    aiomqtt reads faster than its iterator gives, so that a flood would fill any queue, and what is beyond its end is
+    lost without an answer.
+    """
+
+    class Inbox(asyncio.Queue[Any]):
+        def put_nowait(self, item: Any) -> None:
+            take(item)
+
+    return Inbox
+
+
+async def _enter(client: aiomqtt.Client, broker: MqttFilter) -> None:
+    """Wait until the broker has accepted or refused us.
+
+    Raises:
+        aiomqtt.MqttError: it refuses.
+    """
+    entering = asyncio.get_running_loop().create_task(client.__aenter__(), name="mqtt connect")
+    try:
+        await asyncio.shield(entering)
+    except asyncio.CancelledError:
+        # Left alone half way, it would live on without us: without the broker it ends by itself.
+        broker.hang_up()
+        await asyncio.wait([entering], timeout=LEAVE_DEADLINE_S)
+        entering.cancel()
+        await asyncio.gather(entering, return_exceptions=True)
+        raise
+
+
+async def _leave(client: aiomqtt.Client) -> None:
+    """Say goodbye if that is still possible."""
+    import aiomqtt
+
+    with contextlib.suppress(aiomqtt.MqttError, OSError, TimeoutError):
+        async with asyncio.timeout(LEAVE_DEADLINE_S):
+            await client.__aexit__(None, None, None)

@@ -1,0 +1,113 @@
+"""What a broker's silence or refusal means, in words for the one who stands beside the aircraft."""
+
+from __future__ import annotations
+
+import os
+import socket
+import ssl
+from typing import Final
+
+from companion.config import Mqtt
+from companion.errors import LinkError
+from companion.links.mqtt.filter import NoGreetingError
+
+UNSUPPORTED_PROTOCOL: Final = 132
+"""Reason codes of MQTT 5 (its section 2.4); paho turns those of MQTT 3.1.1 into the same."""
+_BAD_PASSWORD: Final = (134, 135)
+_CLIENT_ID: Final = 133
+_UNAVAILABLE: Final = (136, 137)
+_SHUTTING_DOWN: Final = 139
+_TAKEN_OVER: Final = 142
+_LOST: Final = (7, 128)
+"""paho's own number, and what it makes of it for MQTT 5."""
+_SILENT: Final = (16, 141)
+"""Likewise: nothing was heard for twice the keepalive."""
+
+
+def causes(error: BaseException) -> list[BaseException]:
+    """The error and what it came from, outermost first; of a group, its first member's."""
+    found: list[BaseException] = []
+    inner: BaseException | None = error
+    while inner is not None and inner not in found:
+        if isinstance(inner, BaseExceptionGroup):
+            inner = inner.exceptions[0]
+            continue
+        found.append(inner)
+        inner = inner.__cause__ or inner.__context__
+    return found
+
+
+def reason_code(error: BaseException) -> int | None:
+    """What the broker (or paho) said by number, where it said anything."""
+    for cause in causes(error):
+        code = getattr(cause, "rc", None)
+        if code is not None:
+            return int(getattr(code, "value", code))
+    return None
+
+
+def is_of_protocol(error: BaseException) -> bool:
+    """Whether the broker may not speak the version of MQTT that it was spoken to in."""
+    closed = any(isinstance(cause, NoGreetingError) for cause in causes(error))
+    return closed or reason_code(error) == UNSUPPORTED_PROTOCOL or _is_unanswered(error)
+
+
+def _is_unanswered(error: BaseException) -> bool:
+    """Whether what listens there took the connection and then said nothing in time (aiomqtt has no type for it)."""
+    return any(str(cause) == "Operation timed out" for cause in causes(error))
+
+
+def explain(error: BaseException, settings: Mqtt, client_id: str, *, reached: bool) -> str:
+    """Why there is no connection, in one line without the broker's address; `reached`: there was one."""
+    code = reason_code(error)
+    if code is not None:
+        return _of_code(code, error, settings, client_id)
+    hint = " (does it want tls = true?)"
+    if settings.tls:
+        hint = " (does it want a certificate? mqtt.cert_file)" if settings.cert_file is None else ""
+    if _is_unanswered(error):
+        return "the broker does not answer any more" if reached else f"what listens there says nothing{hint}"
+    for cause in causes(error):
+        if isinstance(cause, NoGreetingError):
+            return f"{cause}{hint}"
+        if isinstance(cause, LinkError):
+            return str(cause)
+        if isinstance(cause, OSError) and (words := _of_system(cause, settings)):
+            return words
+    return str(error) or type(error).__name__
+
+
+def _of_code(code: int, error: BaseException, settings: Mqtt, client_id: str) -> str:
+    if code in _BAD_PASSWORD:
+        if settings.username is None:
+            return "the broker asks for a user (mqtt.username, mqtt.password_file)"
+        return f"the broker refuses user {settings.username!r}: unknown, or the password is wrong"
+    if code == _TAKEN_OVER:
+        return (
+            f"another client called {client_id!r} has taken over: is there a second companion for this vehicle?"
+            " (mqtt.base_topic tells them apart)"
+        )
+    words = {
+        UNSUPPORTED_PROTOCOL: "the broker speaks neither MQTT 5 nor 3.1.1",
+        _CLIENT_ID: f"the broker refuses the client id {client_id!r} (mqtt.client_id)",
+        _SHUTTING_DOWN: "the broker shuts down",
+        **dict.fromkeys(_LOST, "the connection is gone (broker stopped? network?)"),
+        **dict.fromkeys(_SILENT, "nothing heard from the broker any more"),
+        **dict.fromkeys(_UNAVAILABLE, "the broker is not available now"),
+    }
+    return words.get(code) or f"the broker says: {causes(error)[-1]}"
+
+
+def _of_system(error: OSError, settings: Mqtt) -> str | None:
+    if isinstance(error, ssl.SSLCertVerificationError):
+        trusted = settings.ca_file or "the system's authorities; mqtt.ca_file names another"
+        return f"the broker's certificate is not trusted: {error.verify_message} (by {trusted})"
+    if isinstance(error, ssl.SSLError):
+        return f"TLS fails: {(error.reason or str(error)).lower().replace('_', ' ')}"
+    if isinstance(error, socket.gaierror):
+        return f"host {settings.host} is not known"
+    if isinstance(error, TimeoutError):
+        return "no answer"
+    if isinstance(error, ConnectionRefusedError):
+        return "nobody listens there (is the broker running?)"
+    return os.strerror(error.errno).lower() if error.errno else None

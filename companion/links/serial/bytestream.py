@@ -1,0 +1,383 @@
+"""A port that comes back by itself: the one place that knows a serial port from `tcp://`.
+
+Whatever was opened ends as one non-blocking descriptor on the event loop, read with `os.read`: one code path, no
+thread in the hot path, and full control over the instant of the time stamp and over when a dead port is closed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import logging
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+from urllib.parse import urlsplit
+
+from companion.errors import LinkError
+from companion.links.serial.port import SerialOpener, close_serial
+from companion.links.system.backoff import Backoff
+from companion.links.system.budget import Budget
+from companion.links.system.tcp import connect_tcp, words_of
+from companion.links.system.together import Together
+
+logger = logging.getLogger(__name__)
+
+READ_BYTES = 4096
+"""As much as a tty buffers: one wake-up empties the port, so one time stamp holds for all that it brought."""
+QUICK_READS = 20
+QUICK_S = 0.0015
+"""So many reads, that far apart in the mean or less, are a stream whose every byte would wake the loop."""
+COLLECT_S = 0.0205
+"""So long such a stream is collected before the next read: a wake-up costs far more than the bytes that it brings.
+
+What it brings is stamped that much late at worst (where the device has no clock of its own), as behind a USB adapter.
+A little more than the 20 ms within which an autopilot takes one heading (autopilots section 6): each read brings one.
+"""
+JUDGED_S = 0.1
+"""So often it is looked at whether a stream is still one to be collected: what comes in bunches is no other stream."""
+FULLEST_LINE = 0.9
+"""Of a line's time, where its stream may be collected."""
+OUT_BUFFER_BYTES = 16384
+"""Over a second at 115200 baud; what waits longer than that is better dropped than sent."""
+LONGEST_PAUSE_S = 1.0
+"""Between two attempts: whatever has come back is open again within 3 s, the opening itself included."""
+BEAT_S = 1.0
+BEAT_WITHIN_S = 8.0
+"""An open that takes all the time it may, and the longest pause after it."""
+FLOOD_PAUSE_S = 0.05
+"""So long a port that brings too much is left alone."""
+DISCARD_BYTES = 65536
+DISCARD_READS = 16
+"""After a pause so much is thrown away at the most, a millisecond's work; the rest waits in the kernel, not here."""
+WORTH_S = 2.0
+"""A connection that lived this long, or that brought bytes, starts the back-off afresh."""
+
+
+@dataclass(frozen=True, slots=True)
+class PortSettings:
+    """Which port, and how its line is set; baud and parity mean nothing for `tcp://HOST:PORT`."""
+
+    url: str
+    baud: int
+    parity: Literal["none", "even", "odd"] = "none"
+
+    @property
+    def is_tcp(self) -> bool:
+        """Whether the other end is a socket (ser2net, a simulator) and not a device."""
+        return self.url.startswith("tcp://")
+
+    @property
+    def seconds_per_byte(self) -> float:
+        """Line time of one byte: start bit, 8 data bits, parity bit if any, stop bit. 0 for tcp://, where unknown."""
+        if self.is_tcp:
+            return 0.0
+        return (10 if self.parity == "none" else 11) / self.baud
+
+    def address(self) -> tuple[str, int]:
+        """Host and port of a tcp:// url.
+
+        Raises:
+            LinkError: the url names no host or no port from 1 to 65535.
+        """
+        try:
+            parts = urlsplit(self.url)
+            host, port = parts.hostname, parts.port
+        except ValueError:
+            host, port = None, None
+        if not host or not port:
+            raise LinkError(f"{self.url}: not an address; allowed: tcp://HOST:PORT with PORT from 1 to 65535")
+        return host, port
+
+
+class ByteLink:
+    """Bytes of one port to `on_bytes(data, t_s)`, for as long as `run` runs; opens again after every loss.
+
+    `t_s` is the loop's time at which the chunk was read. `on_state(connected, reason)` tells of every change, of the
+    reason too while attempts go on; a decoder should be told (`Decoder.interrupted`), as bytes are missing between
+    two connections. All calls are made on the loop's thread; the callbacks must neither block nor raise.
+    """
+
+    def __init__(
+        self,
+        settings: PortSettings,
+        on_bytes: Callable[[bytes, float], None],
+        *,
+        name: str,
+        on_state: Callable[[bool, str], None] | None = None,
+        budget: Budget | None = None,
+        together: Together | None = None,
+    ) -> None:
+        self.settings = settings
+        self.name = name
+        self.budget = budget
+        """How much is taken in; None: whatever comes. What comes beyond it is thrown away unread."""
+        self.together = together
+        """What waits for the next read, whenever this stream is collected; None: nothing."""
+        self.on_gap: Callable[[], None] = lambda: None
+        """Called when bytes were thrown away between the last ones and the next ones."""
+        self.last_error = ""
+        """Why the port is, or last was, not open; one line for people."""
+        self.bytes_received = 0
+        self.bytes_dropped = 0
+        """Bytes that `write` refused because the port was closed or the out-buffer full."""
+        self.reconnects = 0
+        """How often the port was opened again after it had been open."""
+        self.on_beat: Callable[[], None] = lambda: None
+        """Called at every turn of `run`: at least every `BEAT_WITHIN_S`, whether bytes come or not."""
+        self.last_byte_s: float | None = None
+        """The loop's time of the last read that brought bytes."""
+        self._on_bytes, self._on_state = on_bytes, on_state
+        self._descriptor: int | None = None
+        self._reads = 0
+        """That brought something since `_reads_since`, a time and the bytes received by then."""
+        self._reads_since = (0.0, 0)
+        self._turns = 0
+        """Reads of a stream that is collected, since then too, whether they brought something or not."""
+        self._collecting: asyncio.TimerHandle | None = None
+        """The next read, while bytes are collected; None: each wakes the loop."""
+        self._lost: asyncio.Future[str] | None = None
+        self._out = bytearray()
+        self._opener = SerialOpener(settings.url, settings.baud, settings.parity)
+        self._backoff = Backoff(cap_s=LONGEST_PAUSE_S)
+        self._warned = False
+        self._quiet = False
+        self._paused: asyncio.TimerHandle | None = None
+        self._opened_before = False
+        self._said: tuple[bool, str] | None = None
+
+    @property
+    def connected(self) -> bool:
+        """Whether the port is open; says nothing of a device that keeps silent."""
+        return self._descriptor is not None
+
+    @property
+    def collecting(self) -> bool:
+        """Whether it is read at intervals, since its every byte would wake the loop."""
+        return self._collecting is not None
+
+    @property
+    def latency_timer_ms(self) -> int | None:
+        """For how long an FTDI bridge collects bytes before it hands them on; None for other ports."""
+        return self._opener.latency_timer_ms
+
+    async def run(self) -> None:
+        """Keep the port open until cancelled; a loss is an event to report, never an exception."""
+        loop = asyncio.get_running_loop()
+        try:
+            while True:
+                self.on_beat()
+                try:
+                    descriptor = await self._open()
+                except LinkError as error:
+                    self._report_down(str(error))
+                else:
+                    since_s, before = loop.time(), self.bytes_received
+                    self._lost = loop.create_future()
+                    self._attach(loop, descriptor)
+                    reason = await self._until_lost(self._lost)
+                    if self.bytes_received > before or loop.time() - since_s >= WORTH_S or self._quiet:
+                        self._backoff.reset()
+                    self._report_down(reason)
+                await asyncio.sleep(self._backoff.next_s())
+        finally:
+            if self._descriptor is not None:
+                self._close()
+                self._say(connected=False, reason="stopped")
+
+    def confirm(self) -> None:
+        """What is open is the right device: after a loss it is looked for by its lasting name first."""
+        self._opener.confirm()
+
+    def renew(self, reason: str) -> None:
+        """Open it anew: a peer that vanished without a word keeps its connection open for ever. Not worth a warning."""
+        if self._descriptor is not None:
+            self._quiet = True
+            self._lose(f"{self.settings.url}: {reason}")
+
+    def write(self, data: bytes) -> bool:
+        """Send, or keep in the bounded out-buffer; False when closed or full: then nothing of `data` is sent."""
+        if self._descriptor is None or len(self._out) + len(data) > OUT_BUFFER_BYTES:
+            self.bytes_dropped += len(data)
+            return False
+        waiting = bool(self._out)
+        self._out += data
+        if not waiting:
+            self._flush()
+        return self._descriptor is not None
+
+    async def _until_lost(self, lost: asyncio.Future[str]) -> str:
+        while not lost.done():
+            self.on_beat()
+            await asyncio.wait([lost], timeout=BEAT_S)
+        return lost.result()
+
+    async def _open(self) -> int:
+        if self.settings.is_tcp:
+            return await connect_tcp(self.settings.url, self.settings.address())
+        return await self._opener.open()
+
+    def _attach(self, loop: asyncio.AbstractEventLoop, descriptor: int) -> None:
+        self._descriptor = descriptor
+        if self._opened_before:
+            self.reconnects += 1
+        self._opened_before = True
+        self._reads, self._turns, self._reads_since = 0, 0, (loop.time(), self.bytes_received)
+        loop.add_reader(descriptor, self._readable)
+        level = logging.DEBUG if self._quiet else logging.INFO
+        logger.log(level, "%s: %s is %s", self.name, self.settings.url, "back" if self._warned else "open")
+        self._warned = self._quiet = False
+        self._say(connected=True, reason=f"{self.settings.url} is open")
+
+    def _readable(self) -> None:
+        loop = asyncio.get_running_loop()
+        now_s = loop.time()
+        if not self._read(now_s) or self._descriptor is None or self._paused is not None:
+            return
+        self._reads += 1
+        if self._reads == QUICK_READS:
+            if now_s - self._reads_since[0] < QUICK_READS * QUICK_S and self._fits_the_line(now_s):
+                loop.remove_reader(self._descriptor)
+                self._collecting = loop.call_at(now_s + COLLECT_S, self._collected)
+                if self.together is not None:
+                    self.together.drive()
+            self._reads, self._turns, self._reads_since = 0, 0, (now_s, self.bytes_received)
+
+    def _collected(self) -> None:
+        """Read what has come in the meantime; where that is little, let the next byte wake the loop again."""
+        loop = asyncio.get_running_loop()
+        now_s = loop.time()
+        # First of all: whatever happens in this turn, there will be another.
+        self._collecting = loop.call_at(now_s + COLLECT_S, self._collected)
+        self._turns += 1
+        if self.together is not None:
+            self.together.turn(now_s)  # what waits came before what is read now
+        self._reads += self._read(now_s)
+        if self._descriptor is None or self._paused is not None or now_s - self._reads_since[0] < JUDGED_S:
+            return
+        goes_on = 2 * self._reads > self._turns and self._fits_the_line(now_s)
+        self._reads, self._turns, self._reads_since = 0, 0, (now_s, self.bytes_received)
+        if not goes_on:
+            self._stop_collecting()
+            loop.add_reader(self._descriptor, self._readable)
+
+    def _stop_collecting(self) -> None:
+        if self._collecting is not None:
+            self._collecting.cancel()
+            self._collecting = None
+            if self.together is not None:
+                self.together.rest()
+
+    def _fits_the_line(self, now_s: float) -> bool:
+        """Whether the line, as it is set, could have carried what came since `_reads_since`.
+
+        Behind USB the speed may mean nothing, and dating a collected frame by it would put it before the one before it.
+        """
+        since_s, bytes_then = self._reads_since
+        carried = self.bytes_received - bytes_then
+        return carried * self.settings.seconds_per_byte <= FULLEST_LINE * (now_s - since_s)
+
+    def _read(self, now_s: float) -> bool:
+        """Read once and hand it on; whether anything came. A dead port is closed."""
+        if self._descriptor is None:
+            return False
+        try:
+            data = os.read(self._descriptor, READ_BYTES)
+        except (BlockingIOError, InterruptedError):
+            return False
+        except OSError as error:
+            self._lose(self._explain(error))
+            return False
+        if not data:
+            # A tty that was hung up is readable for ever and yields nothing: closing is the only way out of the spin.
+            self._lose(self._explain(None))
+            return False
+        self.bytes_received += len(data)
+        self.last_byte_s = now_s
+        if self.budget is not None and not self.budget.take(len(data), now_s):
+            self._pause()
+        self._on_bytes(data, now_s)
+        return True
+
+    def _pause(self) -> None:
+        """Leave the port alone for a moment: whatever it sends, the others on this loop have their turn."""
+        loop = asyncio.get_running_loop()
+        assert self._descriptor is not None
+        self._stop_collecting()
+        loop.remove_reader(self._descriptor)
+        self._paused = loop.call_later(FLOOD_PAUSE_S, self._resume)
+
+    def _resume(self) -> None:
+        self._paused = None
+        if self._descriptor is None or self.budget is None:
+            return
+        loop = asyncio.get_running_loop()
+        try:
+            for _ in range(DISCARD_READS):
+                data = os.read(self._descriptor, DISCARD_BYTES)
+                if not data:
+                    break  # the reader will find it, and what it means
+                self.bytes_received += len(data)
+                self.budget.discarded += len(data)
+                self.last_byte_s = loop.time()
+        except OSError:
+            pass  # empty, or gone: the reader will find it
+        self.on_gap()
+        self._reads, self._turns, self._reads_since = 0, 0, (loop.time(), self.bytes_received)
+        loop.add_reader(self._descriptor, self._readable)
+
+    def _flush(self) -> None:
+        if self._descriptor is None:
+            return
+        loop = asyncio.get_running_loop()
+        try:
+            while self._out:
+                del self._out[: os.write(self._descriptor, self._out)]
+        except (BlockingIOError, InterruptedError):
+            loop.add_writer(self._descriptor, self._flush)
+            return
+        except OSError as error:
+            self._lose(self._explain(error))
+            return
+        loop.remove_writer(self._descriptor)
+
+    def _explain(self, error: OSError | None) -> str:
+        """What a failed read or write means; None for a read that brought no bytes."""
+        url = self.settings.url
+        if self.settings.is_tcp:
+            return f"{url}: {'the other side closed the connection' if error is None else words_of(error)}"
+        if error is None or error.errno in (errno.EIO, errno.ENXIO, errno.ENODEV):
+            return f"{url}: the device is gone; unplugged?"
+        return f"{url}: {words_of(error)}"
+
+    def _lose(self, reason: str) -> None:
+        # At once, not when `run` gets to it: while a dead descriptor is open, the device comes back under another name.
+        self._close()
+        if self._lost is not None and not self._lost.done():
+            self._lost.set_result(reason)
+
+    def _close(self) -> None:
+        descriptor, self._descriptor = self._descriptor, None
+        self._out.clear()
+        self._stop_collecting()
+        if descriptor is None:
+            return
+        loop = asyncio.get_running_loop()
+        if self._paused is not None:
+            self._paused.cancel()
+            self._paused = None
+        loop.remove_reader(descriptor)
+        loop.remove_writer(descriptor)
+        close_serial(descriptor)
+
+    def _report_down(self, reason: str) -> None:
+        self.last_error = reason
+        logger.log(logging.DEBUG if self._warned or self._quiet else logging.WARNING, "%s: %s", self.name, reason)
+        self._warned = self._warned or not self._quiet
+        self._say(connected=False, reason=reason)
+
+    def _say(self, *, connected: bool, reason: str) -> None:
+        if self._on_state is not None and (connected, reason) != self._said:
+            self._said = (connected, reason)
+            self._on_state(connected, reason)

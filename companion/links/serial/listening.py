@@ -1,0 +1,129 @@
+"""Listening to a port at one line setting after another until somebody is understood; never says a byte.
+
+Opening a port is not without effect: DTR rises, and a board like the Arduino starts anew. So nobody's port is listened
+to without being asked for, and never one that another program holds.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from companion.errors import LinkError
+from companion.links.serial.port import SerialOpener, close_serial
+from companion.links.serial.ports import ROOT, find_holders
+from companion.protocols.guess import (
+    ENOUGH_BYTES,
+    Candidate,
+    Line,
+    likeliest,
+    lines_to_try,
+    plain_share,
+    strangers,
+)
+
+SILENT_S: Final = 3.0
+"""So long the first setting is listened to before it is called silent: what speaks is seen at every speed."""
+LINE_S: Final = 1.0
+LINE_MOST_S: Final = 2.5
+"""For a device that sends once a second: two of its frames."""
+FEW_BYTES: Final = 100
+PARITY_BAUDS: Final = 4
+"""Speeds at which the parities are tried: those whose bytes looked most like text."""
+_MOST_BYTES: Final = 16384
+_LOOK_S: Final = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """What listening has found."""
+
+    line: Line | None
+    """The setting at which somebody is understood; None: nobody is."""
+    candidate: Candidate | None
+    stranger: str | None
+    """Who it is when it is no sensor, in a few words."""
+    bytes_heard: int
+
+
+async def listen(path: str, first: Sequence[Line] = (), root: Path = ROOT) -> Heard:
+    """Try line settings, those believed first, until a device is understood; about half a minute at the most.
+
+    Raises:
+        LinkError: the port cannot be opened, or another program holds it.
+    """
+    if holders := [holder for holder in find_holders(path, root) if holder.pid != os.getpid()]:
+        who = ", ".join(f"{holder.name}, process {holder.pid}" for holder in holders)
+        raise LinkError(f"{path}: in use by another program ({who}); a port serves one reader only")
+    heard, plain = 0, dict[int, float]()
+    bauds: list[int] = []
+    for number, line in enumerate(lines_to_try(first)):
+        if line.parity != "none" and line not in first and plain:
+            bauds = bauds or sorted(plain, key=lambda baud: plain[baud], reverse=True)[:PARITY_BAUDS]
+            if line.baud not in bauds:
+                continue
+        try:
+            data = await _bytes_at(path, line, most_s=LINE_MOST_S if number else SILENT_S)
+        except LinkError as error:
+            if "refuses" in str(error):
+                continue  # a speed that this driver does not know
+            raise
+        heard += len(data)
+        if (found := likeliest(data)) is not None:
+            return Heard(line, found, None, heard)
+        if (stranger := strangers(data)) is not None:
+            return Heard(line, None, stranger, heard)
+        if not heard:
+            break
+        if line.parity == "none":
+            plain[line.baud] = plain_share(data)
+    return Heard(None, None, None, heard)
+
+
+async def _bytes_at(path: str, line: Line, most_s: float) -> bytes:
+    """What comes at one setting, until somebody is surely understood, or surely nobody."""
+    loop = asyncio.get_running_loop()
+    descriptor = await SerialOpener(path, line.baud, line.parity).open()
+    data = bytearray()
+    ended = asyncio.Event()
+    loop.add_reader(descriptor, _reader(descriptor, data, ended))
+    try:
+        since_s = loop.time()
+        looked = 0
+        while not ended.is_set():
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(ended.wait(), _LOOK_S)
+            past_s = loop.time() - since_s
+            if len(data) > looked:
+                looked = len(data)
+                found = likeliest(bytes(data))
+                if (found is not None and found.sure) or (found is None and looked >= ENOUGH_BYTES):
+                    break
+            if past_s >= most_s or (past_s >= LINE_S and len(data) >= FEW_BYTES):
+                break
+    finally:
+        loop.remove_reader(descriptor)
+        close_serial(descriptor)
+    return bytes(data)
+
+
+def _reader(descriptor: int, data: bytearray, ended: asyncio.Event) -> Callable[[], None]:
+    def read() -> None:
+        try:
+            chunk = os.read(descriptor, 4096)
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError:
+            chunk = b""
+        if not chunk:
+            ended.set()
+            asyncio.get_running_loop().remove_reader(descriptor)
+        elif len(data) < _MOST_BYTES:
+            data.extend(chunk)
+
+    return read

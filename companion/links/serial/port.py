@@ -1,0 +1,271 @@
+"""Opening a serial port so that nobody else reads from it, and saying in one line why that failed.
+
+pyserial does the opening and the portable part of the settings; what it does not do is done here: TIOCEXCL, parity
+checking, and VMIN = 1. Its object is dropped at once and only the file descriptor goes on to the event loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import fcntl
+import grp
+import os
+import pwd
+import stat
+import termios
+import threading
+from typing import Literal
+
+from companion.errors import LinkError
+from companion.links.serial.ports import find_holders, lasting_name, latency_timer_ms
+
+Parity = Literal["none", "even", "odd"]
+
+OPEN_DEADLINE_S = 5.0
+"""A healthy USB port opens in some milliseconds; a driver that hangs must not hang the daemon."""
+FAITHFUL_S = 20.0
+"""So long after its loss a device is waited for by its lasting name, whatever bears its old one meanwhile."""
+
+
+def open_serial(path: str, baud: int, parity: Parity) -> int:
+    """Open a port raw, 8 data bits, one stop bit, no flow control, non-blocking; return its descriptor.
+
+    Blocks for as long as the driver does: the event loop calls it through `SerialOpener`.
+
+    Raises:
+        LinkError: one line that names the port and the cause.
+    """
+    import serial  # 10 ms that a daemon without serial ports need not spend
+
+    try:
+        port = serial.Serial(path, baud, parity=parity[0].upper(), timeout=0, exclusive=True)
+    except (OSError, ValueError, OverflowError, termios.error) as error:
+        raise LinkError(explain(path, baud, error)) from None
+    try:
+        # The lock of exclusive=True stops only those who ask for it; TIOCEXCL stops everyone but root.
+        fcntl.ioctl(port.fd, termios.TIOCEXCL)
+        _finish_settings(port.fd, parity)
+        try:
+            port.set_low_latency_mode(True)
+        except (ValueError, NotImplementedError, OSError):
+            pass  # only UARTs and some USB bridges have such a mode; `companion ports` shows an FTDI's timer
+        # The lock belongs to the open file, which a duplicate shares: pyserial's four pipe ends need not stay.
+        descriptor = os.dup(port.fd)
+        os.set_blocking(descriptor, False)
+    except (OSError, termios.error) as error:
+        raise LinkError(explain(path, baud, error)) from None
+    finally:
+        port.close()
+    return descriptor
+
+
+def close_serial(descriptor: int) -> None:
+    """Close a port so that it can be opened again.
+
+    A pseudo-terminal (socat, a simulator) lives on while its other end is open, and TIOCEXCL with it.
+    """
+    with contextlib.suppress(OSError):  # gone already, or a socket
+        fcntl.ioctl(descriptor, termios.TIOCNXCL)
+    os.close(descriptor)
+
+
+def _finish_settings(descriptor: int, parity: Parity) -> None:
+    settings = termios.tcgetattr(descriptor)
+    # A byte that fails its parity or its stop bit is then read as NUL, so a decoder can tell it from data.
+    settings[0] &= ~(termios.IGNPAR | termios.BRKINT | termios.INPCK)
+    if parity != "none":
+        settings[0] |= termios.INPCK
+    # With pyserial's VMIN = 0 a read without data returns 0 bytes, the very sign of a device that has gone.
+    settings[6][termios.VMIN] = 1
+    settings[6][termios.VTIME] = 0
+    termios.tcsetattr(descriptor, termios.TCSANOW, settings)
+
+
+def explain(path: str, baud: int, error: Exception) -> str:
+    """One line for people: which port, what is wrong, what to do."""
+    number = _errno_of(error)
+    if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
+        return f"{path}: no such device; is it plugged in? (`companion ports` lists what is there)"
+    if number == errno.EPERM:
+        # Not the file's mode: systemd's device control, which knows the classes of the drivers loaded at its start.
+        return f"{path}: not permitted: the service's unit does not allow this kind of port (docs/service.md)"
+    if number == errno.EACCES:
+        return f"{path}: permission denied; {_who_may(path)}"
+    if number in (errno.EBUSY, errno.EAGAIN):
+        holders = ", ".join(f"{holder.name}, process {holder.pid}" for holder in find_holders(path))
+        return f"{path}: in use by another program{f' ({holders})' if holders else ''}; a port serves one reader only"
+    if number == errno.EIO:
+        return f"{path}: the device does not answer (input/output error); is it still plugged in?"
+    if not _is_character_device(path):
+        return f"{path}: not a serial port"
+    if isinstance(error, ValueError | OverflowError) or number == errno.EINVAL:
+        return f"{path}: the driver refuses {baud} baud"
+    return f"{path}: cannot be opened: {error}"
+
+
+def _errno_of(error: Exception) -> int | None:
+    number = getattr(error, "errno", None)
+    if isinstance(number, int):
+        return number
+    first = error.args[0] if error.args else None
+    return first if isinstance(first, int) else None  # termios.error is no OSError but carries the same pair
+
+
+def _who_may(path: str) -> str:
+    user = _user_name(os.geteuid())
+    try:
+        status = os.stat(path)
+    except OSError:
+        return f"user {user} may not look into the folder"
+    group = _group_name(status.st_gid)
+    mode = stat.S_IMODE(status.st_mode)
+    if mode & stat.S_IRGRP and mode & stat.S_IWGRP and status.st_gid != 0:
+        return f"user {user} is not in group {group} (usermod -aG {group} {user}, then log in again)"
+    return f"user {user} may not read and write it (owner {_user_name(status.st_uid)}:{group}, mode {mode:04o})"
+
+
+def _user_name(number: int) -> str:
+    try:
+        return pwd.getpwuid(number).pw_name
+    except KeyError:
+        return str(number)
+
+
+def _group_name(number: int) -> str:
+    try:
+        return grp.getgrgid(number).gr_name
+    except KeyError:
+        return str(number)
+
+
+def _exists(path: str) -> bool:
+    return os.path.exists(path)
+
+
+def _is_character_device(path: str) -> bool:
+    try:
+        return stat.S_ISCHR(os.stat(path).st_mode)
+    except OSError:
+        return True
+
+
+class SerialOpener:
+    """Opens one port, again and again, without ever holding up the event loop or the exit of the process.
+
+    The open and the first ioctls of a USB bridge are control transfers: tens of milliseconds when all is well, for
+    ever when the driver hangs. So each attempt runs in a daemon thread of its own. The loop's executor would not
+    do: its threads are few, and asyncio waits for them before the process may end.
+    """
+
+    def __init__(self, path: str, baud: int, parity: Parity) -> None:
+        self._path, self._baud, self._parity = path, baud, parity
+        self._thread: threading.Thread | None = None
+        self.latency_timer_ms: int | None = None
+        """Of an FTDI bridge, as it was read back after the last opening; None for other ports."""
+        self._known: str | None = None
+        self._seen: str | None = None
+        self._since_s: float | None = None
+
+    def confirm(self) -> None:
+        """What was opened last is the right device: remember it by the name that a new plugging does not change."""
+        self._known, self._since_s = self._seen, None
+
+    def _names(self) -> tuple[str, str | None]:
+        """What to open, and of which device only."""
+        if self._known is None:
+            return self._path, None
+        loop = asyncio.get_running_loop()
+        if self._since_s is None:
+            self._since_s = loop.time()
+        if loop.time() - self._since_s > FAITHFUL_S and not _exists(self._known):
+            return self._path, None  # somebody has put another one in its place
+        return self._known, self._path
+
+    async def open(self) -> int:
+        """Return the descriptor of the opened port; when cancelled, whatever is still opened is closed again.
+
+        The kernel's names (/dev/ttyUSB0) go to whoever is plugged in first. A device that was found to be the right
+        one, and has a lasting name, is therefore opened by that after a loss.
+
+        Raises:
+            LinkError: one line that names the port and the cause.
+        """
+        if self._thread is not None and self._thread.is_alive():
+            raise LinkError(f"{self._path}: the driver still hangs in the last attempt to open; replug the device")
+        path, instead_of = self._names()
+        attempt = _Attempt(asyncio.get_running_loop(), path, self._baud, self._parity)
+        self._thread = threading.Thread(target=attempt.run, name=f"open {self._path}", daemon=True)
+        self._thread.start()
+        try:
+            async with asyncio.timeout(OPEN_DEADLINE_S):
+                descriptor = await attempt.result()
+        except TimeoutError:
+            raise LinkError(f"{path}: the driver has not opened it within {OPEN_DEADLINE_S:g} s") from None
+        except LinkError as error:
+            if instead_of is None or not _exists(instead_of):
+                raise
+            raise LinkError(f"{error}; {instead_of} is another device now") from None
+        else:
+            self._seen, self.latency_timer_ms = attempt.lasting_name, attempt.latency_timer_ms
+            return descriptor
+        finally:
+            attempt.abandon()
+
+
+class _Attempt:
+    """One opening in a thread; its descriptor has exactly one owner at any time: thread, this object, or caller."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, path: str, baud: int, parity: Parity) -> None:
+        self._loop, self._path, self._baud, self._parity = loop, path, baud, parity
+        self._finished: asyncio.Future[None] = loop.create_future()
+        self._lock = threading.Lock()
+        self._abandoned = False
+        self._descriptor: int | None = None
+        self._error: LinkError | None = None
+        self.lasting_name: str | None = None
+        self.latency_timer_ms: int | None = None
+
+    def run(self) -> None:
+        """Open the port (in the thread)."""
+        descriptor: int | None = None
+        error: LinkError | None = None
+        try:
+            descriptor = open_serial(self._path, self._baud, self._parity)
+            self.lasting_name, self.latency_timer_ms = lasting_name(self._path), latency_timer_ms(self._path)
+        except LinkError as cause:
+            error = cause
+        except Exception as cause:  # noqa: BLE001 - a thread that died silently would leave its caller waiting
+            error = LinkError(f"{self._path}: cannot be opened: {cause!r}")
+        with self._lock:
+            if self._abandoned:
+                if descriptor is not None:
+                    close_serial(descriptor)
+                return
+            self._descriptor, self._error = descriptor, error
+        try:
+            self._loop.call_soon_threadsafe(self._finish)
+        except RuntimeError:
+            self.abandon()  # the loop has been closed meanwhile
+
+    def _finish(self) -> None:
+        if not self._finished.done():
+            self._finished.set_result(None)
+
+    async def result(self) -> int:
+        """Wait for the thread and take the descriptor over."""
+        await self._finished
+        with self._lock:
+            descriptor, self._descriptor = self._descriptor, None
+        if descriptor is None:
+            raise self._error or LinkError(f"{self._path}: cannot be opened")
+        return descriptor
+
+    def abandon(self) -> None:
+        """Close what nobody has taken, now or when the thread comes back with it."""
+        with self._lock:
+            self._abandoned = True
+            descriptor, self._descriptor = self._descriptor, None
+        if descriptor is not None:
+            close_serial(descriptor)

@@ -1,0 +1,1 @@
+"""What every link shares: TCP, retries, budgets, the service manager."""

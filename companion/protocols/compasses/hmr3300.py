@@ -1,0 +1,106 @@
+r"""Honeywell HMR3300 (three axes) and HMR3200 (two): lines of numbers, no checksum and no start mark.
+
+    123.4, 18.6, -0.5\r\n      heading, pitch, roll in degrees (HMR3300, mode *H)
+    235.6\r\n                  heading only (HMR3200, mode *H)
+    1256, -234, -1894\r\n      magnetometer counts (mode *M): no decimal point in any field
+    #I\r\n                     the answer to a command that it does not know
+
+Source: Honeywell's HMR3200/HMR3300 data sheet: 19200 baud 8N1, 8 lines/s. Since nothing marks a line's start, a line
+is believed only if it follows a whole line end: the rest "3.4, 18.6, -0.5" of a line is as good a line as any.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import ClassVar
+
+from companion.protocols.decoding.base import (
+    CALIBRATING,
+    COMMAND_REFUSED,
+    CUT_SHORT,
+    FIELD_COUNT,
+    LINE_END,
+    NOT_A_MEASUREMENT,
+    OUT_OF_RANGE,
+    PARITY,
+    SHAPE_CHANGED,
+    TOO_LONG,
+    LineDecoder,
+    RejectedError,
+)
+from companion.samples import CompassSample, MagSample, Sample
+
+_DEGREES = re.compile(rb"[+-]?\d{1,3}\.\d{1,3}")
+_COUNTS = re.compile(rb"[+-]?\d{1,6}")
+_FRAGMENT = re.compile(rb"[-+0-9., ]+")
+_DAMAGED = re.compile(rb"[\x00\x80-\xff]")
+_COUNTS_LIMIT = 32768
+_SURE = 3
+"""After so many three-number lines running, one lone number is the debris of two lines, until it has company."""
+
+
+class Hmr3300Decoder(LineDecoder):
+    """Lines of an HMR3300 or HMR3200; gives `CompassSample`, or `MagSample` in counts in mode *M."""
+
+    LIMIT: ClassVar[int] = 40
+
+    def __init__(self, seconds_per_byte: float = 0.0) -> None:
+        super().__init__(seconds_per_byte)
+        self._follows_line_end = True
+        self._triples = 0
+        self._singles = 0
+
+    def interrupted(self) -> None:
+        """Forget the line under way, and do not believe the next one: it may lack its first digits."""
+        super().interrupted()
+        self._follows_line_end = False
+
+    def _line(self, line: bytes, t_s: float, *, cut: bool) -> Sample | None:
+        follows_line_end, self._follows_line_end = self._follows_line_end, True
+        if cut:
+            raise RejectedError(TOO_LONG)
+        if not line.strip(b"\r"):
+            # A bare line feed in mid-stream may have been a line's first digit; after a gap it is the end of the CR LF.
+            self._follows_line_end = bool(line) or not follows_line_end
+            return None
+        if _DAMAGED.search(line):
+            raise RejectedError(PARITY)
+        text = line.removesuffix(b"\r")
+        if text == line or b"\r" in text:
+            # A digit damaged into a line end leaves a rest that looks whole.
+            self._follows_line_end = _FRAGMENT.fullmatch(line) is None
+            raise RejectedError(LINE_END)
+        if not follows_line_end:
+            raise RejectedError(CUT_SHORT)
+        return self._measurement(text, t_s)
+
+    def _measurement(self, text: bytes, t_s: float) -> Sample:
+        if text.startswith(b"#"):
+            raise RejectedError(COMMAND_REFUSED)
+        fields = [field.strip(b" ") for field in text.split(b",")]
+        if len(fields) == 4 and fields[3] == b"C":
+            raise RejectedError(CALIBRATING)
+        degrees = all(map(_DEGREES.fullmatch, fields))
+        if not degrees and not all(map(_COUNTS.fullmatch, fields)):
+            raise RejectedError(NOT_A_MEASUREMENT)  # the banner after power-on, or damage
+        if len(fields) != 3 and not (degrees and len(fields) == 1):
+            raise RejectedError(FIELD_COUNT)
+        if degrees:
+            return self._heading([float(field) for field in fields], t_s)
+        x, y, z = (int(field) for field in fields)
+        if max(abs(x), abs(y), abs(z)) > _COUNTS_LIMIT:
+            raise RejectedError(OUT_OF_RANGE)
+        return MagSample(t_s, counts=(x, y, z))
+
+    def _heading(self, values: list[float], t_s: float) -> CompassSample:
+        heading_deg, *tilt_deg = values
+        if not 0.0 <= heading_deg < 360.0 or any(abs(angle) > 90.0 for angle in tilt_deg):
+            raise RejectedError(OUT_OF_RANGE)
+        if tilt_deg:
+            self._triples, self._singles = min(self._triples + 1, _SURE), 0
+            return CompassSample(t_s, heading_deg, tilt_deg[0], tilt_deg[1])
+        self._singles = min(self._singles + 1, _SURE)
+        if self._triples == _SURE and self._singles < _SURE:
+            raise RejectedError(SHAPE_CHANGED)
+        self._triples = 0
+        return CompassSample(t_s, heading_deg)

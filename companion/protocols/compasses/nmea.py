@@ -1,0 +1,246 @@
+r"""Compasses that speak NMEA 0183, and the Honeywell HMR3000's own sentences. A checksum is demanded.
+
+    $HCHDG,271.1,10.7,E,12.2,W*52          the sensor's own reading, deviation, variation: magnetic is 271.1 + 10.7
+    $HCHDM,093.8,M*2B                      magnetic heading
+    $HEHDT,86.2,T*13    $HETHS,86.2,A*39   true heading; THS with a status, of which V, S and M are no measurement
+    $HCXDR,A,1.6,D,PITCH,A,-0.3,D,ROLL*65  transducers: PTCH or PITCH, ROLL, and the HMR3000's MAGX, MAGY, MAGZ in mG
+    $PTNTHPR,91.7,N,-0.0,N,1.6,N*21        heading, pitch, roll, each with a status (HMR3000)
+    $PTNTCCD,522,-472,109,1841,677,1964,86.3*44    tangents of the tilt times 32768, field, heading (HMR3000)
+
+Sources: NMEA 0183 as the Furuno FR-1500 manual gives it (8.6, from IMO A.382), for THS the JRC JLR-30 manual (appendix
+2-2), Honeywell's HMR3000 manual (900240 rev. B, p. 11 to 13, later edition p. 16). Talkers are any two characters.
+
+One compass may send several of them for one reading, and to different norths. Only one sentence gives headings at a
+time, the first of this list that comes: HPR, HDG, HDM, CCD, THS, HDT; the others count as duplicates. One further down
+takes over when the first has not been heard for `HOLD_S`, but never one to another north: that would be a jump by the
+declination in the middle of a stream. Tilt likewise: HPR, CCD, XDR. So a `CompassSample` says which north it means, but
+for HPR: that one is corrected for whatever has been entered in the device.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, Literal
+
+from companion.protocols.decoding.base import (
+    ALARM,
+    CALIBRATING,
+    DUPLICATE,
+    FIELD_COUNT,
+    NON_FINITE,
+    NOT_A_MEASUREMENT,
+    NOTHING_OF_USE,
+    OTHER_NORTH,
+    OUT_OF_RANGE,
+    OVER_RANGE,
+    UNKNOWN_FIELD,
+    UNKNOWN_SENTENCE,
+    RejectedError,
+    SentenceDecoder,
+)
+from companion.protocols.decoding.checks import check_vector
+from companion.samples import CompassSample, MagSample, Sample, TiltSample
+
+HOLD_S: Final = 3.0
+"""So long a sentence keeps its precedence after it was last heard."""
+
+North = Literal["magnetic", "true"] | None
+
+# Precedence of headings, with the north of each, and of tilts.
+_NORTHS: Final[tuple[North, ...]] = ("true", "true", "magnetic", "magnetic", "magnetic", None)
+_HDT, _THS, _CCD, _HDM, _HDG, _HPR = range(6)
+_TILT_XDR, _TILT_CCD, _TILT_HPR = range(3)
+_NOBODY: Final = -1
+
+_PLAIN: Final[dict[bytes, tuple[int, int, tuple[bytes, ...] | None, North]]] = {
+    b"HDG": (_HDG, 6, None, "magnetic"),
+    b"HDM": (_HDM, 3, (b"M",), "magnetic"),
+    b"HDT": (_HDT, 3, (b"T",), "true"),
+    # Autonomous, estimated; M was typed in, S is simulated, V not valid.
+    b"THS": (_THS, 3, (b"A", b"E"), "true"),
+}
+"""Sentences with nothing but a heading: precedence, number of fields, what the third may be (None: a deviation)."""
+
+_ALARMS: Final = frozenset((b"L", b"P"))
+_STATUSES: Final = frozenset((b"L", b"M", b"N", b"O", b"P", b"C"))
+_DEGREES_PER_MIL: Final = 9 / 160
+_CCD_SCALE: Final = 32768.0
+_ANGLES: Final = {b"PITCH": b"PITCH", b"PTCH": b"PITCH", b"ROLL": b"ROLL"}
+_FIELDS: Final = (b"MAGX", b"MAGY", b"MAGZ")
+
+
+class NmeaDecoder(SentenceDecoder):
+    """Sentences of compasses; gives `CompassSample`, `TiltSample` where there is no heading, and `MagSample`."""
+
+    def __init__(self, seconds_per_byte: float = 0.0) -> None:
+        super().__init__(seconds_per_byte)
+        self._heading_from = _NOBODY
+        """The sentence that gives headings, and when it was last heard."""
+        self._heading_s = 0.0
+        self._tilt_from = _NOBODY
+        self._tilt_s = 0.0
+
+    def interrupted(self) -> None:
+        """Forget the sentence under way, and which one leads: it may be another device."""
+        super().interrupted()
+        self._heading_from = self._tilt_from = _NOBODY
+
+    def _read(self, body: bytes, t_s: float, samples: list[Sample]) -> None:
+        fields = body.split(b",")
+        head = fields[0]
+        plain = _PLAIN.get(head[2:])
+        if plain is None or len(head) != 5:
+            if head == b"PTNTHPR":
+                self._hpr(fields, t_s, samples)
+            elif head == b"PTNTCCD":
+                self._ccd(fields, t_s, samples)
+            elif head[2:] == b"XDR" and len(head) == 5:
+                self._xdr(fields, t_s, samples)
+            else:
+                raise RejectedError(UNKNOWN_SENTENCE)
+            return
+        # All in one piece, because it is what comes most.
+        rank, size, marks, north = plain
+        if len(fields) != size:
+            raise RejectedError(FIELD_COUNT)
+        heading_deg = float(fields[1])
+        if marks is None:
+            if fields[2] and 0.0 <= heading_deg <= 360.0:
+                heading_deg = (heading_deg + _easting(fields[2], fields[3])) % 360.0
+        elif fields[2] not in marks:
+            raise RejectedError(NOT_A_MEASUREMENT if rank == _THS else UNKNOWN_FIELD)
+        if not 0.0 <= heading_deg < 360.0:
+            heading_deg = _full_circle(heading_deg)
+        if rank == self._heading_from:
+            self._heading_s = t_s
+        else:
+            self._claim_heading(rank, t_s)
+        samples.append(CompassSample(t_s, heading_deg, None, None, north))
+
+    def _claim_heading(self, sentence: int, t_s: float) -> None:
+        leader = self._heading_from
+        if sentence < leader:
+            if _NORTHS[sentence] != _NORTHS[leader]:
+                raise RejectedError(OTHER_NORTH)
+            if t_s - self._heading_s <= HOLD_S:
+                raise RejectedError(DUPLICATE)
+        self._heading_from, self._heading_s = sentence, t_s
+
+    def _hpr(self, fields: list[bytes], t_s: float, samples: list[Sample]) -> None:
+        if len(fields) != 7:
+            raise RejectedError(FIELD_COUNT)
+        _, heading, magnetic, pitch, pitch_status, roll, roll_status = fields
+        # Even an alarm keeps the precedence: then the device says that it has no heading, whatever else it sends.
+        self._heading_from, self._heading_s = _HPR, t_s
+        self._tilt_from, self._tilt_s = _TILT_HPR, t_s
+        no_heading = False
+        if not magnetic == pitch_status == roll_status == b"N":
+            _check_statuses((magnetic, pitch_status, roll_status))
+            no_heading = magnetic in _ALARMS
+        pitch_deg, roll_deg = float(pitch), float(roll)
+        heading_deg = 0.0 if no_heading else float(heading)
+        if b"." not in pitch:  # mils are whole numbers, degrees have a decimal
+            pitch_deg, roll_deg = pitch_deg * _DEGREES_PER_MIL, roll_deg * _DEGREES_PER_MIL
+            heading_deg *= _DEGREES_PER_MIL
+        if not (-90.0 <= pitch_deg <= 90.0 and -90.0 <= roll_deg <= 90.0):
+            raise _out_of_range(pitch_deg + roll_deg)
+        if not 0.0 <= heading_deg < 360.0:
+            heading_deg = _full_circle(heading_deg)
+        if no_heading:
+            samples.append(TiltSample(t_s, roll_deg, pitch_deg))
+        else:
+            samples.append(CompassSample(t_s, heading_deg, pitch_deg, roll_deg))
+
+    def _ccd(self, fields: list[bytes], t_s: float, samples: list[Sample]) -> None:
+        if len(fields) != 8:
+            raise RejectedError(FIELD_COUNT)
+        pitch_deg, roll_deg = (math.degrees(math.atan(float(field) / _CCD_SCALE)) for field in fields[1:3])
+        if not math.isfinite(pitch_deg + roll_deg):
+            raise RejectedError(NON_FINITE)
+        heading_deg = float(fields[7])
+        if b"." not in fields[7]:
+            heading_deg *= _DEGREES_PER_MIL
+        if self._tilt_from > _TILT_CCD and t_s - self._tilt_s <= HOLD_S:
+            raise RejectedError(DUPLICATE)  # of HPR, whose heading comes first too
+        self._tilt_from, self._tilt_s = _TILT_CCD, t_s
+        try:
+            self._claim_heading(_CCD, t_s)
+        except RejectedError:
+            samples.append(TiltSample(t_s, roll_deg, pitch_deg))
+        else:
+            north = _NORTHS[_CCD]
+            samples.append(CompassSample(t_s, _full_circle(heading_deg), pitch_deg, roll_deg, north))
+
+    def _xdr(self, fields: list[bytes], t_s: float, samples: list[Sample]) -> None:
+        if len(fields) % 4 != 1:
+            raise RejectedError(FIELD_COUNT)
+        angles_deg: dict[bytes, float] = {}
+        field_mg: dict[bytes, float] = {}
+        for at in range(1, len(fields), 4):
+            kind, value, unit, name = fields[at : at + 4]
+            if kind == b"A" and name in _ANGLES:
+                if unit != b"D":
+                    raise RejectedError(UNKNOWN_FIELD)
+                angles_deg[_ANGLES[name]] = _tilt(value)
+            elif kind == b"G" and name in _FIELDS and value:
+                field_mg[name] = float(value)
+        found: list[Sample] = []
+        if len(angles_deg) == 2 and not (self._tilt_from > _TILT_XDR and t_s - self._tilt_s <= HOLD_S):
+            self._tilt_from, self._tilt_s = _TILT_XDR, t_s
+            found.append(TiltSample(t_s, angles_deg[b"ROLL"], angles_deg[b"PITCH"]))
+        if len(field_mg) == 3:
+            x, y, z = (field_mg[name] / 1000.0 for name in _FIELDS)
+            check_vector((x, y, z))
+            found.append(MagSample(t_s, (x, y, z)))
+        if not found:
+            raise RejectedError(DUPLICATE if len(angles_deg) == 2 else NOTHING_OF_USE)
+        samples += found
+
+
+def _check_statuses(statuses: tuple[bytes, bytes, bytes]) -> None:
+    """Heading, pitch and roll: a tilt beyond its alarm level leaves nothing that could be used."""
+    if not _STATUSES.issuperset(statuses):
+        raise RejectedError(NOT_A_MEASUREMENT)
+    if b"C" in statuses:
+        raise RejectedError(CALIBRATING)
+    if not _ALARMS.isdisjoint(statuses[1:]):
+        raise RejectedError(ALARM)
+
+
+def _out_of_range(value: float) -> RejectedError:
+    return RejectedError(OUT_OF_RANGE if math.isfinite(value) else NON_FINITE)
+
+
+def _full_circle(heading_deg: float) -> float:
+    """The same heading, where a device has rounded 359.96 to 360.0.
+
+    Raises:
+        RejectedError: it is no heading.
+    """
+    if heading_deg == 360.0:
+        return 0.0
+    if not 0.0 <= heading_deg < 360.0:
+        raise _out_of_range(heading_deg)
+    return heading_deg
+
+
+def _easting(field: bytes, side: bytes) -> float:
+    """A deviation, to the east positive."""
+    value = float(field)
+    if not 0.0 <= value <= 180.0:
+        raise _out_of_range(value)
+    if side == b"E":
+        return value
+    if side != b"W":
+        raise RejectedError(UNKNOWN_FIELD)
+    return -value
+
+
+def _tilt(field: bytes) -> float:
+    """A tilt of a transducer; empty where the device is beyond its range (HMR3000 manual, XDR)."""
+    if not field:
+        raise RejectedError(OVER_RANGE)
+    value = float(field)
+    if not -90.0 <= value <= 90.0:
+        raise _out_of_range(value)
+    return value

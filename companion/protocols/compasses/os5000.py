@@ -1,0 +1,80 @@
+r"""OceanServer OS5000 family of compasses (OS4000 to OS5500): tagged fields after `$C`, with a checksum.
+
+    $C320.5P0.2R-18.3T19.0*3C\r\n                            heading, pitch, roll, temperature
+    $C212.4P2.5R-14.0T28.4Mx107977.90My-79422.00Mz173.27Ax0.045Ay-0.245Az0.977*3A\r\n
+
+Which fields there are is set in the device. Source: OS5000 user's guide, format type 0x01 (rev. 3.6, p. 12): heading is
+"corrected for declination if one is entered", so which north it means is the configuration's. Magnetic fields are in
+milligauss only after a calibration with the local horizontal field entered; the manual's own example shows 108 gauss.
+So a field that no place on Earth has is left out.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from companion.protocols.decoding.base import (
+    NOT_A_MEASUREMENT,
+    NOTHING_OF_USE,
+    OUT_OF_RANGE,
+    UNKNOWN_SENTENCE,
+    RejectedError,
+    SentenceDecoder,
+)
+from companion.protocols.decoding.checks import TEMPERATURE_LIMIT_DEGC
+from companion.samples import CompassSample, MagSample, Sample, TiltSample
+
+FIELD_LIMIT_GAUSS: Final = 2.0
+"""Three times the strongest natural field."""
+
+_NUMBER: Final = rb"([-+]?\d{1,7}(?:\.\d{1,6})?)"
+_TAGS: Final = re.compile(rb"(?:C%b)?(?:P%b)?(?:R%b)?(?:T%b)?((?:[A-Z][a-z]?%b)*)" % ((_NUMBER,) * 5))
+_VECTOR: Final = re.compile(rb"Mx%bMy%bMz%b" % ((_NUMBER,) * 3))
+
+
+class Os5000Decoder(SentenceDecoder):
+    """`$C` sentences; gives `CompassSample`, `TiltSample` where there is no heading, and `MagSample`."""
+
+    LIMIT = 250
+    """Bytes from the "$" on; with every field that can be switched on there are some 150."""
+
+    def _read(self, body: bytes, t_s: float, samples: list[Sample]) -> None:
+        match = _TAGS.fullmatch(body)
+        if match is None:
+            raise RejectedError(NOT_A_MEASUREMENT if body[:1] == b"C" else UNKNOWN_SENTENCE)
+        heading, pitch, roll, temperature, more, _ = match.groups()
+        temperature_degc = None if temperature is None else float(temperature)
+        if temperature_degc is not None and not -TEMPERATURE_LIMIT_DEGC <= temperature_degc <= TEMPERATURE_LIMIT_DEGC:
+            raise RejectedError(OUT_OF_RANGE)
+        if pitch is None or roll is None:
+            if heading is None:
+                raise RejectedError(NOTHING_OF_USE)
+            samples.append(CompassSample(t_s, _heading(heading), None, None, None, temperature_degc))
+        else:
+            pitch_deg, roll_deg = float(pitch), float(roll)
+            if not (-90.0 <= pitch_deg <= 90.0 and -180.0 <= roll_deg <= 180.0):
+                raise RejectedError(OUT_OF_RANGE)
+            if heading is None:
+                samples.append(_tilt(t_s, roll_deg, pitch_deg, temperature_degc))
+            else:
+                samples.append(CompassSample(t_s, _heading(heading), pitch_deg, roll_deg, None, temperature_degc))
+        if more and (vector := _VECTOR.search(more)):
+            x, y, z = (float(field) / 1000.0 for field in vector.groups())
+            if max(abs(x), abs(y), abs(z)) <= FIELD_LIMIT_GAUSS:
+                samples.append(MagSample(t_s, (x, y, z)))
+
+
+def _heading(field: bytes) -> float:
+    heading_deg = float(field)
+    if heading_deg == 360.0:  # 359.96, rounded by the device
+        return 0.0
+    if not 0.0 <= heading_deg < 360.0:
+        raise RejectedError(OUT_OF_RANGE)
+    return heading_deg
+
+
+def _tilt(t_s: float, roll_deg: float, pitch_deg: float, temperature_degc: float | None) -> TiltSample:
+    if abs(roll_deg) > 90.0:  # upside down: no gradienter
+        raise RejectedError(OUT_OF_RANGE)
+    return TiltSample(t_s, roll_deg, pitch_deg, temperature_degc)

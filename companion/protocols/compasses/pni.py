@@ -1,0 +1,215 @@
+"""PNI TCM, Prime, TRAX, SeaTRAX and TargetPoint3: the binary protocol.
+
+    00 10 | 05 | 02 | 05 43 B3 F3 33 | 18 41 28 00 00 | 5C 2D      kGetDataResp: heading 359.9, pitch 10.5
+
+A frame is its whole length (16 bits, big-endian), a frame id, a payload, and a CRC-16/XMODEM, big-endian, over all
+before it. Nothing marks its beginning: each offset is tried that has a length and an id that can be. A data frame names
+its own components. Sources: PNI TCM3/TCM5 manual r12 p. 33-43, TCM manual r06 p. 36-47, TRAX manual r06 p. 10 and
+36-50; PNI's own pni-sdk-rs for component 88. Pitch is positive nose up, roll right side down (TRAX p. 10).
+
+Floats are big-endian as the device comes (kBigEndian, TRAX p. 42), but that can be set otherwise and saved, and a
+little-endian heading may read as a small number that looks like one. So both orders are tried on all floats of a frame:
+what is a measurement in only one of them says which it is, twice running before the other is believed.
+"""
+
+from __future__ import annotations
+
+import binascii
+import math
+import struct
+from typing import ClassVar, Final
+
+from companion.protocols.decoding.base import (
+    CHECKSUM,
+    FIELD_COUNT,
+    NON_FINITE,
+    NOTHING_OF_USE,
+    OUT_OF_RANGE,
+    REPLY,
+    UNKNOWN_FIELD,
+    RejectedError,
+)
+from companion.protocols.decoding.framing import ECHO, WAIT, FrameDecoder
+from companion.protocols.decoding.polling import PollDialogue
+from companion.samples import CompassSample, MagSample, Sample, TiltSample
+
+SHORTEST: Final = 5
+LONGEST: Final = 200
+"""A frame may have 4096 bytes by the protocol; one with all components that there are has 97."""
+
+DISTORTION: Final = "magnetic distortion"
+"""The device says that its magnetometer is beyond its range (80 to 150 uT by model): its heading is worth nothing."""
+HEADING_UNSURE: Final = "heading unsure"
+"""The device says that its heading is wrong by more than 10 degrees (TRAX p. 49, kHeadingStatus 3)."""
+NOT_CALIBRATED: Final = "not calibrated by the user"
+BYTE_ORDER: Final = "byte order"
+"""Floats in the other order than those before."""
+
+_MOD_INFO, _SET_COMPONENTS, _GET_DATA, _DATA = 1, 3, 4, 5
+_COMMANDS: Final = frozenset((1, 3, 4, 6, 7, 9, 10, 11, 12, 13, 15, 21, 22, 24, 25, 29, 31, 36, 43, 46, 49, 52, 79, 80))
+_KNOWN: Final = (
+    _COMMANDS | frozenset(range(1, 32)) | {37, 44, 47, 53, 81, *range(107, 111), *range(119, 122), 128, 129, 130}
+)
+
+_HEADING, _TEMPERATURE, _DISTORTION, _CALIBRATED, _PITCH, _ROLL = 5, 7, 8, 9, 24, 25
+_MAG = (27, 28, 29)
+_QUATERNION, _HEADING_STATUS, _MAG_ACCURACY = 77, 79, 88
+_BYTES: Final = frozenset((_DISTORTION, _CALIBRATED, _HEADING_STATUS))
+
+_LIMITS: Final[dict[int, tuple[float, float, float]]] = {
+    # Least and greatest value, and the least magnitude but zero that a device would print: what is smaller is a float
+    # of the other byte order.
+    _HEADING: (0.0, 360.0, 1e-6),
+    _PITCH: (-90.0, 90.0, 1e-6),
+    _ROLL: (-180.0, 180.0, 1e-6),
+    _TEMPERATURE: (-60.0, 150.0, 1e-6),
+    **dict.fromkeys((21, 22, 23), (-100.0, 100.0, 1e-9)),
+    **dict.fromkeys(_MAG, (-1e4, 1e4, 1e-6)),
+    **dict.fromkeys((74, 75, 76), (-100.0, 100.0, 0.0)),
+    _QUATERNION: (-1.001, 1.001, 0.0),
+    _MAG_ACCURACY: (0.0, 1e4, 1e-6),
+}
+_SIZES: Final = {**dict.fromkeys(_LIMITS, 4), _QUATERNION: 16, **dict.fromkeys(_BYTES, 1)}
+_UT_PER_GAUSS: Final = 100.0
+
+
+class PniDecoder(FrameDecoder):
+    """Frames of a PNI compass; gives `CompassSample`, and `MagSample` in gauss where the frame has the field.
+
+    A frame with pitch and roll but no heading gives a `TiltSample` (law "euler").
+    """
+
+    def __init__(self, seconds_per_byte: float = 0.0) -> None:
+        super().__init__(seconds_per_byte)
+        self._little = False
+        self._contrary = 0
+        """Frames running that are measurements only in the other byte order."""
+
+    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
+        if buffer[at]:
+            return self._skip_to(b"\0", buffer, at)
+        available = len(buffer) - at
+        if available < 2:
+            return WAIT
+        size = buffer[at + 1]
+        if not SHORTEST <= size <= LONGEST or (available >= 3 and buffer[at + 2] not in _KNOWN):
+            self.skipped += 1
+            return at + 1
+        if available < 3:
+            return WAIT
+        frame_id, end = buffer[at + 2], at + size
+        try:
+            parts = _components(buffer, at, end) if frame_id == _DATA else []
+            if available < size:
+                return WAIT
+            if binascii.crc_hqx(buffer[at:end], 0) != 0:
+                raise RejectedError(CHECKSUM)
+        except RejectedError as error:
+            return self._reject(error.reason, at + 1)
+        if frame_id != _DATA:
+            return self._reject(ECHO if frame_id in _COMMANDS else REPLY, end)
+        try:
+            samples += self._samples(buffer, parts, self._time_of(origin + end))
+            self.accepted += 1
+        except RejectedError as error:
+            self.rejected[error.reason] += 1
+        return end
+
+    def _samples(self, buffer: bytes, parts: list[tuple[int, int]], t_s: float) -> list[Sample]:
+        flags = {part: buffer[place] for part, place in parts if part in _BYTES}
+        values = self._values(buffer, [(part, place) for part, place in parts if part not in _BYTES])
+        if flags.get(_DISTORTION, 0) > 1 or flags.get(_CALIBRATED, 0) > 1:
+            raise RejectedError(OUT_OF_RANGE)
+        if flags.get(_DISTORTION):
+            raise RejectedError(DISTORTION)
+        if flags.get(_HEADING_STATUS) == 3:
+            raise RejectedError(HEADING_UNSURE)
+        samples: list[Sample] = []
+        heading_deg, pitch_deg, roll_deg = (values.get(part) for part in (_HEADING, _PITCH, _ROLL))
+        if roll_deg is not None and abs(roll_deg) > 90.0:
+            raise RejectedError(OUT_OF_RANGE)  # upside down, where its heading is not specified
+        if heading_deg is not None:
+            samples.append(CompassSample(t_s, heading_deg, pitch_deg, roll_deg))
+        elif pitch_deg is not None and roll_deg is not None:
+            samples.append(TiltSample(t_s, roll_deg, pitch_deg, values.get(_TEMPERATURE)))
+        if all(part in values for part in _MAG):
+            x, y, z = (values[part] / _UT_PER_GAUSS for part in _MAG)
+            samples.append(MagSample(t_s, (x, y, z)))
+        if not samples:
+            raise RejectedError(NOTHING_OF_USE)
+        if flags.get(_CALIBRATED) == 0:
+            self.warned[NOT_CALIBRATED] += 1
+        return samples
+
+    def _values(self, buffer: bytes, parts: list[tuple[int, int]]) -> dict[int, float]:
+        """The floats of a frame by component, in the byte order in which they are a measurement."""
+        raw = b"".join(buffer[place : place + _SIZES[part]] for part, place in parts)
+        names = [part for part, _ in parts for _ in range(_SIZES[part] // 4)]
+        big, little = (struct.unpack(f"{order}{len(names)}f", raw) for order in "><")
+        possible = _possible(names, little), _possible(names, big)
+        if not any(possible):
+            finite = all(map(math.isfinite, little if self._little else big))
+            raise RejectedError(OUT_OF_RANGE if finite else NON_FINITE)
+        if not possible[not self._little]:
+            self._contrary += 1
+            if self._contrary < 2:
+                raise RejectedError(BYTE_ORDER)
+            self._little = not self._little
+        self._contrary = 0
+        return dict(zip(names, little if self._little else big, strict=True))
+
+
+def _possible(names: list[int], values: tuple[float, ...]) -> bool:
+    """Whether all of these can have been measured (a float that is none is in no range)."""
+    for part, value in zip(names, values, strict=True):
+        least, greatest, smallest = _LIMITS[part]
+        if not least <= value <= greatest or 0.0 < abs(value) < smallest or (part == _HEADING and value == 360.0):
+            return False
+    return True
+
+
+def _components(buffer: bytes, at: int, end: int) -> list[tuple[int, int]]:
+    """Component and place of its value, as far as they have arrived, of the data frame from `at` to `end`.
+
+    Raises:
+        RejectedError: a component of unknown length, or they do not fill the frame.
+    """
+    here, last = at + 4, end - 2
+    parts: list[tuple[int, int]] = []
+    if at + 3 >= len(buffer):
+        return parts
+    for _ in range(buffer[at + 3]):
+        if here >= last:
+            raise RejectedError(FIELD_COUNT)
+        if here >= len(buffer):
+            return parts
+        part = buffer[here]
+        if part not in _SIZES:
+            raise RejectedError(UNKNOWN_FIELD)
+        parts.append((part, here + 1))
+        here += 1 + _SIZES[part]
+    if here != last:
+        raise RejectedError(FIELD_COUNT)
+    return parts
+
+
+def frame(frame_id: int, payload: bytes = b"") -> bytes:
+    """A whole frame, as it is sent to a device."""
+    body = struct.pack(">HB", SHORTEST + len(payload), frame_id) + payload
+    return body + struct.pack(">H", binascii.crc_hqx(body, 0))
+
+
+class PniDialogue(PollDialogue):
+    """Asks a silent compass for data, ten times a second at most (57 bytes with the answer, 15 ms at 38400 baud).
+
+    First it chooses what the answers hold, which a device forgets with its power: kSave is "the ONLY command that
+    causes the device to save information" (TRAX p. 46), and it is never sent. A device in continuous mode speaks by
+    itself, and is left alone.
+    """
+
+    QUESTION: ClassVar[bytes] = frame(_GET_DATA)
+    SET_UP: ClassVar[bytes] = frame(
+        _SET_COMPONENTS, bytes((8, _HEADING, _PITCH, _ROLL, _DISTORTION, _CALIBRATED, *_MAG))
+    )
+    PERIOD_S: ClassVar[float] = 0.1
+    NAME: ClassVar[str] = "kGetData"

@@ -1,0 +1,290 @@
+"""What all decoders share: counting, line framing, and the words for why something was rejected.
+
+A decoder is fed bytes as they come, in any split, and gives samples; it never raises for what it is fed. How the
+bytes were split changes neither the samples nor the counts. Whatever waits for its end is bounded.
+"""
+
+from __future__ import annotations
+
+import binascii
+from abc import ABC, abstractmethod
+from collections import Counter
+from typing import ClassVar, Final
+
+from companion.protocols.decoding.clock import SampleTimes
+from companion.samples import Sample
+
+AHEAD_S = 0.5
+"""So far ahead of its line no stream gets: a baud rate then means nothing on that port (USB without a UART)."""
+_STALL_S = 10.0
+"""So long what came may have waited unread."""
+
+ALARM = "alarm"
+CALIBRATING = "calibrating"
+CHECKSUM = "checksum"
+COMMAND_REFUSED = "command refused"
+CUT_SHORT = "cut short"
+DUPLICATE = "duplicate"
+FIELD_COUNT = "field count"
+LINE_END = "line end"
+NO_CHECKSUM = "no checksum"
+NON_FINITE = "non-finite"
+NOT_A_MEASUREMENT = "not a measurement"
+NOT_A_NUMBER = "not a number"
+NOTHING_OF_USE = "nothing of use"
+ORPHAN = "orphan"
+OTHER_NORTH = "other north"
+OUT_OF_RANGE = "out of range"
+OVER_RANGE = "over range"
+PARITY = "parity"
+REPLY = "reply"
+SHAPE_CHANGED = "shape changed"
+SINGLE_AXIS = "single axis"
+TOO_LONG = "too long"
+UNKNOWN_FIELD = "unknown field"
+UNKNOWN_GROUP = "unknown group"
+UNKNOWN_SENTENCE = "unknown sentence"
+
+
+class RejectedError(Exception):
+    """A frame cannot be used; its one argument is the reason to count. Never leaves this room."""
+
+    @property
+    def reason(self) -> str:
+        """Which counter of `Decoder.rejected` it belongs to."""
+        return str(self.args[0])
+
+
+class Decoder(ABC):
+    """Bytes of one device to samples.
+
+    Args:
+        seconds_per_byte: line time of one byte; 0 where unknown (sockets, USB), which leaves the time of the read.
+    """
+
+    device_clock_wraps_s: ClassVar[float | None] = None
+    """`ImuSample.t_device_s` starts again at 0 after so long; None where the device has no clock, or it never does."""
+    sequence_modulus: ClassVar[int | None] = None
+    """`ImuSample.sequence` counts modulo this; None where there is none, or it never wraps."""
+
+    def __init__(self, seconds_per_byte: float = 0.0) -> None:
+        self.seconds_per_byte = seconds_per_byte
+        self.times = SampleTimes(self.device_clock_wraps_s, self.sequence_modulus)
+        self.frame_bytes = 0
+        """Of the latest frame that gave samples; 0 where the decoder does not tell."""
+        self._read_s: float | None = None
+        self._ahead_s = 0.0
+        self.accepted = 0
+        """Frames that gave samples."""
+        self.rejected: Counter[str] = Counter()
+        """Frames, or what began like one, that gave none, by reason."""
+        self.warned: Counter[str] = Counter()
+        """Frames that gave samples and said something against them, by what they said."""
+        self.skipped = 0
+        """Bytes passed over that did not look like part of any frame; many of them mean a wrong baud or protocol."""
+
+    def receive(self, data: bytes, t_s: float) -> list[Sample]:
+        """Take the next bytes, read at `t_s` on the host's clock; return the samples that they complete.
+
+        A sample's time is when it was taken, as well as can be told; a counter and a device clock are unwrapped. A
+        sample whose time cannot be told is counted in `times.dropped`.
+        """
+        samples = self.feed(data, t_s)
+        if self.seconds_per_byte:
+            self._check_line(len(data), t_s)
+        return self.times.place(samples, t_s, self.frame_bytes * self.seconds_per_byte) if samples else samples
+
+    def _check_line(self, received: int, t_s: float) -> None:
+        """Find out whether bytes come faster than the line could carry them: then its line time means nothing."""
+        if self._read_s is not None:
+            self._ahead_s += received * self.seconds_per_byte - (t_s - self._read_s)
+            self._ahead_s = max(self._ahead_s, -_STALL_S)
+            if self._ahead_s > AHEAD_S:
+                self.seconds_per_byte = 0.0
+                self.times.clock.remap()
+        self._read_s = t_s
+
+    @abstractmethod
+    def feed(self, data: bytes, t_s: float) -> list[Sample]:
+        """Take the next bytes, read at `t_s` on the host's clock; return the samples that they complete, as they came.
+
+        A sample's time is that of its frame's last byte: `t_s` less the line time of what came after it.
+        """
+
+    @abstractmethod
+    def interrupted(self) -> None:
+        """Bytes are missing before the next ones (the port was opened again): forget the frame under way."""
+
+
+class LineDecoder(Decoder):
+    r"""Frames a protocol of lines that end in "\n"; a subclass reads one line at a time.
+
+    A line longer than `LIMIT` is given as its last `LIMIT` bytes and marked as cut, so that noise without any line
+    end costs no memory.
+    """
+
+    LIMIT: ClassVar[int] = 80
+
+    def __init__(self, seconds_per_byte: float = 0.0) -> None:
+        super().__init__(seconds_per_byte)
+        self._partial = b""
+        self._cut = False
+
+    def feed(self, data: bytes, t_s: float) -> list[Sample]:  # noqa: D102 - as in the base class
+        text = self._partial + data
+        remaining = len(text)
+        *lines, partial = text.split(b"\n")
+        samples: list[Sample] = []
+        for line in lines:
+            remaining -= len(line) + 1
+            cut = self._cut or len(line) > self.LIMIT
+            self._cut = False
+            try:
+                sample = self._line(line[-self.LIMIT :], t_s - self.seconds_per_byte * remaining, cut=cut)
+            except RejectedError as error:
+                self.rejected[error.reason] += 1
+            else:
+                if sample is not None:
+                    self.accepted += 1
+                    self.frame_bytes = self._frame_bytes(line)
+                    samples.append(sample)
+        if len(partial) > self.LIMIT:
+            partial, self._cut = partial[-self.LIMIT :], True
+        self._partial = partial
+        return samples
+
+    def interrupted(self) -> None:  # noqa: D102 - as in the base class
+        if self._partial:
+            self.rejected[CUT_SHORT] += 1
+        self._partial, self._cut = b"", False
+
+    def _frame_bytes(self, line: bytes) -> int:
+        """Bytes of the frame that ends with this line."""
+        return len(line) + 1
+
+    @abstractmethod
+    def _line(self, line: bytes, t_s: float, *, cut: bool) -> Sample | None:
+        r"""Read one line, without its "\n"; None where it is whole and right but (yet) gives no sample.
+
+        Raises:
+            RejectedError: the line is to be counted as rejected.
+        """
+
+
+class SentenceDecoder(Decoder):
+    r"""Frames a protocol of sentences `$...`; a subclass reads one at a time.
+
+    A sentence may end in "\r", "\n" or both; a "$" always begins a new one. What is outside of sentences is skipped.
+    """
+
+    LIMIT: ClassVar[int] = 160
+    """Bytes of a sentence from its "$" on; what is longer is none."""
+
+    def __init__(self, seconds_per_byte: float = 0.0) -> None:
+        super().__init__(seconds_per_byte)
+        self._partial = b""
+        """From the "$" of the sentence under way; empty outside of one."""
+
+    def feed(self, data: bytes, t_s: float) -> list[Sample]:  # noqa: D102 - as in the base class
+        text = self._partial + data.replace(b"\r", b"\n")
+        lines = text.split(b"\n")
+        remaining, partial = len(text), lines.pop()
+        samples: list[Sample] = []
+        for line in lines:
+            if not line:
+                remaining -= 1
+                continue
+            remaining -= len(line) + 1
+            sentence = self._last_sentence(line)
+            if not sentence:
+                continue
+            try:
+                self._read(body_of_sentence(sentence), t_s - self.seconds_per_byte * remaining, samples)
+            except RejectedError as error:
+                self.rejected[error.reason] += 1
+            except ValueError:
+                self.rejected[NOT_A_NUMBER] += 1
+            else:
+                self.accepted += 1
+                self.frame_bytes = len(line) + 1
+        if partial or self._partial:
+            self._partial = self._last_sentence(partial)
+        return samples
+
+    def interrupted(self) -> None:  # noqa: D102 - as in the base class
+        if self._partial:
+            self.rejected[CUT_SHORT] += 1
+        self._partial = b""
+
+    @abstractmethod
+    def _read(self, body: bytes, t_s: float, samples: list[Sample]) -> None:
+        """Append the samples, one or more, of what stood between "$" and "*"; its checksum was right.
+
+        Raises:
+            RejectedError: the sentence is to be counted as rejected; nothing was appended.
+            ValueError: the same, from `float` and its like: a field is not a number.
+        """
+
+    def _last_sentence(self, text: bytes) -> bytes:
+        """What begins at the last "$" and is not too long yet; everything before it is counted."""
+        start = text.find(b"$")
+        if start < 0:
+            self.skipped += len(text)
+            return b""
+        self.skipped += start
+        while (end := text.find(b"$", start + 1)) >= 0:
+            self._too_long_or(CUT_SHORT, end - start)
+            start = end
+        if len(text) - start > self.LIMIT:
+            self._too_long_or("", len(text) - start)
+            return b""
+        return text[start:]
+
+    def _too_long_or(self, reason: str, length: int) -> None:
+        """Count a sentence that ends without a line end; beyond the limit its bytes belong to no frame."""
+        self.rejected[TOO_LONG if length > self.LIMIT else reason] += 1
+        self.skipped += max(length - self.LIMIT, 0)
+
+
+_HEXADECIMAL: Final = {
+    (high + low).encode(): int(high + low, 16) for high in "0123456789abcdefABCDEF" for low in "0123456789abcdefABCDEF"
+}
+"""Every way to write a byte; a look-up is quicker than `int` and takes no "+5"."""
+
+
+def xor_checksum(body: bytes) -> int:
+    """The checksum of NMEA 0183 and of its imitators: all bytes between "$" and "*" exclusive-ored."""
+    folded, shift = int.from_bytes(body, "little"), 8
+    while shift < 8 * len(body):
+        shift *= 2
+    # Halves folded onto each other: a loop over the bytes takes several times as long.
+    while shift >= 8:
+        folded ^= folded >> shift
+        shift //= 2
+    return folded & 0xFF
+
+
+def body_of_sentence(sentence: bytes) -> bytes:
+    """Check a sentence without its line end, `$body*hh`, and return the body.
+
+    Four hexadecimal digits are a CRC-16/XMODEM instead, as VectorNav devices may be set to send (UM001, 3.8).
+
+    Raises:
+        RejectedError: there is no checksum, or it is wrong.
+    """
+    expected = _HEXADECIMAL.get(sentence[-2:])
+    if expected is not None and sentence[-3:-2] == b"*":
+        body = sentence[1:-3]
+        if xor_checksum(body) != expected:
+            raise RejectedError(CHECKSUM)
+        return body
+    body, _, digits = sentence[1:].rpartition(b"*")
+    if len(digits) != 4:
+        raise RejectedError(NO_CHECKSUM)
+    try:
+        expected = int.from_bytes(binascii.unhexlify(digits), "big")
+    except ValueError:
+        raise RejectedError(NO_CHECKSUM) from None
+    if binascii.crc_hqx(body, 0) != expected:
+        raise RejectedError(CHECKSUM)
+    return body

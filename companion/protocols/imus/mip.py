@@ -1,0 +1,117 @@
+"""MicroStrain (HBK, LORD) inertial sensors: packets of the MIP protocol.
+
+    75 65  set  length  (length, descriptor, data)...  F1 F2        big-endian; F1 F2: 8-bit Fletcher over all before
+
+Source: 3DM-GX5-35 data communications protocol manual, p. 12; MicroStrain's `mip_sdk`. Of the sensor data (set 0x80)
+are used: 0x04 accelerometer in g, 0x05 gyro in rad/s, 0x06 magnetometer in gauss, 0x12 GPS time of week in seconds,
+which is the device's own clock until it has a GPS time. Accelerometer and gyro have to be set to the same rate: they
+then share a packet, and only a pair makes a sample. Axes are X forward, Y right, Z down: level and at rest it reads
+z = -1 g, and a unit with X forward and its base down has the mounting ROTATION_NONE.
+"""
+
+from __future__ import annotations
+
+import struct
+from itertools import accumulate
+from typing import ClassVar, Final
+
+from companion.physics.units import G
+from companion.protocols.decoding.base import CHECKSUM, FIELD_COUNT, NOTHING_OF_USE, REPLY, RejectedError
+from companion.protocols.decoding.checks import check_imu, check_vector
+from companion.protocols.decoding.framing import WAIT, FrameDecoder
+from companion.samples import ImuSample, MagSample, Sample, Vector
+
+MAX_FRAME_BYTES: Final = 4 + 255 + 2
+
+_MARK = b"\x75\x65"
+_SENSOR_DATA = 0x80
+_ACCEL, _GYRO, _MAG, _GPS_TIME = 0x04, 0x05, 0x06, 0x12
+_VECTOR = struct.Struct(">3f")
+_TIME = struct.Struct(">dHH")
+_ABSENT: Final[Vector] = (0.0, 0.0, 0.0)
+
+
+class MipDecoder(FrameDecoder):
+    """MIP packets; gives `ImuSample` and `MagSample`."""
+
+    device_clock_wraps_s: ClassVar[float | None] = 7 * 86400.0  # GPS time of week
+
+    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
+        if not buffer.startswith(_MARK, at):
+            if buffer[at] != _MARK[0]:
+                return self._skip_to(_MARK[:1], buffer, at)
+            if len(buffer) == at + 1:
+                return WAIT
+            self.skipped += 1
+            return at + 1
+        if len(buffer) < at + 4:
+            return WAIT
+        end = at + 4 + buffer[at + 3] + 2
+        if len(buffer) < end:
+            return WAIT
+        if fletcher(buffer[at : end - 2]) != buffer[end - 2 : end]:
+            self.rejected[CHECKSUM] += 1
+            return at + 1  # not `end`: in what a false start took for its own, a good frame may begin
+        try:
+            samples += _decode(buffer, at, end - 2, self._time_of(origin + end))
+            self.accepted += 1
+        except RejectedError as error:
+            self.rejected[error.reason] += 1
+        return end
+
+
+def fletcher(data: bytes) -> bytes:
+    """The two bytes at the end of a packet: the sum of all before, and the sum of all the running sums."""
+    sums = list(accumulate(data))
+    return bytes((sums[-1] & 0xFF, sum(sums) & 0xFF))
+
+
+def _decode(buffer: bytes, at: int, stop: int, t_s: float) -> list[Sample]:
+    """The samples in a packet that begins at `at`, whose checksum is right and begins at `stop`.
+
+    Raises:
+        RejectedError: a field without its length, a value that cannot be, or nothing of use.
+    """
+    if buffer[at + 2] != _SENSOR_DATA:
+        raise RejectedError(REPLY if buffer[at + 2] < _SENSOR_DATA else NOTHING_OF_USE)
+    accel_g: Vector | None = None
+    gyro_rad_s: Vector | None = None
+    mag_gauss: Vector | None = None
+    t_device_s: float | None = None
+    field = at + 4
+    while field < stop:
+        length = buffer[field]
+        if length < 2 or field + length > stop:
+            raise RejectedError(FIELD_COUNT)
+        kind = buffer[field + 1]
+        if kind == _GPS_TIME:
+            if length != 14:
+                raise RejectedError(FIELD_COUNT)
+            t_device_s, _week, _flags = _TIME.unpack_from(buffer, field + 2)
+        elif _ACCEL <= kind <= _MAG:
+            if length != 14:
+                raise RejectedError(FIELD_COUNT)
+            vector = _VECTOR.unpack_from(buffer, field + 2)
+            if kind == _ACCEL:
+                accel_g = vector
+            elif kind == _GYRO:
+                gyro_rad_s = vector
+            else:
+                mag_gauss = vector
+        field += length
+    if t_device_s is not None:
+        check_vector((t_device_s, 0.0, 0.0))
+    accel_m_s2 = _ABSENT
+    if accel_g is not None:
+        x, y, z = accel_g
+        accel_m_s2 = (x * G, y * G, z * G)
+    check_imu(gyro_rad_s or _ABSENT, accel_m_s2, None)
+    samples: list[Sample] = []
+    if accel_g is not None and gyro_rad_s is not None:
+        samples.append(ImuSample(t_s, gyro_rad_s, accel_m_s2, None, None, t_device_s))
+    if mag_gauss is not None:
+        check_vector(mag_gauss)
+        samples.append(MagSample(t_s, mag_gauss))
+    if not samples:
+        raise RejectedError(NOTHING_OF_USE)
+    return samples

@@ -1,0 +1,252 @@
+r"""Sensonor (Safran) STIM300 and STIM318: gyros, accelerometers, inclinometers in one datagram.
+
+    id  (3 x int24, status)...  counter  latency (us)  CRC-32  [CR LF]        big-endian
+
+Source: TS1524 rev. 31. Scales: rate 2^-14 deg/s, inclination 2^-22 g, temperature 2^-8 degC; acceleration 2^-19 g for
+a unit of 10 g, which is assumed, 2^-20 for 5 g, 2^-18 for 30 g, 2^-16 for 80 g (2^-21 for the former 2 g).
+
+*Which range* a unit has, only its configuration datagram tells (table 5-16), sent at power-on. One that has been
+running is judged by gravity: a second at rest shows 1 g in one of the ranges and no other, as they are a factor of two
+apart. Until either is known, samples that are far from 1 g in the assumed range are withheld, not passed on wrong.
+
+*Time*: a sample is older than its datagram by the latency. *Counter*: internal samples, 2000 a second, modulo 256.
+
+*Axes* are those of figure 6-4; a cluster reads +1 g on the axis that points up. The inclinometers become a
+`TiltSample` of the law "axis": the elevation of each axis is the arc sine of its part of the measured gravity, so y,
+nose up, is asin(X / |g|) and x, right side down, is -asin(Y / |g|) with Z down, where Y is right, and +asin(Y / |g|)
+with Z up, where Y is left: the unit may lie on either side, with X forward. Beyond 60 degrees it gives none. Rates and
+forces stay in the unit's own axes: with Z up, ROTATION_ROLL_180 makes them forward, right, down.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import ClassVar, Final
+
+from companion.physics.units import DEG, G
+from companion.protocols.decoding.base import (
+    CHECKSUM,
+    NOTHING_OF_USE,
+    OUT_OF_RANGE,
+    OVER_RANGE,
+    REPLY,
+    RejectedError,
+)
+from companion.protocols.decoding.checks import check_imu
+from companion.protocols.decoding.framing import WAIT, FrameDecoder
+from companion.protocols.imus.stim300_datagrams import (
+    CONFIGURATION,
+    FRAME_BYTES,
+    NORMAL_MODE,
+    Layout,
+    is_whole,
+)
+from companion.samples import ImuSample, Sample, TiltSample, Vector
+
+STARTING = "starting up"
+FAULT = "fault reported"
+OUTSIDE_CONDITIONS = "outside operating conditions"
+RANGE_NOT_KNOWN = "accelerometer range not known"
+OUTPUT_UNIT = "output unit"
+
+REST_TICKS: Final = 2000
+"""So many internal samples at rest, a second, decide the accelerometers' range."""
+REST_DEG_S: Final = 3.0
+"""Of the rate, for "at rest"; a turn-on bias is a tenth of it."""
+
+_ASSUMED_BITS = 19
+_BITS = (16, 18, 19, 20, 21)
+_RANGE_CODES = {0: 19, 2: 21, 3: 20, 4: 18, 6: 16}
+"""Nibbles of bytes 17 and 18 of the configuration datagram, and the bits after the point that they mean."""
+_GYRO_SCALE: Final = DEG / 2**14
+_GYRO_UNIT, _ACCEL_UNIT, _INCLINATION_UNIT, _ACCEL_RANGE = 5, 8, 11, 17
+
+_SYSTEM, _START_UP, _CONDITIONS, _OVERLOAD, _CHANNEL = 0x80, 0x40, 0x20, 0x10, 0x08
+_IDENTIFIER = re.compile(b"[" + b"".join(re.escape(bytes((name,))) for name in sorted(FRAME_BYTES)) + b"]")
+
+
+class Stim300Decoder(FrameDecoder):
+    """STIM300 datagrams; gives `ImuSample` where they hold acceleration, `TiltSample` where they hold inclination.
+
+    There is no start mark: after a loss the next datagram is the next one whose CRC is right, and the bytes before it
+    are counted as skipped. A tilt that cannot be used is counted, though the datagram may have given an `ImuSample`.
+    """
+
+    sequence_modulus: ClassVar[int | None] = 256
+
+    def __init__(self, seconds_per_byte: float = 0.0) -> None:
+        super().__init__(seconds_per_byte)
+        self._in_step = True
+        self._forget()
+
+    def _forget(self) -> None:
+        """It may be another device, or the same with other settings."""
+        self._accel_bits = [_ASSUMED_BITS] * 3
+        self._range_known = False
+        self._rest_bits = 0
+        """The range in which gravity has been seen since `_rest_ticks`."""
+        self._rest_ticks = 0
+        self._counter: int | None = None
+        self._imu_unit_right = True
+        self._inclination_unit_right = True
+
+    def interrupted(self) -> None:  # noqa: D102 - as in the base class
+        super().interrupted()
+        self._in_step = True
+        self._forget()
+
+    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
+        identifier = buffer[at]
+        size = FRAME_BYTES.get(identifier)
+        if size is None:
+            return self._out_of_step(buffer, at)
+        end = at + size
+        if len(buffer) < end:
+            return WAIT
+        frame = buffer[at:end]
+        if not is_whole(frame):
+            if self._in_step:
+                self.rejected[CHECKSUM] += 1
+                self._in_step = False
+            else:
+                self.skipped += 1
+            return at + 1
+        self._in_step = True
+        try:
+            layout = NORMAL_MODE.get(identifier)
+            if layout is None:
+                self._special(identifier, frame)
+                raise RejectedError(REPLY)
+            samples += self._decode(layout, frame, self._time_of(origin + end))
+            self.accepted += 1
+        except RejectedError as error:
+            self.rejected[error.reason] += 1
+        return end
+
+    def _out_of_step(self, buffer: bytes, at: int) -> int:
+        """Where the next datagram may begin; a CR LF after the last one is no loss."""
+        match = _IDENTIFIER.search(buffer, at)
+        end = match.start() if match else len(buffer)
+        self.skipped += len(buffer[at:end].translate(None, b"\r\n"))
+        return end
+
+    def _special(self, identifier: int, frame: bytes) -> None:
+        """Learn the ranges and units from a configuration datagram."""
+        if identifier not in CONFIGURATION:
+            return
+        codes = (frame[_ACCEL_RANGE] >> 4, frame[_ACCEL_RANGE] & 0x0F, frame[_ACCEL_RANGE + 1] >> 4)
+        known = [_RANGE_CODES.get(code) for code in codes]
+        bits = [each for each in known if each is not None]
+        if len(bits) == 3:
+            self._accel_bits, self._range_known = bits, True
+        # Of the low nibble 0 is a rate and 2 its average, 8 and 10 the same delayed; the rest are angles or velocities.
+        self._imu_unit_right = frame[_GYRO_UNIT] & 0x05 == 0 and frame[_ACCEL_UNIT] & 0x0D == 0
+        self._inclination_unit_right = frame[_INCLINATION_UNIT] & 0x0D == 0
+
+    def _decode(self, layout: Layout, frame: bytes, t_s: float) -> list[Sample]:
+        """The samples in one normal mode datagram.
+
+        Raises:
+            RejectedError: the status says that it is not to be used, a value that cannot be, or nothing of use.
+        """
+        values = layout.values.unpack_from(frame)
+        counter, latency_us = values[layout.counter], values[layout.counter + 1]
+        t_s -= latency_us * 1e-6
+        samples: list[Sample] = []
+        refused: RejectedError | None = None
+        if layout.accel is not None:
+            try:
+                samples.append(self._imu(layout, layout.accel, values, counter, t_s))
+            except RejectedError as error:
+                refused = error
+        if layout.inclination is not None:
+            try:
+                samples.append(self._tilt(layout, layout.inclination, values, t_s))
+            except RejectedError as error:
+                if samples:
+                    self.rejected[error.reason] += 1
+                refused = refused or error
+        if not samples:
+            raise refused or RejectedError(NOTHING_OF_USE)
+        return samples
+
+    def _imu(self, layout: Layout, accel: int, values: tuple[int, ...], counter: int, t_s: float) -> ImuSample:
+        if not self._imu_unit_right:
+            raise RejectedError(OUTPUT_UNIT)
+        if values[6] or values[accel + 6]:
+            _check_status(values[6] | values[accel + 6])
+        gx, gy, gz = _int24(values, 0)
+        ax, ay, az = _int24(values, accel)
+        if not self._range_known:
+            self._judge_range(math.hypot(gx, gy, gz) / 2**14, math.hypot(ax, ay, az), counter)
+        bx, by, bz = self._accel_bits
+        gyro_rad_s = (gx * _GYRO_SCALE, gy * _GYRO_SCALE, gz * _GYRO_SCALE)
+        accel_m_s2 = (ax * G / (1 << bx), ay * G / (1 << by), az * G / (1 << bz))
+        temperature_degc = _temperature(values, layout.gyro_temperature)
+        check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
+        return ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, counter)
+
+    def _judge_range(self, rate_deg_s: float, magnitude: float, counter: int) -> None:
+        """Take one reading as evidence of the range, from its magnitude in counts.
+
+        Raises:
+            RejectedError: in the range that is assumed it is far from gravity, so it may well be another.
+        """
+        at_rest = next((bits for bits in _BITS if 0.9 < magnitude / (1 << bits) < 1.1), 0)
+        if not at_rest or rate_deg_s > REST_DEG_S or at_rest != self._rest_bits:
+            self._rest_bits, self._rest_ticks = at_rest, 0
+        elif self._counter is not None:
+            self._rest_ticks += (counter - self._counter) & 0xFF
+        self._counter = counter
+        if self._rest_bits and self._rest_ticks >= REST_TICKS:
+            self._accel_bits, self._range_known = [self._rest_bits] * 3, True
+        elif not 0.7 < magnitude / (1 << _ASSUMED_BITS) < 1.4:
+            raise RejectedError(RANGE_NOT_KNOWN)
+
+    def _tilt(self, layout: Layout, inclination: int, values: tuple[int, ...], t_s: float) -> TiltSample:
+        if not self._inclination_unit_right:
+            raise RejectedError(OUTPUT_UNIT)
+        if values[inclination + 6]:
+            _check_status(values[inclination + 6])
+        x, y, z = _int24(values, inclination)
+        gravity = math.hypot(x, y, z)
+        if not 0.5 < gravity / 2**22 < 1.75:
+            raise RejectedError(OUT_OF_RANGE)
+        if abs(z) < 0.5 * gravity:
+            raise RejectedError(OVER_RANGE)
+        right_down = math.asin(y / gravity) / DEG
+        nose_up = math.asin(x / gravity) / DEG
+        temperature_degc = _temperature(values, layout.inclination_temperature)
+        return TiltSample(t_s, right_down if z > 0 else -right_down, nose_up, temperature_degc)
+
+
+def _int24(values: tuple[int, ...], at: int) -> Vector:
+    return (
+        values[at] << 16 | values[at + 1],
+        values[at + 2] << 16 | values[at + 3],
+        values[at + 4] << 16 | values[at + 5],
+    )
+
+
+def _temperature(values: tuple[int, ...], at: int | None) -> float | None:
+    """The mean of three; None where there is none, or its status is not good."""
+    if at is None or values[at + 3]:
+        return None
+    return (values[at] + values[at + 1] + values[at + 2]) / 768.0
+
+
+def _check_status(status: int) -> None:
+    """Table 5-23.
+
+    Raises:
+        RejectedError: the data are not to be used; the gravest reason.
+    """
+    if status & _START_UP:
+        raise RejectedError(STARTING)
+    if status & (_SYSTEM | _CHANNEL):
+        raise RejectedError(FAULT)
+    if status & _OVERLOAD:
+        raise RejectedError(OVER_RANGE)
+    if status & _CONDITIONS:
+        raise RejectedError(OUTSIDE_CONDITIONS)

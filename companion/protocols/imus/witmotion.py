@@ -1,0 +1,146 @@
+"""WitMotion WT901, JY901, HWT90x and SINxT: frames of 11 bytes that begin with 0x55.
+
+    55 51 ax ay az T SUM      accelerations, 1/2048 g; temperature, 1/100 degree Celsius
+    55 52 wx wy wz T SUM      rates, 2000/32768 deg/s
+    55 53 roll pitch yaw V SUM      angles, 180/32768 deg
+    55 54 hx hy hz T SUM      magnetic field, counts whose unit differs by model
+
+Little-endian 16-bit numbers, and the low byte of the sum of the ten bytes before it. Sources: WitMotion's WT901 data
+sheet p. 10-14, WT901SDCL p. 13-16, HWT905-TTL protocol page (9600 8N1, 10 Hz, 51 to 54 as it comes).
+
+0x55 stands in data too and the sum is weak: a frame is believed only in company, that is when another good one follows
+at once. Alone one place in 10^6 of noise would pass, and one in 256 of the frames that have lost a byte; so it is one
+in 10^12. The price is that the last frame of an epoch waits for the next epoch; its time does not suffer. The packets
+of Bluetooth models (0x61) have no checksum and are not read.
+
+The axes are the device's own, and Z is up. The angles turn Z-Y-X about these axes (WT901 p. 12), so with X forward and
+Y left roll is right side down and pitch nose down: as a gradienter it gives x = roll and y = -pitch, law "euler",
+forward being the device's X. The temperature is as these documents have it; six-axis models (BWT61CL, JY61) count
+1/340 degree from 36.53 instead, and theirs comes out wrong.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+from companion.physics.units import DEG, MG
+from companion.protocols.decoding.base import CHECKSUM, ORPHAN, OUT_OF_RANGE, OVER_RANGE
+from companion.protocols.decoding.framing import WAIT, FrameDecoder
+from companion.samples import ImuSample, MagSample, Sample, TiltSample, Vector
+
+FRAME_BYTES: Final = 11
+ALONE: Final = "without company"
+"""A frame whose sum is right, but none follows it."""
+
+_START: Final = b"\x55"
+_FIRST_TYPE, _LAST_TYPE = 0x50, 0x5F
+_ACCEL, _GYRO, _ANGLE, _MAG = 0x51, 0x52, 0x53, 0x54
+_NUMBERS: Final = struct.Struct("<4h")
+_G_M_S2: Final = 1e3 * MG
+_ACCEL_SCALE: Final = 16.0 * _G_M_S2 / 32768.0
+_GYRO_SCALE: Final = 2000.0 * DEG / 32768.0
+_ANGLE_SCALE: Final = 180.0 / 32768.0
+_LEAST, _GREATEST = -32768, 32767
+_WRONG_SUM: Final = 0
+
+
+class WitMotionDecoder(FrameDecoder):
+    """Frames of a WitMotion device; gives `ImuSample`, `TiltSample` and `MagSample` in counts.
+
+    Acceleration and rate of one epoch are neighbours on the wire and make one `ImuSample`, timed at the latter's end;
+    without its neighbour neither is used.
+    """
+
+    def __init__(self, seconds_per_byte: float = 0.0) -> None:
+        super().__init__(seconds_per_byte)
+        self._good_at = -1
+        """Stream position of a frame that was found good when it followed another, or that waits for one to follow."""
+        self._accel: tuple[int, Vector, float] | None = None
+        """End of the last acceleration's frame, which waits for its rate; m/s^2, degrees Celsius."""
+
+    def interrupted(self) -> None:
+        """Forget the frames and the epoch under way."""
+        super().interrupted()
+        self._drop_accel()
+
+    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
+        if buffer[at] != 0x55:
+            return self._skip_to(_START, buffer, at)
+        if self._good_at != origin + at:
+            size = _good(buffer, at)
+            if size == WAIT:
+                return WAIT
+            if size != FRAME_BYTES:
+                return self._no_frame(size, at)
+            self._good_at = origin + at
+        end = at + FRAME_BYTES
+        following = _good(buffer, end)
+        if following == WAIT:
+            return WAIT
+        if following != FRAME_BYTES:
+            return self._reject(ALONE, at + 1)
+        self._good_at = origin + end
+        self._take(buffer, at, origin, samples)
+        return end
+
+    def _no_frame(self, size: int, at: int) -> int:
+        if size == _WRONG_SUM:
+            return self._reject(CHECKSUM, at + 1)
+        self.skipped += 1
+        return at + 1
+
+    def _take(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> None:
+        kind, end = buffer[at + 1], origin + at + FRAME_BYTES
+        accel = self._accel
+        if accel is not None and not (kind == _GYRO and accel[0] == origin + at):
+            self._drop_accel()
+            accel = None
+        if not _ACCEL <= kind <= _MAG:
+            return  # time, ports, pressure, position, quaternion: right, but nothing for us
+        x, y, z, last = _NUMBERS.unpack_from(buffer, at + 2)
+        if kind == _ACCEL:
+            if max(x, y, z) == _GREATEST or min(x, y, z) == _LEAST:
+                self.rejected[OVER_RANGE] += 1
+                return
+            self._accel = end, (x * _ACCEL_SCALE, y * _ACCEL_SCALE, z * _ACCEL_SCALE), last / 100.0
+        elif kind == _GYRO:
+            self._accel = None
+            if accel is None:
+                self.rejected[ORPHAN] += 1
+            elif max(x, y, z) == _GREATEST or min(x, y, z) == _LEAST:
+                self.rejected[OVER_RANGE] += 1
+            else:
+                gyro_rad_s = (x * _GYRO_SCALE, y * _GYRO_SCALE, z * _GYRO_SCALE)
+                samples.append(ImuSample(self._time_of(end), gyro_rad_s, accel[1], accel[2]))
+                self.accepted += 1
+        elif kind == _MAG:
+            samples.append(MagSample(self._time_of(end), counts=(x, y, z)))
+            self.accepted += 1
+        elif max(abs(x), abs(y)) > 16384:  # beyond 90 degrees
+            self.rejected[OUT_OF_RANGE] += 1
+        else:
+            samples.append(TiltSample(self._time_of(end), x * _ANGLE_SCALE, -y * _ANGLE_SCALE))
+            self.accepted += 1
+
+    def _drop_accel(self) -> None:
+        if self._accel is not None:
+            self.rejected[ORPHAN] += 1
+            self._accel = None
+
+
+def _good(buffer: bytes, at: int) -> int:
+    """`FRAME_BYTES` where a frame begins, `_WRONG_SUM` where it only looks so, 1 where not even that, or `WAIT`."""
+    available = len(buffer) - at
+    if available < 1:
+        return WAIT
+    if buffer[at] != 0x55:
+        return 1
+    if available < 2:
+        return WAIT
+    if not _FIRST_TYPE <= buffer[at + 1] <= _LAST_TYPE:
+        return 1
+    if available < FRAME_BYTES:
+        return WAIT
+    last = at + FRAME_BYTES - 1
+    return FRAME_BYTES if sum(buffer[at:last]) & 0xFF == buffer[last] else _WRONG_SUM

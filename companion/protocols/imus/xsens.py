@@ -1,0 +1,184 @@
+"""Xsens (Movella) MTi: messages MTData2 of the Xbus protocol.
+
+    FA FF 36  length  (id, size, data)...  checksum        big-endian; all bytes after FA sum to 0 modulo 256
+
+A length of 255 means that the true one follows in 16 bits. The low nibble of an id names the number format: 0 float32,
+1 fixed point 12.20, 2 fixed point 16.32 (the fraction first), 3 float64. Used are 0x1020 packet counter, 0x1060
+SampleTimeFine (ticks of 0.1 ms), 0x0810 temperature (sent once a second at most, and held), 0x4020 acceleration in
+m/s^2 and 0x8020 rate of turn in rad/s, else 0x4040 and 0x8040 (both at high rate), 0xC020 magnetic field in arbitrary
+units, 0xE020 status word. Sources: MT0605P.E p. 48 (status word) and chapter 5; MT0101P for identifiers and formats.
+
+Axes: X forward, Y left, Z up; level and at rest it reads z = +9.8. The axes are the device's own: an MTi that lies on
+its base with X forward becomes forward, right, down by the mounting ROTATION_ROLL_180.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import ClassVar, Final
+
+from companion.protocols.decoding.base import (
+    CHECKSUM,
+    FIELD_COUNT,
+    NOTHING_OF_USE,
+    OVER_RANGE,
+    REPLY,
+    TOO_LONG,
+    UNKNOWN_FIELD,
+    RejectedError,
+)
+from companion.protocols.decoding.checks import check_imu, check_vector
+from companion.protocols.decoding.framing import WAIT, FrameDecoder
+from companion.samples import ImuSample, MagSample, Sample, Vector
+
+MAX_DATA_BYTES: Final = 1024
+"""The longest message of inertial data has some 200."""
+MAX_FRAME_BYTES: Final = 6 + MAX_DATA_BYTES + 1
+MAG_COUNTS: Final = 10_000
+"""Counts for one of the arbitrary units of the magnetic field."""
+
+_MARK = b"\xfa\xff"
+_MT_DATA_2 = 0x36
+_EXTENDED = 0xFF
+_HEAD = struct.Struct(">HB")
+_COUNTER, _TIME, _TEMPERATURE, _STATUS = 0x1020, 0x1060, 0x0810, 0xE020
+_ACCEL, _ACCEL_HR, _GYRO, _GYRO_HR, _MAG = 0x4020, 0x4040, 0x8020, 0x8040, 0xC020
+_VECTORS = frozenset((_ACCEL, _ACCEL_HR, _GYRO, _GYRO_HR, _MAG))
+_TICKS_A_SECOND = 10_000.0
+_CLIPPED = 0x3F00
+"""Bits 8 to 10 of the status word: acceleration out of range on X, Y, Z; bits 11 to 13: rate."""
+
+_ABSENT: Final[Vector] = (0.0, 0.0, 0.0)
+_FLOAT32 = struct.Struct(">3f")
+
+
+class XsensDecoder(FrameDecoder):
+    """MTData2 messages; gives `ImuSample`, and `MagSample` with counts for want of a unit."""
+
+    device_clock_wraps_s: ClassVar[float | None] = 2**32 / _TICKS_A_SECOND
+    sequence_modulus: ClassVar[int | None] = 2**16
+
+    def __init__(self, seconds_per_byte: float = 0.0) -> None:
+        super().__init__(seconds_per_byte)
+        self._temperature_degc: float | None = None
+
+    def interrupted(self) -> None:  # noqa: D102 - as in the base class
+        super().interrupted()
+        self._temperature_degc = None
+
+    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
+        if not buffer.startswith(_MARK, at):
+            if buffer[at] != _MARK[0]:
+                return self._skip_to(_MARK[:1], buffer, at)
+            if len(buffer) == at + 1:
+                return WAIT
+            self.skipped += 1
+            return at + 1
+        available = len(buffer) - at
+        if available < 4:
+            return WAIT
+        data, length = at + 4, buffer[at + 3]
+        if length == _EXTENDED:
+            if available < 6:
+                return WAIT
+            data, length = at + 6, int.from_bytes(buffer[at + 4 : at + 6], "big")
+            if length > MAX_DATA_BYTES:
+                self.rejected[TOO_LONG] += 1
+                return at + 1
+        end = data + length + 1
+        if len(buffer) < end:
+            return WAIT
+        if sum(buffer[at + 1 : end]) & 0xFF:
+            self.rejected[CHECKSUM] += 1
+            return at + 1  # not `end`: in what a false start took for its own, a good frame may begin
+        try:
+            if buffer[at + 2] != _MT_DATA_2:
+                raise RejectedError(REPLY)
+            samples += self._decode(buffer, data, end - 1, self._time_of(origin + end))
+            self.accepted += 1
+        except RejectedError as error:
+            self.rejected[error.reason] += 1
+        return end
+
+    def _decode(self, buffer: bytes, field: int, stop: int, t_s: float) -> list[Sample]:
+        """The samples in the fields from `field` to `stop` of a message whose checksum is right.
+
+        Raises:
+            RejectedError: a field without its size, a value that cannot be or was clipped, or nothing of use.
+        """
+        vectors: dict[int, Vector] = {}
+        counter: int | None = None
+        t_device_s: float | None = None
+        while field < stop:
+            if stop - field < 3:
+                raise RejectedError(FIELD_COUNT)
+            kind, size = _HEAD.unpack_from(buffer, field)
+            field += 3
+            if field + size > stop:
+                raise RejectedError(FIELD_COUNT)
+            if kind & 0xFFF0 in _VECTORS:
+                if size == 12 and not kind & 0x0F:
+                    vectors[kind] = _FLOAT32.unpack_from(buffer, field)
+                else:
+                    x, y, z = _numbers(buffer[field : field + size], kind & 0x0F, 3)
+                    vectors[kind & 0xFFF0] = (x, y, z)
+            elif kind == _COUNTER:
+                counter = _unsigned(buffer[field : field + size], 2)
+            elif kind == _TIME:
+                t_device_s = _unsigned(buffer[field : field + size], 4) / _TICKS_A_SECOND
+            elif kind == _STATUS:
+                if _unsigned(buffer[field : field + size], 4) & _CLIPPED:
+                    raise RejectedError(OVER_RANGE)
+            elif kind & 0xFFF0 == _TEMPERATURE:
+                (temperature_degc,) = _numbers(buffer[field : field + size], kind & 0x0F, 1)
+                check_imu(_ABSENT, _ABSENT, temperature_degc)
+                self._temperature_degc = temperature_degc
+            field += size
+        return self._samples(vectors, counter, t_device_s, t_s)
+
+    def _samples(
+        self, vectors: dict[int, Vector], counter: int | None, t_device_s: float | None, t_s: float
+    ) -> list[Sample]:
+        gyro_rad_s, accel_m_s2 = vectors.get(_GYRO), vectors.get(_ACCEL)
+        if gyro_rad_s is None or accel_m_s2 is None:
+            gyro_rad_s = gyro_rad_s or vectors.get(_GYRO_HR)
+            accel_m_s2 = accel_m_s2 or vectors.get(_ACCEL_HR)
+        check_imu(gyro_rad_s or _ABSENT, accel_m_s2 or _ABSENT, None)
+        samples: list[Sample] = []
+        if gyro_rad_s is not None and accel_m_s2 is not None:
+            samples.append(ImuSample(t_s, gyro_rad_s, accel_m_s2, self._temperature_degc, counter, t_device_s))
+        mag = vectors.get(_MAG)
+        if mag is not None:
+            check_vector(mag)
+            x, y, z = mag
+            samples.append(MagSample(t_s, None, (round(x * MAG_COUNTS), round(y * MAG_COUNTS), round(z * MAG_COUNTS))))
+        if not samples:
+            raise RejectedError(NOTHING_OF_USE)
+        return samples
+
+
+def _unsigned(data: bytes, size: int) -> int:
+    if len(data) != size:
+        raise RejectedError(FIELD_COUNT)
+    return int.from_bytes(data, "big")
+
+
+def _numbers(data: bytes, number_format: int, count: int) -> list[float]:
+    """So many numbers in one of the four formats.
+
+    Raises:
+        RejectedError: there is no such format, or the size is not that of so many numbers in it.
+    """
+    if number_format == 2:
+        if len(data) != 6 * count:
+            raise RejectedError(FIELD_COUNT)
+        parts = struct.unpack(">" + "Ih" * count, data)
+        return [whole + fraction / 2**32 for fraction, whole in zip(parts[::2], parts[1::2], strict=True)]
+    code = {0: "f", 1: "i", 3: "d"}.get(number_format)
+    if code is None:
+        raise RejectedError(UNKNOWN_FIELD)
+    unpacker = struct.Struct(f">{count}{code}")
+    if len(data) != unpacker.size:
+        raise RejectedError(FIELD_COUNT)
+    numbers = unpacker.unpack(data)
+    return [number / 2**20 for number in numbers] if code == "i" else list(numbers)

@@ -1,0 +1,1 @@
+"""Decoders of gradienters (two-axis tilt sensors)."""

@@ -1,0 +1,143 @@
+r"""Fluid gradienters that send `X=...` and `Y=...` as two lines: MEAS DPG2 and P-series, BEI INC and AGS.
+
+    X=+00.430\r\nY=-00.084\r\n      degrees; two decimals on the 30 degree models
+    X=+++++++\r\n                   over range (or X=-------)
+
+Sources: MEAS DPG2 manual p. 10, P-series manual p. 13, BEI INC manual p. 10. Serial settings differ: DPG2 9600 8N1,
+P-series 2400 8N1, BEI 9600 8E1. There is no checksum. A reading counts only as a pair of neighbouring lines, X
+first. Commands are single letters that the device echoes; an echo in front of a line is passed over.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import ClassVar, Literal
+
+from companion.protocols.decoding.base import (
+    CUT_SHORT,
+    LINE_END,
+    NOT_A_MEASUREMENT,
+    ORPHAN,
+    OUT_OF_RANGE,
+    OVER_RANGE,
+    PARITY,
+    SHAPE_CHANGED,
+    SINGLE_AXIS,
+    TOO_LONG,
+    LineDecoder,
+    RejectedError,
+)
+from companion.samples import TiltSample
+
+_LAST_AXIS = re.compile(rb".*([XY])=", re.DOTALL)
+_DEGREES = re.compile(rb"[+-]\d\d\.(\d{2,3})")
+_SENTINEL = re.compile(rb"\+{3,}|-{3,}")
+_SINGLE_AXIS = re.compile(rb"[+-]\d\d\.\d{2,3}")
+_ECHO = re.compile(rb"[A-Za-z*]{1,8}")
+_DAMAGED = re.compile(rb"[\x00\x80-\xff]")
+_SURE = 4
+"""So many readings running with fewer decimals than before are the device's way; fewer of them have lost a digit."""
+
+_SPOILED: Literal["spoiled"] = "spoiled"
+
+
+class InclinometerXyDecoder(LineDecoder):
+    """Pairs of lines of an `X=.../Y=...` gradienter; gives `TiltSample`, timed at the end of the Y line."""
+
+    LIMIT: ClassVar[int] = 64
+
+    def __init__(self, seconds_per_byte: float = 0.0) -> None:
+        super().__init__(seconds_per_byte)
+        self._x_deg: float | Literal["spoiled"] | None = None
+        """The X that waits for its Y; "spoiled" when it was rejected, and its Y with it."""
+        self._x_bytes = 0
+        self._decimals = 0
+        self._fewer_running = 0
+
+    def interrupted(self) -> None:
+        """Forget the line and the X under way."""
+        super().interrupted()
+        self._drop_x()
+
+    def _drop_x(self) -> None:
+        if isinstance(self._x_deg, float):
+            self.rejected[ORPHAN] += 1
+        self._x_deg = None
+
+    def _line(self, line: bytes, t_s: float, *, cut: bool) -> TiltSample | None:
+        if not cut and not line.strip(b"\r"):
+            return None
+        match = _LAST_AXIS.match(line)
+        if match is None:
+            self._drop_x()
+            raise RejectedError(self._why_no_axis(line, cut=cut))
+        before = line[: match.start(1)]
+        if cut or before:
+            self._pass_over(before, cut=cut)
+        axis, text = match[1], line[match.end() :]
+        if axis == b"Y":
+            return self._y(text, t_s)
+        self._x(text)
+        self._x_bytes = len(line) + 1
+        return None
+
+    def _frame_bytes(self, line: bytes) -> int:
+        """Both lines: a pair is taken together, before the first of them is sent."""
+        return self._x_bytes + len(line) + 1
+
+    def _why_no_axis(self, line: bytes, *, cut: bool) -> str:
+        if _DAMAGED.search(line):
+            return PARITY
+        if cut:
+            return TOO_LONG
+        return SINGLE_AXIS if _SINGLE_AXIS.fullmatch(line.strip(b"\r")) else NOT_A_MEASUREMENT
+
+    def _pass_over(self, before: bytes, *, cut: bool) -> None:
+        """What stands in front of the last axis of a line: an echo, or something that has lost its line end."""
+        if not cut and _ECHO.fullmatch(before):
+            self.skipped += len(before)
+            return
+        self.rejected[PARITY if _DAMAGED.search(before) else TOO_LONG if cut else CUT_SHORT] += 1
+        self._drop_x()
+
+    def _x(self, text: bytes) -> None:
+        self._drop_x()
+        try:
+            self._x_deg = self._degrees(text)
+        except RejectedError:
+            self._x_deg = _SPOILED
+            raise
+
+    def _y(self, text: bytes, t_s: float) -> TiltSample | None:
+        x_deg, self._x_deg = self._x_deg, None
+        if x_deg == _SPOILED:
+            return None  # the pair has been counted with its X
+        y_deg = self._degrees(text)
+        if not isinstance(x_deg, float):
+            raise RejectedError(ORPHAN)
+        return TiltSample(t_s, x_deg, y_deg)
+
+    def _degrees(self, text: bytes) -> float:
+        if _DAMAGED.search(text):
+            raise RejectedError(PARITY)
+        value = text.removesuffix(b"\r")
+        if value == text:
+            raise RejectedError(LINE_END)
+        if _SENTINEL.fullmatch(value):
+            raise RejectedError(OVER_RANGE)
+        match = _DEGREES.fullmatch(value)
+        if match is None:
+            raise RejectedError(NOT_A_MEASUREMENT)
+        self._check_decimals(len(match[1]))
+        degrees = float(value)
+        if abs(degrees) > 90.0:
+            raise RejectedError(OUT_OF_RANGE)
+        return degrees
+
+    def _check_decimals(self, decimals: int) -> None:
+        """A device prints always as many decimals: `+00.30` after many `+00.430` has lost a digit on the way."""
+        if decimals < self._decimals:
+            self._fewer_running += 1
+            if self._fewer_running < _SURE:
+                raise RejectedError(SHAPE_CHANGED)
+        self._decimals, self._fewer_running = decimals, 0

@@ -1,0 +1,103 @@
+"""RION HCM compasses and HCA inclinometers: frames that begin with 0x68, angles in packed decimal digits.
+
+    68 0D 00 84 | 00 10 50 | 10 10 05 | 01 04 01 | 1C      pitch +10.50, roll -10.05, heading 104.01
+
+After 0x68: length (from itself through the sum), address, command, data, and the low byte of the sum of all from the
+length on. An angle is a sign (0 or 1) and hundreds, then tens and units, then tenths and hundredths. A sum of eight
+bits is weak, but so few bytes are digits of angles that can be that one place in 10^16 of noise passes for them.
+
+Sources: HCM370B/375B manual p. 11-12, HCM705B manual p. 12-17 (9600 8N1; "heading no negative"). The frame of 16 bytes
+with two angles of seven digits is the HCA726's, known from a public driver only, which does not look at the command;
+that it answers 0x84 like the others is assumed. Of the SCA and ACA inclinometers no document was found: their frame is
+said to be the compass', and is read as that. Records of floats (0x94) are not asked for and not read.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, Final
+
+from companion.protocols.decoding.base import CHECKSUM, NOT_A_NUMBER, OUT_OF_RANGE, REPLY, RejectedError
+from companion.protocols.decoding.framing import ECHO, WAIT, FrameDecoder
+from companion.protocols.decoding.polling import PollDialogue
+from companion.samples import CompassSample, Sample, TiltSample
+
+LONGEST: Final = 51
+"""0x94 with nine records."""
+
+_START: Final = b"\x68"
+_READ, _ANSWER, _REPLY_BIT = 0x04, 0x84, 0x80
+_ANGLES_LENGTH, _LONG_ANGLES_LENGTH = 0x0D, 0x0F
+_DOCUMENTED: Final = frozenset((*range(0x04, 0x10), 0x14, 0x2A, *range(0x41, 0x51)))
+_LENGTHS: Final[dict[int, frozenset[int]]] = {
+    **{code: frozenset(range(4, 9)) for code in (*_DOCUMENTED, *(code | _REPLY_BIT for code in _DOCUMENTED))},
+    0x48: frozenset(range(6, 16)),
+    0x94: frozenset(range(10, LONGEST, 5)),
+    _ANSWER: frozenset((_ANGLES_LENGTH, _LONG_ANGLES_LENGTH)),
+}
+"""The lengths that a command or an answer may have; for most no more is documented than that they are short."""
+
+
+class RionDecoder(FrameDecoder):
+    """Frames of a RION device; gives `CompassSample`, or `TiltSample` for the inclinometer's longer frame."""
+
+    def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
+        if buffer[at] != _START[0]:
+            return self._skip_to(_START, buffer, at)
+        available = len(buffer) - at
+        if available < 2:
+            return WAIT
+        length = buffer[at + 1]
+        if not 4 <= length < LONGEST or (available >= 4 and length not in _LENGTHS.get(buffer[at + 3], ())):
+            self.skipped += 1
+            return at + 1
+        if available <= length:
+            return WAIT
+        end = at + 1 + length
+        if sum(buffer[at + 1 : end - 1]) & 0xFF != buffer[end - 1]:
+            return self._reject(CHECKSUM, at + 1)
+        command = buffer[at + 3]
+        if command != _ANSWER:
+            return self._reject(REPLY if command & _REPLY_BIT else ECHO, end)
+        try:
+            samples.append(_measurement(buffer[at + 4 : end - 1], self._time_of(origin + end)))
+            self.accepted += 1
+        except RejectedError as error:
+            return self._reject(error.reason, at + 1)  # rather no frame at all, with a sum that is right by chance
+        return end
+
+
+def _measurement(data: bytes, t_s: float) -> Sample:
+    """The angles of an answer, by its length.
+
+    Raises:
+        RejectedError: not decimal digits, or angles that cannot be.
+    """
+    if len(data) == 9:
+        pitch_deg, roll_deg, heading_deg = (_degrees(data[at : at + 3], 100) for at in (0, 3, 6))
+        if not 0.0 <= heading_deg < 360.0 or max(abs(pitch_deg), abs(roll_deg)) > 90.0:
+            raise RejectedError(OUT_OF_RANGE)
+        return CompassSample(t_s, heading_deg, pitch_deg, roll_deg)
+    x_deg, y_deg = _degrees(data[0:4], 10_000), _degrees(data[4:8], 10_000)
+    if max(abs(x_deg), abs(y_deg)) > 90.0:
+        raise RejectedError(OUT_OF_RANGE)
+    return TiltSample(t_s, x_deg, y_deg)
+
+
+def _degrees(digits: bytes, per_degree: int) -> float:
+    """An angle from its packed digits, the first of which is the sign."""
+    text = digits.hex()
+    if not text.isdecimal() or text[0] not in "01":
+        raise RejectedError(NOT_A_NUMBER)
+    value = int(text[1:]) / per_degree
+    return -value if text[0] == "1" else value
+
+
+class RionDialogue(PollDialogue):
+    """Asks a silent device for its angles, as HCM370B p. 11 and HCM705B p. 12 have it: it comes in this mode.
+
+    Five times a second at most: 19 bytes with the answer (HCA726: 21), 22 ms at 9600 baud, 88 ms at 2400.
+    """
+
+    QUESTION: ClassVar[bytes] = bytes((_START[0], 4, 0, _READ, 4 + _READ))
+    PERIOD_S: ClassVar[float] = 0.2
+    NAME: ClassVar[str] = "68 04 00 04 08"
