@@ -82,7 +82,8 @@ def test_every_message_is_as_before_without_what_is_dropped() -> None:
 
 def test_a_number_of_threads_that_somebody_wants_stays() -> None:
     code = (
-        "import os; from companion.daemon.process import footprint as f; f.prepare(); print(os.environ['OPENBLAS_NUM_THREADS'])"
+        "import os; from companion.daemon.process.footprint import prepare; prepare();"
+        "print(os.environ['OPENBLAS_NUM_THREADS'])"
     )
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "3"}
     ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
