@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable
 from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.service import ArmGate, VehicleView
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.links.mavlink.link import MavlinkLink
 
 VALID_S: Final = 10
@@ -39,7 +38,7 @@ class ArmAuthoriser:
         link: MavlinkLink,
         vehicle: VehicleView,
         gate: ArmGate,
-        say: Callable[[Severity, str, Weight], object],
+        say: Say,
     ) -> None:
         self._link, self._vehicle, self._gate, self._say = link, vehicle, gate, say
         self._attempt_s = self._misdirected_s = -math.inf

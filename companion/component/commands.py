@@ -27,7 +27,7 @@ from companion.component import requests
 from companion.component.identity import autopilot_version
 from companion.component.permission import Permission
 from companion.component.service import CalibrationService, Job, Refusal
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.links.mavlink.link import MavlinkLink
 
 logger = logging.getLogger(__name__)
@@ -89,7 +89,7 @@ class CommandServer:
         self,
         link: MavlinkLink,
         service: CalibrationService,
-        say: Callable[[Severity, str, Weight], object],
+        say: Say,
         wake: Callable[[], None],
         permission: Permission | None = None,
     ) -> None:

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.permission import Permission
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.errors import CompanionError
 from companion.links.mavlink.link import MavlinkLink
 
@@ -67,7 +67,7 @@ class OwnParameters:
     def __init__(
         self,
         link: MavlinkLink,
-        say: Callable[[Severity, str, Weight], object] = lambda severity, text, weight: None,
+        say: Say = lambda severity, text, weight: None,
         wake: Callable[[], None] = lambda: None,
         permission: Permission | None = None,
     ) -> None:

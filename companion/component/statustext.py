@@ -62,6 +62,10 @@ class Weight(enum.IntEnum):
     RESULT = 2
 
 
+Say = Callable[[Severity, str, Weight], object]
+"""Tells people at the ground stations."""
+
+
 def to_ascii(text: str) -> str:
     """One line of plain ASCII: ground stations disagree on everything else."""
     text = unicodedata.normalize("NFKD", " ".join(text.translate(_ASCII).split()))

@@ -67,7 +67,7 @@ class Trouble:
 
     key: str
     words: str
-    lies: bool = False
+    implausible: bool = False
     """Its readings look good and are not: nothing may be measured with them."""
 
 
@@ -228,13 +228,13 @@ class StreamHealth:
     def _lying(self) -> Trouble | None:
         if self._rail >= _RAIL_SAMPLES:
             words = f"reads exactly {RAILS_DEG[self._protocol][1]}: level its base"
-            return Trouble("end of range", words, lies=True)
+            return Trouble("end of range", words, implausible=True)
         since_s, last_s = self.unchanged_since_s, self.last_sample_s
         if since_s is None or last_s is None or self._same < STUCK_SAMPLES or last_s - since_s < STUCK_S:
             return None
         if isinstance(self._reading, tuple) and isinstance(self._reading[0], tuple):
             words = f"stuck: {self._same + 1} equal readings; switch its power off and on"
-            return Trouble("stuck", words, lies=True)
+            return Trouble("stuck", words, implausible=True)
         return None
 
     def _in_part(self, lately: _Mark) -> Trouble | None:

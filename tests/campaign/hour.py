@@ -157,7 +157,7 @@ async def _to_rest(stage: Stage) -> None:
     conductor = stage.service.conductor
     await asyncio.sleep(5.0)
     await stage.until(
-        lambda: (conductor.job is None or conductor.job.finished.done()) and not stage.service.mender.pending, 240.0
+        lambda: (conductor.job is None or conductor.job.finished.done()) and not stage.service.recovery.pending, 240.0
     )
 
 

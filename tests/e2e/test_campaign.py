@@ -85,7 +85,7 @@ def test_a_daemon_that_does_not_mend_is_caught() -> None:
         await asyncio.Event().wait()
 
     def sabotage(stage: Stage) -> None:
-        stage.service.mender._mend = never  # type: ignore[assignment,method-assign]
+        stage.service.recovery._recover = never  # type: ignore[assignment,method-assign]
 
     outcome = run_cell(FAULTS["arms-in-write"], "solving", SEED, sabotage=sabotage)
     assert any("still to be put back" in words for words in outcome.problems), outcome

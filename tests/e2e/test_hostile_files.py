@@ -56,9 +56,9 @@ def test_it_starts_says_so_and_writes_nothing(
             (said,) = [words for words in caplog.messages if path.name in words]
             assert said in rig.service.status()["warnings"]
             assert said.startswith(f"{path}: cannot be {'read' if what == 'a FIFO' else 'used'}: ")
-            assert rig.service.mender.fault is None
-            assert not rig.service.mender.pending
-            assert not rig.service.setup.mender.pending
+            assert rig.service.recovery.fault is None
+            assert not rig.service.recovery.pending
+            assert not rig.service.setup.recovery.pending
             if name == "undo-1.json":
                 answer = rig.service.conductor.start_undo("test")
                 assert isinstance(answer, Refusal)
@@ -80,7 +80,7 @@ def test_nothing_else_in_the_storage_ends_or_hangs_the_start(tmp_path: Path, nam
     async def main() -> None:
         async with Rig(tmp_path).running() as rig:
             await rig.ready()
-            assert rig.service.mender.fault is None
+            assert rig.service.recovery.fault is None
 
     run_virtual(main())
 
@@ -96,7 +96,7 @@ def test_a_journal_of_parameters_that_this_autopilot_has_not_is_brought_to_an_en
 
     async def main() -> None:
         async with Rig(tmp_path, version=version, parameters={"INS_GYROFFS_X": 0.001}).running() as rig:
-            await rig.until(lambda: not rig.service.mender.pending, 20.0)
+            await rig.until(lambda: not rig.service.recovery.pending, 20.0)
             ours = name.startswith("INS")
             assert rig.double.parameter("INS_GYROFFS_X") == pytest.approx(0.0 if ours else 0.001)
             assert len(rig.double.writes) == int(ours)

@@ -196,9 +196,9 @@ def test_who_is_not_believed_is_told_of_once(tmp_path: Path, caplog: pytest.LogC
                 assert status is not None
                 assert status["strangers"] == [{"sender": "255/190", "why": "does not sign", "messages": 3}]
                 assert status["summary"] == "0 messages checked, 3 dropped"
-                assert one.deaf is None
+                assert one.rejecting is None
                 one.signing.admits(b"\xfd\x00\x00\x00\x00\x01\x01\x00\x00\x00\x00\x00")
-                assert one.deaf == "1 unsigned messages dropped: the autopilot does not sign on this link"
+                assert one.rejecting == "1 unsigned messages dropped: the autopilot does not sign on this link"
 
     with caplog.at_level(logging.WARNING):
         run_virtual(main())
@@ -214,5 +214,5 @@ def test_off_is_off_and_a_key_without_use_is_doubted() -> None:
     found.load()
     assert link.signing is None
     assert found.status() is None
-    assert found.deaf is None
+    assert found.rejecting is None
     assert doubtful(config) == ['mavlink.signing_key_file is named, but signing = "off": nothing is signed or checked']

@@ -122,7 +122,7 @@ def test_a_gradienter_that_repeats_its_digits_while_the_aircraft_tilts_is_stuck(
         assert said.startswith("gradienter: stuck: the same reading for ")
         assert said.endswith("; switch its power off and on")
         assert found is not None
-        assert (found.key, found.lies) == ("stuck", True)
+        assert (found.key, found.implausible) == ("stuck", True)
         assert "while the aircraft tilted by 8 deg" in found.words
         assert bench.resets, "nothing may be measured with it"
         assert bench.one.counts == {"stuck": 1}

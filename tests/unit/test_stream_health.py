@@ -26,7 +26,7 @@ def test_a_lily_at_its_rail_is_no_tilt() -> None:
         health.took(b"x", [TiltSample(second, math.degrees(-202.49e-6) + second * 1e-5, -rail_deg)], float(second))
     found = health.trouble(3.1)
     assert found is not None
-    assert (found.key, found.lies) == ("end of range", True)
+    assert (found.key, found.implausible) == ("end of range", True)
     assert "330 microradians" in found.words
     health.took(b"x", [TiltSample(4.0, 0.001, -rail_deg + 5e-5)], 4.0)
     assert health.trouble(4.1) is None

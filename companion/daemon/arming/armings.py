@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import datetime
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +14,7 @@ import msgspec
 
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.calibration.solution.record import Arming, Record
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.arming.readiness import Readiness
 from companion.daemon.offload import Offload
 from companion.errors import StorageError
@@ -25,8 +25,6 @@ logger = logging.getLogger(__name__)
 KEEP: Final = 200
 """Some 400 bytes each: below 100 kB, a season of flying."""
 QUEUE: Final = 16
-
-Say = Callable[[Severity, str, Weight], object]
 
 
 class Armings:

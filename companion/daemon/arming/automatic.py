@@ -25,7 +25,7 @@ from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.solution.validity import Why
 from companion.component.service import JobResult, Refusal
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.arming.in_force import InForce
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -36,7 +36,6 @@ from companion.storage.bounded import BoundedList
 
 logger = logging.getLogger(__name__)
 
-Say = Callable[[Severity, str, Weight], object]
 
 REQUESTER: Final = "the companion itself"
 POLL_S: Final = 1.0

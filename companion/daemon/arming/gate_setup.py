@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
 from typing import Final
 
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.arming.readiness import Readiness
 from companion.errors import AutopilotError
 
 logger = logging.getLogger(__name__)
 
-Say = Callable[[Severity, str, Weight], object]
 
 POLL_S: Final = 1.0
 RETRY_S: Final = 30.0

@@ -21,7 +21,7 @@ from companion.daemon.arming.forecast import Forecast
 from companion.daemon.arming.in_force import InForce
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.course import Stage
-from companion.daemon.offsets.mend import Mender
+from companion.daemon.offsets.recovery import Recovery
 from companion.physics.units import DEG_H, MG
 
 logger = logging.getLogger(__name__)
@@ -49,15 +49,15 @@ class Readiness:
         vehicle: armed or not, which autopilot.
         collector: whether it stands still.
         conductor: what runs, and what is set for arming.
-        mender: whether something has to be put in order first.
+        recovery: whether something has to be put in order first.
         in_force: what is in force, and what speaks against it.
     """
 
     def __init__(
-        self, vehicle: Vehicle, collector: RollingCollector, conductor: Conductor, mender: Mender, in_force: InForce
+        self, vehicle: Vehicle, collector: RollingCollector, conductor: Conductor, recovery: Recovery, in_force: InForce
     ) -> None:
         self._vehicle, self._collector, self._conductor = vehicle, collector, conductor
-        self._mender, self.in_force = mender, in_force
+        self._recovery, self.in_force = recovery, in_force
         self._forecast = Forecast(vehicle, collector, conductor)
         self.why_not_by_itself: Callable[[], str | None] = lambda: "calibrate first"
         """Why no calibration will start by itself, and what to do, or None when one will."""
@@ -121,16 +121,16 @@ class Readiness:
     def _writing(self) -> bool:
         """Whether a job that may write runs, or one that was interrupted is being put in order."""
         job = self._conductor.job
-        return (job is not None and not job.finished.done()) or self._mender.pending
+        return (job is not None and not job.finished.done()) or self._recovery.pending
 
     def _judge(self, now_s: float) -> ArmAnswer:
-        if self._mender.fault is not None:
-            return ArmAnswer("refuse", self._mender.fault)
+        if self._recovery.fault is not None:
+            return ArmAnswer("refuse", self._recovery.fault)
         if (conflict := self._vehicle.conflict) is not None:
             return ArmAnswer("refuse", conflict)
         if self._vehicle.arm_state is ArmState.UNKNOWN:
             return ArmAnswer("wait", "no heartbeat from the autopilot")
-        if self._mender.pending:
+        if self._recovery.pending:
             return ArmAnswer("wait", "old offsets are being put back: wait")
         if not self._conductor.push_parameters:
             return ArmAnswer("refuse", "writing is off (CMP_PUSH): no gate")

@@ -11,7 +11,7 @@ import dataclasses
 import datetime
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -24,7 +24,7 @@ from companion.calibration.collector.rolling import RollingCollector, Window
 from companion.calibration.machine import Event, Machine, State
 from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.calibration.solution.solve import GradienterModel, up_in_vehicle, vehicle_heading_rad
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.config import Config
 from companion.configured import models
 from companion.daemon import offload as estimating
@@ -40,7 +40,6 @@ from companion.samples import Vector
 
 logger = logging.getLogger(__name__)
 
-Say = Callable[[Severity, str, Weight], object]
 
 POLL_S: Final = 0.2
 STAND_S: Final = 12.0

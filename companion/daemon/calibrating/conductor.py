@@ -23,17 +23,17 @@ from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.config import Config
 from companion.daemon.calibrating.align_steps import Plan
 from companion.daemon.calibrating.aligner import Aligner
 from companion.daemon.calibrating.bias_memory import BiasMemory
-from companion.daemon.calibrating.course import Course, Say, Stage
+from companion.daemon.calibrating.course import Course, Stage
 from companion.daemon.calibrating.start_limit import StartLimit
 from companion.daemon.job import ALIGNMENT, Job, JobCancelledError
 from companion.daemon.offload import Offload
-from companion.daemon.offsets.mend import Mender
 from companion.daemon.offsets.push import Pusher
+from companion.daemon.offsets.recovery import Recovery
 from companion.errors import CompanionError, StorageError
 from companion.storage.records import RecordStore
 
@@ -50,7 +50,7 @@ class Conductor:
         collector: RollingCollector,
         course: Course,
         pusher: Pusher,
-        mender: Mender,
+        recovery: Recovery,
         store: RecordStore,
         say: Say,
         offload: Offload,
@@ -60,7 +60,7 @@ class Conductor:
         self._memory = memory
         self._aligner = aligner
         self._config, self._vehicle, self._collector, self._course = config, vehicle, collector, course
-        self._pusher, self._mender, self._store = pusher, mender, store
+        self._pusher, self._recovery, self._store = pusher, recovery, store
         self._say, self._offload = say, offload
         self._machine = course.machine
         self._starts = StartLimit()
@@ -75,7 +75,7 @@ class Conductor:
         self.on_result: Callable[[Record], None] = lambda record: None
         self.on_ended: Callable[[Job, JobResult], None] = lambda job, result: None
         """Told of every end, before the requester is."""
-        mender.on_mended = self._mended
+        recovery.on_mended = self._mended
         self._unsubscribe = vehicle.watch(self._on_event)
 
     # --- what others ask of it (component.service.CalibrationService)
@@ -123,7 +123,7 @@ class Conductor:
         """MAV_STATE_* for the heartbeat."""
         if self._machine.state.busy:
             return mavlink.MAV_STATE_CALIBRATING
-        if self._mender.fault is not None:
+        if self._recovery.fault is not None:
             return mavlink.MAV_STATE_CRITICAL
         return mavlink.MAV_STATE_ACTIVE if self._vehicle.arm_state is ArmState.ARMED else mavlink.MAV_STATE_STANDBY
 
@@ -177,7 +177,7 @@ class Conductor:
         return self._start(job, Event.REQUEST, self._align(job, plan))
 
     def start_undo(self, requester: str, *, force: bool = False) -> Job | Refusal:
-        """Start putting back the values from before the last calibration, or say why not; `force` as `Mender.undo`."""
+        """Start putting back the values from before the last calibration, or say why not (see `Recovery.undo`)."""
         running = self._by_itself()
         if running is not None and self._task is not None:
             # Somebody who wants old values back must not wait for new ones that nobody asked for.
@@ -191,7 +191,7 @@ class Conductor:
         refusal = self._refusal()
         if refusal is not None:
             return refusal
-        why = self._mender.why_no_undo()
+        why = self._recovery.why_no_undo()
         if why is not None:
             return Refusal("nothing_to_undo", why)
         if (refusal := self._starts.refuses(requester)) is not None:
@@ -247,9 +247,9 @@ class Conductor:
             return Refusal(
                 "unknown", "no autopilot heard yet" if age_s is None else f"no heartbeat for {age_s:.0f} s: armed?"
             )
-        if self._mender.fault is not None:
-            return Refusal("other", self._mender.fault)
-        if self._mender.pending:
+        if self._recovery.fault is not None:
+            return Refusal("other", self._recovery.fault)
+        if self._recovery.pending:
             return Refusal("busy", "putting old values back first")
         return None
 
@@ -290,7 +290,7 @@ class Conductor:
             self._collector.reset("just disarmed")
 
     def _mended(self, words: str) -> None:
-        """What the mender has put in order is what `status` says last."""
+        """What the recovery has put in order is what `status` says last."""
         self.reason = words
 
     # --- a calibration
@@ -358,14 +358,14 @@ class Conductor:
         self._machine.on(Event.UNDO)
         if taken_back:
             self._end(job, Event.RESTORED, JobResult("done", "auto calibration taken back"))
-        elif (why := self._mender.why_no_undo()) is not None:
+        elif (why := self._recovery.why_no_undo()) is not None:
             self._end(job, Event.FAULT, JobResult("failed", why))
         else:
             await self._undo(job, force=force)
 
     async def _undo(self, job: Job, *, force: bool) -> None:
         try:
-            job.written = await self._mender.undo(force=force)
+            job.written = await self._recovery.undo(force=force)
         except CompanionError as error:
             self._end(job, Event.FAULT, JobResult("failed", str(error)))
         except Exception as error:

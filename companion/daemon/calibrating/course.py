@@ -26,7 +26,7 @@ from companion.calibration.solution.prior import Expectation
 from companion.calibration.solution.site import Whereabouts
 from companion.calibration.solution.solve import Solution, solve_at
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.config import Config
 from companion.configured import models
 from companion.daemon import offload as estimating
@@ -45,7 +45,6 @@ from companion.recording.collector import RecordedCollector
 
 logger = logging.getLogger(__name__)
 
-Say = Callable[[Severity, str, Weight], object]
 Stage = Literal["dithering", "writing", "checking", "restarting", "settling", "putting back"]
 
 POLL_S: Final = 0.2

@@ -44,7 +44,7 @@ class SensorHealth:
         """How often each trouble has begun, and each event happened."""
         self.stuck: Trouble | None = None
         """That its reading stays while the aircraft does not: found out by who sees the other sensors too."""
-        self.on_lie: Callable[[Trouble], object] = lambda lie: None
+        self.on_implausible: Callable[[Trouble], object] = lambda trouble: None
         """Told, as often as the log, when its readings begin to look good without being so."""
         self._renew_after_s = RENEW_POLLED_AFTER_S if polled else RENEW_AFTER_S
         self._opened_s = self._grace_since_s = 0.0
@@ -78,7 +78,7 @@ class SensorHealth:
             return None
         port = self.link.settings
         line = f"{port.url} at {port.baud} baud, parity {port.parity}" if not port.is_tcp else port.url
-        return Trouble(found.key, f"{line}: {found.words}", found.lies)
+        return Trouble(found.key, f"{line}: {found.words}", found.implausible)
 
     def words(self, now_s: float) -> str | None:
         """What is wrong with it in one line, or None while good samples come."""
@@ -129,14 +129,14 @@ class SensorHealth:
         self._good_since_s = None
         if found.key == self._said:
             return
-        if found.key == ABSENT or (now_s - self._grace_since_s < SILENT_AFTER_S and not found.lies):
+        if found.key == ABSENT or (now_s - self._grace_since_s < SILENT_AFTER_S and not found.implausible):
             return  # the port says itself that it is gone; and what was just opened has a moment to begin
         if self._said is None:
             self._began_s = now_s
         self._said = found.key
         self.counts[found.key] += 1
-        if self._tell(found, now_s) and found.lies:
-            self.on_lie(found)
+        if self._tell(found, now_s) and found.implausible:
+            self.on_implausible(found)
 
     def _tell(self, what: Trouble, now_s: float) -> bool:
         """In the log; whether in the ordinary one."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.seconds.batches import Batch
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.physics.frames import Array, Matrix
 from companion.protocols.stream_health import Trouble
 
@@ -106,7 +106,7 @@ class MotionWitness:
 
     def _heard(self, since_s: float, until_s: float) -> list[list[tuple[int, Array, float]]]:
         """The whole seconds in between, of each IMU that has seen as much as the others."""
-        # Not as the clock: while a sensor lies, nothing is collected of any IMU.
+        # Not as the clock: while a sensor is implausible, nothing is collected of any IMU.
         newest = max((seconds[-1][0] for seconds in self._seconds.values() if seconds), default=0)
         found = [
             [second for second in seconds if since_s <= second[0] <= until_s - 1.0]
@@ -132,7 +132,7 @@ class SensorWatch:
         sensors: Sequence[SerialSensor],
         collector: RollingCollector,
         corrected: Callable[[str], Corrected | None] = lambda name: UNTOUCHED,
-        say: Callable[[Severity, str, Weight], object] = lambda *what: None,
+        say: Say = lambda *what: None,
     ) -> None:
         self._sensors, self._collector = sensors, collector
         self._corrected = corrected
@@ -140,11 +140,11 @@ class SensorWatch:
         self._has_failed = False
         self._say = say
         for sensor in sensors:
-            sensor.health.on_lie = functools.partial(self._tell, sensor)
+            sensor.health.on_implausible = functools.partial(self._tell, sensor)
 
-    def _tell(self, sensor: SerialSensor, lie: Trouble) -> None:
+    def _tell(self, sensor: SerialSensor, trouble: Trouble) -> None:
         """To the ground stations: no calibration comes to an end with it, and what was written with it may be wrong."""
-        self._say(Severity.WARNING, f"{sensor.name}: {lie.words.removeprefix(f'{sensor.line}: ')}", Weight.NEWS)
+        self._say(Severity.WARNING, f"{sensor.name}: {trouble.words.removeprefix(f'{sensor.line}: ')}", Weight.NEWS)
 
     async def run(self) -> None:
         """Look until cancelled."""
@@ -166,7 +166,7 @@ class SensorWatch:
             if "imu" not in sensor.kinds:
                 sensor.health.stuck = self._stuck(sensor)
             found = sensor.health.look(now_s)
-            if found is not None and found.lies:
+            if found is not None and found.implausible:
                 self._collector.reset(f"{sensor.name}: {found.words}", sensor.name if sensor.kinds == {"imu"} else None)
 
     def _stuck(self, sensor: SerialSensor) -> Trouble | None:
@@ -187,17 +187,17 @@ class SensorWatch:
         else:
             return None
         words = f"stuck: the same reading for {last_s - since_s:.0f} s while the aircraft {how}"
-        return Trouble("stuck", f"{words}; switch its power off and on", lies=True)
+        return Trouble("stuck", f"{words}; switch its power off and on", implausible=True)
 
-    def lies(self) -> str | None:
+    def implausible(self) -> str | None:
         """A sensor whose readings look good and are not, and why; None where there is none."""
         now_s = asyncio.get_running_loop().time()
         found = ((sensor.name, sensor.health.trouble(now_s)) for sensor in self._sensors)
-        return next((f"{name}: {each.words}" for name, each in found if each is not None and each.lies), None)
+        return next((f"{name}: {each.words}" for name, each in found if each is not None and each.implausible), None)
 
     def worst(self) -> str | None:
         """Of the sensor that troubles most what is wrong, with its name; None while all do well."""
         now_s = asyncio.get_running_loop().time()
         found = [(sensor.name, sensor.health.trouble(now_s)) for sensor in self._sensors]
-        troubles = sorted((not each.lies, f"{name}: {each.words}") for name, each in found if each is not None)
+        troubles = sorted((not each.implausible, f"{name}: {each.words}") for name, each in found if each is not None)
         return troubles[0][1] if troubles else None

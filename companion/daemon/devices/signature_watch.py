@@ -11,13 +11,12 @@ import asyncio
 import logging
 import math
 from collections import Counter
-from collections.abc import Callable
 from typing import Final, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.signing import Reason, Signing
 
@@ -75,7 +74,7 @@ class SignatureWatch:
         link: MavlinkLink,
         vehicle: Vehicle,
         signing: Signing | None,
-        say: Callable[[Severity, str, Weight], object],
+        say: Say,
     ) -> None:
         self._link, self._vehicle, self._signing, self._say = link, vehicle, signing, say
         self._kind: _Kind | None = None
@@ -92,7 +91,7 @@ class SignatureWatch:
             link.subscribe(mavlink.MAVLink_timesync_message, self._on_timesync)
 
     @property
-    def worry(self) -> str | None:
+    def warning(self) -> str | None:
         """What does not fit, and what to do; None while all does, or nobody is heard."""
         return None if self._kind is None else _WORDS[self._kind][0]
 

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.config import Config
 from companion.daemon.devices.signature_watch import SignatureWatch
 from companion.daemon.offload import Offload
@@ -58,7 +57,7 @@ class LinkSigning:
         config: Config,
         link: MavlinkLink,
         vehicle: Vehicle,
-        say: Callable[[Severity, str, Weight], object],
+        say: Say,
         offload: Offload,
     ) -> None:
         self._config, self._vehicle, self._say, self._offload = config, vehicle, say, offload
@@ -158,7 +157,7 @@ class LinkSigning:
     # --- words
 
     @property
-    def deaf(self) -> str | None:
+    def rejecting(self) -> str | None:
         """Why the autopilot is not heard although something comes; None when signing is not why."""
         signing = self.signing
         if signing is None or not signing.required:
@@ -177,32 +176,32 @@ class LinkSigning:
         }[reason]
 
     @property
-    def worry(self) -> str | None:
+    def warning(self) -> str | None:
         """That the autopilot and we do not believe each other, and what to do; None where they do."""
-        return self._watch.worry
+        return self._watch.warning
 
     def status(self) -> dict[str, Any] | None:
         """For `companion status`; None while signing is off and nothing asks for it."""
         signing = self.signing
         if signing is None:
-            if self.worry is None:
+            if self.warning is None:
                 return None
             return {
                 "good": False,
                 "mode": self.mode,
-                "summary": self.worry,
+                "summary": self.warning,
                 "verified": 0,
                 "doubted": {},
                 "strangers": [],
             }
         doubted = sum(signing.doubted.values())
-        summary = self.deaf or self.trouble or self.worry
+        summary = self.rejecting or self.trouble or self.warning
         if not summary:
             summary = f"{signing.verified} messages checked"
             if doubted:
                 summary += f", {doubted} {'dropped' if signing.required else 'not signed with our key'}"
         return {
-            "good": self.deaf is None and not self.trouble and self.worry is None,
+            "good": self.rejecting is None and not self.trouble and self.warning is None,
             "mode": self.mode,
             "summary": summary,
             "verified": signing.verified,

@@ -28,7 +28,7 @@ from companion.daemon.faces.shown_calibration import shown_calibration
 from companion.daemon.heading.pose_now import PoseNow
 from companion.daemon.job import Job
 from companion.daemon.offload import Offload
-from companion.daemon.offsets.mend import Mender
+from companion.daemon.offsets.recovery import Recovery
 from companion.daemon.offsets.rivalry import Rivalry
 from companion.daemon.recorder.recorder import Recorder
 from companion.errors import CalibrationRefusedError
@@ -89,7 +89,7 @@ class Answers:
         mavlink_url: str,
         rivalry: Rivalry,
         reach: Reach,
-        mender: Mender,
+        recovery: Recovery,
         readiness: Readiness,
         armings: Armings,
         gate_setup: GateSetup,
@@ -98,16 +98,16 @@ class Answers:
         link: MavlinkLink,
         pose: PoseNow,
         trouble: Callable[[], str | None],
-        lies: Callable[[], str | None],
+        implausible: Callable[[], str | None],
         alignment: AlignmentInForce,
     ) -> None:
         self._conductor, self._vehicle, self._collector, self._devices = conductor, vehicle, collector, devices
         self._store, self._offload, self._mavlink_url = store, offload, mavlink_url
-        self._rivalry, self._reach, self._mender, self._readiness = rivalry, reach, mender, readiness
+        self._rivalry, self._reach, self._recovery, self._readiness = rivalry, reach, recovery, readiness
         self._armings, self._gate_setup, self._automatic = armings, gate_setup, automatic
         self._recorder, self._link, self._pose, self._alignment = recorder, link, pose, alignment
-        self._headlines = Headlines(vehicle, collector, conductor, mender, readiness, automatic, mavlink_url, trouble)
-        self._concerns: list[Callable[[], str | None]] = [lies]
+        self._headlines = Headlines(vehicle, collector, conductor, recovery, readiness, automatic, mavlink_url, trouble)
+        self._concerns: list[Callable[[], str | None]] = [implausible]
         self._headlines.concern = lambda: next(filter(None, (concern() for concern in self._concerns)), None)
         self._carried: Carried | None = None
         self._signing: LinkSigning | None = None
@@ -126,8 +126,8 @@ class Answers:
     def watch_access(self, signing: LinkSigning, permission: Permission) -> None:
         """Tell of who is not believed and who was refused, too."""
         self._signing, self._permission = signing, permission
-        self._headlines.deaf = lambda: signing.deaf
-        self._concerns.append(lambda: signing.worry)
+        self._headlines.rejecting = lambda: signing.rejecting
+        self._concerns.append(lambda: signing.warning)
 
     def carry(self, attitude: Carried | None) -> None:
         """Tell of the attitude that is carried, too."""
@@ -239,7 +239,7 @@ class Answers:
                 "armed": self._vehicle.arm_state.value,
                 "summary": f"{self._vehicle.name}, {self._vehicle.arm_state.value}"
                 if self._vehicle.system_id is not None
-                else f"not heard yet on {self._mavlink_url}{self._headlines.why_deaf()}",
+                else f"not heard yet on {self._mavlink_url}{self._headlines.why_rejecting()}",
                 "heartbeat_age_s": None if age_s is None else round(age_s, 1),
                 "messages": received.total() - received["bad"],
                 "bad": received["bad"],
@@ -257,9 +257,9 @@ class Answers:
             ],
             "attitude": None if self._carried is None else self._carried.view(),
             "ground_stations": dict(zip(("good", "summary"), self._reach.words(), strict=True)),
-            "fault": self._mender.fault,
-            "putting_back": self._mender.pending,
-            "why_no_undo": self._mender.why_no_undo(),
+            "fault": self._recovery.fault,
+            "putting_back": self._recovery.pending,
+            "why_no_undo": self._recovery.why_no_undo(),
             "devices": [device | counts.get(str(device["name"]), {}) for device in devices],
             "arming": {
                 **self._readiness.status(),

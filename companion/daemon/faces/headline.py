@@ -21,7 +21,7 @@ from companion.daemon.arming.readiness import Readiness
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.course import Stage
 from companion.daemon.job import Job
-from companion.daemon.offsets.mend import Mender
+from companion.daemon.offsets.recovery import Recovery
 
 Tone = Literal["good", "wait", "busy", "bad"]
 """good: may fly. wait: the pilot's patience. busy: the companion works. bad: somebody has to do something."""
@@ -53,24 +53,24 @@ class Headlines:
         vehicle: Vehicle,
         collector: RollingCollector,
         conductor: Conductor,
-        mender: Mender,
+        recovery: Recovery,
         readiness: Readiness,
         automatic: Automatic,
         mavlink_url: str,
         trouble: Callable[[], str | None],
     ) -> None:
-        self._vehicle, self._collector, self._conductor, self._mender = vehicle, collector, conductor, mender
+        self._vehicle, self._collector, self._conductor, self._recovery = vehicle, collector, conductor, recovery
         self._readiness, self._automatic, self._mavlink_url = readiness, automatic, mavlink_url
         self._trouble = trouble
         """What is wrong with one of our own sensors, and with which; None while all do well."""
-        self.deaf: Callable[[], str | None] = lambda: None
+        self.rejecting: Callable[[], str | None] = lambda: None
         """Why what comes from the autopilot is not believed; None when it is."""
         self.concern: Callable[[], str | None] = lambda: None
         """What else the pilot should know of at once, where the rest is well."""
 
-    def why_deaf(self) -> str:
+    def why_rejecting(self) -> str:
         """To be said behind "not heard yet on ...": why, where that is known."""
-        return f": {why}" if (why := self.deaf()) else ""
+        return f": {why}" if (why := self.rejecting()) else ""
 
     def now(self) -> Headline:
         """The headline of this moment."""
@@ -80,8 +80,8 @@ class Headlines:
 
     def _now(self) -> Headline:
         now_s = asyncio.get_running_loop().time()
-        if self._mender.fault is not None:
-            return Headline("FAULT", self._mender.fault, "bad")
+        if self._recovery.fault is not None:
+            return Headline("FAULT", self._recovery.fault, "bad")
         if (conflict := self._vehicle.conflict) is not None:
             return Headline("TWO AUTOPILOTS", conflict, "bad")
         job = self._conductor.job
@@ -89,7 +89,7 @@ class Headlines:
             return self._working(job, now_s)
         if self._vehicle.arm_state is ArmState.UNKNOWN:
             return self._no_autopilot()
-        if self._mender.pending:
+        if self._recovery.pending:
             return Headline("PUTTING BACK", "an interrupted write is being put back", "busy")
         state, words = self._readiness.state(now_s)
         if self._vehicle.arm_state is ArmState.ARMED:
@@ -105,8 +105,8 @@ class Headlines:
     def _no_autopilot(self) -> Headline:
         age_s = self._vehicle.heartbeat_age_s
         if age_s is None:
-            return Headline("NO AUTOPILOT", f"not heard yet on {self._mavlink_url}{self.why_deaf()}", "bad")
-        why = self.deaf() or "power? cable?"
+            return Headline("NO AUTOPILOT", f"not heard yet on {self._mavlink_url}{self.why_rejecting()}", "bad")
+        why = self.rejecting() or "power? cable?"
         return Headline("NO AUTOPILOT", f"no heartbeat for {age_s:.0f} s: {why}", "bad")
 
     def _working(self, job: Job, now_s: float) -> Headline:

@@ -14,7 +14,7 @@ from companion.autopilot.vehicle.standing_requests import StandingRequests
 from companion.autopilot.vehicle.timesync import TimesyncResponder
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.collector.rolling import RollingCollector
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.config import Config
 from companion.configured import models
 from companion.daemon.arming.in_force import InForce
@@ -34,7 +34,6 @@ from companion.samples import ImuSample, Sample
 logger = logging.getLogger(__name__)
 
 Object = dict[str, Any]
-Say = Callable[[Severity, str, Weight], object]
 
 TICK_S: Final = 0.1
 LOOK_S: Final = 0.5

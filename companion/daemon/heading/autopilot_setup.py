@@ -16,11 +16,11 @@ from companion.autopilot.parameters.float32 import same_float32
 from companion.autopilot.parameters.writer import Change, ParameterWriter
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.solution.record import WrittenParameter
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.config import Config
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.offsets.ledger import Ledger
-from companion.daemon.offsets.mend import Mender, Say
+from companion.daemon.offsets.recovery import Recovery
 from companion.errors import AutopilotError, StorageError
 from companion.links.system.request import Object
 from companion.storage.changes import Changed, ChangeSet
@@ -39,7 +39,7 @@ class AutopilotSetup:
         parameters: to read.
         writer: the guarded one, which everybody shares.
         ledger: of these changes alone.
-        mender: of that ledger.
+        recovery: of that ledger.
         conductor: whether a calibration writes.
         say: STATUSTEXT.
     """
@@ -51,12 +51,12 @@ class AutopilotSetup:
         parameters: ParameterClient,
         writer: ParameterWriter,
         ledger: Ledger,
-        mender: Mender,
+        recovery: Recovery,
         conductor: Conductor,
         say: Say,
     ) -> None:
         self._config, self._vehicle, self._parameters, self._writer = config, vehicle, parameters, writer
-        self._ledger, self._mender, self._conductor, self._say = ledger, mender, conductor, say
+        self._ledger, self._recovery, self._conductor, self._say = ledger, recovery, conductor, say
         self._busy = False
 
     async def answer(self, request: Object) -> Object:
@@ -82,9 +82,9 @@ class AutopilotSetup:
         raise AutopilotError(f"autopilot-setup: {action!r} is not understood; allowed: show, apply, undo")
 
     def _check_may_write(self) -> None:
-        if self._mender.fault is not None:
-            raise StorageError(self._mender.fault)
-        if self._mender.pending:
+        if self._recovery.fault is not None:
+            raise StorageError(self._recovery.fault)
+        if self._recovery.pending:
             raise AutopilotError("an interrupted set-up is being put back first")
         job = self._conductor.job
         if job is not None and not job.finished.done():
@@ -122,7 +122,7 @@ class AutopilotSetup:
             "firmware": self._vehicle.firmware,
             "parameters": rows or [],
             "risks": list(RISKS.get(self._vehicle.firmware or "other", ())),
-            "can_undo": self._mender.why_no_undo() is None,
+            "can_undo": self._recovery.why_no_undo() is None,
             **more,
         }
 
@@ -167,7 +167,7 @@ class AutopilotSetup:
         return () if found is None else found.changes
 
     async def _undo(self, *, force: bool) -> Object:
-        written = await self._mender.undo(force=force)
+        written = await self._recovery.undo(force=force)
         self._say(Severity.WARNING, "Heading set-up taken back: restart the autopilot", Weight.RESULT)
         return self._reply("undone", f"{len(written)} old values back; {REBOOT}", written=_plain(written))
 

@@ -12,11 +12,12 @@ from companion.autopilot.firmware.written import HEADING_SETUP
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.component.statustext import Say
 from companion.config import Config
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.offload import Offload
 from companion.daemon.offsets.ledger import Ledger
-from companion.daemon.offsets.mend import Mender, Say
+from companion.daemon.offsets.recovery import Recovery
 from companion.links.system.request import Object
 from companion.storage.changes import ChangeLog
 
@@ -40,15 +41,15 @@ class HeadingSetup:
         self._folder = config.storage.path / "setup"
         self.ledger = Ledger(ChangeLog(self._folder, HEADING_SETUP), offload)
         command = "companion autopilot-setup --undo"
-        self.mender = Mender(vehicle, parameters, writer, self.ledger, say, contextlib.nullcontext, command=command)
-        self._parts = (config, vehicle, parameters, writer, self.ledger, self.mender, conductor, say)
+        self.recovery = Recovery(vehicle, parameters, writer, self.ledger, say, contextlib.nullcontext, command=command)
+        self._parts = (config, vehicle, parameters, writer, self.ledger, self.recovery, conductor, say)
         self._setup: AutopilotSetup | None = None
 
     async def run(self) -> None:
         """Put back what an earlier daemon has left half done, until cancelled."""
         if self._folder.exists():
             self.ledger.load()
-        await self.mender.run()
+        await self.recovery.run()
 
     async def answer(self, request: Object) -> Object:
         """As `AutopilotSetup.answer`."""

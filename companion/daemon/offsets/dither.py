@@ -1,6 +1,6 @@
 """Offset dither: steps the autopilot's offsets below the last digit of an integer stream, and puts them back.
 
-The old values and all that may stand in their place are kept on disk before the first write, and the mender puts them
+The old values and all that may stand in their place are kept on disk before the first write, and the recovery puts them
 back after whatever ends the dither too early: a cancel, arming, a reboot, a lost link, the daemon's death.
 """
 
@@ -48,7 +48,7 @@ SLACK_S: Final = 6.0
 MOST_VOID: Final = 6
 """Steps that may be void in one dither before it is given up."""
 BACK_WITHIN_S: Final = 20.0
-"""The mender is waited for so long before the job ends without it."""
+"""The recovery is waited for so long before the job ends without it."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -241,7 +241,7 @@ class Ditherer:
         return None
 
     async def _put_back(self) -> str:
-        """Let the mender put the old offsets back, and say what became of it."""
+        """Let the recovery put the old offsets back, and say what became of it."""
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + BACK_WITHIN_S
         while loop.time() < deadline_s and self._vehicle.arm_state is not ArmState.ARMED:

@@ -1,7 +1,7 @@
 """What was changed in the autopilot, in memory and on disk at once.
 
 Open: a write is under way. Orphaned: a write was interrupted (the daemon died, or the old values could not all be
-put back), and the mender has to bring it to an end. Undoable: the last finished write on each vehicle.
+put back), and the recovery has to bring it to an end. Undoable: the last finished write on each vehicle.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Ledger:
 
     @property
     def pending(self) -> bool:
-        """Whether an interrupted write waits for the mender."""
+        """Whether an interrupted write waits for the recovery."""
         return self._orphaned.is_set()
 
     def load(self) -> None:
@@ -50,7 +50,7 @@ class Ledger:
         self.undoable = {each.system_id: each for each in kept if each is not None}
         self.unusable += tuple(file.unusable for file in (journal, *undos) if file.unusable is not None)
         self.lost_write |= journal.unusable is not None
-        self._leave_to_mender()
+        self._leave_to_recovery()
 
     async def interrupted(self) -> ChangeSet:
         """Wait until there is an interrupted write; it stays one until `undone`."""
@@ -64,7 +64,7 @@ class Ledger:
 
         The old values are on disk before the block begins. It says itself how it ended, by `done` or `undone`; and a
         writer's error that has left nothing changed says that they are in force. After anything else (a value left
-        changed, a cancellation, a fault of the program, no word at all) nobody knows what is, and the mender looks.
+        changed, a cancellation, a fault of the program, no word at all) nobody knows what is, and the recovery looks.
 
         Args:
             changes: what the block will change, as far as it is known beforehand.
@@ -86,9 +86,9 @@ class Ledger:
                     await self.undone()
             raise
         finally:
-            self._leave_to_mender()
+            self._leave_to_recovery()
 
-    def _leave_to_mender(self) -> None:
+    def _leave_to_recovery(self) -> None:
         if self._open is not None:
             self._orphaned.set()
 

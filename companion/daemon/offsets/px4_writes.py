@@ -15,7 +15,7 @@ from companion.autopilot.firmware.px4_slots import Sensor, SlotMemory
 from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.offsets.far_step import FarMean, FarStep, FarStepWatch
 from companion.daemon.offsets.ledger import Ledger
@@ -26,7 +26,6 @@ logger = logging.getLogger(__name__)
 
 SENSORS: Final[tuple[Sensor, Sensor]] = ("accel", "gyro")
 
-Say = Callable[[Severity, str, Weight], object]
 Look = Callable[[], Awaitable[str | None]]
 
 
@@ -86,7 +85,7 @@ class Px4Writes:
         """Bring offsets that may not be in use into use, unchanged; True when there were any.
 
         Raises:
-            AutopilotError: this failed; the mender puts right what may be left.
+            AutopilotError: this failed; the recovery puts right what may be left.
             StorageError: the values could not be kept, so nothing was written.
         """
         unsure = [imu for imu in imus if imu.in_force.accel_offset_may_be_unused]

@@ -17,7 +17,7 @@ from companion.autopilot.parameters.float32 import same_float32
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.collector.rolling import Window
 from companion.calibration.solution.draft import Draft
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.job import Job, JobCancelledError
 from companion.daemon.offsets.plan import Plan
 from companion.daemon.offsets.push import Pusher
@@ -25,7 +25,6 @@ from companion.errors import AutopilotError, AutopilotRebootedError, ParameterTi
 
 logger = logging.getLogger(__name__)
 
-Say = Callable[[Severity, str, Weight], object]
 GoOn = Callable[[str], None]
 
 STORED_AFTER_S: Final = 3.0

@@ -6,19 +6,18 @@ import asyncio
 import functools
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.firmware.rivals import Rival, stop
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 
 logger = logging.getLogger(__name__)
 
-Say = Callable[[Severity, str, Weight], object]
 
 JUST_NOW_S: Final = 20.0
 """So long after a landing or a start a rewritten offset is taken for the work of who acts then."""

@@ -47,11 +47,11 @@ from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.far_step import FarStepWatch
 from companion.daemon.offsets.firmware_calibration import FirmwareCalibration
 from companion.daemon.offsets.ledger import Ledger
-from companion.daemon.offsets.mend import Mender
 from companion.daemon.offsets.plan import Planner
 from companion.daemon.offsets.push import Pusher
 from companion.daemon.offsets.px4_writes import Px4Writes
 from companion.daemon.offsets.reboot import Reboot
+from companion.daemon.offsets.recovery import Recovery
 from companion.daemon.offsets.rivalry import Rivalry
 from companion.daemon.recorder.recorder import Recorder
 from companion.errors import StorageError
@@ -142,7 +142,7 @@ class Service:
             FirmwareCalibration(self.vehicle, self.parameters, writer, self.ledger, ekf),
             offload,
         )
-        self.mender = Mender(self.vehicle, self.parameters, writer, self.ledger, self._say, self._changing)
+        self.recovery = Recovery(self.vehicle, self.parameters, writer, self.ledger, self._say, self._changing)
         reboot = Reboot(self.vehicle, self.parameters, pusher, self._say)
         course = Course(
             config,
@@ -166,7 +166,7 @@ class Service:
             self.collector,
             course,
             pusher,
-            self.mender,
+            self.recovery,
             self.store,
             self._say,
             offload,
@@ -180,7 +180,7 @@ class Service:
         self.in_force = InForce(config, self.vehicle, self.collector, self.imus, offload)
         self.in_force.gradienter = self.alignment.model
         self.alignment.on_change = self.in_force.realigned
-        self.readiness = Readiness(self.vehicle, self.collector, self.conductor, self.mender, self.in_force)
+        self.readiness = Readiness(self.vehicle, self.collector, self.conductor, self.recovery, self.in_force)
         self.readiness.reboot_owed = lambda: reboot.owed
         self.automatic = Automatic(
             self.vehicle,
@@ -215,7 +215,7 @@ class Service:
             mavlink_url=config.mavlink.url,
             rivalry=self.rivalry,
             reach=self.reach,
-            mender=self.mender,
+            recovery=self.recovery,
             readiness=self.readiness,
             armings=self.armings,
             gate_setup=self.gate_setup,
@@ -224,7 +224,7 @@ class Service:
             link=self.link,
             pose=self.pose,
             trouble=self.sensor_watch.worst,
-            lies=self.sensor_watch.lies,
+            implausible=self.sensor_watch.implausible,
             alignment=self.alignment,
         )
         self.answers.carry(self.attitude)
@@ -378,7 +378,7 @@ class Service:
                     group.create_task(self.signing.run(), name="signing")
                     if mavlink:
                         group.create_task(run_transport(self.link, self.config.mavlink.url), name="mavlink")
-                    group.create_task(self.mender.run(), name="mender")
+                    group.create_task(self.recovery.run(), name="recovery")
                     group.create_task(self.setup.run(), name="setup")
                     group.create_task(self.reach.run(), name="reach")
                     group.create_task(self.readiness.run(), name="readiness")

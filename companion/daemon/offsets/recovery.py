@@ -14,20 +14,19 @@ from companion.autopilot.parameters.float32 import same_float32
 from companion.autopilot.parameters.writer import Change, ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.solution.record import WrittenParameter
-from companion.component.statustext import Severity, Weight
+from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.offsets.ledger import Ledger
 from companion.errors import AutopilotError, ParameterRefusedError, StorageError
 from companion.storage.changes import Changed, ChangeSet
 
 logger = logging.getLogger(__name__)
 
-Say = Callable[[Severity, str, Weight], object]
 
 RETRY_S: Final = 3.0
 POLL_S: Final = 0.2
 
 
-class Mender:
+class Recovery:
     """Puts values back, guarded like every write; `changing` tells the IMUs that it is us who change them."""
 
     def __init__(
@@ -74,12 +73,12 @@ class Mender:
         while True:
             open_set = await self._ledger.interrupted()
             try:
-                await self._mend(open_set)
+                await self._recover(open_set)
             except (AutopilotError, StorageError) as error:
                 logger.warning("putting old values back: %s; trying again", error)
                 await asyncio.sleep(RETRY_S)
 
-    async def _mend(self, open_set: ChangeSet) -> None:
+    async def _recover(self, open_set: ChangeSet) -> None:
         await self._vehicle.wait_found()
         strange = self._ledger.strange_to(self._vehicle.firmware, open_set)
         if strange or open_set.system_id != self._vehicle.system_id:
