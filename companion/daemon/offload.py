@@ -8,12 +8,23 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from typing import Any
+from typing import Any, Final
 
 from companion.calibration.collector.rolling import RollingCollector, Window
 
 Offload = Callable[..., Awaitable[Any]]
 """Runs a blocking call elsewhere: `asyncio.to_thread` in the daemon."""
+
+
+TICK_S: Final = 0.2
+"""How often the seconds that are over end, also of sources that say nothing."""
+
+
+async def keep_ticking(collector: RollingCollector) -> None:
+    """Tell the collector the time until cancelled: the only one in the daemon who does."""
+    while True:
+        collector.tick(asyncio.get_running_loop().time())
+        await asyncio.sleep(TICK_S)
 
 
 async def catch_up(collector: RollingCollector, offload: Offload, *, since_s: float | None = None) -> None:

@@ -7,9 +7,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from companion.calibration.collector.outlook import Glance, Status
 from companion.calibration.collector.rolling import ImuInput, RollingCollector, Settings, Window
-from companion.calibration.means.estimates import Work
 from companion.calibration.means.pose_models import CompassModel, GradienterModel
 from companion.calibration.stillness.settling import AT_ONCE, Lag
 from companion.recording.journal import Journal
@@ -108,22 +106,13 @@ class RecordedCollector(RollingCollector):
             self.journal.event(asyncio.get_running_loop().time(), "reset", (why, imu))
         super().reset(why, imu)
 
-    def pending(self, now_s: float, *, since_s: float | None = None) -> Work | None:  # noqa: D102
-        self.journal.event(now_s, "look")
-        return super().pending(now_s, since_s=since_s)
-
-    def glance(self, now_s: float) -> Glance:  # noqa: D102
-        self.journal.event(now_s, "look")
-        return super().glance(now_s)
-
-    def status(self, now_s: float) -> Status:  # noqa: D102
-        self.journal.event(now_s, "look")
-        return super().status(now_s)
+    def tick(self, now_s: float) -> None:  # noqa: D102
+        self.journal.event(now_s, "tick")
+        super().tick(now_s)
 
     def window(self, now_s: float, *, since_s: float | None = None) -> Window:  # noqa: D102
         if since_s is not None:
             # A look at what a write has done: nothing is estimated from it.
-            self.journal.event(now_s, "look")
             return super().window(now_s, since_s=since_s)
         self._windows_made += 1
         number = self._windows_made

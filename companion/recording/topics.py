@@ -26,7 +26,7 @@ SERIAL, IMU = "/serial/", "/imu/"
 """Topics of raw bytes and of samples begin so; the device's or the IMU's name follows."""
 GRADIENTER, COMPASS = "/gradienter", "/compass"
 
-JournalEvent = Literal["look", "window", "reset", "imu", "retarget", "expect", "place", "offsets", "solved"]
+JournalEvent = Literal["tick", "window", "reset", "imu", "retarget", "expect", "place", "offsets", "solved"]
 
 
 class RawBytes(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):

@@ -91,12 +91,14 @@ def estimate(
         # Whoever looks has not seen the sample yet that tells him that it is time to.
         if now_s - looked_s >= 1.0:
             looked_s = math.floor(now_s)
+            collector.tick(now_s)
             glance = collector.glance(now_s)
             obstacle = glance.obstacle or obstacle
             if glance.obstacle is None and glance.still_s >= max(MIN_STILL_S, _LONGER * still_s):
                 found.append(_measurement(collector, now_s))
                 still_s = glance.still_s
         collector.add_imu(NAME, ImuSample(now_s, sample.gyro_rad_s, sample.accel_m_s2, sample.temperature_degc))
+    collector.tick(now_s + 0.3)
     glance = collector.glance(now_s + 0.3)
     if glance.obstacle is None and glance.still_s > max(still_s, MIN_STILL_S - 1.0):
         found.append(_measurement(collector, now_s + 0.3))

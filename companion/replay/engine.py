@@ -236,8 +236,8 @@ class Replay:
         if collector is None:
             return
         self._at(entry.t_s)
-        if entry.event == "look":
-            collector.glance(entry.t_s)
+        if entry.event == "tick":
+            collector.tick(entry.t_s)
             return
         detail = state.from_json(entry.detail)
         match entry.event:

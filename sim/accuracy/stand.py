@@ -181,13 +181,18 @@ def collected(
     spans = list(spans_s)
     for t_s, (p, q, r, x, y, z) in zip(times.tolist(), rows.tolist(), strict=True):
         if spans and t_s >= 1.0 + spans[0]:
-            found.append(collector.window(1.0 + spans.pop(0) + _CLOSE_S))
+            found.append(_window(collector, 1.0 + spans.pop(0) + _CLOSE_S))
         while tilts and tilts[-1].t_s <= t_s:
             collector.add_tilt(tilts.pop())
         while headings and headings[-1].t_s <= t_s:
             collector.add_compass(headings.pop())
         collector.add_imu(taken.name, ImuSample(t_s, (p, q, r), (x, y, z)))
-    return found + [collector.window(1.0 + span + _CLOSE_S) for span in spans]
+    return found + [_window(collector, 1.0 + span + _CLOSE_S) for span in spans]
+
+
+def _window(collector: RollingCollector, now_s: float) -> Window:
+    collector.tick(now_s)
+    return collector.window(now_s)
 
 
 def _tilts(standing: Stand, until_s: float) -> list[TiltSample]:

@@ -85,6 +85,7 @@ def calibrate(
         feed(collector, imu.samples_until(now_s))
         feed(collector, gradienter.samples_until(now_s))
         feed(collector, compass.samples_until(now_s))
+    collector.tick(now_s)
     local = local_earth(whereabouts(site))
     tilt = GradienterModel(law, np.eye(3), (0.0, 0.0), tilt_sigma_deg)
     heading = CompassModel(magnetic=True, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=heading_sigma_deg)

@@ -437,7 +437,7 @@ def test_a_damaged_recording_is_one_line_or_a_replay_and_never_anything_else(
     )
     whole, rng = plain.read_bytes(), random.Random(13)
     state = whole.index(b'"state":"{')
-    journal = whole.index(b'"event":"look"')
+    journal = whole.index(b'"event":"tick"')
     path = tmp_path / "damaged.mcap"
     refused: list[str] = []
     for attempt in range(30):

@@ -63,6 +63,7 @@ def test_nothing_that_arrives_raises(events: list[object]) -> None:
 
 
 def check(collector: RollingCollector, now_s: float) -> None:
+    collector.tick(now_s)
     status = collector.status(now_s)
     assert isinstance(status, Status)
     assert 0.0 <= status.progress <= 1.0

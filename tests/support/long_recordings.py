@@ -134,11 +134,11 @@ def _compass(seconds: float) -> Iterator[Entry]:
         yield topics.COMPASS, t_s, topics.compass_json, (CompassSample(t_s, heading, 5.0, -3.0),)
 
 
-def _looks(seconds: float) -> Iterator[Entry]:
-    """Once a second somebody looks, and means are taken."""
+def _ticks(seconds: float) -> Iterator[Entry]:
+    """Once a second the seconds before end, and means are taken."""
     for k in range(1, int(seconds)):
         t_s = START_S + k + 0.4
-        yield topics.JOURNAL, t_s, journal._event, (t_s, "look", None)
+        yield topics.JOURNAL, t_s, journal._event, (t_s, "tick", None)
         yield topics.JOURNAL, t_s, journal._event, (t_s, "window", k)
 
 
@@ -179,7 +179,7 @@ def write_recording(path: Path, *, seconds: float, rate_hz: float = 1000.0, imus
         *(_imu(name, seconds, rate_hz, read_s, seed) for seed, name in enumerate(names)),
         _gradienter(seconds),
         _compass(seconds),
-        _looks(seconds),
+        _ticks(seconds),
     ]
     file.write([Beginning(begin_s, UNIX_S, versions(), msgspec.json.encode(settings), state)])
     entries = heapq.merge(*streams, key=lambda entry: entry[1])

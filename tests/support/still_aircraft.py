@@ -86,6 +86,7 @@ class Feeder:
                 if self.heading is not None and (heading := self.heading(t_s)) is not None:
                     self.collector.add_compass(CompassSample(t_s, heading))
         self.now_s += count / self.rate_hz
+        self.collector.tick(self.now_s)
 
     def waiting_for(self) -> str | None:
         return self.collector.status(self.now_s).waiting_for

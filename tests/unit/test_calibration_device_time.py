@@ -56,7 +56,7 @@ class Fed:
                 assert isinstance(sample, ImuSample)
                 self.collector.add_imu("own", sample)
             self.now_s = arrival_s
-            self.collector.glance(arrival_s)
+            self.collector.tick(arrival_s)
 
     @property
     def source(self) -> SourceStatus:

@@ -81,6 +81,7 @@ def fly(motions: list[Motion], *, device_lag_s: float, known: Lag, until_s: floa
                         collector.add_imu("own", sample)
                     elif isinstance(sample, TiltSample):
                         collector.add_tilt(sample)
+        collector.tick(t_s)
         seen.words.append(collector.status(t_s).waiting_for)
         try:
             window = collector.window(t_s)

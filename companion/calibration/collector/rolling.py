@@ -126,11 +126,23 @@ class RollingCollector(Intake):
         """
         self._forget(why, imu)
 
+    def tick(self, now_s: float) -> None:
+        """Let the seconds end that are over at `now_s` (the samples' clock), also of sources that say nothing.
+
+        Whoever feeds it does this, a few times a second; everything below only looks.
+        """
+        if math.isfinite(now_s):
+            self._now_s = now_s
+            for source in self._sources():
+                source.batches.close_before(now_s - _CLOSE_S)
+            if self._field is not None:
+                self._field.batches.close_before(now_s - _CLOSE_S)
+        self._evaluate()
+
     # ------------------------------------------------------------------------------------------------- what is known
 
     def glance(self, now_s: float) -> Glance:
         """How still it is at `now_s`; costs a small part of what `status` does."""
-        self._advance(now_s)
         return Glance(
             obstacle=self._obstacle(now_s),
             moving=is_moving(self._sources(), now_s, good_now=self._stretch.good_now),
@@ -143,7 +155,6 @@ class RollingCollector(Intake):
 
         It takes milliseconds, more on small boards, and what must be answered at once shall not wait for it.
         """
-        self._advance(now_s)
         if self._obstacle(now_s) is not None:
             return None
         slots = self._slots(since_s)
@@ -156,11 +167,7 @@ class RollingCollector(Intake):
         self._estimates.keep(work, found)
 
     def status(self, now_s: float) -> Status:
-        """Where it stands at `now_s` (the samples' clock); closes seconds that are over.
-
-        Its figures may be those of the second before.
-        """
-        self._advance(now_s)
+        """Where it stands at `now_s` (the samples' clock). Its figures may be those of the second before."""
         sources = self._sources()
         waiting = self._waiting_for(now_s)
         enough = False
@@ -207,7 +214,6 @@ class RollingCollector(Intake):
         Raises:
             CalibrationRefusedError: not still, or not still for long enough.
         """
-        self._advance(now_s)
         if (reason := self._obstacle(now_s)) is not None:
             raise CalibrationRefusedError(reason)
         slots = self._slots(since_s)
@@ -246,15 +252,6 @@ class RollingCollector(Intake):
         self._best_progress = 0.0
         for source in self._sources():
             source.gate.new_stretch()
-
-    def _advance(self, now_s: float) -> None:
-        if math.isfinite(now_s):
-            self._now_s = now_s
-            for source in self._sources():
-                source.batches.close_before(now_s - _CLOSE_S)
-            if self._field is not None:
-                self._field.batches.close_before(now_s - _CLOSE_S)
-        self._evaluate()
 
     def _evaluate(self) -> None:
         """Judge every second that all sources have closed, or that has waited long enough for the missing ones."""

@@ -42,7 +42,7 @@ from companion.daemon.faces.flight_line import define_parameters
 from companion.daemon.heading.heading_setup import HeadingSetup
 from companion.daemon.heading.pose_now import PoseNow
 from companion.daemon.job import ALIGNMENT, Job
-from companion.daemon.offload import Offload
+from companion.daemon.offload import Offload, keep_ticking
 from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.far_step import FarStepWatch
 from companion.daemon.offsets.firmware_calibration import FirmwareCalibration
@@ -378,6 +378,7 @@ class Service:
                     group.create_task(self.signing.run(), name="signing")
                     if mavlink:
                         group.create_task(run_transport(self.link, self.config.mavlink.url), name="mavlink")
+                    group.create_task(keep_ticking(self.collector), name="collector")
                     group.create_task(self.recovery.run(), name="recovery")
                     group.create_task(self.setup.run(), name="setup")
                     group.create_task(self.reach.run(), name="reach")
@@ -413,6 +414,7 @@ class Service:
         running = [self.component.run(), run_transport(self.link, self.config.mavlink.url)]
         running += [
             self.signing.run(),
+            keep_ticking(self.collector),
             self.reach.run(),
             self.gate_setup.run(),
             *(imu.run() for imu in self.imus.values()),
