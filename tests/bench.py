@@ -26,13 +26,14 @@ from companion.calibration.request import What
 from companion.component.arm_authorisation import ArmAuthoriser
 from companion.daemon.job import Job
 from companion.links.mavlink.link import MavlinkLink
-from companion.protocols.registry import Kind, make_decoder
+from companion.protocols.registry import Kind
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
 from companion.samples import ImuSample
 from tests import bench_attitude, bench_daemon, bench_learning, bench_reading, bench_replay, bench_start
 from tests.bench_text import against_pynmeagps
 from tests.support.component import FakeVehicle, ScriptedGate
+from tests.support.decoders import make_decoder
 from tests.support.frames import (
     imu_line,
     mip_imu,

@@ -20,7 +20,8 @@ from typing import Final
 
 from pynmeagps import NMEAReader
 
-from companion.protocols.registry import Kind, make_decoder
+from companion.protocols.registry import Kind
+from tests.support.decoders import make_decoder
 from tests.support.frames import imu_line, sentence
 
 LINES: Final = 2000

@@ -8,24 +8,20 @@ from typing import Literal
 
 from companion.config.sections import Law
 from companion.errors import ConfigError
-from companion.protocols.compasses.hmr3300 import Hmr3300Decoder
-from companion.protocols.compasses.hmr3300_dialogue import Hmr3300Dialogue
-from companion.protocols.compasses.nmea import NmeaDecoder
+from companion.protocols.compasses.hmr3300 import Hmr3300Decoder, Hmr3300Dialogue
+from companion.protocols.compasses.nmea import Hmr3000Dialogue, NmeaDecoder
 from companion.protocols.compasses.os5000 import Os5000Decoder
 from companion.protocols.compasses.pni import PniDecoder, PniDialogue
 from companion.protocols.decoding.base import Decoder
 from companion.protocols.decoding.dialogue import Dialogue
-from companion.protocols.decoding.polls import Hmr3000Dialogue, JewellDialogue
-from companion.protocols.imus.imu_dialogues import MipDialogue, VectorNavDialogue, XsensDialogue
 from companion.protocols.imus.imu_line import ImuLineDecoder
-from companion.protocols.imus.mip import MipDecoder
+from companion.protocols.imus.mip import MipDecoder, MipDialogue
 from companion.protocols.imus.stim300 import Stim300Decoder
-from companion.protocols.imus.vectornav import VectorNavDecoder
+from companion.protocols.imus.vectornav import VectorNavDecoder, VectorNavDialogue
 from companion.protocols.imus.witmotion import WitMotionDecoder
-from companion.protocols.imus.xsens import XsensDecoder
-from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
-from companion.protocols.inclinometers.inclinometer_xy_dialogue import InclinometerXyDialogue
-from companion.protocols.inclinometers.jewell import JewellDecoder
+from companion.protocols.imus.xsens import XsensDecoder, XsensDialogue
+from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder, InclinometerXyDialogue
+from companion.protocols.inclinometers.jewell import JewellDecoder, JewellDialogue
 from companion.protocols.inclinometers.rion import RionDecoder, RionDialogue
 
 Kind = Literal["imu", "gradienter", "compass"]
@@ -115,16 +111,3 @@ def main_kind(name: str) -> Kind:
     raise ConfigError(
         f"found protocol {name!r}; allowed: {', '.join(sorted({n for o in PROTOCOLS.values() for n in o}))}"
     )
-
-
-def make_decoder(kind: Kind, name: str, seconds_per_byte: float = 0.0) -> Decoder:
-    """A new decoder for a kind of device and a protocol name.
-
-    Raises:
-        ConfigError: there is no such protocol for that kind of device.
-    """
-    info = PROTOCOLS[kind].get(name)
-    if info is None:
-        allowed = ", ".join(f'"{known}"' for known in PROTOCOLS[kind])
-        raise ConfigError(f"'{kind}.protocol': found {name!r}; allowed: {allowed}")
-    return info.decoder(seconds_per_byte)

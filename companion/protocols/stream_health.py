@@ -11,20 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from companion.protocols.decoding.base import (
-    CALIBRATING,
-    COMMAND_REFUSED,
-    NON_FINITE,
-    NOTHING_OF_USE,
-    OUT_OF_RANGE,
-    OVER_RANGE,
-    REPLY,
-    SINGLE_AXIS,
-    UNKNOWN_FIELD,
-    UNKNOWN_GROUP,
-    UNKNOWN_SENTENCE,
-    Decoder,
-)
+from companion.protocols.decoding import reasons
+from companion.protocols.decoding.base import Decoder
 from companion.protocols.guess import banner_in, likeliest, looks_garbled, strangers
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
 
@@ -47,8 +35,17 @@ RAILS_DEG: Final = {"jewell": (math.degrees(330e-6), "330 microradians, the end 
 _RAIL_SAMPLES: Final = 3
 _RAIL_TOLERANCE_DEG: Final = 1e-6
 _HARMLESS: Final = frozenset(
-    {CALIBRATING, COMMAND_REFUSED, NON_FINITE, NOTHING_OF_USE, OUT_OF_RANGE, OVER_RANGE, REPLY, SINGLE_AXIS}
-    | {UNKNOWN_FIELD, UNKNOWN_GROUP, UNKNOWN_SENTENCE}
+    {
+        reasons.CALIBRATING,
+        reasons.COMMAND_REFUSED,
+        reasons.NON_FINITE,
+        reasons.NOTHING_OF_USE,
+        reasons.OUT_OF_RANGE,
+        reasons.OVER_RANGE,
+        reasons.REPLY,
+        reasons.SINGLE_AXIS,
+    }
+    | {reasons.UNKNOWN_FIELD, reasons.UNKNOWN_GROUP, reasons.UNKNOWN_SENTENCE}
 )
 """Reasons for rejecting a frame that came whole."""
 _DAMAGED_SHARE: Final = 0.1
@@ -264,11 +261,11 @@ class StreamHealth:
 def _valueless(lately: _Mark) -> Trouble | None:
     """Whole frames without a value in them."""
     least = _DAMAGED_SHARE * max(lately.accepted, 1)
-    if (count := lately.rejected[NON_FINITE]) and count >= least:
+    if (count := lately.rejected[reasons.NON_FINITE]) and count >= least:
         words = f"NaN in {count} whole frames: the device has no valid reading; switch its power off and on"
-        return Trouble(NON_FINITE, words)
-    if (count := lately.rejected[OVER_RANGE]) and count >= least:
-        return Trouble(OVER_RANGE, f"{count} readings are over range: level it")
+        return Trouble(reasons.NON_FINITE, words)
+    if (count := lately.rejected[reasons.OVER_RANGE]) and count >= least:
+        return Trouble(reasons.OVER_RANGE, f"{count} readings are over range: level it")
     return None
 
 

@@ -16,7 +16,7 @@ from companion.calibration.solution.site import LocalEarth, Whereabouts, local_e
 from companion.calibration.solution.solve import CompassModel, GradienterModel, ImuSolution, Solution, solve
 from companion.physics.gradienter import Law
 from companion.protocols.decoding.base import Decoder
-from companion.protocols.registry import Kind, make_decoder
+from companion.protocols.registry import PROTOCOLS, Kind
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
 from sim.aircraft import Site
 from sim.devices import SerialDevice
@@ -29,7 +29,7 @@ class Wire:
 
     def __init__(self, kind: Kind, device: SerialDevice) -> None:
         self.device = device
-        self.decoder: Decoder = make_decoder(kind, device.protocol, device.line_time_s(1))
+        self.decoder: Decoder = PROTOCOLS[kind][device.protocol].decoder(device.line_time_s(1))
         self.decoder.feed(device.power_on(0.0), 0.0)
 
     def samples_until(self, t_s: float) -> list[Sample]:

@@ -19,14 +19,11 @@ from companion.protocols.compasses.pni import LONGEST as PNI_LONGEST
 from companion.protocols.compasses.pni import PniDecoder
 from companion.protocols.decoding.base import Decoder, LineDecoder, SentenceDecoder, xor_checksum
 from companion.protocols.decoding.framing import FrameDecoder
-from companion.protocols.imus import mip as mip_protocol
-from companion.protocols.imus import stim300_datagrams
 from companion.protocols.imus import xsens as xsens_protocol
 from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.protocols.imus.mip import MipDecoder
 from companion.protocols.imus.stim300 import Stim300Decoder
 from companion.protocols.imus.vectornav import SENTENCE_LIMIT, VectorNavDecoder
-from companion.protocols.imus.vectornav_binary import MAX_FRAME_BYTES
 from companion.protocols.imus.witmotion import FRAME_BYTES as WIT_BYTES
 from companion.protocols.imus.witmotion import WitMotionDecoder
 from companion.protocols.imus.xsens import XsensDecoder
@@ -35,6 +32,7 @@ from companion.protocols.inclinometers.jewell import JewellDecoder
 from companion.protocols.inclinometers.rion import LONGEST as RION_LONGEST
 from companion.protocols.inclinometers.rion import RionDecoder
 from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
+from tests.support.decoders import MIP_BYTES, STIM300_BYTES, VECTORNAV_BYTES, XSENS_BYTES
 from tests.support.frames import (
     STIM_CONTENTS,
     big_floats,
@@ -240,10 +238,10 @@ def held_bytes(decoder: Decoder) -> int:
 
 
 LIMITS: dict[type[Decoder], int] = {
-    VectorNavDecoder: max(MAX_FRAME_BYTES, SENTENCE_LIMIT + 1),
-    MipDecoder: mip_protocol.MAX_FRAME_BYTES,
-    XsensDecoder: xsens_protocol.MAX_FRAME_BYTES,
-    Stim300Decoder: stim300_datagrams.MAX_FRAME_BYTES,
+    VectorNavDecoder: max(VECTORNAV_BYTES, SENTENCE_LIMIT + 1),
+    MipDecoder: MIP_BYTES,
+    XsensDecoder: XSENS_BYTES,
+    Stim300Decoder: STIM300_BYTES,
     PniDecoder: PNI_LONGEST,
     RionDecoder: RION_LONGEST,
     WitMotionDecoder: 2 * WIT_BYTES,
@@ -331,7 +329,7 @@ def test_a_good_frame_after_anything_is_found(kind: type[Decoder], data: st.Data
     assert len(alone) == 1
     decoder = kind()
     # A false start may claim up to the longest frame; only what comes after that shows it to be one.
-    samples = decoder.feed(before + GOOD[kind], 0.0) + decoder.feed(bytes(LIMITS.get(kind, MAX_FRAME_BYTES)), 0.0)
+    samples = decoder.feed(before + GOOD[kind], 0.0) + decoder.feed(bytes(LIMITS.get(kind, VECTORNAV_BYTES)), 0.0)
     assert samples[-1:] == alone
 
 

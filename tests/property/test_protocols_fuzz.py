@@ -26,8 +26,9 @@ from companion.protocols.imus.xsens import MAX_DATA_BYTES, XsensDecoder
 from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
 from companion.protocols.inclinometers.jewell import JewellDecoder
 from companion.protocols.inclinometers.rion import RionDecoder
-from companion.protocols.registry import PROTOCOLS, make_decoder
+from companion.protocols.registry import PROTOCOLS
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
+from tests.support.decoders import make_decoder
 from tests.support.frames import (
     imu_line,
     int24,

@@ -20,7 +20,7 @@ from companion.config import Gradienter as Section
 from companion.configured.models import lag
 from companion.errors import CalibrationRefusedError
 from companion.physics.gradienter import attitude_from_readings
-from companion.protocols.registry import PROTOCOLS, make_decoder
+from companion.protocols.registry import PROTOCOLS
 from companion.recording.state import freeze, from_json, to_json
 from companion.samples import ImuSample, TiltSample
 from sim.aircraft import Pose, VirtualAircraft
@@ -28,6 +28,7 @@ from sim.devices import Gradienter, VectorNavBinary
 from sim.imu_model import ImuModel
 from sim.motions import Knock, Motion, Turn
 from sim.scenario import site_at
+from tests.support.decoders import make_decoder
 from tests.support.still_aircraft import Feeder, Floats, imu, settings
 
 SET_DOWN_S = 12.0

@@ -43,7 +43,7 @@ class Talker(Dialogue):
         self.told: list[tuple[Any, ...]] = []
         self.asked: list[float] = []
         self.to_say: Iterator[bytes] = iter(())
-        self.last_words = ""
+        super().__init__()
 
     def opened(self, t_s: float) -> None:
         self.told.append(("opened",))
@@ -55,12 +55,8 @@ class Talker(Dialogue):
         self.asked.append(t_s)
         data = next(self.to_say, b"")
         if data:
-            self.last_words = f"said {data.decode()}"
+            self.words = f"said {data.decode()}"
         return data
-
-    @property
-    def words(self) -> str:
-        return self.last_words
 
 
 class Chatterbox(Talker):
@@ -235,7 +231,7 @@ def test_not_even_a_talkative_dialogue_floods_a_device_or_the_log(caplog: pytest
     async def main() -> None:
         sensor, port, _ = opened(device(*BOTH, dialogue=Chatterbox))
         assert isinstance(sensor.dialogue, Talker)
-        sensor.dialogue.last_words = "said something"
+        sensor.dialogue.words = "said something"
         running = asyncio.create_task(sensor.run())
         await asyncio.sleep(0.3)
         before = len(port.sent)

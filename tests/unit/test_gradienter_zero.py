@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from companion.physics.gradienter import attitude_from_readings
-from companion.protocols.registry import make_decoder
 from companion.samples import TiltSample
 from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import Gradienter, Law
 from sim.scenario import site_at
+from tests.support.decoders import make_decoder
 
 ZERO_DEG = (0.31, -0.22)
 TABLE = Pose(pitch_deg=1.2, roll_deg=-0.9, heading_deg=40.0)

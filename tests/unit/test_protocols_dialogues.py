@@ -7,13 +7,11 @@ from collections.abc import Callable
 
 import pytest
 
-from companion.protocols.compasses.nmea import NmeaDecoder
+from companion.protocols.compasses.nmea import Hmr3000Dialogue, NmeaDecoder
 from companion.protocols.decoding.base import Decoder
-from companion.protocols.decoding.dialogue import SILENT_S, Dialogue
-from companion.protocols.decoding.polls import AGAIN_S, ANSWER_S, PATIENCE, Hmr3000Dialogue, JewellDialogue
-from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
-from companion.protocols.inclinometers.inclinometer_xy_dialogue import InclinometerXyDialogue
-from companion.protocols.inclinometers.jewell import JewellDecoder
+from companion.protocols.decoding.dialogue import AGAIN_S, ANSWER_S, PATIENCE, SILENT_S, Dialogue
+from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder, InclinometerXyDialogue
+from companion.protocols.inclinometers.jewell import JewellDecoder, JewellDialogue
 from sim.aircraft import Pose, VirtualAircraft
 from sim.compasses import NmeaCompass
 from sim.devices import Gradienter, SerialDevice
@@ -145,7 +143,7 @@ def test_an_hmr3000_without_sentences_is_polled() -> None:
     assert line.said[0][0] >= SILENT_S
     assert line.samples == pytest.approx(10.0 / Hmr3000Dialogue.PERIOD_S, rel=0.25)
     assert line.samples >= len(line.said) - 1
-    assert line.dialogue.words == "silent: polled with $PTNT,HPR*78"
+    assert line.dialogue.words == "asked 10 times a second with $PTNT,HPR*78"
 
 
 def test_polling_ends_when_the_device_begins_to_speak() -> None:
@@ -157,7 +155,6 @@ def test_polling_ends_when_the_device_begins_to_speak() -> None:
     asked = len(line.said)
     line.run(20.0)
     assert len(line.said) == asked
-    assert line.dialogue.words == "polled with $PTNT,HPR*78, until it spoke by itself"
 
 
 @pytest.mark.parametrize("output", ["SIM", "XDR", "ASH"])

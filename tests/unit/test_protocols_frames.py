@@ -10,9 +10,9 @@ from typing import Any, get_args
 import pytest
 
 from companion import config
-from companion.errors import ConfigError
-from companion.protocols.registry import PROTOCOLS, Kind, make_decoder
+from companion.protocols.registry import PROTOCOLS, Kind
 from companion.samples import AttitudeSample, CompassSample, ImuSample, MagSample, Sample, TiltSample
+from tests.support.decoders import make_decoder
 from tests.support.frames import big_floats, fletcher
 
 KINDS: dict[str, Kind] = {name: kind for kind, names in reversed(PROTOCOLS.items()) for name in names}
@@ -199,8 +199,3 @@ def test_the_names_are_those_of_the_configuration() -> None:
     assert set(PROTOCOLS["compass"]) == set(get_args(config.CompassProtocol))
     assert all(info.name == name for names in PROTOCOLS.values() for name, info in names.items())
     assert all(info.parity in get_args(config.Parity) for names in PROTOCOLS.values() for info in names.values())
-
-
-def test_an_unknown_protocol_is_refused_with_what_is_allowed() -> None:
-    with pytest.raises(ConfigError, match=r'allowed: "hmr3300", "nmea"'):
-        make_decoder("compass", "vectornav")

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from companion.protocols.compasses.hmr3300 import Hmr3300Decoder
-from companion.protocols.compasses.hmr3300_dialogue import Hmr3300Dialogue
+from companion.protocols.compasses.hmr3300 import Hmr3300Decoder, Hmr3300Dialogue
 from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import HMR3300
 from sim.scenario import site_at

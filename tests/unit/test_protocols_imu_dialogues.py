@@ -6,14 +6,10 @@ import itertools
 
 import pytest
 
-from companion.protocols.decoding.dialogue import SILENT_S
-from companion.protocols.imus.imu_dialogues import (
-    LONGEST_PAUSE_S,
-    MipDialogue,
-    VectorNavDialogue,
-    WhenSilent,
-    XsensDialogue,
-)
+from companion.protocols.decoding.dialogue import LONGEST_PAUSE_S, SILENT_S, WakeDialogue
+from companion.protocols.imus.mip import MipDialogue
+from companion.protocols.imus.vectornav import VectorNavDialogue
+from companion.protocols.imus.xsens import XsensDialogue
 from companion.protocols.registry import PROTOCOLS
 from sim.aircraft import VirtualAircraft
 from sim.devices import SerialDevice
@@ -26,7 +22,7 @@ TO_IDLE, TO_CONFIG = bytes.fromhex("756501020202E1C7"), bytes.fromhex("FAFF3000D
 ALL = [MipDialogue, VectorNavDialogue, XsensDialogue]
 
 
-def asked(dialogue: WhenSilent, from_s: float, to_s: float) -> list[tuple[float, bytes]]:
+def asked(dialogue: WakeDialogue, from_s: float, to_s: float) -> list[tuple[float, bytes]]:
     """What is said, asked every 20 ms."""
     times = [from_s + 0.02 * step for step in range(round((to_s - from_s) / 0.02) + 1)]
     return [(t_s, said) for t_s in times if (said := dialogue.due(t_s))]
@@ -41,7 +37,7 @@ def test_the_registry_knows_them() -> None:
 
 
 @pytest.mark.parametrize("kind", ALL)
-def test_nothing_is_said_before_a_port_is_open_nor_while_a_device_speaks(kind: type[WhenSilent]) -> None:
+def test_nothing_is_said_before_a_port_is_open_nor_while_a_device_speaks(kind: type[WakeDialogue]) -> None:
     dialogue = kind()
     assert asked(dialogue, 0.0, 20.0) == []
     dialogue.opened(20.0)
@@ -52,7 +48,7 @@ def test_nothing_is_said_before_a_port_is_open_nor_while_a_device_speaks(kind: t
 
 
 @pytest.mark.parametrize(("kind", "saying"), [(MipDialogue, RESUME), (XsensDialogue, MEASURE)])
-def test_a_silent_device_is_asked_ever_less_often(kind: type[WhenSilent], saying: bytes) -> None:
+def test_a_silent_device_is_asked_ever_less_often(kind: type[WakeDialogue], saying: bytes) -> None:
     dialogue = kind()
     dialogue.opened(10.0)
     said = asked(dialogue, 10.0, 335.0)

@@ -7,8 +7,9 @@ import struct
 
 import pytest
 
-from companion.protocols.imus.mip import MAX_FRAME_BYTES, MipDecoder
+from companion.protocols.imus.mip import MipDecoder
 from companion.samples import ImuSample, MagSample, Sample
+from tests.support.decoders import MIP_BYTES
 from tests.support.frames import big_floats, fletcher, mip, mip_imu
 
 G = 9.80665
@@ -65,7 +66,7 @@ def test_a_magnetic_field_is_in_gauss_and_may_come_alone() -> None:
     ],
 )
 def test_packets_that_give_nothing_are_counted_by_reason(data: bytes, reason: str) -> None:
-    assert feed(data + PACKET + bytes(MAX_FRAME_BYTES)) == (feed(PACKET)[0], {reason: 1})
+    assert feed(data + PACKET + bytes(MIP_BYTES)) == (feed(PACKET)[0], {reason: 1})
 
 
 @pytest.mark.parametrize("payload", [b"\x00", b"\x01\x04", b"\x0e\x04" + bytes(11), b"\x02"])
@@ -78,7 +79,7 @@ def test_a_packet_inside_what_a_false_start_claims_is_not_lost() -> None:
     for false_start in (b"\x75", b"\x75\x65", b"\x75\x65\x80\xff", PACKET[:-1], b"\x75\x65\x80\x40" + bytes(20)):
         decoder = MipDecoder()
         decoder.feed(false_start + PACKET, 1.0)
-        decoder.feed(bytes(MAX_FRAME_BYTES), 2.0)
+        decoder.feed(bytes(MIP_BYTES), 2.0)
         assert decoder.accepted == 1, false_start
 
 
@@ -86,7 +87,7 @@ def test_every_single_damaged_bit_is_seen() -> None:
     for at in range(len(PACKET) * 8):
         damaged = bytearray(PACKET)
         damaged[at // 8] ^= 1 << at % 8
-        assert feed(bytes(damaged) + bytes(MAX_FRAME_BYTES))[0] == [], at
+        assert feed(bytes(damaged) + bytes(MIP_BYTES))[0] == [], at
 
 
 def test_times_are_those_of_the_packets_ends_even_behind_a_false_start() -> None:

@@ -8,8 +8,7 @@ import pytest
 
 from companion.protocols.compasses.pni import PniDecoder, PniDialogue
 from companion.protocols.decoding.base import Decoder
-from companion.protocols.decoding.dialogue import SILENT_S
-from companion.protocols.decoding.polling import ANSWER_S, PollDialogue
+from companion.protocols.decoding.dialogue import AGAIN_S, ANSWER_S, PATIENCE, SILENT_S, PollDialogue
 from companion.protocols.inclinometers.rion import RionDecoder, RionDialogue
 from companion.protocols.registry import PROTOCOLS
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
@@ -104,7 +103,7 @@ def test_a_pni_compass_that_has_lost_its_power_is_told_again() -> None:
     device.power_on(talk.now_s)
     talk.unplugged = False
     before = len(talk.samples)
-    talk.run(1.5)
+    talk.run(AGAIN_S + 1.5)
     assert device.components == (5, 24, 25, 8, 9, 27, 28, 29)
     assert len(talk.samples) > before
 
@@ -141,11 +140,11 @@ def test_the_asking_ends_when_the_device_begins_to_speak_and_comes_back_when_it_
     assert len(talk.said) - asked == pytest.approx(15, abs=2)
 
 
-def test_a_device_that_does_not_answer_is_asked_once_a_second() -> None:
+def test_a_device_that_does_not_answer_is_asked_more_seldom() -> None:
     talk = Conversation(RionDialogue(), RionDecoder(), RionCompass(aircraft()))
     talk.unplugged = True
     talk.run(SILENT_S + 20.0)
-    assert len(talk.said) == pytest.approx(20.0 / ANSWER_S, abs=1)
+    assert len(talk.said) == pytest.approx(PATIENCE + (20.0 - PATIENCE * ANSWER_S) / AGAIN_S, abs=1)
 
 
 def test_its_own_echo_is_no_answer_and_no_speech() -> None:

@@ -7,12 +7,12 @@ import math
 import pytest
 
 from companion.physics.gradienter import attitude_from_readings
-from companion.protocols.imus.stim300 import Stim300Decoder
-from companion.protocols.imus.stim300_datagrams import MAX_FRAME_BYTES, is_whole
+from companion.protocols.imus.stim300 import Stim300Decoder, is_whole
 from companion.samples import ImuSample, Sample, TiltSample
 from sim.aircraft import Pose, VirtualAircraft
 from sim.binary_imus import Stim300
 from sim.imu_model import ImuModel
+from tests.support.decoders import STIM300_BYTES
 from tests.support.frames import (
     STIM_CONTENTS,
     STIM_SPECIAL_SIZES,
@@ -209,17 +209,17 @@ def test_an_inclination_that_tells_no_tilt_is_counted(inclination: tuple[int, ..
 
 def test_a_loss_costs_one_count_and_the_bytes_of_the_datagram() -> None:
     decoder = Stim300Decoder()
-    decoder.feed(DATAGRAM[:17] + DATAGRAM[18:] + 3 * DATAGRAM + bytes(MAX_FRAME_BYTES), 1.0)
+    decoder.feed(DATAGRAM[:17] + DATAGRAM[18:] + 3 * DATAGRAM + bytes(STIM300_BYTES), 1.0)
     assert decoder.accepted == 3
     assert decoder.rejected == {"checksum": 1}
-    assert 0 < decoder.skipped <= len(DATAGRAM) + MAX_FRAME_BYTES
+    assert 0 < decoder.skipped <= len(DATAGRAM) + STIM300_BYTES
 
 
 def test_every_single_damaged_bit_is_seen() -> None:
     for at in range(len(DATAGRAM) * 8):
         damaged = bytearray(DATAGRAM)
         damaged[at // 8] ^= 1 << at % 8
-        assert feed(bytes(damaged) + bytes(MAX_FRAME_BYTES))[0] == [], at
+        assert feed(bytes(damaged) + bytes(STIM300_BYTES))[0] == [], at
 
 
 def test_times_are_those_of_the_datagrams_ends_less_the_latency() -> None:

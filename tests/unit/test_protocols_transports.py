@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import pytest
 
 from companion.protocols.decoding.base import Decoder
-from companion.protocols.registry import PROTOCOLS, Kind, make_decoder
+from companion.protocols.registry import PROTOCOLS, Kind
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample
+from tests.support.decoders import make_decoder
 from tests.support.frames import (
     imu_line,
     mip_imu,

@@ -8,8 +8,8 @@ import struct
 import pytest
 
 from companion.protocols.imus.vectornav import VectorNavDecoder
-from companion.protocols.imus.vectornav_binary import MAX_FRAME_BYTES
 from companion.samples import AttitudeSample, ImuSample, MagSample, Sample
+from tests.support.decoders import VECTORNAV_BYTES
 from tests.support.frames import (
     COMMON_SIZES,
     IMU_SIZES,
@@ -155,7 +155,7 @@ def test_a_compensated_rate_is_paired_with_an_uncompensated_force_only_for_want_
     ],
 )
 def test_binary_frames_that_give_nothing_are_counted_by_reason(data: bytes, reason: str) -> None:
-    samples, rejected = feed(data + bytes(MAX_FRAME_BYTES))
+    samples, rejected = feed(data + bytes(VECTORNAV_BYTES))
     assert samples == []
     assert rejected == {reason: 1}
 
@@ -170,7 +170,7 @@ def test_a_frame_inside_what_a_false_start_claims_is_not_lost(frame: bytes) -> N
     for false_start in (b"\xfa", b"\xfa\x01", b"\xfa\x05\x21\x01\x10", b"\xfa\x01\xff\x7f", b"$VNYMR,1,2", b"$", b"$V"):
         decoder = VectorNavDecoder()
         decoder.feed(false_start + frame, 1.0)
-        decoder.feed(bytes(MAX_FRAME_BYTES), 2.0)
+        decoder.feed(bytes(VECTORNAV_BYTES), 2.0)
         assert decoder.accepted == 1, false_start
 
 
@@ -186,7 +186,7 @@ def test_every_single_damaged_bit_is_seen() -> None:
         for at in range(len(frame) * 8):
             damaged = bytearray(frame)
             damaged[at // 8] ^= 1 << at % 8
-            samples, _ = feed(bytes(damaged) + b"\r\n" + bytes(MAX_FRAME_BYTES))
+            samples, _ = feed(bytes(damaged) + b"\r\n" + bytes(VECTORNAV_BYTES))
             # The very same samples: a hexadecimal digit of the checksum in the other case.
             assert samples in ([], right), damaged
 

@@ -7,8 +7,9 @@ import struct
 
 import pytest
 
-from companion.protocols.imus.xsens import MAX_DATA_BYTES, MAX_FRAME_BYTES, XsensDecoder
+from companion.protocols.imus.xsens import MAX_DATA_BYTES, XsensDecoder
 from companion.samples import ImuSample, MagSample, Sample
+from tests.support.decoders import XSENS_BYTES
 from tests.support.frames import big_floats, mtdata2, xbus, xsens_imu
 
 MESSAGE = xsens_imu()
@@ -132,14 +133,14 @@ def test_other_bits_of_the_status_are_no_reason() -> None:
     ],
 )
 def test_messages_that_give_nothing_are_counted_by_reason(data: bytes, reason: str) -> None:
-    assert feed(data + MESSAGE + bytes(MAX_FRAME_BYTES)) == (feed(MESSAGE)[0], {reason: 1})
+    assert feed(data + MESSAGE + bytes(XSENS_BYTES)) == (feed(MESSAGE)[0], {reason: 1})
 
 
 def test_a_message_inside_what_a_false_start_claims_is_not_lost() -> None:
     for false_start in (b"\xfa", b"\xfa\xff", b"\xfa\xff\x36\xfe", b"\xfa\xff\x36\xff", MESSAGE[:-1], b"\xfa\xfa"):
         decoder = XsensDecoder()
         decoder.feed(false_start + MESSAGE, 1.0)
-        decoder.feed(bytes(MAX_FRAME_BYTES), 2.0)
+        decoder.feed(bytes(XSENS_BYTES), 2.0)
         assert decoder.accepted == 1, false_start
 
 
@@ -147,7 +148,7 @@ def test_every_single_damaged_bit_is_seen() -> None:
     for at in range(len(MESSAGE) * 8):
         damaged = bytearray(MESSAGE)
         damaged[at // 8] ^= 1 << at % 8
-        assert feed(bytes(damaged) + bytes(MAX_FRAME_BYTES))[0] == [], at
+        assert feed(bytes(damaged) + bytes(XSENS_BYTES))[0] == [], at
 
 
 def test_times_are_those_of_the_messages_ends() -> None:

@@ -14,7 +14,7 @@ import pytest
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.solution.site import Whereabouts
 from companion.errors import StorageError
-from companion.protocols.registry import PROTOCOLS, Kind, make_decoder
+from companion.protocols.registry import PROTOCOLS, Kind
 from companion.recording.state import freeze, from_json, to_json
 from sim.aircraft import VirtualAircraft
 from sim.binary_imus import MipImu, Stim300, XsensImu
@@ -26,6 +26,7 @@ from sim.pni import PniCompass
 from sim.rion import RionCompass
 from sim.scenario import site_at
 from sim.witmotion import WitMotionImu
+from tests.support.decoders import make_decoder
 from tests.support.frames import imu_line
 from tests.support.rig import POSE
 from tests.support.still_aircraft import Feeder, imu, settings

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.protocols.registry import make_decoder
 from companion.samples import ImuSample, MagSample, Sample, TiltSample
 from sim.aircraft import Pose, VirtualAircraft
 from sim.binary_imus import Stim300
 from sim.devices import SerialDevice
 from sim.families import GRADIENTERS, IMUS
 from sim.imu_model import ImuModel
+from tests.support.decoders import make_decoder
 
 POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
 FLU = np.array([1.0, -1.0, -1.0])

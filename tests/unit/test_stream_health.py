@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from companion.protocols.decoding.base import NON_FINITE
+from companion.protocols.decoding import reasons
 from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
 from companion.protocols.stream_health import RAILS_DEG, SILENT_AFTER_S, StreamHealth
@@ -156,7 +156,7 @@ def test_silence_beats_everything_that_was_said_before() -> None:
     health = StreamHealth("imu_line", decoder)
     frame = imu_frame(1, rate="nan")
     health.took(frame, decoder.feed(frame, 0.0), 0.0)
-    assert decoder.rejected[NON_FINITE] == 1
+    assert decoder.rejected[reasons.NON_FINITE] == 1
     found = health.trouble(SILENT_AFTER_S + 0.1)
     assert found is not None
     assert found.key == "silent"

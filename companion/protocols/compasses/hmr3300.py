@@ -12,22 +12,11 @@ is believed only if it follows a whole line end: the rest "3.4, 18.6, -0.5" of a
 from __future__ import annotations
 
 import re
-from typing import ClassVar
+from typing import ClassVar, Final
 
-from companion.protocols.decoding.base import (
-    CALIBRATING,
-    COMMAND_REFUSED,
-    CUT_SHORT,
-    FIELD_COUNT,
-    LINE_END,
-    NOT_A_MEASUREMENT,
-    OUT_OF_RANGE,
-    PARITY,
-    SHAPE_CHANGED,
-    TOO_LONG,
-    LineDecoder,
-    RejectedError,
-)
+from companion.protocols.decoding import reasons
+from companion.protocols.decoding.base import LineDecoder, RejectedError
+from companion.protocols.decoding.dialogue import AGAIN_S, ANSWER_S, SILENT_S, Dialogue
 from companion.samples import CompassSample, MagSample, Sample
 
 _DEGREES = re.compile(rb"[+-]?\d{1,3}\.\d{1,3}")
@@ -58,49 +47,101 @@ class Hmr3300Decoder(LineDecoder):
     def _line(self, line: bytes, t_s: float, *, cut: bool) -> Sample | None:
         follows_line_end, self._follows_line_end = self._follows_line_end, True
         if cut:
-            raise RejectedError(TOO_LONG)
+            raise RejectedError(reasons.TOO_LONG)
         if not line.strip(b"\r"):
             # A bare line feed in mid-stream may have been a line's first digit; after a gap it is the end of the CR LF.
             self._follows_line_end = bool(line) or not follows_line_end
             return None
         if _DAMAGED.search(line):
-            raise RejectedError(PARITY)
+            raise RejectedError(reasons.PARITY)
         text = line.removesuffix(b"\r")
         if text == line or b"\r" in text:
             # A digit damaged into a line end leaves a rest that looks whole.
             self._follows_line_end = _FRAGMENT.fullmatch(line) is None
-            raise RejectedError(LINE_END)
+            raise RejectedError(reasons.LINE_END)
         if not follows_line_end:
-            raise RejectedError(CUT_SHORT)
+            raise RejectedError(reasons.CUT_SHORT)
         return self._measurement(text, t_s)
 
     def _measurement(self, text: bytes, t_s: float) -> Sample:
         if text.startswith(b"#"):
-            raise RejectedError(COMMAND_REFUSED)
+            raise RejectedError(reasons.COMMAND_REFUSED)
         fields = [field.strip(b" ") for field in text.split(b",")]
         if len(fields) == 4 and fields[3] == b"C":
-            raise RejectedError(CALIBRATING)
+            raise RejectedError(reasons.CALIBRATING)
         degrees = all(map(_DEGREES.fullmatch, fields))
         if not degrees and not all(map(_COUNTS.fullmatch, fields)):
-            raise RejectedError(NOT_A_MEASUREMENT)  # the banner after power-on, or damage
+            raise RejectedError(reasons.NOT_A_MEASUREMENT)  # the banner after power-on, or damage
         if len(fields) != 3 and not (degrees and len(fields) == 1):
-            raise RejectedError(FIELD_COUNT)
+            raise RejectedError(reasons.FIELD_COUNT)
         if degrees:
             return self._heading([float(field) for field in fields], t_s)
         x, y, z = (int(field) for field in fields)
         if max(abs(x), abs(y), abs(z)) > _COUNTS_LIMIT:
-            raise RejectedError(OUT_OF_RANGE)
+            raise RejectedError(reasons.OUT_OF_RANGE)
         return MagSample(t_s, counts=(x, y, z))
 
     def _heading(self, values: list[float], t_s: float) -> CompassSample:
         heading_deg, *tilt_deg = values
         if not 0.0 <= heading_deg < 360.0 or any(abs(angle) > 90.0 for angle in tilt_deg):
-            raise RejectedError(OUT_OF_RANGE)
+            raise RejectedError(reasons.OUT_OF_RANGE)
         if tilt_deg:
             self._triples, self._singles = min(self._triples + 1, _SURE), 0
             return CompassSample(t_s, heading_deg, tilt_deg[0], tilt_deg[1])
         self._singles = min(self._singles + 1, _SURE)
         if self._triples == _SURE and self._singles < _SURE:
-            raise RejectedError(SHAPE_CHANGED)
+            raise RejectedError(reasons.SHAPE_CHANGED)
         self._triples = 0
         return CompassSample(t_s, heading_deg)
+
+
+ALONE_S: Final = 0.4
+"""How long after the answer no other line may come: three periods of the stream (8 lines a second, HMR3200: 15)."""
+_ONE_LINE: Final = re.compile(rb"[-+0-9][-+0-9., ]{0,38}\r\n")
+_MOST: Final = 80
+"""Bytes of an answer that are kept: two lines and more are no answer."""
+
+
+class Hmr3300Dialogue(Dialogue):
+    """Starts a stopped stream; says nothing to a device that streams.
+
+    `*S` toggles the stream and so is never sent blind: it would stop a device that streams behind a bad contact.
+    `*Q` asks for one line and is obeyed only while the stream is stopped (Honeywell's HMR3200/HMR3300 data sheet).
+    So a device that has been silent is asked for one line; that line, alone, proves that it is there and stopped,
+    and only then does `*S` follow.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._ask_at_s = 0.0
+        self._asked_s: float | None = None
+        self._heard_s: float | None = None
+        self._answer = b""
+        """What came since the question."""
+
+    def opened(self, t_s: float) -> None:  # noqa: D102 - as in the base class
+        self._ask_at_s, self._asked_s = t_s + SILENT_S, None
+
+    def heard(self, data: bytes, samples: int, t_s: float) -> None:  # noqa: D102
+        if self._asked_s is None:
+            # Whatever it says, even what cannot be read: it is no device that keeps silent.
+            self._ask_at_s = t_s + SILENT_S
+        else:
+            self._answer, self._heard_s = (self._answer + data)[:_MOST], t_s
+
+    def due(self, t_s: float) -> bytes:  # noqa: D102
+        if self._asked_s is None:
+            if t_s < self._ask_at_s:
+                return b""
+            self._asked_s, self._heard_s, self._answer = t_s, None, b""
+            self.words = "silent: asked for one line with *Q"
+            return b"*Q\r\n"
+        if t_s < (self._asked_s + ANSWER_S if self._heard_s is None else self._heard_s + ALONE_S):
+            return b""
+        self._asked_s = None
+        if _ONE_LINE.fullmatch(self._answer):
+            self._ask_at_s = t_s + SILENT_S
+            self.words = "it was stopped: stream started with *S"
+            return b"*S\r\n"
+        self._ask_at_s = t_s + AGAIN_S
+        return b""

@@ -22,23 +22,10 @@ from __future__ import annotations
 import math
 from typing import Final, Literal
 
-from companion.protocols.decoding.base import (
-    ALARM,
-    CALIBRATING,
-    DUPLICATE,
-    FIELD_COUNT,
-    NON_FINITE,
-    NOT_A_MEASUREMENT,
-    NOTHING_OF_USE,
-    OTHER_NORTH,
-    OUT_OF_RANGE,
-    OVER_RANGE,
-    UNKNOWN_FIELD,
-    UNKNOWN_SENTENCE,
-    RejectedError,
-    SentenceDecoder,
-)
+from companion.protocols.decoding import reasons
+from companion.protocols.decoding.base import RejectedError, SentenceDecoder
 from companion.protocols.decoding.checks import check_vector
+from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 
 HOLD_S: Final = 3.0
@@ -97,18 +84,18 @@ class NmeaDecoder(SentenceDecoder):
             elif head[2:] == b"XDR" and len(head) == 5:
                 self._xdr(fields, t_s, samples)
             else:
-                raise RejectedError(UNKNOWN_SENTENCE)
+                raise RejectedError(reasons.UNKNOWN_SENTENCE)
             return
         # All in one piece, because it is what comes most.
         rank, size, marks, north = plain
         if len(fields) != size:
-            raise RejectedError(FIELD_COUNT)
+            raise RejectedError(reasons.FIELD_COUNT)
         heading_deg = float(fields[1])
         if marks is None:
             if fields[2] and 0.0 <= heading_deg <= 360.0:
                 heading_deg = (heading_deg + _easting(fields[2], fields[3])) % 360.0
         elif fields[2] not in marks:
-            raise RejectedError(NOT_A_MEASUREMENT if rank == _THS else UNKNOWN_FIELD)
+            raise RejectedError(reasons.NOT_A_MEASUREMENT if rank == _THS else reasons.UNKNOWN_FIELD)
         if not 0.0 <= heading_deg < 360.0:
             heading_deg = _full_circle(heading_deg)
         if rank == self._heading_from:
@@ -121,14 +108,14 @@ class NmeaDecoder(SentenceDecoder):
         leader = self._heading_from
         if sentence < leader:
             if _NORTHS[sentence] != _NORTHS[leader]:
-                raise RejectedError(OTHER_NORTH)
+                raise RejectedError(reasons.OTHER_NORTH)
             if t_s - self._heading_s <= HOLD_S:
-                raise RejectedError(DUPLICATE)
+                raise RejectedError(reasons.DUPLICATE)
         self._heading_from, self._heading_s = sentence, t_s
 
     def _hpr(self, fields: list[bytes], t_s: float, samples: list[Sample]) -> None:
         if len(fields) != 7:
-            raise RejectedError(FIELD_COUNT)
+            raise RejectedError(reasons.FIELD_COUNT)
         _, heading, magnetic, pitch, pitch_status, roll, roll_status = fields
         # Even an alarm keeps the precedence: then the device says that it has no heading, whatever else it sends.
         self._heading_from, self._heading_s = _HPR, t_s
@@ -153,15 +140,15 @@ class NmeaDecoder(SentenceDecoder):
 
     def _ccd(self, fields: list[bytes], t_s: float, samples: list[Sample]) -> None:
         if len(fields) != 8:
-            raise RejectedError(FIELD_COUNT)
+            raise RejectedError(reasons.FIELD_COUNT)
         pitch_deg, roll_deg = (math.degrees(math.atan(float(field) / _CCD_SCALE)) for field in fields[1:3])
         if not math.isfinite(pitch_deg + roll_deg):
-            raise RejectedError(NON_FINITE)
+            raise RejectedError(reasons.NON_FINITE)
         heading_deg = float(fields[7])
         if b"." not in fields[7]:
             heading_deg *= _DEGREES_PER_MIL
         if self._tilt_from > _TILT_CCD and t_s - self._tilt_s <= HOLD_S:
-            raise RejectedError(DUPLICATE)  # of HPR, whose heading comes first too
+            raise RejectedError(reasons.DUPLICATE)  # of HPR, whose heading comes first too
         self._tilt_from, self._tilt_s = _TILT_CCD, t_s
         try:
             self._claim_heading(_CCD, t_s)
@@ -173,14 +160,14 @@ class NmeaDecoder(SentenceDecoder):
 
     def _xdr(self, fields: list[bytes], t_s: float, samples: list[Sample]) -> None:
         if len(fields) % 4 != 1:
-            raise RejectedError(FIELD_COUNT)
+            raise RejectedError(reasons.FIELD_COUNT)
         angles_deg: dict[bytes, float] = {}
         field_mg: dict[bytes, float] = {}
         for at in range(1, len(fields), 4):
             kind, value, unit, name = fields[at : at + 4]
             if kind == b"A" and name in _ANGLES:
                 if unit != b"D":
-                    raise RejectedError(UNKNOWN_FIELD)
+                    raise RejectedError(reasons.UNKNOWN_FIELD)
                 angles_deg[_ANGLES[name]] = _tilt(value)
             elif kind == b"G" and name in _FIELDS and value:
                 field_mg[name] = float(value)
@@ -193,22 +180,22 @@ class NmeaDecoder(SentenceDecoder):
             check_vector((x, y, z))
             found.append(MagSample(t_s, (x, y, z)))
         if not found:
-            raise RejectedError(DUPLICATE if len(angles_deg) == 2 else NOTHING_OF_USE)
+            raise RejectedError(reasons.DUPLICATE if len(angles_deg) == 2 else reasons.NOTHING_OF_USE)
         samples += found
 
 
 def _check_statuses(statuses: tuple[bytes, bytes, bytes]) -> None:
     """Heading, pitch and roll: a tilt beyond its alarm level leaves nothing that could be used."""
     if not _STATUSES.issuperset(statuses):
-        raise RejectedError(NOT_A_MEASUREMENT)
+        raise RejectedError(reasons.NOT_A_MEASUREMENT)
     if b"C" in statuses:
-        raise RejectedError(CALIBRATING)
+        raise RejectedError(reasons.CALIBRATING)
     if not _ALARMS.isdisjoint(statuses[1:]):
-        raise RejectedError(ALARM)
+        raise RejectedError(reasons.ALARM)
 
 
 def _out_of_range(value: float) -> RejectedError:
-    return RejectedError(OUT_OF_RANGE if math.isfinite(value) else NON_FINITE)
+    return RejectedError(reasons.OUT_OF_RANGE if math.isfinite(value) else reasons.NON_FINITE)
 
 
 def _full_circle(heading_deg: float) -> float:
@@ -232,15 +219,27 @@ def _easting(field: bytes, side: bytes) -> float:
     if side == b"E":
         return value
     if side != b"W":
-        raise RejectedError(UNKNOWN_FIELD)
+        raise RejectedError(reasons.UNKNOWN_FIELD)
     return -value
 
 
 def _tilt(field: bytes) -> float:
     """A tilt of a transducer; empty where the device is beyond its range (HMR3000 manual, XDR)."""
     if not field:
-        raise RejectedError(OVER_RANGE)
+        raise RejectedError(reasons.OVER_RANGE)
     value = float(field)
     if not -90.0 <= value <= 90.0:
         raise _out_of_range(value)
     return value
+
+
+class Hmr3000Dialogue(PollDialogue):
+    """`$PTNT,HPR*78` to an HMR3000, which comes with all its sentences switched off; to others an unknown sentence.
+
+    It measures 13.75 times a second (HMR3000 manual, p. 8). It could be told to stream, but keeps the rates of its
+    sentences in EEPROM (3.8).
+    """
+
+    QUESTION = b"$PTNT,HPR*78\r\n"
+    PERIOD_S = 0.1
+    NAME = "$PTNT,HPR*78"

@@ -14,14 +14,8 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from companion.protocols.decoding.base import (
-    NOT_A_MEASUREMENT,
-    NOTHING_OF_USE,
-    OUT_OF_RANGE,
-    UNKNOWN_SENTENCE,
-    RejectedError,
-    SentenceDecoder,
-)
+from companion.protocols.decoding import reasons
+from companion.protocols.decoding.base import RejectedError, SentenceDecoder
 from companion.protocols.decoding.checks import TEMPERATURE_LIMIT_DEGC
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 
@@ -42,19 +36,19 @@ class Os5000Decoder(SentenceDecoder):
     def _read(self, body: bytes, t_s: float, samples: list[Sample]) -> None:
         match = _TAGS.fullmatch(body)
         if match is None:
-            raise RejectedError(NOT_A_MEASUREMENT if body[:1] == b"C" else UNKNOWN_SENTENCE)
+            raise RejectedError(reasons.NOT_A_MEASUREMENT if body[:1] == b"C" else reasons.UNKNOWN_SENTENCE)
         heading, pitch, roll, temperature, more, _ = match.groups()
         temperature_degc = None if temperature is None else float(temperature)
         if temperature_degc is not None and not -TEMPERATURE_LIMIT_DEGC <= temperature_degc <= TEMPERATURE_LIMIT_DEGC:
-            raise RejectedError(OUT_OF_RANGE)
+            raise RejectedError(reasons.OUT_OF_RANGE)
         if pitch is None or roll is None:
             if heading is None:
-                raise RejectedError(NOTHING_OF_USE)
+                raise RejectedError(reasons.NOTHING_OF_USE)
             samples.append(CompassSample(t_s, _heading(heading), None, None, None, temperature_degc))
         else:
             pitch_deg, roll_deg = float(pitch), float(roll)
             if not (-90.0 <= pitch_deg <= 90.0 and -180.0 <= roll_deg <= 180.0):
-                raise RejectedError(OUT_OF_RANGE)
+                raise RejectedError(reasons.OUT_OF_RANGE)
             if heading is None:
                 samples.append(_tilt(t_s, roll_deg, pitch_deg, temperature_degc))
             else:
@@ -70,11 +64,11 @@ def _heading(field: bytes) -> float:
     if heading_deg == 360.0:  # 359.96, rounded by the device
         return 0.0
     if not 0.0 <= heading_deg < 360.0:
-        raise RejectedError(OUT_OF_RANGE)
+        raise RejectedError(reasons.OUT_OF_RANGE)
     return heading_deg
 
 
 def _tilt(t_s: float, roll_deg: float, pitch_deg: float, temperature_degc: float | None) -> TiltSample:
     if abs(roll_deg) > 90.0:  # upside down: no gradienter
-        raise RejectedError(OUT_OF_RANGE)
+        raise RejectedError(reasons.OUT_OF_RANGE)
     return TiltSample(t_s, roll_deg, pitch_deg, temperature_degc)

@@ -19,18 +19,10 @@ import math
 import struct
 from typing import ClassVar, Final
 
-from companion.protocols.decoding.base import (
-    CHECKSUM,
-    FIELD_COUNT,
-    NON_FINITE,
-    NOTHING_OF_USE,
-    OUT_OF_RANGE,
-    REPLY,
-    UNKNOWN_FIELD,
-    RejectedError,
-)
+from companion.protocols.decoding import reasons
+from companion.protocols.decoding.base import RejectedError
+from companion.protocols.decoding.dialogue import PollDialogue
 from companion.protocols.decoding.framing import ECHO, WAIT, FrameDecoder
-from companion.protocols.decoding.polling import PollDialogue
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 
 SHORTEST: Final = 5
@@ -103,23 +95,18 @@ class PniDecoder(FrameDecoder):
             if available < size:
                 return WAIT
             if binascii.crc_hqx(buffer[at:end], 0) != 0:
-                raise RejectedError(CHECKSUM)
+                raise RejectedError(reasons.CHECKSUM)
         except RejectedError as error:
             return self._reject(error.reason, at + 1)
         if frame_id != _DATA:
-            return self._reject(ECHO if frame_id in _COMMANDS else REPLY, end)
-        try:
-            samples += self._samples(buffer, parts, self._time_of(origin + end))
-            self.accepted += 1
-        except RejectedError as error:
-            self.rejected[error.reason] += 1
-        return end
+            return self._reject(ECHO if frame_id in _COMMANDS else reasons.REPLY, end)
+        return self._accept(samples, self._samples, buffer, parts, self._time_of(origin + end), end=end)
 
     def _samples(self, buffer: bytes, parts: list[tuple[int, int]], t_s: float) -> list[Sample]:
         flags = {part: buffer[place] for part, place in parts if part in _BYTES}
         values = self._values(buffer, [(part, place) for part, place in parts if part not in _BYTES])
         if flags.get(_DISTORTION, 0) > 1 or flags.get(_CALIBRATED, 0) > 1:
-            raise RejectedError(OUT_OF_RANGE)
+            raise RejectedError(reasons.OUT_OF_RANGE)
         if flags.get(_DISTORTION):
             raise RejectedError(DISTORTION)
         if flags.get(_HEADING_STATUS) == 3:
@@ -127,7 +114,7 @@ class PniDecoder(FrameDecoder):
         samples: list[Sample] = []
         heading_deg, pitch_deg, roll_deg = (values.get(part) for part in (_HEADING, _PITCH, _ROLL))
         if roll_deg is not None and abs(roll_deg) > 90.0:
-            raise RejectedError(OUT_OF_RANGE)  # upside down, where its heading is not specified
+            raise RejectedError(reasons.OUT_OF_RANGE)  # upside down, where its heading is not specified
         if heading_deg is not None:
             samples.append(CompassSample(t_s, heading_deg, pitch_deg, roll_deg))
         elif pitch_deg is not None and roll_deg is not None:
@@ -136,7 +123,7 @@ class PniDecoder(FrameDecoder):
             x, y, z = (values[part] / _UT_PER_GAUSS for part in _MAG)
             samples.append(MagSample(t_s, (x, y, z)))
         if not samples:
-            raise RejectedError(NOTHING_OF_USE)
+            raise RejectedError(reasons.NOTHING_OF_USE)
         if flags.get(_CALIBRATED) == 0:
             self.warned[NOT_CALIBRATED] += 1
         return samples
@@ -149,7 +136,7 @@ class PniDecoder(FrameDecoder):
         possible = _possible(names, little), _possible(names, big)
         if not any(possible):
             finite = all(map(math.isfinite, little if self._little else big))
-            raise RejectedError(OUT_OF_RANGE if finite else NON_FINITE)
+            raise RejectedError(reasons.OUT_OF_RANGE if finite else reasons.NON_FINITE)
         if not possible[not self._little]:
             self._contrary += 1
             if self._contrary < 2:
@@ -180,16 +167,16 @@ def _components(buffer: bytes, at: int, end: int) -> list[tuple[int, int]]:
         return parts
     for _ in range(buffer[at + 3]):
         if here >= last:
-            raise RejectedError(FIELD_COUNT)
+            raise RejectedError(reasons.FIELD_COUNT)
         if here >= len(buffer):
             return parts
         part = buffer[here]
         if part not in _SIZES:
-            raise RejectedError(UNKNOWN_FIELD)
+            raise RejectedError(reasons.UNKNOWN_FIELD)
         parts.append((part, here + 1))
         here += 1 + _SIZES[part]
     if here != last:
-        raise RejectedError(FIELD_COUNT)
+        raise RejectedError(reasons.FIELD_COUNT)
     return parts
 
 

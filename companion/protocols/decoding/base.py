@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from typing import ClassVar, Final
 
+from companion.protocols.decoding import reasons
 from companion.protocols.decoding.clock import SampleTimes
 from companion.samples import Sample
 
@@ -18,32 +19,6 @@ AHEAD_S = 0.5
 """So far ahead of its line no stream gets: a baud rate then means nothing on that port (USB without a UART)."""
 _STALL_S = 10.0
 """So long what came may have waited unread."""
-
-ALARM = "alarm"
-CALIBRATING = "calibrating"
-CHECKSUM = "checksum"
-COMMAND_REFUSED = "command refused"
-CUT_SHORT = "cut short"
-DUPLICATE = "duplicate"
-FIELD_COUNT = "field count"
-LINE_END = "line end"
-NO_CHECKSUM = "no checksum"
-NON_FINITE = "non-finite"
-NOT_A_MEASUREMENT = "not a measurement"
-NOT_A_NUMBER = "not a number"
-NOTHING_OF_USE = "nothing of use"
-ORPHAN = "orphan"
-OTHER_NORTH = "other north"
-OUT_OF_RANGE = "out of range"
-OVER_RANGE = "over range"
-PARITY = "parity"
-REPLY = "reply"
-SHAPE_CHANGED = "shape changed"
-SINGLE_AXIS = "single axis"
-TOO_LONG = "too long"
-UNKNOWN_FIELD = "unknown field"
-UNKNOWN_GROUP = "unknown group"
-UNKNOWN_SENTENCE = "unknown sentence"
 
 
 class RejectedError(Exception):
@@ -155,7 +130,7 @@ class LineDecoder(Decoder):
 
     def interrupted(self) -> None:  # noqa: D102 - as in the base class
         if self._partial:
-            self.rejected[CUT_SHORT] += 1
+            self.rejected[reasons.CUT_SHORT] += 1
         self._partial, self._cut = b"", False
 
     def _frame_bytes(self, line: bytes) -> int:
@@ -203,7 +178,7 @@ class SentenceDecoder(Decoder):
             except RejectedError as error:
                 self.rejected[error.reason] += 1
             except ValueError:
-                self.rejected[NOT_A_NUMBER] += 1
+                self.rejected[reasons.NOT_A_NUMBER] += 1
             else:
                 self.accepted += 1
                 self.frame_bytes = len(line) + 1
@@ -213,7 +188,7 @@ class SentenceDecoder(Decoder):
 
     def interrupted(self) -> None:  # noqa: D102 - as in the base class
         if self._partial:
-            self.rejected[CUT_SHORT] += 1
+            self.rejected[reasons.CUT_SHORT] += 1
         self._partial = b""
 
     @abstractmethod
@@ -233,7 +208,7 @@ class SentenceDecoder(Decoder):
             return b""
         self.skipped += start
         while (end := text.find(b"$", start + 1)) >= 0:
-            self._too_long_or(CUT_SHORT, end - start)
+            self._too_long_or(reasons.CUT_SHORT, end - start)
             start = end
         if len(text) - start > self.LIMIT:
             self._too_long_or("", len(text) - start)
@@ -242,7 +217,7 @@ class SentenceDecoder(Decoder):
 
     def _too_long_or(self, reason: str, length: int) -> None:
         """Count a sentence that ends without a line end; beyond the limit its bytes belong to no frame."""
-        self.rejected[TOO_LONG if length > self.LIMIT else reason] += 1
+        self.rejected[reasons.TOO_LONG if length > self.LIMIT else reason] += 1
         self.skipped += max(length - self.LIMIT, 0)
 
 
@@ -276,15 +251,15 @@ def body_of_sentence(sentence: bytes) -> bytes:
     if expected is not None and sentence[-3:-2] == b"*":
         body = sentence[1:-3]
         if xor_checksum(body) != expected:
-            raise RejectedError(CHECKSUM)
+            raise RejectedError(reasons.CHECKSUM)
         return body
     body, _, digits = sentence[1:].rpartition(b"*")
     if len(digits) != 4:
-        raise RejectedError(NO_CHECKSUM)
+        raise RejectedError(reasons.NO_CHECKSUM)
     try:
         expected = int.from_bytes(binascii.unhexlify(digits), "big")
     except ValueError:
-        raise RejectedError(NO_CHECKSUM) from None
+        raise RejectedError(reasons.NO_CHECKSUM) from None
     if binascii.crc_hqx(body, 0) != expected:
-        raise RejectedError(CHECKSUM)
+        raise RejectedError(reasons.CHECKSUM)
     return body

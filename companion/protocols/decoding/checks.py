@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from companion.protocols.decoding.base import NON_FINITE, NOT_A_NUMBER, OUT_OF_RANGE, RejectedError
+from companion.protocols.decoding import reasons
+from companion.protocols.decoding.base import RejectedError
 from companion.samples import Vector
 
 GYRO_LIMIT_RAD_S = 100.0
@@ -23,10 +24,10 @@ def numbers(fields: list[bytes]) -> list[float]:
     try:
         values = list(map(float, fields))
     except ValueError:
-        raise RejectedError(NOT_A_NUMBER) from None
+        raise RejectedError(reasons.NOT_A_NUMBER) from None
     # One test for all of them: whatever is not finite makes the sum so.
     if not math.isfinite(sum(values)):
-        raise RejectedError(NON_FINITE)
+        raise RejectedError(reasons.NON_FINITE)
     return values
 
 
@@ -40,7 +41,7 @@ def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | 
     ax, ay, az = accel_m_s2
     temperature = temperature_degc or 0.0
     if not math.isfinite(gx + gy + gz + ax + ay + az + temperature):
-        raise RejectedError(NON_FINITE)
+        raise RejectedError(reasons.NON_FINITE)
     gyro, accel = GYRO_LIMIT_RAD_S, ACCEL_LIMIT_M_S2
     if not (
         -gyro <= gx <= gyro
@@ -51,7 +52,7 @@ def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | 
         and -accel <= az <= accel
         and -TEMPERATURE_LIMIT_DEGC <= temperature <= TEMPERATURE_LIMIT_DEGC
     ):
-        raise RejectedError(OUT_OF_RANGE)
+        raise RejectedError(reasons.OUT_OF_RANGE)
 
 
 def check_attitude(yaw_deg: float, pitch_deg: float, roll_deg: float) -> None:
@@ -61,9 +62,9 @@ def check_attitude(yaw_deg: float, pitch_deg: float, roll_deg: float) -> None:
         RejectedError: an angle is not finite or out of range.
     """
     if not math.isfinite(yaw_deg + pitch_deg + roll_deg):
-        raise RejectedError(NON_FINITE)
+        raise RejectedError(reasons.NON_FINITE)
     if not (-180.0 <= yaw_deg <= 360.0 and -90.0 <= pitch_deg <= 90.0 and -180.0 <= roll_deg <= 180.0):
-        raise RejectedError(OUT_OF_RANGE)
+        raise RejectedError(reasons.OUT_OF_RANGE)
 
 
 def check_vector(vector: Vector) -> None:
@@ -73,4 +74,4 @@ def check_vector(vector: Vector) -> None:
         RejectedError: a component is not finite.
     """
     if not math.isfinite(sum(vector)):
-        raise RejectedError(NON_FINITE)
+        raise RejectedError(reasons.NON_FINITE)

@@ -8,14 +8,24 @@ Pure: time comes in, bytes go out.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Final
+from typing import ClassVar, Final
 
 SILENT_S: Final = 2.0
-"""So long a device that streams by itself is waited for before anything is said to it."""
+"""How long a device that streams by itself is waited for before anything is said to it."""
+ANSWER_S: Final = 1.0
+"""How long an answer is waited for before the device is asked again; none of those polled here documents a delay."""
+PATIENCE: Final = 3
+AGAIN_S: Final = 5.0
+"""The pause between questions after `PATIENCE` of them that nobody has answered."""
+LONGEST_PAUSE_S: Final = 64.0
 
 
 class Dialogue(ABC):
     """The companion's half of the conversation with one device, on one opened port after another."""
+
+    def __init__(self) -> None:
+        self.words = ""
+        """What was last asked of the device, for people; empty while nothing was ("stream started with S")."""
 
     @abstractmethod
     def opened(self, t_s: float) -> None:
@@ -29,7 +39,89 @@ class Dialogue(ABC):
     def due(self, t_s: float) -> bytes:
         """What is to be sent now; empty for nothing. Asked every 20 ms or so, and after every `heard`."""
 
-    @property
-    @abstractmethod
-    def words(self) -> str:
-        """What was last asked of the device, for people; empty while nothing was ("stream started with S")."""
+
+class PollDialogue(Dialogue):
+    """Asks for one reading after another, each only after the answer to the last; silent while the device speaks.
+
+    What the device says without having been asked ends the asking, until it has been silent for `SILENT_S` again.
+    """
+
+    QUESTION: ClassVar[bytes]
+    SET_UP: ClassVar[bytes] = b""
+    """Said before the first question, and before the one after a question in vain: it may have been without power."""
+    PERIOD_S: ClassVar[float]
+    NAME: ClassVar[str]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._quiet_until_s = self._next_s = 0.0
+        self._asked_s: float | None = None
+        """When the question was put that has not been answered yet."""
+        self._since_asked = 0
+        """Bytes that came since then."""
+        self._set_up = False
+        self._unanswered = 0
+
+    def opened(self, t_s: float) -> None:  # noqa: D102 - as in the base class
+        self._quiet_until_s, self._asked_s, self._set_up, self._unanswered = t_s + SILENT_S, None, False, 0
+
+    def heard(self, data: bytes, samples: int, t_s: float) -> None:  # noqa: D102
+        if not data.strip(b"\r\n"):  # the rest of a line that is known already
+            return
+        if self._asked_s is None:
+            self._quiet_until_s = t_s + SILENT_S
+        elif samples:
+            self._asked_s, self._unanswered = None, 0
+        self._since_asked += len(data)
+
+    def due(self, t_s: float) -> bytes:  # noqa: D102
+        if self._asked_s is not None:
+            if t_s - self._asked_s < (ANSWER_S if self._unanswered < PATIENCE else AGAIN_S):
+                return b""
+            self._asked_s, self._set_up = None, False
+            self._unanswered += 1
+            if self._since_asked > len(self.SET_UP + self.QUESTION):  # more than an echo: it speaks, if not to us
+                self._quiet_until_s = t_s + SILENT_S
+        if t_s < max(self._quiet_until_s, self._next_s):
+            return b""
+        self._asked_s, self._next_s, self._since_asked = t_s, t_s + self.PERIOD_S, 0
+        answers = ", no answer yet" if self._unanswered else ""
+        self.words = f"asked {1.0 / self.PERIOD_S:.0f} times a second with {self.NAME}{answers}"
+        set_up, self._set_up = self._set_up, True
+        return self.QUESTION if set_up else self.SET_UP + self.QUESTION
+
+
+class WakeDialogue(Dialogue):
+    """Says one thing after another to a device that keeps silent, so that it streams again, and begins again.
+
+    A device that sends anything, be it what it was not asked for, is left alone. Pauses double from one attempt to the
+    next, so that a device that is off is not shouted at for ever.
+    """
+
+    SAYINGS: ClassVar[tuple[tuple[bytes, str], ...]]
+    """What to send, and the words for it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._quiet_since_s: float | None = None
+        self._pause_s = SILENT_S
+        self._next = 0
+
+    def opened(self, t_s: float) -> None:  # noqa: D102 - as in the base class
+        self._quiet_since_s, self._pause_s, self._next, self.words = t_s, SILENT_S, 0, ""
+
+    def heard(self, data: bytes, samples: int, t_s: float) -> None:  # noqa: D102 - as in the base class
+        if data:
+            self._quiet_since_s = t_s
+        if samples:
+            self._pause_s, self._next = SILENT_S, 0
+
+    def due(self, t_s: float) -> bytes:  # noqa: D102 - as in the base class
+        if self._quiet_since_s is None or t_s - self._quiet_since_s < self._pause_s:
+            return b""
+        saying, self.words = self.SAYINGS[self._next]
+        self._next += 1
+        if self._next == len(self.SAYINGS):
+            self._next, self._pause_s = 0, min(2.0 * self._pause_s, LONGEST_PAUSE_S)
+        self._quiet_since_s = t_s
+        return saying

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import deque
+from collections.abc import Callable
 from typing import Final
 
-from companion.protocols.decoding.base import CUT_SHORT, Decoder
+from companion.protocols.decoding import reasons
+from companion.protocols.decoding.base import Decoder, RejectedError
 from companion.samples import Sample
 
 WAIT: Final = -1
@@ -53,7 +55,7 @@ class FrameDecoder(Decoder):
 
     def interrupted(self) -> None:  # noqa: D102 - as in the base class
         if self._buffer:
-            self.rejected[CUT_SHORT] += 1
+            self.rejected[reasons.CUT_SHORT] += 1
         self._buffer = b""
         self._chunks.clear()
 
@@ -71,8 +73,26 @@ class FrameDecoder(Decoder):
         self.skipped += end - at
         return end
 
+    def _find_mark(self, mark: bytes, buffer: bytes, at: int) -> int:
+        """Where to go on when no mark of two bytes stands at `at`: `WAIT` where its second byte has not come yet."""
+        if buffer[at] != mark[0]:
+            return self._skip_to(mark[:1], buffer, at)
+        if len(buffer) == at + 1:
+            return WAIT
+        self.skipped += 1
+        return at + 1
+
     def _reject(self, reason: str, end: int) -> int:
         self.rejected[reason] += 1
+        return end
+
+    def _accept(self, samples: list[Sample], found: Callable[..., list[Sample]], *arguments: object, end: int) -> int:
+        """Take in what `found(*arguments)` reads in a whole frame, which may reject it, and go on at `end`."""
+        try:
+            samples += found(*arguments)
+            self.accepted += 1
+        except RejectedError as error:
+            self.rejected[error.reason] += 1
         return end
 
     def _time_of(self, end: int) -> float:

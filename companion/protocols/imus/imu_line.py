@@ -12,13 +12,8 @@ from typing import ClassVar, Final
 
 import msgspec
 
-from companion.protocols.decoding.base import (
-    FIELD_COUNT,
-    OUT_OF_RANGE,
-    UNKNOWN_SENTENCE,
-    RejectedError,
-    SentenceDecoder,
-)
+from companion.protocols.decoding import reasons
+from companion.protocols.decoding.base import RejectedError, SentenceDecoder
 from companion.protocols.decoding.checks import check_imu
 from companion.samples import ImuSample, Sample
 
@@ -34,7 +29,7 @@ class ImuLineDecoder(SentenceDecoder):
 
     def _read(self, body: bytes, t_s: float, samples: list[Sample]) -> None:
         if not body.startswith(b"IMU,"):
-            raise RejectedError(UNKNOWN_SENTENCE)
+            raise RejectedError(reasons.UNKNOWN_SENTENCE)
         try:
             # As JSON, which is twice as quick as nine conversions; a "+1.0" or "007" or an empty T is left to them.
             values = _numbers(b"[%b]" % body[4:])
@@ -42,7 +37,7 @@ class ImuLineDecoder(SentenceDecoder):
             values = _slowly(body)
         sequence, t_us, gx, gy, gz, ax, ay, az, temperature_degc = values
         if not (0 <= sequence <= 0xFFFF and 0 <= t_us <= 0xFFFFFFFF):
-            raise RejectedError(OUT_OF_RANGE)
+            raise RejectedError(reasons.OUT_OF_RANGE)
         gyro_rad_s, accel_m_s2 = (gx, gy, gz), (ax, ay, az)
         check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
         samples.append(ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, sequence, t_us / 1e6))
@@ -57,6 +52,6 @@ def _slowly(body: bytes) -> _Values:
     """
     fields = body.split(b",")
     if len(fields) != 10:
-        raise RejectedError(FIELD_COUNT)
+        raise RejectedError(reasons.FIELD_COUNT)
     gx, gy, gz, ax, ay, az = map(float, fields[3:9])
     return int(fields[1]), int(fields[2]), gx, gy, gz, ax, ay, az, float(fields[9]) if fields[9] else None

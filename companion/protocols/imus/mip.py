@@ -16,12 +16,12 @@ from itertools import accumulate
 from typing import ClassVar, Final
 
 from companion.physics.units import G
-from companion.protocols.decoding.base import CHECKSUM, FIELD_COUNT, NOTHING_OF_USE, REPLY, RejectedError
+from companion.protocols.decoding import reasons
+from companion.protocols.decoding.base import RejectedError
 from companion.protocols.decoding.checks import check_imu, check_vector
+from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.protocols.decoding.framing import WAIT, FrameDecoder
 from companion.samples import ImuSample, MagSample, Sample, Vector
-
-MAX_FRAME_BYTES: Final = 4 + 255 + 2
 
 _MARK = b"\x75\x65"
 _SENSOR_DATA = 0x80
@@ -38,26 +38,17 @@ class MipDecoder(FrameDecoder):
 
     def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         if not buffer.startswith(_MARK, at):
-            if buffer[at] != _MARK[0]:
-                return self._skip_to(_MARK[:1], buffer, at)
-            if len(buffer) == at + 1:
-                return WAIT
-            self.skipped += 1
-            return at + 1
+            return self._find_mark(_MARK, buffer, at)
         if len(buffer) < at + 4:
             return WAIT
         end = at + 4 + buffer[at + 3] + 2
         if len(buffer) < end:
             return WAIT
         if fletcher(buffer[at : end - 2]) != buffer[end - 2 : end]:
-            self.rejected[CHECKSUM] += 1
-            return at + 1  # not `end`: in what a false start took for its own, a good frame may begin
-        try:
-            samples += _decode(buffer, at, end - 2, self._time_of(origin + end))
-            self.accepted += 1
-        except RejectedError as error:
-            self.rejected[error.reason] += 1
-        return end
+            return self._reject(
+                reasons.CHECKSUM, at + 1
+            )  # not `end`: in what a false start took for its own, a good frame may begin
+        return self._accept(samples, _decode, buffer, at, end - 2, self._time_of(origin + end), end=end)
 
 
 def fletcher(data: bytes) -> bytes:
@@ -73,7 +64,7 @@ def _decode(buffer: bytes, at: int, stop: int, t_s: float) -> list[Sample]:
         RejectedError: a field without its length, a value that cannot be, or nothing of use.
     """
     if buffer[at + 2] != _SENSOR_DATA:
-        raise RejectedError(REPLY if buffer[at + 2] < _SENSOR_DATA else NOTHING_OF_USE)
+        raise RejectedError(reasons.REPLY if buffer[at + 2] < _SENSOR_DATA else reasons.NOTHING_OF_USE)
     accel_g: Vector | None = None
     gyro_rad_s: Vector | None = None
     mag_gauss: Vector | None = None
@@ -82,15 +73,15 @@ def _decode(buffer: bytes, at: int, stop: int, t_s: float) -> list[Sample]:
     while field < stop:
         length = buffer[field]
         if length < 2 or field + length > stop:
-            raise RejectedError(FIELD_COUNT)
+            raise RejectedError(reasons.FIELD_COUNT)
         kind = buffer[field + 1]
         if kind == _GPS_TIME:
             if length != 14:
-                raise RejectedError(FIELD_COUNT)
+                raise RejectedError(reasons.FIELD_COUNT)
             t_device_s, _week, _flags = _TIME.unpack_from(buffer, field + 2)
         elif _ACCEL <= kind <= _MAG:
             if length != 14:
-                raise RejectedError(FIELD_COUNT)
+                raise RejectedError(reasons.FIELD_COUNT)
             vector = _VECTOR.unpack_from(buffer, field + 2)
             if kind == _ACCEL:
                 accel_g = vector
@@ -113,5 +104,11 @@ def _decode(buffer: bytes, at: int, stop: int, t_s: float) -> list[Sample]:
         check_vector(mag_gauss)
         samples.append(MagSample(t_s, mag_gauss))
     if not samples:
-        raise RejectedError(NOTHING_OF_USE)
+        raise RejectedError(reasons.NOTHING_OF_USE)
     return samples
+
+
+class MipDialogue(WakeDialogue):
+    """Base command 0x06: an idle device sends again what it is set to send (mip_sdk: "out of idle mode")."""
+
+    SAYINGS = ((bytes.fromhex("756501020206E5CB"), "stream resumed with MIP command 01 06"),)

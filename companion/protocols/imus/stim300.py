@@ -16,33 +16,114 @@ apart. Until either is known, samples that are far from 1 g in the assumed range
 nose up, is asin(X / |g|) and x, right side down, is -asin(Y / |g|) with Z down, where Y is right, and +asin(Y / |g|)
 with Z up, where Y is left: the unit may lie on either side, with X forward. Beyond 60 degrees it gives none. Rates and
 forces stay in the unit's own axes: with Z up, ROTATION_ROLL_180 makes them forward, right, down.
+
+Datagrams: tables 5-13 to 5-23. Those with AUX (0x98 to 0x9C, 0xAD to 0xAF) are those
+of earlier revisions, which rev. 31 calls PPS (0xF0 to 0xF7); both add one cluster of a 24-bit value and a status byte.
 """
 
 from __future__ import annotations
 
 import math
 import re
+import struct
+import zlib
+from dataclasses import dataclass
 from typing import ClassVar, Final
 
 from companion.physics.units import DEG, G
-from companion.protocols.decoding.base import (
-    CHECKSUM,
-    NOTHING_OF_USE,
-    OUT_OF_RANGE,
-    OVER_RANGE,
-    REPLY,
-    RejectedError,
-)
+from companion.protocols.decoding import reasons
+from companion.protocols.decoding.base import RejectedError
 from companion.protocols.decoding.checks import check_imu
 from companion.protocols.decoding.framing import WAIT, FrameDecoder
-from companion.protocols.imus.stim300_datagrams import (
-    CONFIGURATION,
-    FRAME_BYTES,
-    NORMAL_MODE,
-    Layout,
-    is_whole,
-)
 from companion.samples import ImuSample, Sample, TiltSample, Vector
+
+CRC_BYTES: Final = 4
+PART_NUMBER, SERIAL_NUMBER = (0xB1, 0xB3), (0xB5, 0xB7)
+CONFIGURATION: Final = (0xBC, 0xBD)
+EXTENDED_ERROR, BIAS_TRIM = (0xBE, 0xBF), (0xD1, 0xD2)
+
+SPECIAL_BYTES: Final[dict[int, int]] = {
+    identifier: size
+    for identifiers, size in (
+        (PART_NUMBER, 20),
+        (SERIAL_NUMBER, 20),
+        (CONFIGURATION, 26),
+        (EXTENDED_ERROR, 21),
+        (BIAS_TRIM, 40),
+    )
+    for identifier in identifiers
+}
+"""Sizes, with the CRC, of the datagrams that are sent at start-up or on demand; the second of each ends in CR LF."""
+
+_VECTOR = "bHbHbHB"
+"""Three 24-bit numbers, each as its signed first byte and the rest, and the cluster's status byte."""
+_REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where the parts of one normal mode datagram stand among its unpacked values; None: it does not have them."""
+
+    frame_bytes: int
+    values: struct.Struct
+    accel: int | None
+    inclination: int | None
+    gyro_temperature: int | None
+    inclination_temperature: int | None
+    counter: int
+
+
+def _layout(*, accel: bool, inclination: bool, temperature: bool, extra: bool) -> Layout:
+    code, count = ">x" + _VECTOR, 7
+    places: dict[str, int] = {}
+    for name, present in (("accel", accel), ("inclination", inclination)):
+        if present:
+            places[name] = count
+            code, count = code + _VECTOR, count + 7
+    if temperature:
+        for name in ("gyro", *places):
+            places[f"{name}_temperature"] = count
+            code, count = code + "hhhB", count + 4
+    if extra:
+        code, count = code + "xxxB", count + 1
+    values = struct.Struct(code + "BH")
+    return Layout(
+        frame_bytes=values.size + CRC_BYTES,
+        values=values,
+        accel=places.get("accel"),
+        inclination=places.get("inclination"),
+        gyro_temperature=places.get("gyro_temperature"),
+        inclination_temperature=places.get("inclination_temperature"),
+        counter=count,
+    )
+
+
+def _normal_mode() -> dict[int, Layout]:
+    layouts: dict[int, Layout] = {}
+    for content in range(8):
+        accel, inclination, temperature = bool(content & 1), bool(content & 2), bool(content & 4)
+        plain = _layout(accel=accel, inclination=inclination, temperature=temperature, extra=False)
+        extra = _layout(accel=accel, inclination=inclination, temperature=temperature, extra=True)
+        first = 0xA0 if content > 4 else 0x90
+        layouts |= {first + content: plain, first + 8 + content: extra, 0xF0 + content: extra}
+    return layouts
+
+
+NORMAL_MODE: Final = _normal_mode()
+FRAME_BYTES: Final = {name: layout.frame_bytes for name, layout in NORMAL_MODE.items()} | SPECIAL_BYTES
+
+
+def is_whole(frame: bytes) -> bool:
+    """Whether the CRC at the end of a datagram is right.
+
+    CRC-32/MPEG-2 over the datagram and as many zero bytes as fill its last word, which are not sent. It is zlib's CRC
+    with all bits in the other order and without the last inversion, so zlib can do the work on mirrored bytes.
+    """
+    mirrored = frame.translate(_REVERSED)
+    body = mirrored[:-CRC_BYTES]
+    crc = zlib.crc32(body.ljust(len(body) + 3 & ~3, b"\0")) ^ 0xFFFFFFFF
+    return crc == int.from_bytes(mirrored[-CRC_BYTES:], "little")
+
 
 STARTING = "starting up"
 FAULT = "fault reported"
@@ -107,22 +188,17 @@ class Stim300Decoder(FrameDecoder):
         frame = buffer[at:end]
         if not is_whole(frame):
             if self._in_step:
-                self.rejected[CHECKSUM] += 1
+                self.rejected[reasons.CHECKSUM] += 1
                 self._in_step = False
             else:
                 self.skipped += 1
             return at + 1
         self._in_step = True
-        try:
-            layout = NORMAL_MODE.get(identifier)
-            if layout is None:
-                self._special(identifier, frame)
-                raise RejectedError(REPLY)
-            samples += self._decode(layout, frame, self._time_of(origin + end))
-            self.accepted += 1
-        except RejectedError as error:
-            self.rejected[error.reason] += 1
-        return end
+        layout = NORMAL_MODE.get(identifier)
+        if layout is None:
+            self._special(identifier, frame)
+            return self._reject(reasons.REPLY, end)
+        return self._accept(samples, self._decode, layout, frame, self._time_of(origin + end), end=end)
 
     def _out_of_step(self, buffer: bytes, at: int) -> int:
         """Where the next datagram may begin; a CR LF after the last one is no loss."""
@@ -168,7 +244,7 @@ class Stim300Decoder(FrameDecoder):
                     self.rejected[error.reason] += 1
                 refused = refused or error
         if not samples:
-            raise refused or RejectedError(NOTHING_OF_USE)
+            raise refused or RejectedError(reasons.NOTHING_OF_USE)
         return samples
 
     def _imu(self, layout: Layout, accel: int, values: tuple[int, ...], counter: int, t_s: float) -> ImuSample:
@@ -212,9 +288,9 @@ class Stim300Decoder(FrameDecoder):
         x, y, z = _int24(values, inclination)
         gravity = math.hypot(x, y, z)
         if not 0.5 < gravity / 2**22 < 1.75:
-            raise RejectedError(OUT_OF_RANGE)
+            raise RejectedError(reasons.OUT_OF_RANGE)
         if abs(z) < 0.5 * gravity:
-            raise RejectedError(OVER_RANGE)
+            raise RejectedError(reasons.OVER_RANGE)
         right_down = math.asin(y / gravity) / DEG
         nose_up = math.asin(x / gravity) / DEG
         temperature_degc = _temperature(values, layout.inclination_temperature)
@@ -247,6 +323,6 @@ def _check_status(status: int) -> None:
     if status & (_SYSTEM | _CHANNEL):
         raise RejectedError(FAULT)
     if status & _OVERLOAD:
-        raise RejectedError(OVER_RANGE)
+        raise RejectedError(reasons.OVER_RANGE)
     if status & _CONDITIONS:
         raise RejectedError(OUTSIDE_CONDITIONS)

@@ -25,7 +25,7 @@ import struct
 from typing import Final
 
 from companion.physics.units import DEG, MG
-from companion.protocols.decoding.base import CHECKSUM, ORPHAN, OUT_OF_RANGE, OVER_RANGE
+from companion.protocols.decoding import reasons
 from companion.protocols.decoding.framing import WAIT, FrameDecoder
 from companion.samples import ImuSample, MagSample, Sample, TiltSample, Vector
 
@@ -86,7 +86,7 @@ class WitMotionDecoder(FrameDecoder):
 
     def _no_frame(self, size: int, at: int) -> int:
         if size == _WRONG_SUM:
-            return self._reject(CHECKSUM, at + 1)
+            return self._reject(reasons.CHECKSUM, at + 1)
         self.skipped += 1
         return at + 1
 
@@ -101,15 +101,15 @@ class WitMotionDecoder(FrameDecoder):
         x, y, z, last = _NUMBERS.unpack_from(buffer, at + 2)
         if kind == _ACCEL:
             if max(x, y, z) == _GREATEST or min(x, y, z) == _LEAST:
-                self.rejected[OVER_RANGE] += 1
+                self.rejected[reasons.OVER_RANGE] += 1
                 return
             self._accel = end, (x * _ACCEL_SCALE, y * _ACCEL_SCALE, z * _ACCEL_SCALE), last / 100.0
         elif kind == _GYRO:
             self._accel = None
             if accel is None:
-                self.rejected[ORPHAN] += 1
+                self.rejected[reasons.ORPHAN] += 1
             elif max(x, y, z) == _GREATEST or min(x, y, z) == _LEAST:
-                self.rejected[OVER_RANGE] += 1
+                self.rejected[reasons.OVER_RANGE] += 1
             else:
                 gyro_rad_s = (x * _GYRO_SCALE, y * _GYRO_SCALE, z * _GYRO_SCALE)
                 samples.append(ImuSample(self._time_of(end), gyro_rad_s, accel[1], accel[2]))
@@ -118,14 +118,14 @@ class WitMotionDecoder(FrameDecoder):
             samples.append(MagSample(self._time_of(end), counts=(x, y, z)))
             self.accepted += 1
         elif max(abs(x), abs(y)) > 16384:  # beyond 90 degrees
-            self.rejected[OUT_OF_RANGE] += 1
+            self.rejected[reasons.OUT_OF_RANGE] += 1
         else:
             samples.append(TiltSample(self._time_of(end), x * _ANGLE_SCALE, -y * _ANGLE_SCALE))
             self.accepted += 1
 
     def _drop_accel(self) -> None:
         if self._accel is not None:
-            self.rejected[ORPHAN] += 1
+            self.rejected[reasons.ORPHAN] += 1
             self._accel = None
 
 

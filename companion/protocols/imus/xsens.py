@@ -17,23 +17,15 @@ from __future__ import annotations
 import struct
 from typing import ClassVar, Final
 
-from companion.protocols.decoding.base import (
-    CHECKSUM,
-    FIELD_COUNT,
-    NOTHING_OF_USE,
-    OVER_RANGE,
-    REPLY,
-    TOO_LONG,
-    UNKNOWN_FIELD,
-    RejectedError,
-)
+from companion.protocols.decoding import reasons
+from companion.protocols.decoding.base import RejectedError
 from companion.protocols.decoding.checks import check_imu, check_vector
+from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.protocols.decoding.framing import WAIT, FrameDecoder
 from companion.samples import ImuSample, MagSample, Sample, Vector
 
 MAX_DATA_BYTES: Final = 1024
 """The longest message of inertial data has some 200."""
-MAX_FRAME_BYTES: Final = 6 + MAX_DATA_BYTES + 1
 MAG_COUNTS: Final = 10_000
 """Counts for one of the arbitrary units of the magnetic field."""
 
@@ -68,12 +60,7 @@ class XsensDecoder(FrameDecoder):
 
     def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         if not buffer.startswith(_MARK, at):
-            if buffer[at] != _MARK[0]:
-                return self._skip_to(_MARK[:1], buffer, at)
-            if len(buffer) == at + 1:
-                return WAIT
-            self.skipped += 1
-            return at + 1
+            return self._find_mark(_MARK, buffer, at)
         available = len(buffer) - at
         if available < 4:
             return WAIT
@@ -83,22 +70,17 @@ class XsensDecoder(FrameDecoder):
                 return WAIT
             data, length = at + 6, int.from_bytes(buffer[at + 4 : at + 6], "big")
             if length > MAX_DATA_BYTES:
-                self.rejected[TOO_LONG] += 1
-                return at + 1
+                return self._reject(reasons.TOO_LONG, at + 1)
         end = data + length + 1
         if len(buffer) < end:
             return WAIT
         if sum(buffer[at + 1 : end]) & 0xFF:
-            self.rejected[CHECKSUM] += 1
-            return at + 1  # not `end`: in what a false start took for its own, a good frame may begin
-        try:
-            if buffer[at + 2] != _MT_DATA_2:
-                raise RejectedError(REPLY)
-            samples += self._decode(buffer, data, end - 1, self._time_of(origin + end))
-            self.accepted += 1
-        except RejectedError as error:
-            self.rejected[error.reason] += 1
-        return end
+            return self._reject(
+                reasons.CHECKSUM, at + 1
+            )  # not `end`: in what a false start took for its own, a good frame may begin
+        if buffer[at + 2] != _MT_DATA_2:
+            return self._reject(reasons.REPLY, end)
+        return self._accept(samples, self._decode, buffer, data, end - 1, self._time_of(origin + end), end=end)
 
     def _decode(self, buffer: bytes, field: int, stop: int, t_s: float) -> list[Sample]:
         """The samples in the fields from `field` to `stop` of a message whose checksum is right.
@@ -111,11 +93,11 @@ class XsensDecoder(FrameDecoder):
         t_device_s: float | None = None
         while field < stop:
             if stop - field < 3:
-                raise RejectedError(FIELD_COUNT)
+                raise RejectedError(reasons.FIELD_COUNT)
             kind, size = _HEAD.unpack_from(buffer, field)
             field += 3
             if field + size > stop:
-                raise RejectedError(FIELD_COUNT)
+                raise RejectedError(reasons.FIELD_COUNT)
             if kind & 0xFFF0 in _VECTORS:
                 if size == 12 and not kind & 0x0F:
                     vectors[kind] = _FLOAT32.unpack_from(buffer, field)
@@ -128,7 +110,7 @@ class XsensDecoder(FrameDecoder):
                 t_device_s = _unsigned(buffer[field : field + size], 4) / _TICKS_A_SECOND
             elif kind == _STATUS:
                 if _unsigned(buffer[field : field + size], 4) & _CLIPPED:
-                    raise RejectedError(OVER_RANGE)
+                    raise RejectedError(reasons.OVER_RANGE)
             elif kind & 0xFFF0 == _TEMPERATURE:
                 (temperature_degc,) = _numbers(buffer[field : field + size], kind & 0x0F, 1)
                 check_imu(_ABSENT, _ABSENT, temperature_degc)
@@ -153,13 +135,13 @@ class XsensDecoder(FrameDecoder):
             x, y, z = mag
             samples.append(MagSample(t_s, None, (round(x * MAG_COUNTS), round(y * MAG_COUNTS), round(z * MAG_COUNTS))))
         if not samples:
-            raise RejectedError(NOTHING_OF_USE)
+            raise RejectedError(reasons.NOTHING_OF_USE)
         return samples
 
 
 def _unsigned(data: bytes, size: int) -> int:
     if len(data) != size:
-        raise RejectedError(FIELD_COUNT)
+        raise RejectedError(reasons.FIELD_COUNT)
     return int.from_bytes(data, "big")
 
 
@@ -171,14 +153,48 @@ def _numbers(data: bytes, number_format: int, count: int) -> list[float]:
     """
     if number_format == 2:
         if len(data) != 6 * count:
-            raise RejectedError(FIELD_COUNT)
+            raise RejectedError(reasons.FIELD_COUNT)
         parts = struct.unpack(">" + "Ih" * count, data)
         return [whole + fraction / 2**32 for fraction, whole in zip(parts[::2], parts[1::2], strict=True)]
     code = {0: "f", 1: "i", 3: "d"}.get(number_format)
     if code is None:
-        raise RejectedError(UNKNOWN_FIELD)
+        raise RejectedError(reasons.UNKNOWN_FIELD)
     unpacker = struct.Struct(f">{count}{code}")
     if len(data) != unpacker.size:
-        raise RejectedError(FIELD_COUNT)
+        raise RejectedError(reasons.FIELD_COUNT)
     numbers = unpacker.unpack(data)
     return [number / 2**20 for number in numbers] if code == "i" else list(numbers)
+
+
+class XsensDialogue(WakeDialogue):
+    """GoToMeasurement: from the config state back to sending (MT0605P.E, p. 53).
+
+    A device that has just got power says WakeUp and waits half a second. It is answered with the same: WakeUpAck would
+    put it into the config state, and a device that is set not to measure by itself waits for ever.
+    """
+
+    SAYINGS = ((bytes.fromhex("FAFF1000F1"), "measurement started with GoToMeasurement"),)
+    WAKE_UP: ClassVar[bytes] = bytes.fromhex("FAFF3E00C3")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._tail = b""
+        self._woken = False
+
+    def opened(self, t_s: float) -> None:  # noqa: D102 - as in the base class
+        super().opened(t_s)
+        self._tail, self._woken = b"", False
+
+    def heard(self, data: bytes, samples: int, t_s: float) -> None:  # noqa: D102 - as in the base class
+        super().heard(data, samples, t_s)
+        text = self._tail + data
+        self._tail = text[-(len(self.WAKE_UP) - 1) :]
+        # What it said after the WakeUp shows that it has gone on by itself.
+        self._woken = text.endswith(self.WAKE_UP) or (self._woken and not data)
+
+    def due(self, t_s: float) -> bytes:  # noqa: D102 - as in the base class
+        if not self._woken:
+            return super().due(t_s)
+        self._woken, self._quiet_since_s = False, t_s
+        saying, self.words = self.SAYINGS[0]
+        return saying

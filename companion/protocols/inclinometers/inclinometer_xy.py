@@ -11,22 +11,11 @@ first. Commands are single letters that the device echoes; an echo in front of a
 from __future__ import annotations
 
 import re
-from typing import ClassVar, Literal
+from typing import ClassVar, Final, Literal
 
-from companion.protocols.decoding.base import (
-    CUT_SHORT,
-    LINE_END,
-    NOT_A_MEASUREMENT,
-    ORPHAN,
-    OUT_OF_RANGE,
-    OVER_RANGE,
-    PARITY,
-    SHAPE_CHANGED,
-    SINGLE_AXIS,
-    TOO_LONG,
-    LineDecoder,
-    RejectedError,
-)
+from companion.protocols.decoding import reasons
+from companion.protocols.decoding.base import LineDecoder, RejectedError
+from companion.protocols.decoding.dialogue import AGAIN_S, SILENT_S, Dialogue
 from companion.samples import TiltSample
 
 _LAST_AXIS = re.compile(rb".*([XY])=", re.DOTALL)
@@ -61,7 +50,7 @@ class InclinometerXyDecoder(LineDecoder):
 
     def _drop_x(self) -> None:
         if isinstance(self._x_deg, float):
-            self.rejected[ORPHAN] += 1
+            self.rejected[reasons.ORPHAN] += 1
         self._x_deg = None
 
     def _line(self, line: bytes, t_s: float, *, cut: bool) -> TiltSample | None:
@@ -87,17 +76,19 @@ class InclinometerXyDecoder(LineDecoder):
 
     def _why_no_axis(self, line: bytes, *, cut: bool) -> str:
         if _DAMAGED.search(line):
-            return PARITY
+            return reasons.PARITY
         if cut:
-            return TOO_LONG
-        return SINGLE_AXIS if _SINGLE_AXIS.fullmatch(line.strip(b"\r")) else NOT_A_MEASUREMENT
+            return reasons.TOO_LONG
+        return reasons.SINGLE_AXIS if _SINGLE_AXIS.fullmatch(line.strip(b"\r")) else reasons.NOT_A_MEASUREMENT
 
     def _pass_over(self, before: bytes, *, cut: bool) -> None:
         """What stands in front of the last axis of a line: an echo, or something that has lost its line end."""
         if not cut and _ECHO.fullmatch(before):
             self.skipped += len(before)
             return
-        self.rejected[PARITY if _DAMAGED.search(before) else TOO_LONG if cut else CUT_SHORT] += 1
+        self.rejected[
+            reasons.PARITY if _DAMAGED.search(before) else reasons.TOO_LONG if cut else reasons.CUT_SHORT
+        ] += 1
         self._drop_x()
 
     def _x(self, text: bytes) -> None:
@@ -114,24 +105,24 @@ class InclinometerXyDecoder(LineDecoder):
             return None  # the pair has been counted with its X
         y_deg = self._degrees(text)
         if not isinstance(x_deg, float):
-            raise RejectedError(ORPHAN)
+            raise RejectedError(reasons.ORPHAN)
         return TiltSample(t_s, x_deg, y_deg)
 
     def _degrees(self, text: bytes) -> float:
         if _DAMAGED.search(text):
-            raise RejectedError(PARITY)
+            raise RejectedError(reasons.PARITY)
         value = text.removesuffix(b"\r")
         if value == text:
-            raise RejectedError(LINE_END)
+            raise RejectedError(reasons.LINE_END)
         if _SENTINEL.fullmatch(value):
-            raise RejectedError(OVER_RANGE)
+            raise RejectedError(reasons.OVER_RANGE)
         match = _DEGREES.fullmatch(value)
         if match is None:
-            raise RejectedError(NOT_A_MEASUREMENT)
+            raise RejectedError(reasons.NOT_A_MEASUREMENT)
         self._check_decimals(len(match[1]))
         degrees = float(value)
         if abs(degrees) > 90.0:
-            raise RejectedError(OUT_OF_RANGE)
+            raise RejectedError(reasons.OUT_OF_RANGE)
         return degrees
 
     def _check_decimals(self, decimals: int) -> None:
@@ -139,5 +130,84 @@ class InclinometerXyDecoder(LineDecoder):
         if decimals < self._decimals:
             self._fewer_running += 1
             if self._fewer_running < _SURE:
-                raise RejectedError(SHAPE_CHANGED)
+                raise RejectedError(reasons.SHAPE_CHANGED)
         self._decimals, self._fewer_running = decimals, 0
+
+
+LEVEL_S: Final = 0.5
+"""How long the answer to `*` is waited for: three characters, 13 ms at 2400 baud."""
+READING_S: Final = 1.0
+"""Long enough after `R` that no second reading comes from a device that was stopped: it streams 10 a second."""
+SETUP_S: Final = 60.0
+"""Until a device in its setup level is asked again."""
+
+_USER: Final = re.compile(rb"\*?U[A-Z](?:\r\n)?")
+_SETUP: Final = re.compile(rb"\*?S[A-Z](?:\r\n)?")
+_READING: Final = re.compile(rb"R?X=[-+]+[0-9.]*\r\nY=[-+]+[0-9.]*\r\n")
+_MOST: Final = 64
+"""Bytes of an answer that are kept: two readings and more are no answer."""
+
+
+class InclinometerXyDialogue(Dialogue):
+    """Starts a stopped stream; says nothing to a device that streams, nor to one that is being set up.
+
+    `F` starts the stream of a BEI INC or AGS, `S` that of a MEAS DPG2. But in a BEI's setup level `F` is stored in
+    EEPROM (BEI manual, p. 12), so it is asked for its level first with `*`: "U" and a letter is the user level, "S"
+    and a letter the setup level (p. 11). A MEAS in its user level does not react to that, nor to any other letter
+    that it does not know (DPG2 manual, p. 11); it is asked for one reading with `R`, which it gives only while
+    stopped, and then gets its `S`. Its setup level, which somebody would have to have typed "fima" for within the
+    last ten minutes, has no such question.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._next_s = 0.0
+        self._asked: Literal["", "level", "reading"] = ""
+        self._answer = b""
+
+    def opened(self, t_s: float) -> None:  # noqa: D102 - as in the base class
+        self._listen(t_s + SILENT_S)
+
+    def _listen(self, until_s: float) -> None:
+        self._asked, self._next_s = "", until_s
+
+    def heard(self, data: bytes, samples: int, t_s: float) -> None:  # noqa: D102
+        if self._asked:
+            self._answer = (self._answer + data)[:_MOST]
+        else:
+            self._next_s = max(self._next_s, t_s + SILENT_S)
+
+    def due(self, t_s: float) -> bytes:  # noqa: D102
+        if t_s < self._next_s:
+            return b""
+        if self._asked == "level":
+            return self._after_level(t_s)
+        if self._asked == "reading":
+            return self._after_reading(t_s)
+        return self._ask("level", b"*", t_s + LEVEL_S)
+
+    def _ask(self, what: Literal["level", "reading"], question: bytes, until_s: float) -> bytes:
+        self._asked, self._next_s, self._answer = what, until_s, b""
+        self.words = f"silent: asked with {question.decode()}"
+        return question
+
+    def _after_level(self, t_s: float) -> bytes:
+        if not self._answer:
+            return self._ask("reading", b"R", t_s + READING_S)
+        if _SETUP.fullmatch(self._answer):
+            self._listen(t_s + SETUP_S)
+            self.words = "it is in its setup level: switch it off and on"
+            return b""
+        self._listen(t_s + SILENT_S)
+        return self._start(b"F") if _USER.fullmatch(self._answer) else b""
+
+    def _after_reading(self, t_s: float) -> bytes:
+        if _READING.fullmatch(self._answer):
+            self._listen(t_s + SILENT_S)
+            return self._start(b"S")
+        self._listen(t_s + AGAIN_S)
+        return b""
+
+    def _start(self, letter: bytes) -> bytes:
+        self.words = f"it was stopped: stream started with {letter.decode()}"
+        return letter

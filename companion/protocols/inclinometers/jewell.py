@@ -21,20 +21,10 @@ import math
 import re
 from typing import ClassVar, Final
 
-from companion.protocols.decoding.base import (
-    COMMAND_REFUSED,
-    CUT_SHORT,
-    LINE_END,
-    NOT_A_MEASUREMENT,
-    OUT_OF_RANGE,
-    OVER_RANGE,
-    PARITY,
-    TOO_LONG,
-    LineDecoder,
-    RejectedError,
-    body_of_sentence,
-)
+from companion.protocols.decoding import reasons
+from companion.protocols.decoding.base import LineDecoder, RejectedError, body_of_sentence
 from companion.protocols.decoding.checks import TEMPERATURE_LIMIT_DEGC
+from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import TiltSample
 
 LILY_RAIL_URAD: Final = 330.0
@@ -82,19 +72,19 @@ class JewellDecoder(LineDecoder):
 def _why(text: bytes, *, cut: bool) -> str:
     """Why this is no line, or no line any more."""
     if _DAMAGED.search(text):
-        return PARITY
+        return reasons.PARITY
     if cut:
-        return TOO_LONG
+        return reasons.TOO_LONG
     if text.startswith(b"ERR "):
-        return COMMAND_REFUSED
-    return CUT_SHORT if text.startswith((b"$", b"LILY,", b"IRIS,")) else NOT_A_MEASUREMENT
+        return reasons.COMMAND_REFUSED
+    return reasons.CUT_SHORT if text.startswith((b"$", b"LILY,", b"IRIS,")) else reasons.NOT_A_MEASUREMENT
 
 
 def _reading(text: bytes, t_s: float) -> TiltSample:
     if _DAMAGED.search(text):
-        raise RejectedError(PARITY)
+        raise RejectedError(reasons.PARITY)
     if b"\r" in text:
-        raise RejectedError(LINE_END)
+        raise RejectedError(reasons.LINE_END)
     if b",A," not in text and (match := _SIM[0].fullmatch(text) or _SIM[1].fullmatch(text)):
         x, y, temperature = match.groups()
         return _sample(t_s, float(x), float(y), float(temperature))
@@ -103,7 +93,7 @@ def _reading(text: bytes, t_s: float) -> TiltSample:
         if head == b"YXXDR":
             body_of_sentence(text)
         elif b"*" in text:
-            raise RejectedError(NOT_A_MEASUREMENT)
+            raise RejectedError(reasons.NOT_A_MEASUREMENT)
         return _sample(t_s, _degrees(x, x_unit), _degrees(y, y_unit), float(temperature))
     if match := _TCM.fullmatch(text):
         body_of_sentence(text)
@@ -111,11 +101,11 @@ def _reading(text: bytes, t_s: float) -> TiltSample:
     if match := _LILY.fullmatch(text):
         x_urad, y_urad, _, temperature_degc, _ = map(float, match.groups())
         if max(abs(x_urad), abs(y_urad)) >= LILY_RAIL_URAD:
-            raise RejectedError(OVER_RANGE)
+            raise RejectedError(reasons.OVER_RANGE)
         return _sample(t_s, math.degrees(x_urad * 1e-6), math.degrees(y_urad * 1e-6), temperature_degc)
     if match := _IRIS.fullmatch(text):
         return _sample(t_s, *map(float, match.groups()))
-    raise RejectedError(NOT_A_MEASUREMENT)
+    raise RejectedError(reasons.NOT_A_MEASUREMENT)
 
 
 def _degrees(field: bytes, unit: bytes) -> float:
@@ -125,17 +115,28 @@ def _degrees(field: bytes, unit: bytes) -> float:
         RejectedError: it is not written like one, or it is the rail of a LILY.
     """
     if _TILTS[unit].fullmatch(field) is None:
-        raise RejectedError(NOT_A_MEASUREMENT)
+        raise RejectedError(reasons.NOT_A_MEASUREMENT)
     value = float(field)
     if unit == b"D":
         return value
     # Other models measure far more; of theirs one reading in many thousands is lost.
     if abs(value) == LILY_RAIL_URAD:
-        raise RejectedError(OVER_RANGE)
+        raise RejectedError(reasons.OVER_RANGE)
     return math.degrees(value * 1e-6)
 
 
 def _sample(t_s: float, x_deg: float, y_deg: float, temperature_degc: float | None) -> TiltSample:
     if max(abs(x_deg), abs(y_deg)) > 90.0 or abs(temperature_degc or 0.0) > TEMPERATURE_LIMIT_DEGC:
-        raise RejectedError(OUT_OF_RANGE)
+        raise RejectedError(reasons.OUT_OF_RANGE)
     return TiltSample(t_s, x_deg, y_deg, temperature_degc)
+
+
+class JewellDialogue(PollDialogue):
+    """`*9900XY` to a Jewell tiltmeter: one reading in the format that is set, from whichever target it is (99).
+
+    It could be told to stream, but keeps its output settings (Tuff Tilt Digital manual, p. 15).
+    """
+
+    QUESTION = b"*9900XY\r\n"
+    PERIOD_S = 0.2
+    NAME = "*9900XY"

@@ -16,9 +16,10 @@ from __future__ import annotations
 
 from typing import ClassVar, Final
 
-from companion.protocols.decoding.base import CHECKSUM, NOT_A_NUMBER, OUT_OF_RANGE, REPLY, RejectedError
+from companion.protocols.decoding import reasons
+from companion.protocols.decoding.base import RejectedError
+from companion.protocols.decoding.dialogue import PollDialogue
 from companion.protocols.decoding.framing import ECHO, WAIT, FrameDecoder
-from companion.protocols.decoding.polling import PollDialogue
 from companion.samples import CompassSample, Sample, TiltSample
 
 LONGEST: Final = 51
@@ -54,10 +55,10 @@ class RionDecoder(FrameDecoder):
             return WAIT
         end = at + 1 + length
         if sum(buffer[at + 1 : end - 1]) & 0xFF != buffer[end - 1]:
-            return self._reject(CHECKSUM, at + 1)
+            return self._reject(reasons.CHECKSUM, at + 1)
         command = buffer[at + 3]
         if command != _ANSWER:
-            return self._reject(REPLY if command & _REPLY_BIT else ECHO, end)
+            return self._reject(reasons.REPLY if command & _REPLY_BIT else ECHO, end)
         try:
             samples.append(_measurement(buffer[at + 4 : end - 1], self._time_of(origin + end)))
             self.accepted += 1
@@ -75,11 +76,11 @@ def _measurement(data: bytes, t_s: float) -> Sample:
     if len(data) == 9:
         pitch_deg, roll_deg, heading_deg = (_degrees(data[at : at + 3], 100) for at in (0, 3, 6))
         if not 0.0 <= heading_deg < 360.0 or max(abs(pitch_deg), abs(roll_deg)) > 90.0:
-            raise RejectedError(OUT_OF_RANGE)
+            raise RejectedError(reasons.OUT_OF_RANGE)
         return CompassSample(t_s, heading_deg, pitch_deg, roll_deg)
     x_deg, y_deg = _degrees(data[0:4], 10_000), _degrees(data[4:8], 10_000)
     if max(abs(x_deg), abs(y_deg)) > 90.0:
-        raise RejectedError(OUT_OF_RANGE)
+        raise RejectedError(reasons.OUT_OF_RANGE)
     return TiltSample(t_s, x_deg, y_deg)
 
 
@@ -87,7 +88,7 @@ def _degrees(digits: bytes, per_degree: int) -> float:
     """An angle from its packed digits, the first of which is the sign."""
     text = digits.hex()
     if not text.isdecimal() or text[0] not in "01":
-        raise RejectedError(NOT_A_NUMBER)
+        raise RejectedError(reasons.NOT_A_NUMBER)
     value = int(text[1:]) / per_degree
     return -value if text[0] == "1" else value
 

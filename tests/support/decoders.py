@@ -1,0 +1,18 @@
+"""Decoders by name, and the longest frames that their protocols know."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from companion.protocols.decoding.base import Decoder
+from companion.protocols.registry import PROTOCOLS, Kind
+
+MIP_BYTES: Final = 4 + 255 + 2
+XSENS_BYTES: Final = 6 + 1024 + 1
+STIM300_BYTES: Final = 70
+VECTORNAV_BYTES: Final = 300
+
+
+def make_decoder(kind: Kind, name: str, seconds_per_byte: float = 0.0) -> Decoder:
+    """A new decoder for a kind of device and a protocol's name."""
+    return PROTOCOLS[kind][name].decoder(seconds_per_byte)
