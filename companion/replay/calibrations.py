@@ -51,6 +51,8 @@ class Calibrations:
         self._solved_with: dict[str, ImuCalibration | None] = {}
         """The offsets in force when that was measured; by now others may have been written."""
         self._no_solution = ""
+        self._refused: str | None = None
+        """Why the estimator refuses here what was measured then."""
         self._alignment: AlignmentUsed | None = None
 
     def begin(
@@ -63,7 +65,8 @@ class Calibrations:
         """Go on from what was known when a part of the recording began."""
         self._windows.update(windows)
         self.where, self.offsets = where, offsets
-        self._solution, self._no_solution = None, "it was measured before this part of the recording"
+        self._solution, self._refused = None, None
+        self._no_solution = "it was measured before this part of the recording"
         if solved is not None:
             self.solve(solved)
 
@@ -75,7 +78,7 @@ class Calibrations:
 
     def solve(self, detail: dict[str, Any]) -> None:
         """Work out what was solved from means that were taken before."""
-        self._solution, self._no_solution = None, ""
+        self._solution, self._no_solution, self._refused = None, "", None
         window = self._windows.get(detail["window"])
         self.where, self._solved_with = detail["where"], detail["offsets"]
         used = detail.get("alignment")
@@ -94,7 +97,7 @@ class Calibrations:
             whole = {found.name: self._whole(found) for found in solution.imus}
             self._solution = weigh(solution, whole, detail.get("expectation") or Expectation()).solution
         except CalibrationRefusedError as error:
-            self._no_solution = f"refused here: {error}"
+            self._refused = f"refused here: {error}"
 
     def _solved(self, window: Window, what: What) -> Solution:
         config = self.config
@@ -110,18 +113,19 @@ class Calibrations:
     def recorded(self, recorded: Record) -> None:
         """Take the record that ended a calibration."""
         solution, self._solution = self._solution, None
-        why = self._no_solution
         if recorded.pose is None:
             # It ended before anything was worked out; there is nothing to recompute.
             self.again.append(Replayed(recorded, [], "it ended before anything was worked out"))
         elif solution is not None:
             again = record_again(recorded, solution, self._solved_with)
             self.again.append(Replayed(again, differences(recorded, again), None))
-        elif why.startswith("refused here"):
-            gone = msgspec.structs.replace(recorded, state="failed", reason=why, pose=None, site=None, imus=())
+        elif self._refused is not None:
+            gone = msgspec.structs.replace(
+                recorded, state="failed", reason=self._refused, pose=None, site=None, imus=()
+            )
             self.again.append(Replayed(gone, differences(recorded, gone), None))
         else:
-            self.again.append(Replayed(recorded, [], why))
+            self.again.append(Replayed(recorded, [], self._no_solution))
 
     def estimate(self, collector: RollingCollector, now_s: float, draft: Draft, seconds: float) -> Record:
         """What a calibration would have found now.

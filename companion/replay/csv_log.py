@@ -21,7 +21,7 @@ from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.record import Record
-from companion.calibration.solution.site import Whereabouts
+from companion.calibration.solution.site import Remedies, Whereabouts
 from companion.calibration.solution.solve import CompassModel, GradienterModel, solve_at
 from companion.config import Mounting, Noise
 from companion.errors import CalibrationRefusedError
@@ -33,12 +33,7 @@ MAX_STILL_S: Final = 3600.0
 NAME: Final = "imu"
 # The collector drops the second in which a stream begins: here that is its first millisecond.
 _FIRST_S: Final = 999.999
-_IN_OPTIONS: Final = (
-    ("set vehicle.latitude_deg or wait for GPS", "say --latitude-deg"),
-    ("set vehicle.height_m or wait for GPS", "say --height-m"),
-    ("no compass:", "no --heading-deg:"),
-)
-"""Warnings of the estimator that speak of the daemon's configuration, in the words of the command line."""
+_REMEDIES: Final = Remedies("say --latitude-deg", "say --height-m", no_heading="no --heading-deg")
 _LONGER: Final = 1.1
 """A window is worked out again when the stretch has grown by so much."""
 
@@ -93,7 +88,7 @@ def estimate(
             looked_s = math.floor(now_s)
             collector.tick(now_s)
             glance = collector.glance(now_s)
-            obstacle = glance.obstacle or obstacle
+            obstacle = obstacle if glance.obstacle is None else glance.obstacle.words
             if glance.obstacle is None and glance.still_s >= max(MIN_STILL_S, _LONGER * still_s):
                 found.append(_measurement(collector, now_s))
                 still_s = glance.still_s
@@ -110,17 +105,10 @@ def estimate(
     if not tilt_known:
         draft.warnings.append("no accelerometer biases without --pitch-deg and --roll-deg")
     try:
-        draft.solution = solve_at(*_posed(best, pose), What.BOTH if tilt_known else What.GYROS)
+        draft.solution = solve_at(*_posed(best, pose), What.BOTH if tilt_known else What.GYROS, _REMEDIES)
     except CalibrationRefusedError as error:
         return draft.record("failed", str(error), seconds)
-    record = draft.record("done", in_words(draft.solution), seconds)
-    return msgspec.structs.replace(record, warnings=tuple(map(_in_options, record.warnings)))
-
-
-def _in_options(words: str) -> str:
-    for of_the_daemon, of_the_command in _IN_OPTIONS:
-        words = words.replace(of_the_daemon, of_the_command)
-    return words
+    return draft.record("done", in_words(draft.solution), seconds)
 
 
 def _measurement(collector: RollingCollector, now_s: float) -> Measurement | str:

@@ -45,7 +45,6 @@ class Intake(ABC):
         self._heading = compass_source(keep, lags[1]) if compass else None
         self._breaks: dict[str, int] = {}
         self._field = None if field_by is None else FieldHeading(*field_by, keep)
-        self._restarted_because = ""
         self.unknown_samples = 0
 
     @abstractmethod
@@ -70,7 +69,7 @@ class Intake(ABC):
             return
         if sample.breaks != self._breaks.get(name, 0):
             self._breaks[name] = sample.breaks
-            self._forget(f"imu {name} restarted", name)
+            self._forget(name)
         stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
         row = sample.gyro_rad_s + sample.accel_m_s2
         if source.batches.add(sample.t_s, row, sample.temperature_degc, stamp):
@@ -135,8 +134,7 @@ class Intake(ABC):
         if added:
             self._break()
 
-    def _forget(self, why: str, imu: str | None) -> None:
-        self._restarted_because = why
+    def _forget(self, imu: str | None) -> None:
         for source in self._sources():
             if imu is None or (source.kind == "imu" and source.name == imu):
                 source.batches.forget()

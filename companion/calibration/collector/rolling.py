@@ -14,8 +14,7 @@ import msgspec
 
 from companion.calibration.collector.intake import Intake
 from companion.calibration.collector.measurement import Measurement, PoseSeconds
-from companion.calibration.collector.obstacles import is_moving, obstacle, settling
-from companion.calibration.collector.outlook import Glance, Status
+from companion.calibration.collector.outlook import Glance, Obstacle, Status, obstacle, settling
 from companion.calibration.collector.sources import Source, SourceStatus
 from companion.calibration.collector.stop import Settings, expected_s, is_enough
 from companion.calibration.collector.trace import Snapshot, TraceLog
@@ -104,7 +103,6 @@ class RollingCollector(Intake):
         self._best_progress = 0.0
         self._estimates = Estimates()
         self._trace = TraceLog()
-        self._restarted_because = ""
         self._restarts = 0
         for imu in imus:
             self.set_imu(imu)
@@ -124,7 +122,7 @@ class RollingCollector(Intake):
 
         The second under way is forgotten too. The stretch begins again; learned noise stays.
         """
-        self._forget(why, imu)
+        self._forget(imu)
 
     def tick(self, now_s: float) -> None:
         """Let the seconds end that are over at `now_s` (the samples' clock), also of sources that say nothing.
@@ -145,7 +143,6 @@ class RollingCollector(Intake):
         """How still it is at `now_s`; costs a small part of what `status` does."""
         return Glance(
             obstacle=self._obstacle(now_s),
-            moving=is_moving(self._sources(), now_s, good_now=self._stretch.good_now),
             still_s=float(self._stretch.good),
             steady_s=float(self._stretch.steady),
         )
@@ -175,7 +172,7 @@ class RollingCollector(Intake):
         if self._stretch.begun and waiting is None:
             estimates = self._estimate(self._slots(None), late=1)
             if isinstance(estimates, CalibrationRefusedError):
-                waiting = str(estimates)
+                waiting = Obstacle(str(estimates))
             else:
                 enough = self._stretch.full or is_enough(self._settings, estimates)
                 needed = max(expected_s(self._settings, estimates), self._stretch.good + 1)
@@ -188,11 +185,10 @@ class RollingCollector(Intake):
         self._best_progress = min(max(self._best_progress, progress), 1.0 if enough else 0.99)
         return Status(
             still_s=float(self._stretch.good),
-            waiting_for=waiting,
+            obstacle=waiting,
             enough=enough,
             progress=self._best_progress,
             sources=tuple(source.status(now_s) for source in sources),
-            restarted_because=self._restarted_because,
         )
 
     def window(self, now_s: float, *, since_s: float | None = None) -> Window:
@@ -215,7 +211,7 @@ class RollingCollector(Intake):
             CalibrationRefusedError: not still, or not still for long enough.
         """
         if (reason := self._obstacle(now_s)) is not None:
-            raise CalibrationRefusedError(reason)
+            raise CalibrationRefusedError(reason.words)
         slots = self._slots(since_s)
         if not self._are_enough(slots, since_s):
             needed = self._min_good if since_s is None else min(MIN_BATCHES, self._min_good)
@@ -311,18 +307,17 @@ class RollingCollector(Intake):
             elif slot not in source.unsettled:
                 source.gate.accept(batch)
 
-    def _obstacle(self, now_s: float) -> str | None:
+    def _obstacle(self, now_s: float) -> Obstacle | None:
         return obstacle(self._sources(), now_s, good_now=self._stretch.good_now, min_good=self._min_good)
 
-    def _waiting_for(self, now_s: float) -> str | None:
-        obstacle = self._obstacle(now_s)
-        if obstacle is not None:
-            return obstacle
+    def _waiting_for(self, now_s: float) -> Obstacle | None:
+        if (moves := self._obstacle(now_s)) is not None:
+            return moves
         left_s = 0 if self._stretch.begun else self._min_good - self._stretch.good
         settles = self._settles(self._slots(None), left_s)
-        if settles is not None or not left_s:
-            return settles
-        return f"hold still {left_s} s more"
+        if settles is not None:
+            return Obstacle(settles)
+        return Obstacle(f"hold still {left_s} s more", hold_still_s=left_s) if left_s else None
 
     def _settles(self, slots: list[int], left_s: int) -> str | None:
         return settling((self._tilt, self._heading), slots, min(MIN_BATCHES, self._min_good), left_s)

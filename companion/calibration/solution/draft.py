@@ -145,5 +145,5 @@ def in_words(solution: Solution | None) -> str:
         parts.append(f"{np.max(gyros) / DEG_H:.1f} deg/h")
     if accels:
         parts.append(f"{np.max(accels) / MG:.2f} mg")
-    unknown = f"; not known: {', '.join(solution.unknown)}" if solution.unknown else ""
-    return f"sigma {', '.join(parts)}{unknown}"
+    unknown = ", ".join(f"{triad} {name}" for name, triad in solution.unknown)
+    return f"sigma {', '.join(parts)}{f'; not known: {unknown}' if unknown else ''}"

@@ -33,6 +33,18 @@ _GRAVITY_SIGMA_M_S2: Final = 0.0155
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class Remedies:
+    """What a user can do about what is missing: in the configuration, or where a command asks for an estimate."""
+
+    latitude: str = "set vehicle.latitude_deg or wait for GPS"
+    height: str = "set vehicle.height_m or wait for GPS"
+    no_heading: str = "no compass"
+
+
+IN_CONFIGURATION: Final = Remedies()
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class Whereabouts:
     """What is known of place and date, and who said so ("configuration", "autopilot", ...)."""
 
@@ -57,6 +69,7 @@ class LocalEarth:
     warnings: tuple[str, ...]
     field: earth.MagneticField | None = None
     """The Earth's magnetic field by its model; None without position and date."""
+    remedies: Remedies = IN_CONFIGURATION
 
     def rate_in_body(self, body_from_ned: Matrix, *, heading_known: bool) -> Uncertain:
         """The Earth's rate in body axes.
@@ -73,13 +86,13 @@ class LocalEarth:
         return Uncertain(body_from_ned @ mean, body_from_ned @ covariance @ body_from_ned.T)
 
 
-def local_earth(where: Whereabouts) -> LocalEarth:
+def local_earth(where: Whereabouts, remedies: Remedies = IN_CONFIGURATION) -> LocalEarth:
     """Everything the equations need of a place."""
     warnings: list[str] = []
     covariance = np.zeros((3, 3))
     gravity: float | None = None
     if where.latitude_deg is None:
-        warnings.append("latitude unknown: Earth rate and gravity uncertain (set vehicle.latitude_deg or wait for GPS)")
+        warnings.append(f"latitude unknown: Earth rate and gravity uncertain ({remedies.latitude})")
         rate = np.array([earth.EARTH_RATE_RAD_S * _MEAN_COS, 0.0, 0.0])
         covariance = earth.EARTH_RATE_RAD_S**2 * np.diag([_VARIANCE_COS, 0.0, _VARIANCE_SIN])
         used_gravity, gravity_sigma = _MEAN_GRAVITY_M_S2, _GRAVITY_SIGMA_M_S2
@@ -88,7 +101,7 @@ def local_earth(where: Whereabouts) -> LocalEarth:
         used_gravity = gravity = earth.gravity_m_s2(where.latitude_deg, where.height_m or 0.0)
         gravity_sigma = GRAVITY_MODEL_SIGMA_M_S2
         if where.height_m is None:
-            warnings.append("height unknown: gravity uncertain by 0.3 mg (set vehicle.height_m or wait for GPS)")
+            warnings.append(f"height unknown: gravity uncertain by 0.3 mg ({remedies.height})")
             gravity_sigma = math.hypot(gravity_sigma, UNKNOWN_HEIGHT_SIGMA_M * GRAVITY_BY_HEIGHT_1_S2)
     field = _magnetic_field(where, warnings)
     return LocalEarth(
@@ -107,6 +120,7 @@ def local_earth(where: Whereabouts) -> LocalEarth:
         declination_sigma_deg=UNKNOWN_DECLINATION_SIGMA_DEG if field is None else field.declination_sigma_deg,
         warnings=tuple(warnings),
         field=field,
+        remedies=remedies,
     )
 
 

@@ -21,8 +21,9 @@ from companion.calibration.means.pose_models import CompassModel, GradienterMode
 from companion.calibration.request import What
 from companion.calibration.solution import magnetic
 from companion.calibration.solution.bias import accelerometer_bias, attitude_error_jacobian, bias_covariance, gyro_bias
+from companion.calibration.solution.history import Triad
 from companion.calibration.solution.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site
-from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
+from companion.calibration.solution.site import IN_CONFIGURATION, LocalEarth, Remedies, Whereabouts, local_earth
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
 from companion.physics.gradienter import up_jacobian
@@ -128,8 +129,8 @@ class Solution:
     site: Site
     imus: tuple[ImuSolution, ...]
     warnings: tuple[str, ...]
-    unknown: tuple[str, ...] = ()
-    """What was asked for and its readings do not tell, such as "gyro fc"; the IMU's warnings say why."""
+    unknown: tuple[tuple[str, Triad], ...] = ()
+    """IMUs and triads that were asked for and whose readings do not tell; the IMU's warnings say why."""
     magnetic: Magnetic | None = None
     """How good the heading can be; None without a compass."""
     shared: Shared | None = None
@@ -162,7 +163,9 @@ def solve(
             )
         warnings.append("no gradienter: gyros only, accelerometers not calibrated")
     if compass is None or window.heading is None:
-        warnings.append("no compass: the horizontal part of the Earth's rate is unknown, gyro sigma widened")
+        warnings.append(
+            f"{local.remedies.no_heading}: the horizontal part of the Earth's rate is unknown, gyro sigma widened"
+        )
     truth = truth_of(window, gradienter if tilted is not None else None, compass, local, warnings)
     imus = tuple(_estimate(imu, truth, local, gyros=what.gyros, accelerometers=accelerometers) for imu in window.imus)
     if all(imu.gyro_rad_s is None and imu.accel_m_s2 is None for imu in imus):
@@ -171,8 +174,8 @@ def solve(
         ]
         if refusals:
             raise CalibrationRefusedError("; ".join(refusals))
-    unknown = [f"gyro {imu.name}" for imu in window.imus if what.gyros and imu.refused("gyro")]
-    unknown += [f"accel {imu.name}" for imu in window.imus if accelerometers and imu.refused("accel")]
+    unknown: list[tuple[str, Triad]] = [(imu.name, "gyro") for imu in window.imus if what.gyros and imu.refused("gyro")]
+    unknown += [(imu.name, "accel") for imu in window.imus if accelerometers and imu.refused("accel")]
     shared = _shared(truth, local, gradienter.sigma_deg * DEG if gradienter is not None and tilted is not None else 0.0)
     return Solution(
         pose=_pose(truth),
@@ -192,13 +195,14 @@ def solve_at(
     gradienter: GradienterModel | None,
     compass: CompassModel | None,
     what: What,
+    remedies: Remedies = IN_CONFIGURATION,
 ) -> Solution:
     """`solve`, with all that the place is needed for (the magnetic model takes the longest), in one call for a thread.
 
     Raises:
         CalibrationRefusedError: as `solve`.
     """
-    return solve(window, local_earth(where), gradienter, compass, what)
+    return solve(window, local_earth(where, remedies), gradienter, compass, what)
 
 
 def truth_of(

@@ -384,7 +384,7 @@ class InForce:
                 ("accel", imu.accel_m_s2, imu.accel_sigma_use_m_s2),
             ):
                 key: Key = (imu.name, "gyro" if triad == "gyro" else "accel")
-                if f"{triad} {imu.name}" in solution.unknown:
+                if key in solution.unknown:
                     self._leave_out(key)
                     continue
                 if residual is not None and key in self._left_out:

@@ -138,7 +138,7 @@ class Readiness:
         if self._conductor.is_writing:
             return ArmAnswer("wait", self._forecast.words(now_s))
         if glance.obstacle is not None and not glance.moving:
-            return ArmAnswer("refuse", glance.obstacle)
+            return ArmAnswer("refuse", glance.obstacle.words)
         if (reading := self.in_force.reading()) is not None:
             return ArmAnswer("wait", f"reading {reading}")
         findings = self.in_force.findings(now_s)

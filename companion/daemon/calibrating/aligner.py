@@ -155,7 +155,8 @@ class Aligner:
                 words = f"{why or f'{number - 1} done. Now {wish}'}; waiting for it to move"
             elif waiting_for is not None:
                 # Once it stands again, what to do is said by itself.
-                words = waiting_for if waiting_for.startswith("hold still") else f"{why or wish}; {waiting_for}"
+                stands = status.obstacle is not None and status.obstacle.hold_still_s is not None
+                words = waiting_for if stands else f"{why or wish}; {waiting_for}"
             else:
                 words = f"measuring, {max(still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
             self._show(measuring=share > 0.0)

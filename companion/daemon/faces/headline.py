@@ -153,9 +153,11 @@ class Headlines:
         glance = self._collector.glance(now_s)
         if glance.obstacle is not None and not glance.moving:
             # The sensor's own trouble says what to do; that nothing comes from it is only what follows.
-            return Headline("NOT CALIBRATED", self._trouble() or glance.obstacle, "bad")
+            return Headline("NOT CALIBRATED", self._trouble() or glance.obstacle.words, "bad")
         if glance.obstacle is not None:
-            return _hold_still(glance.obstacle) or Headline("HOLD STILL", glance.obstacle, "wait")
+            if (hold_s := glance.obstacle.hold_still_s) is not None:
+                return Headline(f"HOLD STILL {hold_s} s", "measuring begins then", "wait")
+            return Headline("HOLD STILL", glance.obstacle.words, "wait")
         left_s = self._readiness.until_calibrated_s(now_s)
         return Headline(f"HOLD STILL {left_s:.0f} s", f"{words}: it calibrates by itself", "wait")
 

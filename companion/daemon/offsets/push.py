@@ -289,7 +289,8 @@ class Pusher:
             words = status.waiting_for or ""
             if words and status.still_s > 0.0:
                 # How long a calibration must be still says nothing about how long a step takes to show.
-                words = self._collector.glance(loop.time()).obstacle or ""
+                moves = self._collector.glance(loop.time()).obstacle
+                words = "" if moves is None else moves.words
                 if not words and status.still_s < self._look_s:
                     words = f"hold still {self._look_s - status.still_s:.0f} s more"
             if words and loop.time() < since_s + TELEMETRY_S:
