@@ -213,11 +213,11 @@ def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:
 
     The date is the autopilot's (from its GNSS), else the host's; it only picks the year of the magnetic model.
     """
-    if vehicle.unix_time_s is not None:
-        date = datetime.datetime.fromtimestamp(vehicle.unix_time_s, tz=datetime.UTC).date()
+    if vehicle.place.unix_time_s is not None:
+        date = datetime.datetime.fromtimestamp(vehicle.place.unix_time_s, tz=datetime.UTC).date()
     else:
         date = datetime.datetime.now(tz=datetime.UTC).date()
-    place, position = config.vehicle, vehicle.position
+    place, position = config.vehicle, vehicle.place.position
     if place.latitude_deg is not None:
         height_m, source = place.height_m, "configuration"
         if height_m is None and position is not None:

@@ -289,7 +289,7 @@ class Stage(Rig):
 
     def census(self) -> Census:
         """Of the living daemon."""
-        handlers = sum(len(each) for each in self.link._handlers.values()) + len(self.service.vehicle._watchers)
+        handlers = sum(len(each) for each in self.link._handlers.values()) + len(self.service.vehicle._listeners)
         return Census(len(tasks_of(self.owner)), handlers, len(os.listdir("/proc/self/fd")))
 
     def words(self) -> Iterator[str]:

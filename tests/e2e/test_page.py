@@ -195,7 +195,7 @@ def test_the_attitude_and_the_biases_that_are_shown_are_the_true_ones(tmp_path: 
             await rig.ready()
             magnetic = rig.service.status()["pose"]
             assert magnetic["north"] == "magnetic"
-            await rig.until(lambda: rig.service.vehicle.position is not None, 10.0)
+            await rig.until(lambda: rig.service.vehicle.place.position is not None, 10.0)
             true_north = (await rig.service.answers.look())["pose"]
             assert magnetic["pitch_deg"] == pytest.approx(POSE.pitch_deg, abs=0.05)
             assert magnetic["roll_deg"] == pytest.approx(POSE.roll_deg, abs=0.05)

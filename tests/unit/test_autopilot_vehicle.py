@@ -44,7 +44,7 @@ def latched(vehicle: Vehicle) -> int | None:
 
 
 def position(vehicle: Vehicle) -> Position | None:
-    return vehicle.position
+    return vehicle.place.position
 
 
 @contextlib.asynccontextmanager
@@ -265,10 +265,10 @@ def test_asks_for_what_it_needs_and_learns_version_time_and_place() -> None:
             assert autopilot.intervals[mavlink.MAVLINK_MSG_ID_HEARTBEAT] == pytest.approx(0.2)
             assert vehicle.version == "4.8.0-dev"
             assert vehicle.name == "ArduPilot 4.8.0-dev, system 1"
-            assert vehicle.position is not None
-            assert vehicle.position.latitude_deg == pytest.approx(40.0)
-            assert vehicle.position.height_m == pytest.approx(50.0)
-            assert vehicle.unix_time_s == pytest.approx(1_800_000_000 + autopilot.uptime_s(), abs=0.01)
+            assert vehicle.place.position is not None
+            assert vehicle.place.position.latitude_deg == pytest.approx(40.0)
+            assert vehicle.place.position.height_m == pytest.approx(50.0)
+            assert vehicle.place.unix_time_s == pytest.approx(1_800_000_000 + autopilot.uptime_s(), abs=0.01)
 
     run_virtual(main())
 
@@ -285,7 +285,7 @@ def test_a_silent_command_server_is_asked_again_and_wedges_nothing() -> None:
             assert len(asked) < 20
             autopilot.on_message = lambda message: True
             await asyncio.sleep(40.0)
-            assert vehicle.unix_time_s is not None
+            assert vehicle.place.unix_time_s is not None
 
     run_virtual(main())
 
@@ -306,9 +306,9 @@ def test_position_zero_zero_is_no_position_and_gps_serves_instead() -> None:
             link.receive(
                 mavlink.MAVLink_gps_raw_int_message(1000, 3, 100000000, 200000000, 1000, 0, 0, 0, 0, 9).pack(codec), t_s
             )
-        assert vehicle.position is not None
-        assert vehicle.position.source == "autopilot GPS_RAW_INT"
-        assert vehicle.position.longitude_deg == pytest.approx(20.0)
+        assert vehicle.place.position is not None
+        assert vehicle.place.position.source == "autopilot GPS_RAW_INT"
+        assert vehicle.place.position.longitude_deg == pytest.approx(20.0)
         vehicle.close()
 
     run_virtual(main())

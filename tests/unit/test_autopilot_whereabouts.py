@@ -16,9 +16,9 @@ EQUATOR = (0.0001, 8.5456, 488.0)
 Story = Callable[[TimeAndPlace], Coroutine[None, None, None]]
 
 
-def tell(story: Story) -> None:
+def tell(story: Story, *, carried: bool = False) -> None:
     async def main() -> None:
-        await story(TimeAndPlace())
+        await story(TimeAndPlace(lambda: carried))
 
     run_virtual(main())
 
@@ -156,7 +156,6 @@ def test_what_gnss_wanders_is_followed_and_small_steps_lead_nowhere_while_still(
 
 def test_who_is_carried_is_followed_wherever_it_goes() -> None:
     async def story(told: TimeAndPlace) -> None:
-        told.is_carried = lambda: True
         await say_for(told, 4, *HOME)
         for k in range(1000):  # 200 km by car, up and over a pass
             here = (HOME[0] + 0.0018 * k, HOME[1], HOME[2] + 2.0 * min(k, 1000 - k))
@@ -166,7 +165,7 @@ def test_who_is_carried_is_followed_wherever_it_goes() -> None:
         say(told, *EQUATOR)  # no car goes as far in a second
         assert told.doubt is not None
 
-    tell(story)
+    tell(story, carried=True)
 
 
 def test_a_restart_forgets_the_place_and_not_what_it_is_compared_with() -> None:

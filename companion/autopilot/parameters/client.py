@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import math
 from collections.abc import Callable, Iterable, Iterator
 from typing import Final
@@ -28,9 +27,8 @@ from companion.errors import (
     ParameterRefusedError,
     ParameterTimeoutError,
 )
-from companion.links.mavlink.link import MavlinkLink, Unsubscribe
-
-logger = logging.getLogger(__name__)
+from companion.links.mavlink.link import MavlinkLink
+from companion.links.system.listeners import Listeners, Unsubscribe
 
 _NO_ERROR: Final = 0
 _DOES_NOT_EXIST: Final = 1
@@ -67,7 +65,7 @@ class ParameterClient:
         self._repeated = 0.0
         """Share of requests that were answered only after a repetition, of late."""
         self._inboxes: list[Inbox] = []
-        self._watchers: list[Callable[[str, float], None]] = []
+        self._listeners: Listeners[[str, float]] = Listeners()
         self._answering: str | None = None
         self._absent: set[str] = set()
         """Names that this boot of the autopilot has shown not to have: told by silence, that takes seconds to learn."""
@@ -230,13 +228,7 @@ class ParameterClient:
 
     def watch(self, callback: Callable[[str, float], None]) -> Unsubscribe:
         """Be told of every PARAM_VALUE of the autopilot, whoever caused it; returns how to stop that."""
-        self._watchers.append(callback)
-
-        def unsubscribe() -> None:
-            if callback in self._watchers:
-                self._watchers.remove(callback)
-
-        return unsubscribe
+        return self._listeners.add(callback)
 
     def close(self) -> None:
         """Stop listening."""
@@ -328,11 +320,7 @@ class ParameterClient:
         for inbox in self._inboxes:
             if inbox.name == name or (inbox.name == "" and message.param_index == 0):
                 inbox.put(value)
-        for callback in tuple(self._watchers):
-            try:
-                callback(name, value)
-            except Exception:
-                logger.exception("a watcher failed on %s", name)
+        self._listeners.tell(name, value)
 
     def _on_error(self, message: mavlink.MAVLink_param_error_message, _t_s: float) -> None:
         addressed = message.target_system in (0, self._link.system_id) and message.target_component in (

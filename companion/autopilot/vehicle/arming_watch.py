@@ -6,6 +6,7 @@ heartbeats are heard too. So "armed" outweighs "disarmed", and who says both by 
 
 from __future__ import annotations
 
+import enum
 import math
 from collections import deque
 from typing import Final
@@ -17,6 +18,16 @@ _CHANGES: Final = 4
 _CHANGES_WITHIN_S: Final = 5.0
 """Arming and disarming twice within this time is more than pilots and autopilots do."""
 _CONTRADICTION_HOLDS_S: Final = 10.0
+_TWO_HOLDS_S: Final = 5.0
+"""How long after the last sign of a second autopilot under our vehicle's ids nothing is believed of either."""
+
+
+class ArmState(enum.Enum):
+    """Whether the motors may turn. Only DISARMED permits a write."""
+
+    DISARMED = "disarmed"
+    ARMED = "armed"
+    UNKNOWN = "unknown"
 
 
 class ArmingWatch:
@@ -24,7 +35,7 @@ class ArmingWatch:
 
     def __init__(self) -> None:
         self._armed: bool | None = None
-        self._armed_s = self._contradiction_s = -math.inf
+        self._armed_s = self._contradiction_s = self._two_s = -math.inf
         self._changes_s: deque[float] = deque(maxlen=_CHANGES)
 
     def heard(self, t_s: float, *, armed: bool) -> None:
@@ -46,6 +57,16 @@ class ArmingWatch:
         if t_s - self._armed_s < ARMED_HOLDS_S:
             return True
         return self._armed
+
+    def two_seen(self, t_s: float) -> None:
+        """Something else has shown that two autopilots have these ids."""
+        self._two_s = t_s
+
+    def conflict(self, t_s: float, system_id: int | None) -> str | None:
+        """What is wrong when two autopilots speak under the ids of one; then nothing is believed of either."""
+        if self.contradicts_itself(t_s):
+            return f"system id {system_id} says armed and disarmed by turns: two autopilots, or a forger"
+        return f"two autopilots have system id {system_id}" if t_s - self._two_s < _TWO_HOLDS_S else None
 
     def contradicts_itself(self, t_s: float) -> bool:
         """Whether armed and disarmed heartbeats come by turns, as of two autopilots, or of one and a forger."""

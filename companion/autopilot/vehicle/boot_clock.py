@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Final
+import asyncio
+from collections.abc import Callable
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.links.mavlink.link import MavlinkLink, Message
+from companion.links.mavlink.signing import EARLIEST_S
 
 _BACK_S: Final = 0.5
 """Late and repeated packets step back by milliseconds; a restart by all the time it was up."""
@@ -64,3 +71,67 @@ def _too_slow(boot_s: float, t_s: float, since: tuple[float, float]) -> bool:
     advance_s = (boot_s - since[0]) % _WRAP_S
     fits_in_silence = boot_s <= silence_s * _CLOCKS + _BACK_S
     return silence_s > _GAP_S and fits_in_silence and advance_s < 0.5 * silence_s - 0.5
+
+
+class BootWatch:
+    """Reads the time since boot from every message of the autopilot that carries it, and tells of restarts.
+
+    Args:
+        link: the connection.
+        sent: whether a message is the autopilot's.
+        on_restart: called when it has restarted, before anybody else hears of the message that shows it.
+    """
+
+    def __init__(self, link: MavlinkLink, sent: Callable[[Message], bool], on_restart: Callable[[], None]) -> None:
+        self._sent, self._on_restart = sent, on_restart
+        self._clock = BootClock()
+        self._heard = asyncio.Event()
+        self._unsubscribe = [
+            link.subscribe(mavlink.MAVLink_system_time_message, self._on_boot_ms),
+            link.subscribe(mavlink.MAVLink_global_position_int_message, self._on_boot_ms),
+            link.subscribe(mavlink.MAVLink_attitude_message, self._on_boot_ms),
+            link.subscribe(mavlink.MAVLink_scaled_imu_message, self._on_boot_ms),
+            link.subscribe(mavlink.MAVLink_scaled_imu2_message, self._on_boot_ms),
+            link.subscribe(mavlink.MAVLink_scaled_imu3_message, self._on_boot_ms),
+            link.subscribe(mavlink.MAVLink_raw_imu_message, self._on_boot_us),
+            link.subscribe(mavlink.MAVLink_highres_imu_message, self._on_boot_us),
+        ]
+
+    @property
+    def latest_s(self) -> float | None:
+        """The time since boot that was heard last."""
+        return self._clock.latest_s
+
+    def begin_anew(self) -> None:
+        """Another firmware runs there now."""
+        self._clock = BootClock()
+
+    async def wait(self, timeout_s: float) -> bool:
+        """Wait for the next message that carries the time since boot; False: none came in time."""
+        self._heard.clear()
+        try:
+            async with asyncio.timeout(timeout_s):
+                await self._heard.wait()
+        except TimeoutError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Stop listening."""
+        for unsubscribe in self._unsubscribe:
+            unsubscribe()
+
+    def _on_boot_ms(self, message: Any, t_s: float) -> None:
+        if self._sent(message):
+            self._take(message.time_boot_ms * 1e-3, t_s)
+
+    def _on_boot_us(self, message: Any, t_s: float) -> None:
+        # The field may carry UTC instead; no autopilot has been up since the nineteen-seventies.
+        if self._sent(message) and message.time_usec * 1e-6 < EARLIEST_S:
+            self._take(message.time_usec * 1e-6, t_s)
+
+    def _take(self, boot_s: float, t_s: float) -> None:
+        restarted = self._clock.rebooted(boot_s, t_s)
+        self._heard.set()
+        if restarted:
+            self._on_restart()

@@ -1,13 +1,15 @@
-"""Which of all the heartbeats on a network is that of the autopilot to calibrate."""
+"""Which of all the heartbeats on a network is that of the autopilot to calibrate, and what it is."""
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+Firmware = Literal["ardupilot", "px4", "other"]
+
 ADOPT_OTHER_COMPONENT_S: Final = 2.0
-"""So long an autopilot on another component than 1 must have been heard before it is taken for the one."""
+"""How long an autopilot on another component than 1 must have been heard before it is taken for the one."""
 
 _NOT_AIRCRAFT: Final = frozenset(
     {
@@ -39,6 +41,22 @@ def is_aircraft(message: mavlink.MAVLink_heartbeat_message) -> bool:
     return message.type not in _NOT_AIRCRAFT and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID
 
 
+def firmware_of(message: mavlink.MAVLink_heartbeat_message) -> Firmware:
+    """Which firmware a heartbeat is of."""
+    known: dict[int, Firmware] = {
+        mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot",
+        mavlink.MAV_AUTOPILOT_PX4: "px4",
+    }
+    return known.get(message.autopilot, "other")
+
+
+def version_text(packed: int) -> str:
+    """Major, minor, patch and kind of release from AUTOPILOT_VERSION.flight_sw_version, one byte each."""
+    major, minor, patch, kind = packed.to_bytes(4, "big")
+    suffix = "-dev" if kind < 64 else "-alpha" if kind < 128 else "-beta" if kind < 192 else "-rc" if kind < 255 else ""
+    return f"{major}.{minor}.{patch}{suffix}"
+
+
 class Latch:
     """Decides which autopilot is taken.
 
@@ -57,7 +75,7 @@ class Latch:
             return False
         if component == mavlink.MAV_COMP_ID_AUTOPILOT1:
             return True
-        if message.autopilot not in (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mavlink.MAV_AUTOPILOT_PX4):
+        if firmware_of(message) == "other":
             return False
         first_s = self._candidates.setdefault((system, component), t_s)
         return t_s - first_s >= ADOPT_OTHER_COMPONENT_S

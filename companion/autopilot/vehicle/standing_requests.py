@@ -16,7 +16,8 @@ LONGEST_PAUSE_S: Final = 30.0
 @dataclasses.dataclass(slots=True)
 class _Wanted:
     message: type[Message]
-    rate_hz: float
+    rate_hz: float | None
+    """None: wanted once, and again after a restart."""
     heard_s: float = -math.inf
     asked_s: float = -math.inf
     pause_s: float = FIRST_PAUSE_S
@@ -29,8 +30,8 @@ class StandingRequests:
         self._commands = commands
         self._wanted: list[_Wanted] = []
 
-    def add(self, message: type[Message], rate_hz: float) -> None:
-        """Want a message from now on."""
+    def add(self, message: type[Message], rate_hz: float | None) -> None:
+        """Want a message from now on; without a rate, only once after every `forget_asking`."""
         self._wanted.append(_Wanted(message, rate_hz))
 
     def heard(self, message: Message, t_s: float) -> None:
@@ -43,13 +44,19 @@ class StandingRequests:
         """Ask at once for whatever is missing: what was streamed before a loss is gone after a restart."""
         for wanted in self._wanted:
             wanted.asked_s, wanted.pause_s = -math.inf, FIRST_PAUSE_S
+            if wanted.rate_hz is None:
+                wanted.heard_s = -math.inf
 
     def ask_for_missing(self, now_s: float) -> None:
         """Ask for what has stayed away, unless it was asked for a short time ago."""
         for wanted in self._wanted:
-            silent = now_s - wanted.heard_s > 2.5 / wanted.rate_hz
+            age_s = now_s - wanted.heard_s
+            silent = age_s == math.inf if wanted.rate_hz is None else age_s > 2.5 / wanted.rate_hz
             if silent and now_s - wanted.asked_s > wanted.pause_s:
                 if wanted.asked_s > -math.inf:
                     wanted.pause_s = min(2 * wanted.pause_s, LONGEST_PAUSE_S)
                 wanted.asked_s = now_s
-                self._commands.request_message_interval(wanted.message.id, wanted.rate_hz)
+                if wanted.rate_hz is None:
+                    self._commands.request_message(wanted.message.id)
+                else:
+                    self._commands.request_message_interval(wanted.message.id, wanted.rate_hz)

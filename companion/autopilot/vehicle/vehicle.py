@@ -8,7 +8,6 @@ armed heartbeat has come under the vehicle's ids for 3 s, from whomever (`arming
 from __future__ import annotations
 
 import asyncio
-import enum
 import logging
 import math
 from collections.abc import Callable
@@ -16,14 +15,16 @@ from typing import Final, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.vehicle.arming_watch import ArmingWatch
-from companion.autopilot.vehicle.boot_clock import BootClock
+from companion.autopilot.vehicle.arming_watch import ArmingWatch, ArmState
+from companion.autopilot.vehicle.boot_clock import BootWatch
 from companion.autopilot.vehicle.commands import Commands
-from companion.autopilot.vehicle.latch import Latch, is_aircraft
+from companion.autopilot.vehicle.latch import Firmware, Latch, firmware_of, is_aircraft, version_text
 from companion.autopilot.vehicle.standing_requests import StandingRequests
-from companion.autopilot.vehicle.whereabouts import Position, TimeAndPlace
-from companion.links.mavlink.link import MavlinkLink, Message, Unsubscribe
-from companion.links.mavlink.signing import EARLIEST_S
+from companion.autopilot.vehicle.whereabouts import TimeAndPlace
+from companion.links.mavlink.link import Handler, M, MavlinkLink, Message
+from companion.links.system.listeners import Listeners, Unsubscribe
+
+__all__ = ["ArmState", "Firmware", "Vehicle", "VehicleEvent"]
 
 logger = logging.getLogger(__name__)
 
@@ -38,33 +39,17 @@ FRESH_WITHIN_S: Final = 0.3
 
 _BEHIND_ANSWER_S: Final = 0.03
 """How long after its answer to the request a heartbeat may leave ArduPilot (20 ms); PX4 sends it before the answer."""
+_HEARTBEAT_ID: Final[int] = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 _OVERDUE_S: Final = 1.1
 _TICK_S: Final = 0.5
 _STALL_S: Final = 1.0
-_CONFLICT_S: Final = 5.0
-"""So long after the last sign of a second autopilot under our vehicle's ids nothing is believed of either."""
 _RESTARTS_S: Final = 1.0
-"""No autopilot restarts twice in that time: two whose times since boot alternate do."""
+"""Within this time no autopilot restarts twice; two whose times since boot alternate seem to."""
 
-Firmware = Literal["ardupilot", "px4", "other"]
 VehicleEvent = Literal["armed", "disarmed", "lost", "found", "rebooted"]
 """What `Vehicle.watch` tells. "found": latched, or heard again after "lost". "armed" and "disarmed": the heartbeat
 says so and the one before, if any, said otherwise; so the first heartbeat of all brings "found" and one of them.
 "disarmed" comes when that is believed: 3 s after the last armed heartbeat."""
-
-
-_FIRMWARES: Final[dict[int, Firmware]] = {
-    mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot",
-    mavlink.MAV_AUTOPILOT_PX4: "px4",
-}
-
-
-class ArmState(enum.Enum):
-    """Whether the motors may turn. Only DISARMED permits a write."""
-
-    DISARMED = "disarmed"
-    ARMED = "armed"
-    UNKNOWN = "unknown"
 
 
 class Vehicle:
@@ -73,13 +58,16 @@ class Vehicle:
     Args:
         link: the connection; its system id follows the vehicle's when that is latched.
         system_id: the vehicle's, or None to latch the first real autopilot that is heard. Once latched it stays.
+        is_carried: whether the aircraft moves, or may fly: then its place changes rightly.
 
     A real autopilot is a heartbeat with a known autopilot type and the type of a vehicle: ground stations,
     gimbals, ADS-B receivers and the like are ignored, whatever they claim. Component 1 is taken at once; another
     component only if it is ArduPilot or PX4 and component 1 stays silent for 2 s.
     """
 
-    def __init__(self, link: MavlinkLink, *, system_id: int | None = None) -> None:
+    def __init__(
+        self, link: MavlinkLink, *, system_id: int | None = None, is_carried: Callable[[], bool] = lambda: False
+    ) -> None:
         self.system_id: int | None = None
         self.component_id: int = mavlink.MAV_COMP_ID_AUTOPILOT1
         self.firmware: Firmware | None = None
@@ -93,42 +81,34 @@ class Vehicle:
         """Whether its last heartbeat was signed (MAVLink 2)."""
         self.boots = 0
         """How many restarts were seen."""
-        self.place = TimeAndPlace()
+        self.place = TimeAndPlace(is_carried)
         """What it says of time and place."""
-        self.commands = Commands(link, self._target)
+        self.commands = Commands(link, lambda: None if self.system_id is None else (self.system_id, self.component_id))
         self._link = link
         self._latch = Latch(system_id)
         self._heartbeat_s: float | None = None
         self._heartbeat_link_id: int | None = None
         self._arming = ArmingWatch()
         self._armed_told: bool | None = None
-        self._contradiction_logged = False
-        self._conflict_s = self._restarted_s = -math.inf
+        self._conflict_logged = False
+        self._restarted_s = -math.inf
         self._lost = True
         self._trusted_from_s = -math.inf
-        self._boot_clock = BootClock()
-        self._watchers: list[Callable[[VehicleEvent], None]] = []
+        self._boot = BootWatch(link, self.sent, self._on_restart)
+        self._listeners: Listeners[[VehicleEvent]] = Listeners()
         self._found = asyncio.Event()
         self._heartbeat_waiters: list[asyncio.Event] = []
-        self._boot_time_heard = asyncio.Event()
         self._wanted = StandingRequests(self.commands)
-        self._version_asked_s, self._version_pause_s = -math.inf, 2.0
         self._lost_timer: asyncio.TimerHandle | None = None
         self._tick_timer: asyncio.TimerHandle | None = None
         self._tick_due_s = math.inf
         self._closed = False
         self._unsubscribe = [
             link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat),
-            link.subscribe(mavlink.MAVLink_system_time_message, self._on_system_time),
-            link.subscribe(mavlink.MAVLink_autopilot_version_message, self._on_version),
-            link.subscribe(mavlink.MAVLink_global_position_int_message, self._on_global_position),
-            link.subscribe(mavlink.MAVLink_gps_raw_int_message, self._on_gps),
-            link.subscribe(mavlink.MAVLink_attitude_message, self._on_boot_ms),
-            link.subscribe(mavlink.MAVLink_scaled_imu_message, self._on_boot_ms),
-            link.subscribe(mavlink.MAVLink_scaled_imu2_message, self._on_boot_ms),
-            link.subscribe(mavlink.MAVLink_scaled_imu3_message, self._on_boot_ms),
-            link.subscribe(mavlink.MAVLink_raw_imu_message, self._on_boot_us),
-            link.subscribe(mavlink.MAVLink_highres_imu_message, self._on_boot_us),
+            link.subscribe(mavlink.MAVLink_system_time_message, self._of_ours(self.place.hear_time)),
+            link.subscribe(mavlink.MAVLink_autopilot_version_message, self._of_ours(self._on_version)),
+            link.subscribe(mavlink.MAVLink_global_position_int_message, self._of_ours(self.place.hear_estimate)),
+            link.subscribe(mavlink.MAVLink_gps_raw_int_message, self._of_ours(self.place.hear_receiver)),
         ]
 
     @property
@@ -150,12 +130,7 @@ class Vehicle:
     @property
     def conflict(self) -> str | None:
         """What is wrong when two autopilots speak under the ids of one; then the arm state is UNKNOWN."""
-        now_s = asyncio.get_running_loop().time()
-        if self._arming.contradicts_itself(now_s):
-            return f"system id {self.system_id} says armed and disarmed by turns: two autopilots, or a forger"
-        if now_s - self._conflict_s < _CONFLICT_S:
-            return f"two autopilots have system id {self.system_id}"
-        return None
+        return self._arming.conflict(asyncio.get_running_loop().time(), self.system_id)
 
     @property
     def alive(self) -> bool:
@@ -169,16 +144,6 @@ class Vehicle:
         if self._heartbeat_s is None:
             return None
         return asyncio.get_running_loop().time() - self._heartbeat_s
-
-    @property
-    def unix_time_s(self) -> float | None:
-        """UTC as the autopilot has it (from its GNSS), carried on by the loop's clock; None when it has none."""
-        return self.place.unix_time_s
-
-    @property
-    def position(self) -> Position | None:
-        """Where it stands, as far as the autopilot can be believed; None when it says no place."""
-        return self.place.position
 
     @property
     def name(self) -> str:
@@ -213,35 +178,23 @@ class Vehicle:
 
     def watch(self, callback: Callable[[VehicleEvent], None]) -> Unsubscribe:
         """Be told of events, in the order in which they are seen; returns how to stop that."""
-        self._watchers.append(callback)
-
-        def unsubscribe() -> None:
-            if callback in self._watchers:
-                self._watchers.remove(callback)
-
-        return unsubscribe
+        return self._listeners.add(callback)
 
     @property
     def boot_s(self) -> float | None:
         """Its time since boot as it was heard last."""
-        return self._boot_clock.latest_s
+        return self._boot.latest_s
 
     async def hear_boot_time(self, timeout_s: float = 1.0) -> bool:
         """Ask for the time since boot and wait for it; afterwards `boots` counts every restart until now.
 
         Without this a quick restart shows only once its time messages come again. False: none came in time.
         """
-        heard = self._boot_time_heard
-        heard.clear()
         request = self.commands.request_message(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
         try:
-            async with asyncio.timeout(timeout_s):
-                await heard.wait()
-        except TimeoutError:
-            return False
+            return await self._boot.wait(timeout_s)
         finally:
             request.cancel()
-        return True
 
     async def wait_found(self) -> None:
         """Wait, without limit, until the autopilot is being heard."""
@@ -257,8 +210,7 @@ class Vehicle:
         """
         heard = asyncio.Event()
         self._heartbeat_waiters.append(heard)
-        heartbeat_id: int = mavlink.MAVLINK_MSG_ID_HEARTBEAT
-        request = self.commands.request_message(heartbeat_id)
+        request = self.commands.request_message(_HEARTBEAT_ID)
         try:
             async with asyncio.timeout(within_s):
                 await request
@@ -278,21 +230,15 @@ class Vehicle:
         self._found.clear()
         for unsubscribe in self._unsubscribe:
             unsubscribe()
+        self._boot.close()
         for timer in (self._lost_timer, self._tick_timer):
             if timer is not None:
                 timer.cancel()
         self.commands.close()
 
-    def _target(self) -> tuple[int, int] | None:
-        return None if self.system_id is None else (self.system_id, self.component_id)
-
     def _tell(self, event: VehicleEvent) -> None:
         logger.log(logging.WARNING if event in ("lost", "rebooted") else logging.INFO, "%s: %s", self.name, event)
-        for callback in tuple(self._watchers):
-            try:
-                callback(event)
-            except Exception:
-                logger.exception("a watcher failed on %r", event)
+        self._listeners.tell(event)
 
     # --- heartbeats
 
@@ -308,7 +254,7 @@ class Vehicle:
         ours = self._is_ours(message) and self._is_on_our_link(message)
         if ours or armed:
             self._arming.heard(now_s, armed=armed)
-            self._log_contradiction(now_s)
+            self._log_conflict()
         if not ours:
             return
         was_lost = self._lost
@@ -331,7 +277,7 @@ class Vehicle:
 
     def _is_ours(self, message: mavlink.MAVLink_heartbeat_message) -> bool:
         """Whether a heartbeat under our ids is our vehicle's; ArduPilot and PX4 both are system 1 out of the box."""
-        firmware = _FIRMWARES.get(message.autopilot, "other")
+        firmware = firmware_of(message)
         if firmware == self.firmware:
             return True
         if firmware == "other":
@@ -341,7 +287,7 @@ class Vehicle:
             return False
         # Another firmware has been flashed while we heard nothing.
         self.firmware = firmware
-        self._boot_clock = BootClock()
+        self._boot.begin_anew()
         self._restarted()
         return True
 
@@ -356,24 +302,23 @@ class Vehicle:
             self._heartbeat_link_id = link_id
         return link_id == self._heartbeat_link_id
 
-    def _log_contradiction(self, now_s: float) -> None:
-        contradicts = self._arming.contradicts_itself(now_s)
-        if contradicts and not self._contradiction_logged:
-            logger.error("%s: %s; nothing is written", self.name, self.conflict)
-        self._contradiction_logged = contradicts
-
     def _notice_conflict(self) -> None:
-        now_s = asyncio.get_running_loop().time()
-        if now_s - self._conflict_s > _CONFLICT_S:
-            logger.error("%s: two autopilots have this system id; nothing is written to either", self.name)
-        self._conflict_s = now_s
+        self._arming.two_seen(asyncio.get_running_loop().time())
+        self._log_conflict()
+
+    def _log_conflict(self) -> None:
+        conflict = self.conflict
+        if conflict is not None and not self._conflict_logged:
+            logger.error("%s: %s; nothing is written", self.name, conflict)
+        self._conflict_logged = conflict is not None
 
     def _take(self, message: mavlink.MAVLink_heartbeat_message) -> None:
         self.system_id, self.component_id = message.get_srcSystem(), message.get_srcComponent()
         self._link.join((self.system_id, self.component_id))
-        self.firmware = _FIRMWARES.get(message.autopilot, "other")
+        self.firmware = firmware_of(message)
         self._wanted.add(mavlink.MAVLink_system_time_message, 1.0)
         self._wanted.add(mavlink.MAVLink_global_position_int_message, 1.0)
+        self._wanted.add(mavlink.MAVLink_autopilot_version_message, None)
         self._tick()
 
     def _watch_for_loss(self) -> None:
@@ -406,8 +351,7 @@ class Vehicle:
         # What was streamed before a loss is gone if the autopilot restarted meanwhile.
         self._wanted.forget_asking()
         if self.firmware == "ardupilot":
-            heartbeat_id: int = mavlink.MAVLINK_MSG_ID_HEARTBEAT
-            self.commands.request_message_interval(heartbeat_id, HEARTBEAT_RATE_HZ)
+            self.commands.request_message_interval(_HEARTBEAT_ID, HEARTBEAT_RATE_HZ)
         self._ask_for_missing(asyncio.get_running_loop().time())
 
     def _ask_for_missing(self, now_s: float) -> None:
@@ -415,25 +359,17 @@ class Vehicle:
         if overdue and self.firmware == "px4":
             # Its heartbeat cannot be had faster than once a second, so that after a single one that is lost nobody
             # would know whether it is armed.
-            heartbeat_id: int = mavlink.MAVLINK_MSG_ID_HEARTBEAT
-            self.commands.request_message(heartbeat_id)
+            self.commands.request_message(_HEARTBEAT_ID)
         self._wanted.ask_for_missing(now_s)
-        if self.version is None and now_s - self._version_asked_s > self._version_pause_s:
-            self._version_asked_s = now_s
-            self._version_pause_s = min(2 * self._version_pause_s, 60.0)
-            self.commands.request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
 
     # --- what the other messages tell
 
-    def _boot_time(self, boot_s: float, t_s: float) -> None:
-        restarted = self._boot_clock.rebooted(boot_s, t_s)
-        self._boot_time_heard.set()
-        if restarted:
-            now_s = asyncio.get_running_loop().time()
-            if now_s - self._restarted_s < _RESTARTS_S:
-                self._notice_conflict()
-            self._restarted_s = now_s
-            self._restarted()
+    def _on_restart(self) -> None:
+        now_s = asyncio.get_running_loop().time()
+        if now_s - self._restarted_s < _RESTARTS_S:
+            self._notice_conflict()
+        self._restarted_s = now_s
+        self._restarted()
 
     def _restarted(self) -> None:
         self.boots += 1
@@ -441,54 +377,19 @@ class Vehicle:
         self._armed_told = None
         self.place.restarted()
         self.version = self.capabilities = None
-        self._version_asked_s, self._version_pause_s = -math.inf, 2.0
         self._ask_soon()
         self._tell("rebooted")
 
-    def _on_boot_ms(
-        self,
-        message: mavlink.MAVLink_attitude_message
-        | mavlink.MAVLink_scaled_imu_message
-        | mavlink.MAVLink_scaled_imu2_message
-        | mavlink.MAVLink_scaled_imu3_message,
-        t_s: float,
-    ) -> None:
-        if self.sent(message):
-            self._boot_time(message.time_boot_ms * 1e-3, t_s)
+    def _of_ours(self, handler: Handler[M]) -> Handler[M]:
+        """The handler, called only with what the latched autopilot has sent."""
 
-    def _on_boot_us(
-        self, message: mavlink.MAVLink_raw_imu_message | mavlink.MAVLink_highres_imu_message, t_s: float
-    ) -> None:
-        # The field may carry UTC instead; no autopilot has been up since the nineteen-seventies.
-        if self.sent(message) and message.time_usec * 1e-6 < EARLIEST_S:
-            self._boot_time(message.time_usec * 1e-6, t_s)
+        def hear(message: M, t_s: float) -> None:
+            if self.sent(message):
+                self._wanted.heard(message, t_s)
+                handler(message, t_s)
 
-    def _on_system_time(self, message: mavlink.MAVLink_system_time_message, t_s: float) -> None:
-        if not self.sent(message):
-            return
-        self._wanted.heard(message, t_s)
-        self._boot_time(message.time_boot_ms * 1e-3, t_s)
-        self.place.hear_time(message, t_s)
+        return hear
 
     def _on_version(self, message: mavlink.MAVLink_autopilot_version_message, _t_s: float) -> None:
-        if self.sent(message):
-            self.version = _version_text(message.flight_sw_version)
-            self.capabilities = message.capabilities
-
-    def _on_global_position(self, message: mavlink.MAVLink_global_position_int_message, t_s: float) -> None:
-        if not self.sent(message):
-            return
-        self._wanted.heard(message, t_s)
-        self._boot_time(message.time_boot_ms * 1e-3, t_s)
-        self.place.hear_estimate(message, t_s)
-
-    def _on_gps(self, message: mavlink.MAVLink_gps_raw_int_message, t_s: float) -> None:
-        if self.sent(message):
-            self.place.hear_receiver(message, t_s)
-
-
-def _version_text(packed: int) -> str:
-    """Major, minor, patch and kind of release from AUTOPILOT_VERSION.flight_sw_version, one byte each."""
-    major, minor, patch, kind = packed.to_bytes(4, "big")
-    suffix = "-dev" if kind < 64 else "-alpha" if kind < 128 else "-beta" if kind < 192 else "-rc" if kind < 255 else ""
-    return f"{major}.{minor}.{patch}{suffix}"
+        self.version = version_text(message.flight_sw_version)
+        self.capabilities = message.capabilities

@@ -33,7 +33,7 @@ CONFIRMED_AFTER_S: Final = 2.5
 """A first place, which is sent once a second: what one packet says is not enough."""
 SETTLED_AFTER_S: Final = 30.0
 SILENT_S: Final = 5.0
-"""After so long without word from a place nobody says any more that the aircraft is there."""
+"""How long a place counts as said after it was said last."""
 
 _OR_SET: Final = "(or set vehicle.latitude_deg, longitude_deg, height_m)"
 _EARTH_RADIUS_M: Final = 6_371_000.0
@@ -61,13 +61,16 @@ class _Claim:
 
 
 class TimeAndPlace:
-    """Takes the autopilot's messages; whoever calls has made sure that they are the autopilot's."""
+    """Takes the autopilot's messages; whoever calls has made sure that they are the autopilot's.
 
-    def __init__(self) -> None:
+    Args:
+        is_carried: whether the aircraft moves, or may fly: then its place changes rightly.
+    """
+
+    def __init__(self, is_carried: Callable[[], bool] = lambda: False) -> None:
         self.position: Position | None = None
         """The place that is believed."""
-        self.is_carried: Callable[[], bool] = lambda: False
-        """Whether the aircraft moves, or may fly: then its place changes rightly."""
+        self._is_carried = is_carried
         self._anchor: Position | None = None
         """What other places are compared with: it stays where it is while the aircraft stands still."""
         self._claim: _Claim | None = None
@@ -119,7 +122,7 @@ class TimeAndPlace:
             self.position = place
             if claim is not None:
                 claim.since_s = t_s  # who contradicts it begins anew
-        elif place is not None and _is_near(place, self.position) and self.is_carried():
+        elif place is not None and _is_near(place, self.position) and self._is_carried():
             self.position = self._anchor = place
         elif claim is None or t_s - claim.heard_s >= SILENT_S or not _is_near(place, claim.place):
             self._claim = _Claim(place, t_s, t_s)

@@ -97,7 +97,7 @@ class Service:
         self.link = link or MavlinkLink(
             system_id=config.vehicle.system_id or 1, component_id=config.mavlink.component_id
         )
-        self.vehicle = Vehicle(self.link, system_id=config.vehicle.system_id)
+        self.vehicle = Vehicle(self.link, system_id=config.vehicle.system_id, is_carried=self._is_carried)
         self.parameters = ParameterClient(self.link, self.vehicle)
         self.collector = RecordedCollector(
             models.settings(config),
@@ -109,7 +109,6 @@ class Service:
             field_by=models.field_by(config),
             message_of=self._message_of,
         )
-        self.vehicle.place.is_carried = self._is_carried
         self.slots = SlotMemory()
         self._imu_rate_hz = models.imu_rate_hz(config) if imu_rate_hz is None else imu_rate_hz
         self.imus = {imu.name: self._autopilot_imu(imu) for imu in config.imu if imu.source == "autopilot"}

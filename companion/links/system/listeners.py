@@ -1,0 +1,40 @@
+"""Who wants to be told of something: in the order in which they came, and none of them can keep it from the others."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Generic, ParamSpec
+
+logger = logging.getLogger(__name__)
+
+P = ParamSpec("P")
+Unsubscribe = Callable[[], None]
+
+
+class Listeners(Generic[P]):
+    """Callbacks of one kind."""
+
+    def __init__(self) -> None:
+        self._callbacks: list[Callable[P, object]] = []
+
+    def __len__(self) -> int:
+        return len(self._callbacks)
+
+    def add(self, callback: Callable[P, object]) -> Unsubscribe:
+        """Tell the callback from now on; returns how to stop that."""
+        self._callbacks.append(callback)
+
+        def unsubscribe() -> None:
+            if callback in self._callbacks:
+                self._callbacks.remove(callback)
+
+        return unsubscribe
+
+    def tell(self, *args: P.args, **kwargs: P.kwargs) -> None:
+        """Call all of them."""
+        for callback in tuple(self._callbacks):
+            try:
+                callback(*args, **kwargs)
+            except Exception:
+                logger.exception("a listener failed on %r", args)
