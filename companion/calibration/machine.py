@@ -11,14 +11,18 @@ from typing import Final
 
 
 class State(enum.Enum):
-    """Where a calibration stands; the values are what users see."""
+    """Where a calibration stands."""
 
     IDLE = "idle"
     WAITING = "waiting"
     COLLECTING = "collecting"
     SOLVING = "solving"
+    DITHERING = "dithering"
     WRITING = "writing"
     VERIFYING = "verifying"
+    RESTARTING = "restarting"
+    SETTLING = "settling"
+    UNDOING = "undoing"
     DONE = "done"
     FAILED = "failed"
     CANCELLED = "cancelled"
@@ -28,6 +32,16 @@ class State(enum.Enum):
         """Whether work is under way."""
         return self not in RESTING
 
+    @property
+    def is_writing(self) -> bool:
+        """Whether offsets are being changed and not yet known to be right."""
+        return self in _WRITING
+
+    @property
+    def shown(self) -> str:
+        """What users see: the coarser words that other programs rely on."""
+        return _SHOWN.get(self, self).value
+
 
 class Event(enum.Enum):
     """What can happen to it."""
@@ -35,35 +49,48 @@ class Event(enum.Enum):
     REQUEST = "request"
     UNDO = "undo"
     STILL = "still long enough"
-    MOVED = "moved"
+    MOVED = "moved, or not as believed"
     ENOUGH = "measured enough"
+    DITHER = "integers do not tell"
     WRITE = "biases to write"
     NOTHING_TO_WRITE = "nothing to write"
     WRITTEN = "read back"
-    AGAIN = "not the right IMU"
     VERIFIED = "seen in the telemetry"
-    RESTORED = "old values back"
+    REBOOT = "seen, reboot wanted"
+    CONCLUDED = "in force"
     FAULT = "fault"
     CANCEL = "cancel"
 
 
 RESTING: Final = (State.IDLE, State.DONE, State.FAILED, State.CANCELLED)
+_SHOWN: Final = {
+    State.DITHERING: State.SOLVING,
+    State.RESTARTING: State.VERIFYING,
+    State.SETTLING: State.VERIFYING,
+    State.UNDOING: State.WRITING,
+}
+_WRITING: Final = {State.WRITING, State.VERIFYING, *_SHOWN}
 
 TRANSITIONS: Final[dict[tuple[State, Event], State]] = {
     **{(state, Event.REQUEST): State.WAITING for state in RESTING},
-    **{(state, Event.UNDO): State.WRITING for state in RESTING},
+    **{(state, Event.UNDO): State.UNDOING for state in RESTING},
     (State.WAITING, Event.STILL): State.COLLECTING,
     (State.COLLECTING, Event.MOVED): State.WAITING,
     (State.COLLECTING, Event.ENOUGH): State.SOLVING,
+    (State.SOLVING, Event.DITHER): State.DITHERING,
+    (State.DITHERING, Event.DITHER): State.DITHERING,
     # What was measured can turn out stale (an offset changed under it): measure again.
-    (State.SOLVING, Event.MOVED): State.WAITING,
-    (State.SOLVING, Event.WRITE): State.WRITING,
-    (State.SOLVING, Event.NOTHING_TO_WRITE): State.DONE,
+    **{(state, Event.MOVED): State.WAITING for state in (State.SOLVING, State.DITHERING)},
+    **{(state, Event.WRITE): State.WRITING for state in (State.SOLVING, State.DITHERING)},
+    **{(state, Event.NOTHING_TO_WRITE): State.DONE for state in (State.SOLVING, State.DITHERING)},
     (State.WRITING, Event.WRITTEN): State.VERIFYING,
     # What was written acts on another IMU than believed; it is put back, and now it is known.
-    (State.WRITING, Event.AGAIN): State.WAITING,
-    (State.WRITING, Event.RESTORED): State.DONE,
-    (State.VERIFYING, Event.VERIFIED): State.DONE,
+    (State.WRITING, Event.MOVED): State.WAITING,
+    (State.VERIFYING, Event.VERIFIED): State.SETTLING,
+    (State.VERIFYING, Event.REBOOT): State.RESTARTING,
+    (State.RESTARTING, Event.VERIFIED): State.SETTLING,
+    (State.SETTLING, Event.CONCLUDED): State.DONE,
+    (State.UNDOING, Event.CONCLUDED): State.DONE,
     **{(state, Event.FAULT): State.FAILED for state in State if state not in RESTING},
     **{(state, Event.CANCEL): State.CANCELLED for state in State if state not in RESTING},
 }

@@ -24,12 +24,19 @@ class Job:
     """A calibration or an undo; `finished` is done exactly once."""
 
     def __init__(
-        self, kind: str, what: What, requester: str, deadline_s: float | None, *, reboot: bool = False
+        self,
+        kind: str,
+        what: What,
+        requester: str,
+        deadline_s: float | None,
+        *,
+        reboot: bool = False,
+        automatic: bool = False,
     ) -> None:
         self.kind, self.what, self.requester = kind, what, requester
         self.reboot = reboot
         """Whether the autopilot is to be restarted once the result is stored."""
-        self.automatic = False
+        self.automatic = automatic
         """Whether nobody asked for it."""
         self.armed = False
         """Whether the aircraft was armed since, be it for a moment."""
@@ -48,6 +55,11 @@ class Job:
         self._nudge = asyncio.Event()
 
     @property
+    def is_running(self) -> bool:
+        """Whether its end is still to come."""
+        return not self.finished.done()
+
+    @property
     def progress_percent(self) -> int:
         """0 to 100, never falling."""
         return self._percent
@@ -62,8 +74,9 @@ class Job:
         """Whether somebody has asked it to stop."""
         return self._cancelled_by is not None
 
-    def adopt(self, requester: str, deadline_s: float | None) -> None:
+    def adopt(self, requester: str, deadline_s: float | None, *, reboot: bool) -> None:
         """Somebody asks for what already runs by itself: from now on it is theirs."""
+        self.reboot |= reboot
         self.kind, self.requester, self.deadline_s, self.automatic = "calibration", requester, deadline_s, False
 
     def cancel(self, by: str) -> None:

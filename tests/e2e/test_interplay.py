@@ -12,6 +12,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import ArmState
+from companion.calibration.machine import State
 from companion.calibration.request import What
 from companion.calibration.solution.validity import Why
 from companion.component.service import Refusal
@@ -32,7 +33,7 @@ GYRO_Y = offset_names(1, "gyro")[1]
 
 
 async def settling(rig: Rig) -> None:
-    await rig.until(lambda: rig.service.conductor.stage == "settling", 90.0)
+    await rig.until(lambda: rig.service.conductor.state is State.SETTLING, 90.0)
 
 
 def whys(rig: Rig) -> set[Why]:
@@ -82,7 +83,7 @@ def test_what_another_station_writes_while_the_ekf_settles_shuts_the_gate_and_st
 def test_what_another_station_writes_during_the_check_is_not_overwritten_by_the_next_try(tmp_path: Path) -> None:
     async def main() -> None:
         async with Rig(tmp_path, **QUICK).running() as rig:
-            await rig.until(lambda: rig.service.conductor.stage == "checking", 90.0)
+            await rig.until(lambda: rig.service.conductor.state is State.VERIFYING, 90.0)
             rig.double.write_as_another_station(GYRO_Y, 0.0123)
             await rig.until(lambda: bool(rig.service.store.history(1)), 200.0)
             assert rig.service.store.history(1)[0].state == "failed"

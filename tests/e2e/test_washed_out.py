@@ -56,7 +56,7 @@ def test_what_was_measured_before_the_cancel_is_a_record(tmp_path: Path) -> None
             await rig.ready()
             job = ask(rig, "a pilot")
             assert isinstance(job, Job)
-            await rig.until(lambda: rig.service.conductor.is_writing, 60.0)
+            await rig.until(lambda: rig.service.conductor.state.is_writing, 60.0)
             rig.service.conductor.cancel("a pilot")
             assert (await job.finished).outcome == "cancelled"
             assert [record.state for record in rig.service.store.history()] == ["cancelled"]

@@ -19,9 +19,10 @@ def test_the_main_road() -> None:
         (Event.ENOUGH, "solving"),
         (Event.WRITE, "writing"),
         (Event.WRITTEN, "verifying"),
-        (Event.VERIFIED, "done"),
-        (Event.UNDO, "writing"),
-        (Event.RESTORED, "done"),
+        (Event.VERIFIED, "settling"),
+        (Event.CONCLUDED, "done"),
+        (Event.UNDO, "undoing"),
+        (Event.CONCLUDED, "done"),
     ]
     for event, state in road:
         assert machine.on(event).value == state
@@ -40,7 +41,18 @@ def test_every_state_can_be_reached_and_left() -> None:
 
 def test_nothing_is_written_without_having_been_solved_or_asked_to_undo() -> None:
     into_writing = {(old, event) for (old, event), new in TRANSITIONS.items() if new is State.WRITING}
-    assert into_writing == {(State.SOLVING, Event.WRITE)} | {(state, Event.UNDO) for state in RESTING}
+    assert into_writing == {(State.SOLVING, Event.WRITE), (State.DITHERING, Event.WRITE)}
+    into_dithering = {old for (old, _), new in TRANSITIONS.items() if new is State.DITHERING}
+    assert into_dithering == {State.SOLVING, State.DITHERING}
+    assert {old for (old, event), new in TRANSITIONS.items() if new is State.UNDOING} == set(RESTING)
+
+
+def test_users_see_the_words_that_other_programs_rely_on() -> None:
+    assert {state.shown for state in State} == {
+        "idle", "waiting", "collecting", "solving", "writing", "verifying", "done", "failed", "cancelled"
+    }  # fmt: skip
+    assert {state.shown for state in State if state.is_writing} == {"solving", "writing", "verifying"}
+    assert not State.SOLVING.is_writing
 
 
 def test_an_event_out_of_place_is_a_programs_fault() -> None:

@@ -28,6 +28,7 @@ from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.arming.in_force import InForce
 from companion.daemon.calibrating.conductor import Conductor
+from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.daemon.offload import Offload
@@ -167,8 +168,7 @@ class Automatic:
 
     def _is_possible(self) -> bool:
         """Disarmed, nothing else runs, and the window would not get better by waiting."""
-        job = self._conductor.job
-        if (job is not None and not job.finished.done()) or self._vehicle.arm_state is not ArmState.DISARMED:
+        if self._conductor.why_not((Rung.BUSY, Rung.ARMED, Rung.UNKNOWN)) is not None:
             return False
         status = self._collector.status(asyncio.get_running_loop().time())
         return status.waiting_for is None and status.enough and self._in_force.measured

@@ -1,6 +1,6 @@
 """What of a write is under way, and how long it will take yet: for the pilot who stands beside it and wants to arm.
 
-Only an estimate, made from what such writes take on both firmwares; but within one stage it never gets longer while
+Only an estimate, made from what such writes take on both firmwares; but within one state it never gets longer while
 the aircraft is still, because nobody believes a countdown that counts up.
 """
 
@@ -12,6 +12,7 @@ from typing import Final
 from companion.autopilot.firmware.firmwares import settle_s
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.machine import State
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.offsets.push import LOOK_S
 
@@ -24,9 +25,9 @@ EKF_S: Final = {"ardupilot": 3.0}
 MOVED_S: Final = 4.0
 """An estimate that has slipped by so much is of a look that has begun again."""
 _VERB: Final = {
-    "dithering": "dithering offsets",
-    "writing": "writing offsets",
-    "checking": "checking new offsets",
+    State.DITHERING: "dithering offsets",
+    State.WRITING: "writing offsets",
+    State.VERIFYING: "checking new offsets",
 }
 
 
@@ -42,7 +43,7 @@ class Forecast:
     def __init__(self, vehicle: Vehicle, collector: RollingCollector, conductor: Conductor) -> None:
         self._vehicle, self._collector, self._conductor = vehicle, collector, conductor
         self._promised: tuple[object, float] | None = None
-        """The stage, and the time at which its end was promised."""
+        """The state, and the time at which its end was promised."""
 
     @property
     def whole_s(self) -> float:
@@ -55,32 +56,32 @@ class Forecast:
 
     def words(self, now_s: float) -> str:
         """What is going on and for how long yet, for somebody who may not arm because of it."""
-        stage = self._conductor.stage
-        if stage == "putting back":
+        state = self._conductor.state
+        if state is State.UNDOING:
             return "old offsets are being put back: wait"
-        if stage == "restarting":
+        if state is State.RESTARTING:
             return "autopilot is being restarted: wait"
-        if stage == "settling":
-            return f"EKF settling: wait, {self._left_s('settling', self._conductor.settling_s, now_s):.0f} s at most"
-        if stage is None:
+        if state is State.SETTLING:
+            return f"EKF settling: wait, {self._left_s(state, self._conductor.settling_s, now_s):.0f} s at most"
+        if state not in _VERB:
             return "writing new offsets: wait"
-        left_s = self._left_s(stage, self._estimate_s(stage, now_s), now_s)
-        return f"hold still {left_s:.0f} s: {_VERB[stage]}"
+        left_s = self._left_s(state, self._estimate_s(state, now_s), now_s)
+        return f"hold still {left_s:.0f} s: {_VERB[state]}"
 
-    def _estimate_s(self, stage: str, now_s: float) -> float:
+    def _estimate_s(self, state: State, now_s: float) -> float:
         after_s = EKF_S.get(self._vehicle.firmware or "", 0.0)
-        if stage == "checking":
+        if state is State.VERIFYING:
             return self._check_s - self._collector.glance(now_s).still_s + after_s
-        if stage == "dithering":
+        if state is State.DITHERING:
             return self._conductor.dither_s + self.whole_s
         return self.whole_s
 
-    def _left_s(self, stage: str, estimate_s: float, now_s: float) -> float:
+    def _left_s(self, state: State, estimate_s: float, now_s: float) -> float:
         end_s = now_s + estimate_s
-        if self._promised is not None and self._promised[0] == stage:
+        if self._promised is not None and self._promised[0] is state:
             promised_s = self._promised[1]
             # Only a movement makes the look at the telemetry start again.
-            started_again = stage == "checking" and end_s > promised_s + MOVED_S
+            started_again = state is State.VERIFYING and end_s > promised_s + MOVED_S
             end_s = end_s if started_again else min(end_s, promised_s)
-        self._promised = (stage, end_s)
+        self._promised = (state, end_s)
         return max(1.0, math.ceil(end_s - now_s))

@@ -12,16 +12,16 @@ import math
 from collections.abc import Callable
 from typing import Final, Literal
 
-from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.machine import State
 from companion.calibration.solution.validity import Why
 from companion.component.service import ArmAnswer
 from companion.config import AtArm
 from companion.daemon.arming.forecast import Forecast
 from companion.daemon.arming.in_force import InForce
 from companion.daemon.calibrating.conductor import Conductor
-from companion.daemon.calibrating.course import Stage
-from companion.daemon.offsets.recovery import Recovery
+from companion.daemon.calibrating.why_not import Rung
 from companion.physics.units import DEG_H, MG
 
 logger = logging.getLogger(__name__)
@@ -32,13 +32,19 @@ STEADY_S: Final = 2.0
 OLDEST_ANSWER_S: Final = 1.5
 """An answer that was not renewed for so long (the loop stood still) is none."""
 
-_IN_THE_MIDDLE: Final[dict[Stage, str]] = {
-    "dithering": "offsets are being dithered",
-    "writing": "in the middle of writing new offsets",
-    "checking": "new offsets written, not checked yet",
-    "restarting": "autopilot is being restarted",
-    "settling": "new offsets, EKF still settling",
-    "putting back": "old offsets are being put back",
+_IN_THE_MIDDLE: Final[dict[State, str]] = {
+    State.DITHERING: "offsets are being dithered",
+    State.WRITING: "in the middle of writing new offsets",
+    State.VERIFYING: "new offsets written, not checked yet",
+    State.RESTARTING: "autopilot is being restarted",
+    State.SETTLING: "new offsets, EKF still settling",
+    State.UNDOING: "old offsets are being put back",
+}
+_CLOSED: Final = (Rung.FAULT, Rung.CONFLICT, Rung.UNKNOWN, Rung.PENDING)
+"""What keeps the gate closed whatever is in force; the other rungs have answers of their own."""
+_WAITS: Final = {
+    Rung.UNKNOWN: "no heartbeat from the autopilot",
+    Rung.PENDING: "old offsets are being put back: wait",
 }
 
 
@@ -49,15 +55,12 @@ class Readiness:
         vehicle: armed or not, which autopilot.
         collector: whether it stands still.
         conductor: what runs, and what is set for arming.
-        recovery: whether something has to be put in order first.
         in_force: what is in force, and what speaks against it.
     """
 
-    def __init__(
-        self, vehicle: Vehicle, collector: RollingCollector, conductor: Conductor, recovery: Recovery, in_force: InForce
-    ) -> None:
+    def __init__(self, vehicle: Vehicle, collector: RollingCollector, conductor: Conductor, in_force: InForce) -> None:
         self._vehicle, self._collector, self._conductor = vehicle, collector, conductor
-        self._recovery, self.in_force = recovery, in_force
+        self.in_force = in_force
         self._forecast = Forecast(vehicle, collector, conductor)
         self.why_not_by_itself: Callable[[], str | None] = lambda: "calibrate first"
         """Why no calibration will start by itself, and what to do, or None when one will."""
@@ -85,7 +88,7 @@ class Readiness:
         """The answer as of the last fraction of a second; what can change at once is looked at again."""
         if asyncio.get_running_loop().time() - self._answered_s > OLDEST_ANSWER_S:
             return ArmAnswer("wait", "companion is busy: try again")
-        if self._conductor.is_writing and self._answer.verdict == "accept":
+        if self._conductor.state.is_writing and self._answer.verdict == "accept":
             return ArmAnswer("wait", "writing new offsets: wait")
         return self._answer
 
@@ -120,22 +123,16 @@ class Readiness:
     @property
     def _writing(self) -> bool:
         """Whether a job that may write runs, or one that was interrupted is being put in order."""
-        job = self._conductor.job
-        return (job is not None and not job.finished.done()) or self._recovery.pending
+        return self._conductor.why_not((Rung.BUSY, Rung.PENDING)) is not None
 
     def _judge(self, now_s: float) -> ArmAnswer:
-        if self._recovery.fault is not None:
-            return ArmAnswer("refuse", self._recovery.fault)
-        if (conflict := self._vehicle.conflict) is not None:
-            return ArmAnswer("refuse", conflict)
-        if self._vehicle.arm_state is ArmState.UNKNOWN:
-            return ArmAnswer("wait", "no heartbeat from the autopilot")
-        if self._recovery.pending:
-            return ArmAnswer("wait", "old offsets are being put back: wait")
+        if (obstacle := self._conductor.why_not(_CLOSED)) is not None:
+            wait = _WAITS.get(obstacle.rung)
+            return ArmAnswer("refuse", obstacle.words) if wait is None else ArmAnswer("wait", wait)
         if not self._conductor.push_parameters:
             return ArmAnswer("refuse", "writing is off (CMP_PUSH): no gate")
         glance = self._collector.glance(now_s)
-        if self._conductor.is_writing:
+        if self._conductor.state.is_writing:
             return ArmAnswer("wait", self._forecast.words(now_s))
         if glance.obstacle is not None and not glance.moving:
             return ArmAnswer("refuse", glance.obstacle.words)
@@ -171,14 +168,13 @@ class Readiness:
         """In which state it would arm now, in a word and in one short line."""
         state, words = self._state(now_s)
         held_back = self.in_force.held_back
-        if held_back is None or self._conductor.stage is not None:
+        if held_back is None or self._conductor.state.is_writing:
             return state, words
         return state, f"{words}; {held_back}; calibrate to write it" if words else f"{held_back}; calibrate to write it"
 
     def _state(self, now_s: float) -> tuple[Literal["calibrated", "checked", "uncalibrated"], str]:
-        stage = self._conductor.stage
-        if stage is not None:
-            return "uncalibrated", _IN_THE_MIDDLE[stage]
+        if (middle := _IN_THE_MIDDLE.get(self._conductor.state)) is not None:
+            return "uncalibrated", middle
         if (reading := self.in_force.reading()) is not None:
             return "uncalibrated", reading
         findings = self.in_force.findings(now_s)

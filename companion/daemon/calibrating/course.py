@@ -10,7 +10,7 @@ import asyncio
 import logging
 import math
 from collections.abc import Callable, Container, Mapping
-from typing import Final, Literal
+from typing import Final
 
 import msgspec
 
@@ -45,7 +45,6 @@ from companion.recording.collector import RecordedCollector
 
 logger = logging.getLogger(__name__)
 
-Stage = Literal["dithering", "writing", "checking", "restarting", "settling", "putting back"]
 
 POLL_S: Final = 0.2
 """A second that is complete is looked at when it is; so often at what else may change."""
@@ -65,6 +64,7 @@ class Course:
     def __init__(
         self,
         config: Config,
+        machine: Machine,
         vehicle: Vehicle,
         collector: RecordedCollector,
         imus: Mapping[str, AutopilotImu],
@@ -80,8 +80,7 @@ class Course:
         self._config, self._vehicle, self._collector, self._imus = config, vehicle, collector, imus
         self._pusher, self._ditherer, self._reboot = pusher, ditherer, reboot
         self._say, self._offload, self._alignment = say, offload, alignment
-        self.machine = Machine()
-        """Where it stands."""
+        self.machine = machine
         self.settings = models.settings(config)
         """How good is good enough."""
         self.on_solved: Callable[[Window, Window, Whereabouts, What, Expectation], None] = lambda *of_what: None
@@ -89,26 +88,22 @@ class Course:
         from before."""
         self._written = {imu.name for imu in config.imu if imu.name in imus or imu.autopilot_instance is not None}
         """IMUs whose offsets are in the autopilot."""
-        self._late: Stage = "checking"
-        """Of State.VERIFYING."""
         self._settled_by_s = 0.0
-        self._dithered = False
         self._upsets: dict[str, int] = {}
         """By IMU, how many there had been before this calibration."""
 
-    @property
-    def is_dithering(self) -> bool:
-        """Whether offsets are being stepped, or were and what comes of it is being worked out."""
-        return self._ditherer.active or (self._dithered and self.machine.state is State.SOLVING)
+    def retarget(self, settings: Settings) -> None:
+        """Change how good is good enough."""
+        self.settings = settings
 
     @property
-    def stage(self) -> Stage | None:
-        """What of a write is under way; None while nothing is being written."""
-        if self.is_dithering:
-            return "dithering"
-        if self.machine.state is State.WRITING:
-            return "writing"
-        return self._late if self.machine.state is State.VERIFYING else None
+    def push(self) -> bool:
+        """Whether results are written to the autopilot."""
+        return self._pusher.enabled
+
+    def switch(self, *, push: bool) -> None:
+        """Change that."""
+        self._pusher.enabled = push
 
     @property
     def settling_s(self) -> float:
@@ -136,7 +131,7 @@ class Course:
             except WriteFailedError as error:
                 if error.kind not in ("not as believed", "without effect") or error.left_changed:
                     raise
-                self.machine.on(Event.AGAIN if self.machine.state is State.WRITING else Event.MOVED)
+                self.machine.on(Event.MOVED)
                 if error.kind == "not as believed":
                     logger.warning("%s; put back, measuring again for the right one", error.reason)
                     draft.begin_again(f"{error.reason}; put back, and written where it belongs")
@@ -158,7 +153,6 @@ class Course:
 
     async def _measure_and_push(self, job: Job, draft: Draft) -> None:
         self._collector.retarget(self._wanted(job.what))
-        self._dithered = False
         while True:
             self._collector.on_second = job.look_again
             try:
@@ -202,18 +196,19 @@ class Course:
             )
 
         async with self._pusher.written(plan, draft, lambda words: job.progress(MEASURED_PERCENT, words)) as plan:
-            self._late = "checking"
             self.machine.on(Event.WRITTEN)
             job.progress(WRITTEN_PERCENT, "watching the telemetry take the new offsets")
             await self._pusher.verify(plan, window, draft, go_on)
-        self._late = "restarting" if job.reboot else "checking"
+        if job.reboot:
+            self.machine.on(Event.REBOOT)
         boots = self._vehicle.boots
         await self._reboot.conclude(job, plan, window, draft)
+        self.machine.on(Event.VERIFIED)
         if self._vehicle.boots == boots:  # after a restart the EKF has started afresh
             await self._settle(job, plan, draft)
             if self._vehicle.boots != boots:
                 await self._reboot.survived(plan, draft)
-        self.machine.on(Event.VERIFIED)
+        self.machine.on(Event.CONCLUDED)
 
     async def _weighed(
         self, solution: Solution, job: Job, draft: Draft, tell: Callable[[Expectation], None]
@@ -259,7 +254,6 @@ class Course:
             job.progress(SETTLING_PERCENT, words)
 
         self._settled_by_s = asyncio.get_running_loop().time() + self._pusher.settles_within_s(plan)
-        self._late = "settling"
         try:
             words = await self._pusher.settle(plan, go_on)
         except JobCancelledError as cancelled:
@@ -272,9 +266,7 @@ class Course:
         """The window with better means for IMUs whose integers do not tell, where that is allowed."""
         if not self._pusher.enabled:
             return window
-        refined = await self._ditherer.refine(window, job, draft, lambda words: job.progress(MEASURED_PERCENT, words))
-        self._dithered = any(imu.dithered for imu in refined.imus)
-        return refined
+        return await self._ditherer.refine(window, job, draft, lambda words: job.progress(MEASURED_PERCENT, words))
 
     def _wanted(self, what: What) -> Settings:
         """The targets of what was asked for; the rest may be as bad as it likes."""

@@ -13,6 +13,7 @@ from companion.component.service import Refusal
 from companion.daemon.calibrating.align_steps import HEADINGS, Plan
 from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.calibrating.conductor import Conductor
+from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.job import ALIGNMENT
 from companion.errors import CalibrationRefusedError
 from companion.links.system.request import Object
@@ -34,9 +35,8 @@ async def answer_align(
     if action == "show":
         yield {"kind": "result", **_shown(alignment)}
     elif action == "forget":
-        job = conductor.job
-        if job is not None and not job.finished.done():
-            raise CalibrationRefusedError(f"a {job.kind} is running ({job.words or conductor.state.value})")
+        if (busy := conductor.why_not((Rung.BUSY,))) is not None:
+            raise CalibrationRefusedError(busy.words)
         was = await alignment.forget()
         words = "the configuration's zero and sigma are in force" if was else "there was no alignment to forget"
         yield {"kind": "result", "state": "done", "reason": words}
@@ -66,10 +66,10 @@ async def _measure(conductor: Conductor, request: Object, face: str) -> AsyncIte
     job = conductor.start_alignment(plan, f"{face} align", float(timeout_s))
     if isinstance(job, Refusal):
         raise CalibrationRefusedError(job.reason)
-    while not job.finished.done():
+    while job.is_running:
         yield {
             "kind": "progress",
-            "state": conductor.state.value,
+            "state": conductor.state.shown,
             "percent": job.progress_percent,
             "text": job.words,
             "job": ALIGNMENT,

@@ -106,7 +106,7 @@ class Answers:
         self._rivalry, self._reach, self._recovery, self._readiness = rivalry, reach, recovery, readiness
         self._armings, self._gate_setup, self._automatic = armings, gate_setup, automatic
         self._recorder, self._link, self._pose, self._alignment = recorder, link, pose, alignment
-        self._headlines = Headlines(vehicle, collector, conductor, recovery, readiness, automatic, mavlink_url, trouble)
+        self._headlines = Headlines(vehicle, collector, conductor, readiness, automatic, mavlink_url, trouble)
         self._concerns: list[Callable[[], str | None]] = [implausible]
         self._headlines.concern = lambda: next(filter(None, (concern() for concern in self._concerns)), None)
         self._carried: Carried | None = None
@@ -156,7 +156,7 @@ class Answers:
             if running and self._conductor.job is not None:
                 await asyncio.shield(self._conductor.job.finished)
             reason = self._conductor.reason if running else "nothing was running"
-            yield {"kind": "result", "state": self._conductor.state.value, "reason": reason}
+            yield {"kind": "result", "state": self._conductor.state.shown, "reason": reason}
         elif command == "undo":
             job = _accepted(self._conductor.start_undo(f"{face} undo", force=request.get("force") is True))
             result = await asyncio.shield(job.finished)
@@ -199,12 +199,12 @@ class Answers:
         reboot = request.get("reboot") is True
         job = _accepted(self._conductor.start_calibration(what, f"{face} calibrate", timeout_s, reboot=reboot))
         if not request.get("wait"):
-            yield {"kind": "result", "state": self._conductor.state.value, "reason": "calibration started"}
+            yield {"kind": "result", "state": self._conductor.state.shown, "reason": "calibration started"}
             return
-        while not job.finished.done():
+        while job.is_running:
             yield {
                 "kind": "progress",
-                "state": self._conductor.state.value,
+                "state": self._conductor.state.shown,
                 "percent": self._conductor.progress_percent,
                 "text": job.words,
             }
@@ -218,8 +218,7 @@ class Answers:
 
     def status(self) -> Object:
         """What the daemon is doing, as JSON can hold it."""
-        conductor, job = self._conductor, self._conductor.job
-        busy = job is not None and not job.finished.done()
+        conductor, job = self._conductor, self._conductor.running
         now_s = asyncio.get_running_loop().time()
         still = self._collector.status(now_s)
         age_s = self._vehicle.heartbeat_age_s
@@ -228,9 +227,9 @@ class Answers:
         counts = {source.name: {"lost": source.lost, "dropped": source.dropped} for source in still.sources}
         return {
             "headline": _plain(self._headlines.now()),
-            "state": conductor.state.value,
-            "reason": job.words if busy and job is not None else conductor.reason,
-            "progress": conductor.progress_percent if busy else None,
+            "state": conductor.state.shown,
+            "reason": job.words if job is not None else conductor.reason,
+            "progress": conductor.progress_percent if job is not None else None,
             "still_s": round(still.still_s, 1),
             "waiting_for": still.waiting_for,
             "vehicle": {

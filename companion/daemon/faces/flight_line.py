@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Final, get_args
 
-from companion.calibration.solution.record import ImuRecord, Record
+from companion.calibration.solution.record import ImuRecord
 from companion.component.own_parameters import OwnParameters
+from companion.component.service import JobResult
 from companion.config import AtArm, Config
 from companion.daemon.calibrating.conductor import Conductor
+from companion.daemon.job import Job
 from companion.errors import ConfigError
 from companion.physics.units import DEG_H, MG
 
@@ -44,12 +46,15 @@ def define_parameters(parameters: OwnParameters, config: Config, conductor: Cond
     parameters.define("CMP_GYR_SIG", 0.0, 0.0, LARGEST, read_only=True)
     parameters.define("CMP_ACC_SIG", 0.0, 0.0, LARGEST, read_only=True)
 
-    def show(record: Record) -> None:
+    def show(job: Job, result: JobResult) -> None:
+        del result
+        if (record := job.record) is None:
+            return
         parameters.set("CMP_STATE", STATE_NUMBER[record.state])
         parameters.set("CMP_GYR_SIG", _worst(record.imus, "gyro_sigma_use_rad_s", DEG_H))
         parameters.set("CMP_ACC_SIG", _worst(record.imus, "accel_sigma_use_m_s2", MG))
 
-    conductor.on_result = show
+    conductor.watch(show)
 
 
 def _whole(name: str, value: float) -> int:

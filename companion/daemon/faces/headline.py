@@ -19,20 +19,17 @@ from companion.calibration.machine import State
 from companion.daemon.arming.automatic import Automatic
 from companion.daemon.arming.readiness import Readiness
 from companion.daemon.calibrating.conductor import Conductor
-from companion.daemon.calibrating.course import Stage
+from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.job import Job
-from companion.daemon.offsets.recovery import Recovery
 
 Tone = Literal["good", "wait", "busy", "bad"]
 """good: may fly. wait: the pilot's patience. busy: the companion works. bad: somebody has to do something."""
 
-_STAGES: Final[dict[Stage, str]] = {
-    "dithering": "DITHERING",
-    "writing": "WRITING",
-    "checking": "CHECKING",
-    "restarting": "RESTARTING AUTOPILOT",
-    "settling": "SETTLING",
-    "putting back": "PUTTING BACK",
+_WRITING: Final[dict[State, str]] = {
+    State.DITHERING: "DITHERING",
+    State.WRITING: "WRITING",
+    State.VERIFYING: "CHECKING",
+    State.RESTARTING: "RESTARTING AUTOPILOT",
 }
 _HOLD_STILL: Final = re.compile(r"hold still (\d+) s(?: more)?(?:: )?")
 
@@ -53,13 +50,12 @@ class Headlines:
         vehicle: Vehicle,
         collector: RollingCollector,
         conductor: Conductor,
-        recovery: Recovery,
         readiness: Readiness,
         automatic: Automatic,
         mavlink_url: str,
         trouble: Callable[[], str | None],
     ) -> None:
-        self._vehicle, self._collector, self._conductor, self._recovery = vehicle, collector, conductor, recovery
+        self._vehicle, self._collector, self._conductor = vehicle, collector, conductor
         self._readiness, self._automatic, self._mavlink_url = readiness, automatic, mavlink_url
         self._trouble = trouble
         """What is wrong with one of our own sensors, and with which; None while all do well."""
@@ -80,19 +76,20 @@ class Headlines:
 
     def _now(self) -> Headline:
         now_s = asyncio.get_running_loop().time()
-        if self._recovery.fault is not None:
-            return Headline("FAULT", self._recovery.fault, "bad")
-        if (conflict := self._vehicle.conflict) is not None:
-            return Headline("TWO AUTOPILOTS", conflict, "bad")
-        job = self._conductor.job
-        if job is not None and not job.finished.done():
+        job, obstacle = self._conductor.running, self._conductor.why_not()
+        rung = obstacle.rung if obstacle is not None else None
+        if obstacle is not None and rung is Rung.FAULT:
+            return Headline("FAULT", obstacle.words, "bad")
+        if obstacle is not None and rung is Rung.CONFLICT:
+            return Headline("TWO AUTOPILOTS", obstacle.words, "bad")
+        if job is not None:
             return self._working(job, now_s)
-        if self._vehicle.arm_state is ArmState.UNKNOWN:
+        if rung is Rung.UNKNOWN:
             return self._no_autopilot()
-        if self._recovery.pending:
+        if self._conductor.why_not((Rung.PENDING,)) is not None:
             return Headline("PUTTING BACK", "an interrupted write is being put back", "busy")
         state, words = self._readiness.state(now_s)
-        if self._vehicle.arm_state is ArmState.ARMED:
+        if rung is Rung.ARMED:
             if state == "uncalibrated":
                 return Headline("ARMED", f"not calibrated: {words}", "bad")
             return Headline("ARMED", words, "good")
@@ -110,18 +107,18 @@ class Headlines:
         return Headline("NO AUTOPILOT", f"no heartbeat for {age_s:.0f} s: {why}", "bad")
 
     def _working(self, job: Job, now_s: float) -> Headline:
-        words, percent = job.words or self._conductor.state.value, job.progress_percent
+        words, percent = job.words or self._conductor.state.shown, job.progress_percent
         if job.cancelled:
             return Headline("CANCELLING", words, "busy")
-        stage = self._conductor.stage
-        if stage == "settling":
+        state = self._conductor.state
+        if state is State.SETTLING:
             reason = "new offsets are in; the autopilot's EKF settles, at most so long"
             return Headline(f"SETTLING {math.ceil(self._conductor.settling_s)} s", reason, "busy")
-        if stage == "putting back":
+        if state is State.UNDOING:
             return Headline("PUTTING BACK", "the old values are being written", "busy")
-        if stage is not None:
-            return Headline(f"{_STAGES[stage]} {percent} %", words, "busy")
-        if self._conductor.state in (State.COLLECTING, State.SOLVING):
+        if state in _WRITING:
+            return Headline(f"{_WRITING[state]} {percent} %", words, "busy")
+        if state in (State.COLLECTING, State.SOLVING):
             return Headline(f"MEASURING {percent} %", words, "busy")
         if self._vehicle.arm_state is ArmState.UNKNOWN:
             return self._no_autopilot()

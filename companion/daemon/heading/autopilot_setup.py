@@ -86,8 +86,7 @@ class AutopilotSetup:
             raise StorageError(self._recovery.fault)
         if self._recovery.pending:
             raise AutopilotError("an interrupted set-up is being put back first")
-        job = self._conductor.job
-        if job is not None and not job.finished.done():
+        if (job := self._conductor.running) is not None:
             raise AutopilotError(f"a {job.kind} is running: wait, or companion cancel")
         if self._conductor.only_listening is not None:
             raise AutopilotError(self._conductor.only_listening)

@@ -23,6 +23,7 @@ from companion.autopilot.parameters.writer import Change, ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.collector.rolling import RollingCollector, Window
 from companion.calibration.collector.sources import integer_batches
+from companion.calibration.machine import Event, Machine
 from companion.calibration.means.dither import SECONDS, STEPS, Dithered, Step, combine, shifts_lsb, why_void
 from companion.calibration.means.windows import ImuWindow
 from companion.calibration.noise.allan import noise_profile
@@ -81,14 +82,13 @@ class Ditherer:
         collector: RollingCollector,
         writer: ParameterWriter,
         ledger: Ledger,
+        machine: Machine,
     ) -> None:
         self.enabled = config.push.dither and config.push.parameters
-        self.active = False
-        """Offsets are stepped at this moment, so nobody should arm."""
         self.left_s = 0.0
         """How long it will take yet, about; each IMU that needs it has a dither of its own."""
         self._vehicle, self._parameters, self._imus = vehicle, parameters, imus
-        self._collector, self._writer, self._ledger = collector, writer, ledger
+        self._collector, self._writer, self._ledger, self._machine = collector, writer, ledger, machine
         self._profiles = {imu.name: noise_profile(imu.profile) for imu in config.imu}
         self._horizon_s = 180.0
 
@@ -116,11 +116,8 @@ class Ditherer:
                 found.append(each)
                 continue
             writes = self._parameters.writes
-            self.active = True
-            try:
-                result = await self._dither(each, imu, job, progress)
-            finally:
-                self.active = False
+            self._machine.on(Event.DITHER)
+            result = await self._dither(each, imu, job, progress)
             writes = self._parameters.writes - writes
             draft.warn(each.name, f"imu {each.name}: offsets dithered and put back, {writes} parameter writes")
             found.append(_with(each, result))

@@ -44,8 +44,11 @@ class Recovery:
         self._ledger, self._say, self._changing = ledger, say, changing
         self._command = command
         """By which people ask for an undo."""
+        self._watchers: list[Callable[[str], None]] = []
 
-        self.on_mended: Callable[[str], None] = lambda words: None
+    def watch(self, on_recovered: Callable[[str], None]) -> None:
+        """Be told, in words, of what was put in order."""
+        self._watchers.append(on_recovered)
 
     @property
     def fault(self) -> str | None:
@@ -106,7 +109,8 @@ class Recovery:
         if foreign:
             words += f"; changed by others, left alone: {', '.join(foreign)}"
         logger.warning("%s", words)
-        self.on_mended(words)
+        for watcher in self._watchers:
+            watcher(words)
         self._say(Severity.WARNING, words, Weight.RESULT)
 
     async def undo(self, *, force: bool = False) -> dict[str, WrittenParameter]:

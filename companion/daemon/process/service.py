@@ -15,6 +15,7 @@ from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.autopilot.vehicle.ekf import EkfWatch
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.calibration.machine import Machine
 from companion.component.component import Component
 from companion.component.service import JobResult
 from companion.config import Config, Imu
@@ -31,6 +32,7 @@ from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.calibrating.bias_memory import BiasMemory
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.course import Course
+from companion.daemon.calibrating.results import Results
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.reach import Reach
 from companion.daemon.devices.sensor_watch import UNTOUCHED, Corrected, SensorWatch
@@ -54,7 +56,6 @@ from companion.daemon.offsets.reboot import Reboot
 from companion.daemon.offsets.recovery import Recovery
 from companion.daemon.offsets.rivalry import Rivalry
 from companion.daemon.recorder.recorder import Recorder
-from companion.errors import StorageError
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.transport import run_transport
 from companion.links.system.request import Object
@@ -143,8 +144,10 @@ class Service:
         )
         self.recovery = Recovery(self.vehicle, self.parameters, writer, self.ledger, self._say, self._changing)
         reboot = Reboot(self.vehicle, self.parameters, pusher, self._say)
+        machine = Machine()
         course = Course(
             config,
+            machine,
             self.vehicle,
             self.collector,
             self.imus,
@@ -152,25 +155,14 @@ class Service:
             self._say,
             offload,
             reboot,
-            Ditherer(config, self.vehicle, self.parameters, self.imus, self.collector, writer, self.ledger),
+            Ditherer(config, self.vehicle, self.parameters, self.imus, self.collector, writer, self.ledger, machine),
             self.alignment,
             self.memory,
         )
-        aligner = Aligner(
-            config, self.vehicle, self.collector, self.imus, course.machine, self.alignment, self._say, offload
-        )
+        aligner = Aligner(config, self.vehicle, self.collector, self.imus, machine, self.alignment, self._say, offload)
+        self.results = Results(self.store, self.collector, self.memory, self._say, offload)
         self.conductor = Conductor(
-            config,
-            self.vehicle,
-            self.collector,
-            course,
-            pusher,
-            self.recovery,
-            self.store,
-            self._say,
-            offload,
-            aligner,
-            self.memory,
+            config, self.vehicle, self.collector, course, aligner, self.recovery, self.results, self._say
         )
         course.on_solved = self.recorder.on_solved
         self.recorder.alignment = lambda: self.alignment.used
@@ -179,7 +171,7 @@ class Service:
         self.in_force = InForce(config, self.vehicle, self.collector, self.imus, offload)
         self.in_force.gradienter = self.alignment.model
         self.alignment.on_change = self.in_force.realigned
-        self.readiness = Readiness(self.vehicle, self.collector, self.conductor, self.recovery, self.in_force)
+        self.readiness = Readiness(self.vehicle, self.collector, self.conductor, self.in_force)
         self.readiness.reboot_owed = lambda: reboot.owed
         self.automatic = Automatic(
             self.vehicle,
@@ -191,7 +183,7 @@ class Service:
             self._say,
             offload,
         )
-        self.conductor.on_ended = self._on_ended
+        self.conductor.watch(self._on_ended)
         self.readiness.why_not_by_itself = self.automatic.why_not
         self.armings = Armings(self.vehicle, self.readiness, config.storage.path, self._say, offload)
         self.gate_setup = GateSetup(self.vehicle, self.parameters, self.readiness, self._say)
@@ -366,10 +358,7 @@ class Service:
         if self.ledger.fault is not None:
             # Stay and say so: a daemon that is gone is harder to understand from the field.
             logger.error("%s", self.ledger.fault)
-        try:
-            self.conductor.last = next(iter(self.store.history(limit=1)), None)
-        except StorageError as error:
-            logger.warning("%s; the daemon goes on without earlier records", error)
+        self.results.load()
         try:
             async with asyncio.TaskGroup() as group:
                 try:

@@ -157,7 +157,7 @@ class MqttFace:
     async def _look(self, link: MqttLink, topics: Topics) -> None:
         """Put what has changed into the outbox."""
         now_s = asyncio.get_running_loop().time()
-        state = self._conductor.state.value
+        state = self._conductor.state.shown
         if state != self._state or now_s - self._state_s >= STATE_S:
             self._state, self._state_s = state, now_s
             self._look_rarely(link, topics, now_s)
@@ -184,8 +184,7 @@ class MqttFace:
 
     @property
     def _is_busy(self) -> bool:
-        job = self._conductor.job
-        return job is not None and not job.finished.done()
+        return self._conductor.running is not None
 
     def _progress_now(self) -> bytes:
         """How the latest job does; empty before the first."""
@@ -197,7 +196,7 @@ class MqttFace:
                 "kind": job.kind,
                 "what": job.what.name.lower(),
                 "requester": job.requester,
-                "state": self._conductor.state.value,
+                "state": self._conductor.state.shown,
                 "percent": self._conductor.progress_percent,
                 "text": job.words if self._is_busy else self._conductor.reason,
             }
