@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 
 from companion.physics.units import DEG
 from companion.rotations import ROTATIONS_DEG
+from companion.samples import Vector
 
-Matrix = NDArray[np.float64]
-Array = NDArray[np.float64]
+Floats = NDArray[np.float64]
+Matrix = Floats
+Array = Floats
 
 FRD_FROM_RFU: Matrix = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
@@ -55,6 +57,12 @@ def rotation_matrix(mounting: str | tuple[float, float, float]) -> Matrix:
     if all(angle % 90.0 == 0.0 for angle in angles_deg):
         return np.rint(matrix) + 0.0  # exact where it can be, and no negative zeros
     return matrix
+
+
+def vector(values: Array) -> Vector:
+    """Three axes as plain numbers."""
+    x, y, z = values.tolist()
+    return x, y, z
 
 
 def skew(vector: Array) -> Matrix:

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.errors import StorageError
+from companion.physics.frames import Floats
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import ImuSample
 
@@ -31,8 +31,6 @@ _LONGEST: Final = 1 << 14
 """No line has more characters: a hundred columns have a tenth of that."""
 _AROUND: Final = ' "\t\r\n'
 """What may stand around a number."""
-
-Floats = NDArray[np.float64]
 
 
 class _Columns:

@@ -10,17 +10,15 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.autopilot.telemetry import imu_messages
 from companion.config import Config, Noise
 from companion.errors import StorageError
+from companion.physics.frames import Floats
 from companion.recording import topics
 from companion.recording.walk import MAGIC, Attachment, Message, Metadata, Recording
 from companion.replay.csv_columns import read_arrays
 from companion.replay.csv_log import NAME
-
-Floats = NDArray[np.float64]
 
 TRUNCATED: Final = frozenset(
     message.kind.message

@@ -10,8 +10,9 @@ from typing import Final, Literal
 
 import msgspec
 
-from companion.calibration.collector.trace import MAX_SECONDS, Axes, ImuTrace, Trace, VerdictTrace
+from companion.calibration.collector.trace import MAX_SECONDS, ImuTrace, Trace, VerdictTrace
 from companion.calibration.solution.record import Record
+from companion.samples import Vector
 
 Triad = Literal["gyro", "accel"]
 State = Literal["still", "moving", "fault", "unknown"]
@@ -31,9 +32,9 @@ class AllanPoint(msgspec.Struct, frozen=True):
     """Allan deviation of three axes at one averaging time, with about one sigma to either side."""
 
     tau_s: int
-    deviation: Axes
-    low: Axes
-    high: Axes
+    deviation: Vector
+    low: Vector
+    high: Vector
 
 
 class Allan(msgspec.Struct, frozen=True):
@@ -95,7 +96,7 @@ def _interval(freedom: float) -> tuple[float, float]:
     return math.sqrt(1.0 / high), math.sqrt(1.0 / low)
 
 
-def _axes(values: Iterable[float]) -> Axes:
+def _axes(values: Iterable[float]) -> Vector:
     x, y, z = (float(value) for value in values)
     return x, y, z
 
@@ -131,8 +132,8 @@ class Point(msgspec.Struct, frozen=True):
     number: int
     unix_s: float | None
     temperature_degc: float | None
-    bias: Axes
-    sigma_use: Axes
+    bias: Vector
+    sigma_use: Vector
 
 
 def history(records: Sequence[tuple[int, Record]], imu: str, triad: Triad) -> list[Point]:

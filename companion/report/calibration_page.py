@@ -8,7 +8,7 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.collector.trace import Axes, Trace
+from companion.calibration.collector.trace import Trace
 from companion.calibration.noise.allan import AllanModel
 from companion.calibration.solution.record import Arming, ImuRecord, Outcome, Record
 from companion.report import svg
@@ -34,6 +34,7 @@ from companion.report.page import (
     written_count,
 )
 from companion.report.seconds import allan_figure, stillness
+from companion.samples import Vector
 
 MAX_WRITTEN: Final = 60
 
@@ -195,7 +196,7 @@ def _triad(imu: ImuRecord, triad: Triad, material: Material) -> Markup:
 
 
 def _against_the_floor(
-    stat: Axes, use: Axes, model: AllanModel | None, unit: float, unit_name: str, profile: str
+    stat: Vector, use: Vector, model: AllanModel | None, unit: float, unit_name: str, profile: str
 ) -> str:
     if model is None:
         return "What this sensor can hold is not known: neither the record nor the configuration names its profile."
@@ -210,7 +211,7 @@ def _against_the_floor(
     return words
 
 
-def _sigmas(name: str, triad: Triad, stat: Axes, use: Axes, model: AllanModel | None) -> Markup:
+def _sigmas(name: str, triad: Triad, stat: Vector, use: Vector, model: AllanModel | None) -> Markup:
     """A dumbbell an axis: what averaging left, and what the next minutes can expect, against the floor."""
     unit, unit_name = UNITS[triad]
     floor = [] if model is None else [model.floor / unit]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from companion.calibration.alignment.align_record import AlignmentRecord, check
+from companion.calibration.alignment.align_record import FORMAT_VERSION, AlignmentRecord, check
 from companion.storage.state import StateFile
 
 
@@ -12,4 +12,4 @@ class AlignmentStore(StateFile[AlignmentRecord]):
     """`alignment.json` in the storage directory."""
 
     def __init__(self, directory: Path) -> None:
-        super().__init__(directory / "alignment.json", AlignmentRecord, check)
+        super().__init__(directory / "alignment.json", AlignmentRecord, check, FORMAT_VERSION)

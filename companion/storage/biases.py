@@ -32,7 +32,7 @@ class BiasStore:
     """`biases.json` in the storage directory."""
 
     def __init__(self, directory: Path) -> None:
-        self._file: StateFile[_File] = StateFile(directory / "biases.json", _File, _check)
+        self._file: StateFile[_File] = StateFile(directory / "biases.json", _File, _check, FORMAT_VERSION)
 
     def read(self) -> dict[str, KnownImu]:
         """By IMU, what is kept; what cannot be used is set aside and begun anew, since nothing hangs on it."""
@@ -54,8 +54,6 @@ class BiasStore:
 
 
 def _check(found: _File) -> None:
-    if found.format_version != FORMAT_VERSION:
-        raise msgspec.ValidationError(f"format {found.format_version}, known is {FORMAT_VERSION}")
     for known in found.imus.values():
         for point in known.points:
             check(point)

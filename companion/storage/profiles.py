@@ -8,10 +8,11 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 
+from companion import formats
 from companion.calibration.noise.allan import PROFILES, AllanModel, NoiseProfile
 from companion.config import Noise
 from companion.config.profiles import CATALOGUE
@@ -214,11 +215,7 @@ def given_profile(wanted: str, directory: Callable[[], Path]) -> str | Noise:
 
 
 def _from_json(data: bytes) -> SavedProfile:
-    raw: Any = msgspec.json.decode(data)
-    version = raw.get("format_version") if isinstance(raw, dict) else None
-    if isinstance(version, int) and version > FORMAT_VERSION:
-        raise ValueError(f"found format {version}; allowed: up to {FORMAT_VERSION} (a newer companion has saved it)")
-    found = msgspec.convert(raw, SavedProfile)
+    found: SavedProfile = formats.decode(data, SavedProfile, FORMAT_VERSION)
     for model in (found.gyro, found.accel):
         figures = (model.white, model.flicker, model.walk)
         if not all(map(math.isfinite, figures)) or min(figures) < 0.0 or model.white == 0.0:

@@ -20,6 +20,7 @@ from typing import Any, Final, Generic, TypeVar
 
 import msgspec
 
+from companion import formats
 from companion.errors import StorageError
 from companion.storage.atomic import remove_durably, write_atomically
 
@@ -94,9 +95,11 @@ class StateFile(Generic[T]):
         check: raises msgspec.ValidationError where what was found, or is to be kept, cannot be.
     """
 
-    def __init__(self, path: Path, kind: Any, check: Callable[[T], None] = lambda _: None) -> None:
+    def __init__(
+        self, path: Path, kind: Any, check: Callable[[T], None] = lambda _: None, newest: int | None = None
+    ) -> None:
         self.path = path
-        self._kind, self._check = kind, check
+        self._kind, self._check, self._newest = kind, check, newest
         self.unusable: str | None = None
         """What `take` has met last, in one line; None where all was well."""
 
@@ -107,7 +110,7 @@ class StateFile(Generic[T]):
             StorageError: it cannot be used: where and why, in one line.
         """
         try:
-            found: T = msgspec.json.decode(unsealed(read_regular(self.path)), type=self._kind)
+            found: T = formats.decode(unsealed(read_regular(self.path)), self._kind, self._newest)
             self._check(found)
         except (FileNotFoundError, NotADirectoryError):
             return None

@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from companion.calibration.collector.trace import Axes, ImuTrace, Trace, VerdictTrace
+from companion.calibration.collector.trace import ImuTrace, Trace, VerdictTrace
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.solution.record import (
     Arming,
@@ -20,6 +20,7 @@ from companion.calibration.solution.record import (
     WrittenParameter,
 )
 from companion.physics.units import DEG_H, MG
+from companion.samples import Vector
 from companion.storage.atomic import write_atomically
 from companion.storage.records import RecordStore
 
@@ -29,7 +30,7 @@ ACCEL_MG = (2.4125, -2.1596, 0.89809)
 PER_K_DEG_H = (1.5, -0.8, 0.3)
 
 
-def _axes(values: object) -> Axes:
+def _axes(values: object) -> Vector:
     x, y, z = np.asarray(values, dtype=np.float64).tolist()
     return x, y, z
 

@@ -10,7 +10,8 @@ from hypothesis.extra.numpy import arrays
 from scipy import stats
 
 from companion.calibration.means.ramps import slope_limit
-from companion.calibration.noise.robust import HUBER_C, Floats, huber_line, huber_mean, median, robust_mean
+from companion.calibration.noise.robust import HUBER_C, huber_line, huber_mean, median, robust_mean
+from companion.physics.frames import Floats
 
 
 def test_huber_mean_solves_its_own_equation() -> None:

@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.calibration.solution.record import Axes, Magnetic
+from companion.calibration.solution.record import Magnetic
 from companion.cli import main
 from companion.physics.units import DEG_H, MG
 from companion.report import calibration_page as calibration
@@ -28,6 +28,7 @@ from companion.report.advice import advice
 from companion.report.calibration_page import calibration_page
 from companion.report.history_page import history_page
 from companion.report.source import Storage
+from companion.samples import Vector
 from companion.storage.records import RecordStore
 from tests.support.histories import a_season, arming, imu_record, record, white_trace
 
@@ -469,7 +470,7 @@ _COLUMNS = (
     words=st.text(),
 )
 def test_whatever_a_record_holds_gives_pages(
-    axes: list[Axes], temperatures: list[float | None], started: list[str], words: str
+    axes: list[Vector], temperatures: list[float | None], started: list[str], words: str
 ) -> None:
     records = []
     for k, (temperature, at) in enumerate(zip(temperatures, started, strict=True)):

@@ -131,6 +131,14 @@ def test_a_damaged_record_is_passed_over_and_said(tmp_path: Path, caplog: pytest
     assert "000002.json: not a readable record" in caplog.text
 
 
+def test_a_record_of_a_newer_companion_is_refused_in_one_line(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path)
+    store.save(_record("newer")).write_bytes(b'{"format_version": 2, "reason": ["of", "another", "type"]}')
+    found = next(store.entries())
+    assert found.record is None
+    assert found.problem.endswith("found format 2; allowed: up to 1 (a newer companion has saved it)")
+
+
 def test_a_record_that_was_changed_is_passed_over_and_one_from_before_there_were_checksums_is_not(
     tmp_path: Path,
 ) -> None:

@@ -12,14 +12,14 @@ import numpy as np
 
 from companion.calibration.alignment.align import Alignment, Figures, ImuAlignment
 from companion.calibration.alignment.align_model import Stand
-from companion.physics.frames import roll_pitch_from_up
+from companion.physics.frames import Array, roll_pitch_from_up, vector
 from companion.physics.units import DEG, DEG_H, MG
+from companion.samples import Vector
 
 FORMAT_VERSION = 1
 MOST_DEG = 90.0
 """Of a gradienter's zero and of its sigma."""
 
-Axes = tuple[float, float, float]
 Pair = tuple[float, float]
 Kind = Literal["zero", "tilts"]
 
@@ -30,15 +30,15 @@ class GradienterSettings(msgspec.Struct, frozen=True, kw_only=True):
     port: str
     protocol: str
     law: str
-    mounting: str | Axes
+    mounting: str | Vector
     offset_deg: Pair
 
 
 class Determined(msgspec.Struct, frozen=True, kw_only=True):
     """Three figures, one sigma each; `known`: the stands determine it, else it is little more than was known before."""
 
-    value: Axes
-    sigma: Axes
+    value: Vector
+    sigma: Vector
     known: tuple[bool, bool, bool]
 
 
@@ -47,9 +47,9 @@ class ImuAlignmentRecord(msgspec.Struct, frozen=True, kw_only=True):
 
     name: str
     temperature_degc: float | None
-    level_bias_mg: Axes
+    level_bias_mg: Vector
     """The effective accelerometer bias when level: what a calibration there finds."""
-    level_sigma_mg: Axes
+    level_sigma_mg: Vector
     accel_bias_mg: Determined
     """Without scale, shear and misalignment, each of which looks like a bias in one pose."""
     accel_scale: Determined
@@ -110,10 +110,8 @@ def check(record: AlignmentRecord) -> None:
     """Whether a record can be used.
 
     Raises:
-        msgspec.ValidationError: of another format, or figures that no gradienter has.
+        msgspec.ValidationError: figures that no gradienter has.
     """
-    if record.format_version != FORMAT_VERSION:
-        raise msgspec.ValidationError(f"format {record.format_version}, known is {FORMAT_VERSION}")
     figures = [*record.offset_deg, record.sigma_deg]
     if not np.abs(figures).max() < MOST_DEG or record.sigma_deg <= 0.0:
         raise msgspec.ValidationError(f"offset and sigma {figures} cannot be")
@@ -155,6 +153,5 @@ def _determined(figures: Figures, unit: float) -> Determined:
     return Determined(value=_axes(figures.value / unit), sigma=_axes(figures.sigma / unit), known=(x, y, z))
 
 
-def _axes(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Axes:
-    x, y, z = (round(float(value), 7) for value in values)
-    return x, y, z
+def _axes(values: Array) -> Vector:
+    return vector(np.round(values, 7))

@@ -14,11 +14,13 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from companion import formats
 from companion.calibration.collector.sources import Kind, Source
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import AllanModel
+from companion.physics.frames import Floats
+from companion.samples import Vector
 
 FORMAT_VERSION: Final = 1
 
@@ -30,9 +32,6 @@ MAX_WORDS: Final = 100
 _FARTHEST: Final = 100_000_000
 _DIGITS: Final = 7
 """Significant ones: 0.1 ug on 1 g."""
-
-Floats = NDArray[np.float64]
-Axes = tuple[float, float, float]
 
 
 class ImuTrace(msgspec.Struct, frozen=True, kw_only=True):
@@ -50,11 +49,11 @@ class ImuTrace(msgspec.Struct, frozen=True, kw_only=True):
     accel_step_m_s2: float
     samples: tuple[int, ...]
     temperature_degc: tuple[float | None, ...]
-    gyro_rad_s: tuple[Axes | None, ...]
-    gyro_variance_rad2_s2: tuple[Axes | None, ...]
+    gyro_rad_s: tuple[Vector | None, ...]
+    gyro_variance_rad2_s2: tuple[Vector | None, ...]
     """Of one sample."""
-    accel_m_s2: tuple[Axes | None, ...]
-    accel_variance_m2_s4: tuple[Axes | None, ...]
+    accel_m_s2: tuple[Vector | None, ...]
+    accel_variance_m2_s4: tuple[Vector | None, ...]
 
 
 class VerdictTrace(msgspec.Struct, frozen=True, kw_only=True):
@@ -95,9 +94,9 @@ def from_json(data: bytes) -> Trace:
     """Read a trace back.
 
     Raises:
-        msgspec.MsgspecError: not a trace of this format.
+        msgspec.MsgspecError: not a trace, or one of a newer companion.
     """
-    trace = msgspec.json.decode(data, type=Trace)
+    trace: Trace = formats.decode(data, Trace, FORMAT_VERSION)
     length = len(trace.second)
     columns: list[Sequence[object]] = [trace.good]
     for verdict in trace.verdicts:
@@ -231,7 +230,7 @@ def _imu(imu: ImuInput, column: Sequence[_Seen | None]) -> ImuTrace:
         known = seen is not None and seen.mean is not None and seen.variance is not None
         means.append(seen.mean if seen is not None and known else None)
         variances.append(seen.variance if seen is not None and known else None)
-    # Axes are taken as independent, as everywhere: only their variances turn.
+    # Vector are taken as independent, as everywhere: only their variances turn.
     turned = np.square(rotation)
     return ImuTrace(
         name=imu.name,
@@ -252,6 +251,6 @@ def _imu(imu: ImuInput, column: Sequence[_Seen | None]) -> ImuTrace:
     )
 
 
-def _axes(values: Floats) -> Axes:
+def _axes(values: Floats) -> Vector:
     x, y, z = (float(f"{value:.{_DIGITS}g}") for value in values.tolist())
     return x, y, z

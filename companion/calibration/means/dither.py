@@ -16,14 +16,12 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import NoiseProfile, floor_variance
 from companion.calibration.noise.robust import median
 from companion.calibration.seconds.batches import Batch
 from companion.errors import CalibrationRefusedError
-
-Floats = NDArray[np.float64]
+from companion.physics.frames import Floats
 
 STEPS: Final = 10
 """Offsets in one step of the stream."""

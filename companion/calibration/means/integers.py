@@ -19,8 +19,8 @@ from companion.calibration.means.quantised import MIN_BEYOND_TWO, Cells, Fit, fi
 from companion.calibration.noise.robust import HUBER_C as FLOAT_HUBER_C
 from companion.calibration.noise.robust import median
 from companion.calibration.seconds.batches import Batch
+from companion.physics.frames import Floats
 
-Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 HUBER_C: Final = 4.0

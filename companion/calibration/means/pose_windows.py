@@ -7,13 +7,11 @@ from typing import Final, Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import white_noise
 from companion.calibration.noise.robust import huber_mean
 from companion.calibration.seconds.batches import Batch
-
-Floats = NDArray[np.float64]
+from companion.physics.frames import Floats
 
 _MAX_DECIMALS: Final = 4
 

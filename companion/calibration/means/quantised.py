@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from companion.physics.frames import Floats
 
 MIN_BEYOND_TWO: Final = 5.0
 """Readings that must lie outside the two commonest integers for both mean and sigma to be known. With two integers

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.calibration.noise.robust import Line
-
-Floats = NDArray[np.float64]
+from companion.physics.frames import Floats
 
 RAMP_T: Final = 5.0
 """|t| of a slope that counts as one, more in a short window. On sensors without a ramp a lower one costs more than it

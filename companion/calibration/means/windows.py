@@ -30,10 +30,9 @@ from companion.calibration.noise.allan import (
 from companion.calibration.noise.robust import huber_line, median, robust_mean
 from companion.calibration.seconds.batches import Batch
 from companion.errors import CalibrationRefusedError
+from companion.physics.frames import Floats, vector
 from companion.physics.units import DEG_H, MG
-
-Floats = NDArray[np.float64]
-Axes = tuple[float, float, float]
+from companion.samples import Vector
 
 WHITE_SHARE: Final = 0.09
 """White variance over floor variance below which more averaging buys nothing: white part 30 % of the floor."""
@@ -63,7 +62,7 @@ class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
     gyro_grid_rad_s: float = 0.0
     """Steps of its own that the sensor's readings had before they became integers of the stream; 0: much finer."""
     accel_grid_m_s2: float = 0.0
-    gyro_prior_rad_s: Axes | None = None
+    gyro_prior_rad_s: Vector | None = None
     """Bias known from before, in the sensor's axes and of this very stream; gates a steady turn at start."""
 
 
@@ -97,13 +96,13 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     samples: int
     duration_s: float
     """Good seconds that went into the means."""
-    gyro_rad_s: Axes
-    accel_m_s2: Axes
-    gyro_sigma_stat_rad_s: Axes
-    accel_sigma_stat_m_s2: Axes
-    gyro_sigma_use_rad_s: Axes
+    gyro_rad_s: Vector
+    accel_m_s2: Vector
+    gyro_sigma_stat_rad_s: Vector
+    accel_sigma_stat_m_s2: Vector
+    gyro_sigma_use_rad_s: Vector
     """sqrt(V(T, H)) of the sensor alone; what the pose adds comes in `solve`."""
-    accel_sigma_use_m_s2: Axes
+    accel_sigma_use_m_s2: Vector
     temperature_degc: float | None
     warnings: tuple[str, ...]
     hidden: dict[Literal["gyro", "accel"], Hidden] = {}
@@ -302,8 +301,8 @@ def _imu_estimate(
         name=imu.name,
         samples=sum(batch.n for batch in batches),
         duration_s=float(len(batches)),
-        gyro_rad_s=_axes(rotation @ gyro.mean),
-        accel_m_s2=_axes(rotation @ accel.mean),
+        gyro_rad_s=vector(rotation @ gyro.mean),
+        accel_m_s2=vector(rotation @ accel.mean),
         gyro_sigma_stat_rad_s=_turned(rotation, gyro.stat_variance),
         accel_sigma_stat_m_s2=_turned(rotation, accel.stat_variance),
         gyro_sigma_use_rad_s=_turned(rotation, gyro.use_variance),
@@ -315,13 +314,9 @@ def _imu_estimate(
     return ImuEstimate(gyro=gyro, accel=accel, window=window)
 
 
-def _axes(values: Floats) -> Axes:
-    return float(values[0]), float(values[1]), float(values[2])
-
-
-def _turned(rotation: Floats, variance: Floats) -> Axes:
+def _turned(rotation: Floats, variance: Floats) -> Vector:
     """Sigmas of independent axes after a rotation."""
-    return _axes(np.sqrt(np.square(rotation) @ variance))
+    return vector(np.sqrt(np.square(rotation) @ variance))
 
 
 def _refuse_broken(imu: ImuInput, batches: Sequence[Batch]) -> None:

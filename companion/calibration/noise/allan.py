@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from companion.config.sections import Noise
 from companion.errors import ConfigError
+from companion.physics.frames import Floats
 from companion.physics.units import DEG_H, MG
-
-Floats = NDArray[np.float64]
 
 FLOOR_OF_FLICKER: Final = math.sqrt(2.0 * math.log(2.0) / math.pi)
 """Allan deviation of pure flicker noise over B: 0.664."""

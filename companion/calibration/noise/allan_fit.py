@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import FLOOR_OF_FLICKER, allan_variance
+from companion.physics.frames import Floats
 
-Floats = NDArray[np.float64]
 Slots = NDArray[np.int64]
 
 KNOWN_SIGMAS: Final = 2.0

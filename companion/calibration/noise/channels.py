@@ -8,10 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sized
 
-import numpy as np
-from numpy.typing import NDArray
-
-Floats = NDArray[np.float64]
+from companion.physics.frames import Floats
 
 
 def lower_quartile(ordered: list[float]) -> float:

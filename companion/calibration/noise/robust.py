@@ -12,9 +12,9 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from companion.physics.frames import Floats
 
 HUBER_C: Final = 1.345
 BIWEIGHT_C: Final = 6.0

@@ -11,7 +11,6 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.calibration.means.windows import ImuInput, estimates
 from companion.calibration.noise.allan import NoiseProfile, allan_variance
@@ -19,8 +18,7 @@ from companion.calibration.noise.robust import median
 from companion.calibration.profiling.profile_fit import LEAST_STILL_S, TRIADS, Triad, fit_profile
 from companion.calibration.profiling.rest import CHANNELS, MIN_SECONDS, Rest
 from companion.calibration.seconds.batches import Batch
-
-Floats = NDArray[np.float64]
+from companion.physics.frames import Floats
 
 MEANS_S: Final = (10, 30, 60)
 NEXT_S: Final = 60

@@ -14,14 +14,13 @@ from typing import Final, Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import FLOOR_OF_FLICKER, AllanModel, NoiseProfile
 from companion.calibration.noise.allan_fit import AxisFit, Curve, curve, fit_axis
 from companion.calibration.profiling.rest import CHANNELS, Rest
 from companion.errors import CalibrationRefusedError
+from companion.physics.frames import Floats
 
-Floats = NDArray[np.float64]
 Triad = Literal["gyro", "accel"]
 
 TRIADS: Final[tuple[tuple[Triad, slice], ...]] = (("gyro", slice(0, 3)), ("accel", slice(3, 6)))

@@ -18,8 +18,7 @@ from companion.calibration.noise.allan import NoiseProfile
 from companion.calibration.seconds.batches import Batch
 from companion.calibration.stillness.gates import ImuGate
 from companion.calibration.stillness.stretch import Stretch
-
-Floats = NDArray[np.float64]
+from companion.physics.frames import Floats
 
 CHANNELS: Final = 6
 MIN_SECONDS: Final = 16

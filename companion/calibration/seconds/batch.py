@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.calibration.noise.robust import median
-
-Floats = NDArray[np.float64]
+from companion.physics.frames import Floats
 
 MAX_LEVELS: Final = 1024
 """Integers between the lowest and the highest of one second that are counted one by one; at rest it is a tenth."""

@@ -12,15 +12,15 @@ from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.history import Point, Triad
 from companion.calibration.solution.record import (
     AlignmentUsed,
-    Axes,
     CrossCovariance,
     ImuRecord,
     Record,
     WrittenParameter,
 )
 from companion.calibration.solution.solve import ImuSolution, Solution
-from companion.physics.frames import Array, Matrix
+from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG_H, MG
+from companion.samples import Vector
 
 
 @dataclasses.dataclass(slots=True)
@@ -107,11 +107,8 @@ class Draft:
         )
 
 
-def _axes(vector: Array | None) -> Axes | None:
-    if vector is None:
-        return None
-    x, y, z = (float(value) for value in vector)
-    return x, y, z
+def _axes(values: Array | None) -> Vector | None:
+    return None if values is None else vector(values)
 
 
 def _covariance(matrix: Matrix, *, gyro: bool, accel: bool) -> tuple[tuple[float | None, ...], ...] | None:

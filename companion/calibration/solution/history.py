@@ -1,5 +1,7 @@
 """What earlier calibrations found of one IMU, and which of it is worth a prior.
 
+from companion.samples import Vector
+
 Kept are whole biases as they were *measured*, never what a prior has made of them: a prior that learns from itself
 believes itself more with every calibration. One power-up is one point, however often was calibrated in it: the bias
 that the sensor has started with is in all of them.
@@ -12,7 +14,8 @@ from typing import Final, Literal
 
 import msgspec
 
-Axes = tuple[float, float, float]
+from companion.samples import Vector
+
 Triad = Literal["gyro", "accel"]
 
 MOST_RAD_S: Final = 10.0
@@ -46,11 +49,11 @@ class PowerUp(msgspec.Struct, frozen=True, kw_only=True):
 class Measured(msgspec.Struct, frozen=True, kw_only=True):
     """One triad's whole bias, vehicle FRD, rad/s or m/s^2, as the readings alone gave it."""
 
-    bias: Axes
-    sigma_stat: Axes
-    sigma_use: Axes
+    bias: Vector
+    sigma_stat: Vector
+    sigma_use: Vector
     """Of the sensor alone, without what the pose adds."""
-    sigma_shared: Axes
+    sigma_shared: Vector
     """What the place and the heading add; of an accelerometer without the gradienter's zero."""
     suspect: bool = False
     """It contradicted what was known."""
@@ -71,7 +74,7 @@ class Point(msgspec.Struct, frozen=True, kw_only=True):
     unix_s: float
     power_up: PowerUp
     temperature_degc: float | None
-    up: Axes
+    up: Vector
     """Unit vector in the vehicle's axes: the attitude at which the accelerometers' bias was measured."""
     zero: str | None = None
     """Which zero of the gradienter the accelerometers were measured with; None without them."""

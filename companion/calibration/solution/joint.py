@@ -24,11 +24,11 @@ from typing import Final
 import numpy as np
 
 from companion.calibration.solution.doubt import Doubt, Witness, doubts
-from companion.calibration.solution.history import Axes, Measured, Point, PowerUp, Triad
+from companion.calibration.solution.history import Measured, Point, PowerUp, Triad
 from companion.calibration.solution.prior import Expectation, Expected, ExpectedImu
 from companion.calibration.solution.record import AccelPrior, GyroPrior, Prior
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
-from companion.physics.frames import Array, Matrix
+from companion.physics.frames import Array, Matrix, vector
 
 Whole = Mapping[str, tuple[Array | None, Array | None]]
 """By IMU: whole gyro and accelerometer bias by the readings alone, (3,) each, vehicle FRD."""
@@ -159,7 +159,7 @@ def points(
             unix_s=unix_s,
             power_up=power_ups[imu.name],
             temperature_degc=imu.temperature_degc,
-            up=_axes(shared.up),
+            up=vector(shared.up),
             zero=zero if whole[imu.name][1] is not None else None,
             zero_sigma_rad=shared.zero_sigma_rad,
             gyro=_measured(
@@ -186,10 +186,10 @@ def _measured(bias: Array | None, stat: Array, use: Array, shared: Array, *, sus
     if bias is None:
         return None
     return Measured(
-        bias=_axes(bias),
-        sigma_stat=_axes(stat),
-        sigma_use=_axes(np.sqrt(use)),
-        sigma_shared=_axes(np.sqrt(shared)),
+        bias=vector(bias),
+        sigma_stat=vector(stat),
+        sigma_use=vector(np.sqrt(use)),
+        sigma_shared=vector(np.sqrt(shared)),
         suspect=suspect,
     )
 
@@ -356,8 +356,8 @@ def _prior(
         if one.imu != imu:
             continue
         witness, expected = _witness(solution, shared, one), one.expected
-        sigma = _axes(np.sqrt(np.array(expected.variance)))
-        shift = _axes(witness.difference / witness.sigma)
+        sigma = vector(np.sqrt(np.array(expected.variance)))
+        shift = vector(witness.difference / witness.sigma)
         measured = whole[name][_TRIADS.index(one.triad)]
         assert measured is not None  # of nothing else something is known
         if one.triad == "gyro":
@@ -367,7 +367,7 @@ def _prior(
                 temperature_model=expected.by_temperature,
                 expected_rad_s=expected.value,
                 sigma_rad_s=sigma,
-                measured_rad_s=_axes(measured),
+                measured_rad_s=vector(measured),
                 shift_sigma=shift,
             )
         else:
@@ -377,12 +377,7 @@ def _prior(
                 temperature_model=expected.by_temperature,
                 expected_m_s2=expected.value,
                 sigma_m_s2=sigma,
-                measured_m_s2=_axes(measured),
+                measured_m_s2=vector(measured),
                 shift_sigma=shift,
             )
     return None if gyro is None and accel is None else Prior(gyro=gyro, accel=accel)
-
-
-def _axes(values: Array) -> Axes:
-    x, y, z = (float(value) for value in values)
-    return x, y, z

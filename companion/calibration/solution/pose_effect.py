@@ -16,7 +16,7 @@ import numpy as np
 from companion.calibration.alignment.align_model import Priors
 from companion.calibration.alignment.align_record import Determined, ImuAlignmentRecord
 from companion.calibration.solution.record import Effective
-from companion.physics.frames import Array, Matrix
+from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, MG
 
 LEVEL: Final = np.array([0.0, 0.0, -1.0])
@@ -57,9 +57,9 @@ class PoseEffect:
         own = np.square(whole) @ np.square(gravity_m_s2 * up)
         return Effective(
             scale_from=self.source,
-            scale_sigma_m_s2=_axes(gravity_m_s2 * np.diag(whole)),
-            level_sigma_m_s2=_axes(np.sqrt(np.square(sigma_use_m_s2) + np.square(whole) @ to_level)),
-            sensor_sigma_m_s2=_axes(np.sqrt(np.square(sigma_use_m_s2) + own)),
+            scale_sigma_m_s2=vector(gravity_m_s2 * np.diag(whole)),
+            level_sigma_m_s2=vector(np.sqrt(np.square(sigma_use_m_s2) + np.square(whole) @ to_level)),
+            sensor_sigma_m_s2=vector(np.sqrt(np.square(sigma_use_m_s2) + own)),
         )
 
     def warning(self, name: str, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> str | None:
@@ -104,8 +104,3 @@ def _beside(values: Array) -> Matrix:
     """xy, xz, yz as a symmetric matrix."""
     xy, xz, yz = values
     return np.array([[0.0, xy, xz], [xy, 0.0, yz], [xz, yz, 0.0]])
-
-
-def _axes(values: Array) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return x, y, z

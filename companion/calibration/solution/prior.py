@@ -16,15 +16,13 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import AllanModel, floor_variance
 from companion.calibration.solution.history import Measured, Point, PowerUp, Triad, believed
 from companion.calibration.solution.pose_effect import PoseEffect
-from companion.physics.frames import Array
+from companion.physics.frames import Array, Floats, vector
 from companion.physics.units import DEG_H, MG
-
-Axes = tuple[float, float, float]
+from companion.samples import Vector
 
 GUARDS_FROM: Final = 3
 """Power-ups."""
@@ -45,14 +43,12 @@ _AT_LEAST: Final = 0.5
 _IN_RUN_MEAN_S: Final = 30.0
 _SHORTEST_GAP_S: Final = 180.0
 
-Floats = NDArray[np.float64]
-
 
 class Expected(msgspec.Struct, frozen=True, kw_only=True):
     """What one triad's whole bias should be today, vehicle FRD, rad/s or m/s^2."""
 
-    value: Axes
-    variance: Axes
+    value: Vector
+    variance: Vector
     """Of today's bias about it, without the gradienter's zero."""
     limit: float
     """Of the gate, in sigmas: 4, or what is as improbable where the scatter is known from few points."""
@@ -98,7 +94,7 @@ class Now(msgspec.Struct, frozen=True, kw_only=True):
     unix_s: float
     power_up: PowerUp
     temperature_degc: float | None
-    up: Axes
+    up: Vector
     gravity_m_s2: float
     zero: str | None
 
@@ -149,8 +145,8 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect) 
     together = np.square(np.abs(fit.share) @ np.abs(pose)) + np.max(np.square([f.sigma_shared for f in found]), axis=0)
     same, other = _zeros(chosen, fit.share, now.zero) if triad == "accel" else (0.0, 0.0)
     return Expected(
-        value=_axes(fit.value),
-        variance=_axes(fit.variance + together),
+        value=vector(fit.value),
+        variance=vector(fit.variance + together),
         limit=student_limit(fit.freedom),
         power_ups=count,
         weighs=count >= WEIGHS_FROM and excess_k == 0.0,
@@ -189,8 +185,8 @@ def expect_today(last: Point, triad: Triad, now: Now, effect: PoseEffect, model:
     )
     same = triad == "accel" and last.zero == now.zero
     return Expected(
-        value=_axes(bias[0]),
-        variance=_axes(variance),
+        value=vector(bias[0]),
+        variance=vector(variance),
         limit=GATE_SIGMAS,
         power_ups=1,
         weighs=False,
@@ -297,8 +293,3 @@ def _zeros(points: Sequence[Point], share: Floats, today: str | None) -> tuple[f
         sigmas[point.zero] = point.zero_sigma_rad
     same = shares.pop(today, 0.0)
     return same, math.hypot(*(part * sigmas[zero] for zero, part in shares.items()), 0.0)
-
-
-def _axes(values: Floats) -> Axes:
-    x, y, z = (float(value) for value in values)
-    return x, y, z

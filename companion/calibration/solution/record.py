@@ -1,5 +1,7 @@
 """The record of one calibration: what was found, how well, and what was done with it.
 
+from companion.samples import Vector
+
 The keys are a surface that others rely on. What is unknown or does not apply is None (null in JSON), never absent
 and never zero. All axes are the vehicle's FRD.
 """
@@ -10,9 +12,11 @@ from typing import Literal
 
 import msgspec
 
+from companion import formats
+from companion.samples import Vector
+
 FORMAT_VERSION = 1
 
-Axes = tuple[float, float, float]
 Outcome = Literal["verified", "stored", "failed", "rolled_back"]
 
 
@@ -110,12 +114,12 @@ class GyroPrior(msgspec.Struct, frozen=True, kw_only=True):
     """Behind it, not counting this one."""
     temperature_model: bool
     """A line over temperature; else a mean."""
-    expected_rad_s: Axes
-    sigma_rad_s: Axes
+    expected_rad_s: Vector
+    sigma_rad_s: Vector
     """Of today's bias about it."""
-    measured_rad_s: Axes
+    measured_rad_s: Vector
     """Today's whole bias by the readings alone."""
-    shift_sigma: Axes
+    shift_sigma: Vector
     """Measured less expected, in sigmas of that difference."""
 
 
@@ -125,10 +129,10 @@ class AccelPrior(msgspec.Struct, frozen=True, kw_only=True):
     used: bool
     power_ups: int
     temperature_model: bool
-    expected_m_s2: Axes
-    sigma_m_s2: Axes
-    measured_m_s2: Axes
-    shift_sigma: Axes
+    expected_m_s2: Vector
+    sigma_m_s2: Vector
+    measured_m_s2: Vector
+    shift_sigma: Vector
 
 
 class Prior(msgspec.Struct, frozen=True, kw_only=True):
@@ -143,12 +147,12 @@ class Effective(msgspec.Struct, frozen=True, kw_only=True):
 
     scale_from: Literal["assumed", "alignment"]
     """An alignment with tilts has told the scale; else 0.5 % is assumed."""
-    scale_sigma_m_s2: Axes
+    scale_sigma_m_s2: Vector
     """Scale error times 1 g, one sigma an axis: an axis' bias moves by it times the change of its share of gravity;
     the vertical one's of a level aircraft that is tilted, times 1 - cos(tilt)."""
-    level_sigma_m_s2: Axes
+    level_sigma_m_s2: Vector
     """Sigma of the bias as that of the level aircraft."""
-    sensor_sigma_m_s2: Axes
+    sensor_sigma_m_s2: Vector
     """Sigma of the bias as the sensor's own, in its own axes, whatever its attitude."""
 
 
@@ -167,16 +171,16 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     samples: int
     temperature_degc: float | None
-    gyro_bias_rad_s: Axes | None
-    gyro_sigma_stat_rad_s: Axes | None
-    gyro_sigma_use_rad_s: Axes | None
-    accel_bias_m_s2: Axes | None
-    accel_sigma_stat_m_s2: Axes | None
-    accel_sigma_use_m_s2: Axes | None
+    gyro_bias_rad_s: Vector | None
+    gyro_sigma_stat_rad_s: Vector | None
+    gyro_sigma_use_rad_s: Vector | None
+    accel_bias_m_s2: Vector | None
+    accel_sigma_stat_m_s2: Vector | None
+    accel_sigma_use_m_s2: Vector | None
     covariance: tuple[tuple[float | None, ...], ...] | None
     """6x6: gyro x y z in rad/s, accelerometer x y z in m/s^2; None where that half was not determined."""
-    residual_gyro_rad_s: Axes | None
-    residual_accel_m_s2: Axes | None
+    residual_gyro_rad_s: Vector | None
+    residual_accel_m_s2: Vector | None
     warnings: tuple[str, ...] = ()
     written: dict[str, WrittenParameter] = {}
     prior: Prior | None = None
@@ -260,6 +264,7 @@ def from_json(data: bytes) -> Record:
     """Read a record back.
 
     Raises:
-        msgspec.MsgspecError: not a record of this format.
+        msgspec.MsgspecError: not a record, or one of a newer companion.
     """
-    return msgspec.json.decode(data, type=Record)
+    record: Record = formats.decode(data, Record, FORMAT_VERSION)
+    return record

@@ -24,8 +24,8 @@ import msgspec
 
 from companion.calibration.noise.allan import AllanModel, floor_variance
 from companion.physics.units import DEG_H, MG
+from companion.samples import Vector
 
-Axes = tuple[float, float, float]
 Triad = Literal["gyro", "accel"]
 
 DRIFT_SIGMAS: Final = 2.0
@@ -69,9 +69,9 @@ class Held(msgspec.Struct, frozen=True, kw_only=True):
     """When that was seen last."""
     temperature_degc: float | None
     """Then."""
-    sigma_use: Axes
+    sigma_use: Vector
     """rad/s or m/s^2."""
-    expected: Axes
+    expected: Vector
     """Output minus truth while all is well: zero where the autopilot corrects, else the whole bias."""
     seen: bool
     """Whether its effect was seen in the telemetry."""
@@ -82,8 +82,8 @@ class Held(msgspec.Struct, frozen=True, kw_only=True):
 class Present(msgspec.Struct, frozen=True, kw_only=True):
     """What the rolling window says now: output minus truth at this pose (rad/s or m/s^2, vehicle FRD)."""
 
-    residual: Axes
-    sigma_use: Axes
+    residual: Vector
+    sigma_use: Vector
 
 
 class Finding(msgspec.Struct, frozen=True):
@@ -94,7 +94,7 @@ class Finding(msgspec.Struct, frozen=True):
 
 
 @functools.lru_cache(maxsize=128)
-def age_limit_s(model: AllanModel, sigma_use: Axes, averaged_s: float) -> float:
+def age_limit_s(model: AllanModel, sigma_use: Vector, averaged_s: float) -> float:
     """The horizon H at which the expected wandering, V(T, H) without its white part, reaches DRIFT_SIGMAS sigma_use.
 
     Args:

@@ -24,7 +24,6 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import NoiseProfile
 from companion.calibration.noise.channels import (
@@ -36,9 +35,8 @@ from companion.calibration.noise.channels import (
     scatter_of_difference,
 )
 from companion.calibration.seconds.batches import Batch
+from companion.physics.frames import Floats
 from companion.physics.units import DEG, MG
-
-Floats = NDArray[np.float64]
 
 GYRO_MOTION_RAD_S: Final = 0.10 * DEG
 """rms of the slow part of the rate in one second. A tenth of a degree a second over 10 s is an attitude error of the

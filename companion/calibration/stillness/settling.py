@@ -14,11 +14,9 @@ from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.calibration.seconds.batches import Batch
-
-Floats = NDArray[np.float64]
+from companion.physics.frames import Floats
 
 UNKNOWN_DEG: Final = 5.0
 """What it may be off by after a movement during which nothing was heard of it."""

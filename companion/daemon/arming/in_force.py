@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 import msgspec
-import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.vehicle.vehicle import Vehicle
@@ -25,7 +24,6 @@ from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.record import ImuRecord, Record
 from companion.calibration.solution.solve import GradienterModel, Solution, solve_at
 from companion.calibration.solution.validity import (
-    Axes,
     Finding,
     Held,
     Limits,
@@ -45,10 +43,12 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import ALIGNMENT, Job
 from companion.daemon.offload import Offload
 from companion.errors import CalibrationRefusedError
+from companion.physics.frames import vector
+from companion.samples import Vector
 
 logger = logging.getLogger(__name__)
 
-_ZERO: Final[Axes] = (0.0, 0.0, 0.0)
+_ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 # Causes that a measurement settles. What the pilot undid and what somebody else chose is theirs until asked for, and
 # what a boot replaced is pushed again.
 _SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED})
@@ -59,8 +59,8 @@ SETTLED_EVERY_S: Final = 5
 class _Known(msgspec.Struct, frozen=True):
     """The offsets that the autopilot had when they were looked at last."""
 
-    gyro: Axes
-    accel: Axes
+    gyro: Vector
+    accel: Vector
     boots: int
 
 
@@ -392,7 +392,7 @@ class InForce:
                     self._held[key] = Why.NEVER
                 if residual is None or key not in self._held:
                     continue
-                present = Present(residual=_axes(residual), sigma_use=_axes(sigma))
+                present = Present(residual=vector(residual), sigma_use=vector(sigma))
                 self._present[key] = present
                 self._confirm(key, present, imu.temperature_degc, end_s, averaged_s)
                 held = self._held[key]
@@ -441,8 +441,3 @@ def _judged(config: Config) -> list[Imu]:
     """The IMUs that the autopilot flies with; where it has none of them, all."""
     flown = [imu for imu in config.imu if imu.source == "autopilot" or imu.autopilot_instance is not None]
     return flown or list(config.imu)
-
-
-def _axes(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Axes:
-    x, y, z = (float(value) for value in values)
-    return x, y, z

@@ -20,7 +20,7 @@ from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.alignment.align_record import ImuAlignmentRecord
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.solution.doubt import Doubt
-from companion.calibration.solution.history import Axes, Point, PowerUp, Triad
+from companion.calibration.solution.history import Point, PowerUp, Triad
 from companion.calibration.solution.joint import Whole, points
 from companion.calibration.solution.pose_effect import pose_effect
 from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, expect, expect_today
@@ -31,6 +31,7 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.sensors import SerialSensor
 from companion.daemon.offload import Offload
 from companion.errors import StorageError
+from companion.physics.frames import vector
 from companion.storage.biases import KEEP_POINTS, BiasStore, KnownImu
 
 logger = logging.getLogger(__name__)
@@ -150,7 +151,7 @@ class BiasMemory:
             unix_s=unix_s,
             power_up=self.power_up(name, unix_s),
             temperature_degc=imu.temperature_degc,
-            up=_axes(shared.up),
+            up=vector(shared.up),
             gravity_m_s2=shared.gravity_m_s2,
             zero=self._zero(),
         )
@@ -296,8 +297,3 @@ def _host() -> str:
         return _BOOT_ID.read_text(encoding="ascii").strip()
     except (OSError, ValueError):
         return os.urandom(8).hex()
-
-
-def _axes(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Axes:
-    x, y, z = (float(value) for value in values)
-    return x, y, z

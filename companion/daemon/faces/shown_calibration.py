@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from companion.calibration.solution.record import Axes, ImuRecord, Record
+from companion.calibration.solution.record import ImuRecord, Record
 from companion.daemon.arming.in_force import InForce
 from companion.physics.units import DEG_H, MG
+from companion.samples import Vector
 
 
 def shown_calibration(in_force: InForce, last: Record | None, now_s: float) -> dict[str, object] | None:
@@ -47,5 +48,5 @@ def _imu(imu: ImuRecord, now_degc: float | None) -> dict[str, object]:
     }
 
 
-def _scaled(axes: Axes | None, unit: float, decimals: int) -> list[float] | None:
+def _scaled(axes: Vector | None, unit: float, decimals: int) -> list[float] | None:
     return None if axes is None else [round(value / unit, decimals) for value in axes]

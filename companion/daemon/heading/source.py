@@ -9,7 +9,7 @@ import numpy as np
 
 from companion.attitude.estimator import AttitudeSettings
 from companion.calibration.noise.allan import noise_profile
-from companion.calibration.solution.record import Axes, ImuRecord
+from companion.calibration.solution.record import ImuRecord
 from companion.calibration.solution.site import LocalEarth
 from companion.config import Config, Imu
 from companion.physics.frames import rotation_matrix
@@ -18,7 +18,7 @@ from companion.samples import ImuSample, Vector
 
 UNCALIBRATED_ACCEL_MG: Final = 50.0
 """What a consumer accelerometer may be off by where only the gyros were calibrated."""
-_ZERO: Final[Axes] = (0.0, 0.0, 0.0)
+_ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 
 
 def carrying_imu(config: Config) -> Imu:
@@ -60,12 +60,12 @@ def settings_of(imu: Imu, record: ImuRecord, local: LocalEarth, gyro_step_rad_s:
     )
 
 
-def _level_sigma(record: ImuRecord) -> Axes | None:
+def _level_sigma(record: ImuRecord) -> Vector | None:
     """Of the bias as the level aircraft's, which it mostly is in flight, however it stood when it was calibrated."""
     return record.accel_sigma_use_m_s2 if record.effective is None else record.effective.level_sigma_m_s2
 
 
-def _left(record: ImuRecord, residual: Axes | None, mark: str) -> Axes | None:
+def _left(record: ImuRecord, residual: Vector | None, mark: str) -> Vector | None:
     """What an autopilot's stream still has in it: nothing, if it was written; else what was found there."""
     outcomes = {one.outcome for name, one in record.written.items() if mark in name}
     return _ZERO if outcomes and outcomes <= {"verified", "stored"} else residual
