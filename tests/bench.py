@@ -109,7 +109,7 @@ async def _one_calibration(folder: Path, recordings_mb: int = 0) -> float:
     async with Rig(folder, own_imu=True, recordings_mb=recordings_mb).running() as rig:
         await rig.ready()
         start_s, virtual_s = time.process_time(), rig.now_s
-        job = rig.service.conductor.start_calibration(What.BOTH, "bench")
+        job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "bench")
         assert isinstance(job, Job), job
         await job.finished
         return (time.process_time() - start_s) / (rig.now_s - virtual_s)
@@ -168,7 +168,7 @@ async def _longest_stalls(folder: Path) -> dict[str, float]:
     rig.offload = stalls.offload
     with stalls.watching():
         async with rig.running():
-            await rig.until(lambda: rig.service.readiness.answer().verdict == "accept", 100.0)
+            await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 100.0)
             rig.double.arm()
             await asyncio.sleep(2.0)
             rig.double.disarm()

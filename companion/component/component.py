@@ -16,6 +16,7 @@ from companion.component.own_parameters import OwnParameters
 from companion.component.permission import Permission
 from companion.component.service import ArmGate, CalibrationService, VehicleView
 from companion.component.statustext import Severity, StatusText, Weight
+from companion.config.senders import Senders
 from companion.links.mavlink.link import MavlinkLink
 
 HEARTBEAT_PERIOD_S = 1.0
@@ -30,17 +31,24 @@ class Component:
     """
 
     def __init__(
-        self, link: MavlinkLink, vehicle: VehicleView, service: CalibrationService, gate: ArmGate | None = None
+        self,
+        link: MavlinkLink,
+        vehicle: VehicleView,
+        service: CalibrationService,
+        gate: ArmGate | None = None,
+        *,
+        texts: StatusText | None = None,
+        senders: Senders | None = None,
     ) -> None:
         self._link, self._vehicle, self._service = link, vehicle, service
-        self._woken = asyncio.Event()
+        self.texts = texts or StatusText(link)
+        self._woken = self.texts.woken
         self._known_as = link.system_id
         """The system id under which we were heard last."""
         self._next_heartbeat_s = -math.inf
         self.on_beat: Callable[[], None] = lambda: None
         """Called at every turn of the working loop."""
-        self.texts = StatusText(link, self._woken.set)
-        self.permission = Permission()
+        self.permission = Permission(senders)
         self.parameters = OwnParameters(link, self.texts.say, self._woken.set, self.permission)
         self._commands = CommandServer(link, service, self.texts.say, self._woken.set, self.permission)
         self._authoriser = ArmAuthoriser(link, vehicle, gate, self.texts.say) if gate is not None else None

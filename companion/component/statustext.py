@@ -96,16 +96,17 @@ class _Text(NamedTuple):
 class StatusText:
     """The component's voice.
 
-    `step` sends what may be sent now; `wake` is called when there is something new to send.
+    `step` sends what may be sent now.
     """
 
-    def __init__(self, link: MavlinkLink, wake: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, link: MavlinkLink) -> None:
+        self.woken = asyncio.Event()
+        """Set when there is something new to send: whoever calls `step` waits for it."""
         self.dropped = 0
         """Texts that a full queue pushed out, or that waited for a link until they were stale."""
         self.suppressed = 0
         """Repeats that were not said again."""
         self._link = link
-        self._wake = wake
         self._waiting: dict[Weight, deque[_Text]] = {weight: deque() for weight in reversed(Weight)}
         self._said_s: OrderedDict[tuple[Severity, str], float] = OrderedDict()
         self._sending: deque[mavlink.MAVLink_statustext_message] = deque()
@@ -129,7 +130,7 @@ class StatusText:
             return False
         self._remember(severity, text, now_s)
         self._waiting[weight].append(_Text(severity, text, now_s))
-        self._wake()
+        self.woken.set()
         return True
 
     def step(self, now_s: float) -> float:

@@ -28,10 +28,9 @@ class RecordedCollector(RollingCollector):
         gradienter_lag: likewise.
         compass_lag: likewise.
         field_by: likewise.
-        message_of: the autopilot's message that an IMU's samples come in at present; None for one of our own.
     """
 
-    not_state: Final = frozenset({"journal", "windows", "on_second", "_message_of", "_windows_made"})
+    not_state: Final = frozenset({"journal", "windows", "on_second", "_messages", "_windows_made"})
 
     def __init__(
         self,
@@ -43,7 +42,6 @@ class RecordedCollector(RollingCollector):
         gradienter_lag: Lag = AT_ONCE,
         compass_lag: Lag = AT_ONCE,
         field_by: tuple[CompassModel, GradienterModel | None] | None = None,
-        message_of: Callable[[str], str | None],
     ) -> None:
         self.journal = Journal()
         self.windows: deque[tuple[int, Window]] = deque(maxlen=WINDOWS_KEPT)
@@ -51,7 +49,8 @@ class RecordedCollector(RollingCollector):
         self.on_second: Callable[[], None] = lambda: None
         """Called when every source has had its say on a second, from within whatever call brought that about: look
         later, not there."""
-        self._message_of = message_of
+        self._messages: dict[str, str | None] = {}
+        """By IMU, the autopilot's message that its samples come in."""
         self._windows_made = 0
         super().__init__(
             settings,
@@ -69,7 +68,7 @@ class RecordedCollector(RollingCollector):
 
     def add_imu(self, name: str, sample: ImuSample) -> None:  # noqa: D102 - as in the base class
         if self.journal.queues:
-            self.journal.imu(name, sample, self._message_of(name), sample.t_s)
+            self.journal.imu(name, sample, self._messages.get(name), sample.t_s)
         super().add_imu(name, sample)
 
     def add_tilt(self, sample: TiltSample) -> None:  # noqa: D102
@@ -86,7 +85,9 @@ class RecordedCollector(RollingCollector):
         if self._next != before:
             self.on_second()
 
-    def set_imu(self, imu: ImuInput) -> None:  # noqa: D102
+    def set_imu(self, imu: ImuInput, message: str | None = None) -> None:
+        """As in the base class; `message` is the autopilot's that its samples come in, None for one of our own."""
+        self._messages[imu.name] = message
         if self.journal.queues:
             self.journal.event(asyncio.get_running_loop().time(), "imu", imu)
         super().set_imu(imu)

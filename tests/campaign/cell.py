@@ -162,7 +162,7 @@ class _Course:
             strangers = judge.others(stage)
             # The broker is behind a real socket: whoever is slow to connect must not count as grown afterwards.
             for _ in range(CONNECTS):
-                if stage.service.mqtt is None or stage.service.mqtt.status()["connected"]:
+                if stage.service.faces.mqtt is None or stage.service.faces.mqtt.status()["connected"]:
                     break
                 await asyncio.sleep(0.25)
             whole = stage.census()
@@ -214,7 +214,7 @@ class _Course:
             async with asyncio.timeout(60.0):
                 await entered.wait()
             await asyncio.sleep(stage.chance.uniform(0.0, SHORTEST_S[stage.variant.name][phase]))
-            found = stage.service.conductor.state
+            found = stage.service.calibrating.conductor.state
             if found is not state:
                 raise MissedError(found.value)
         self._tell(f"{phase}: strikes")
@@ -257,10 +257,10 @@ class _Course:
         deadline_s = stage.now_s + RECOVERED_WITHIN_S
 
         def restless() -> str:
-            job = stage.service.conductor.job
+            job = stage.service.calibrating.conductor.job
             if job is not None and not job.finished.done():
                 return f"the {job.kind} still runs: {job.words}"
-            if stage.service.recovery.pending:
+            if stage.service.offsets.recovery.pending:
                 return "old values are still to be put back"
             return ""
 
@@ -281,8 +281,8 @@ class _Course:
     def _judge_rest(self, records: dict[str, bytes]) -> None:
         stage, fault = self._stage, self._fault
         now = judge.vectors(stage)
-        last = stage.service.conductor.last
-        done = [self._written(record) for record in stage.service.store.history() if record.state == "done"]
+        last = stage.service.calibrating.conductor.last
+        done = [self._written(record) for record in stage.service.calibrating.store.history() if record.state == "done"]
         done += judge.undoable(stage)
         for words in judge.half_written(now, *self._known, *[{**now, **each} for each in done if each]):
             if "somebody else" not in self._scene.notes:
@@ -332,12 +332,12 @@ class _Course:
                 break
             await asyncio.sleep(4.0)  # what has been heard of a second autopilot, say, counts for seconds
         if result != ACCEPTED:
-            last = stage.service.conductor.last
+            last = stage.service.calibrating.conductor.last
             self._wrong(
                 f"no calibration afterwards: {result}, {last.reason if last else None}; {stage.ground.texts()[-3:]}"
             )
             return
-        last = stage.service.conductor.last
+        last = stage.service.calibrating.conductor.last
         assert last is not None
         for words in judge.off_truth(stage, last):
             self._wrong(f"afterwards: {words}")
@@ -363,7 +363,7 @@ class _Course:
         now = stage.census()
         if _leaked(calm, now):
             self._wrong(f"not as before the fault: {calm} {now}")
-        if stage.service.mqtt is not None and stage.service.mqtt.link is not None:
-            waiting = len(stage.service.mqtt.link.outbox)
+        if stage.service.faces.mqtt is not None and stage.service.faces.mqtt.link is not None:
+            waiting = len(stage.service.faces.mqtt.link.outbox)
             if waiting > 80:
                 self._wrong(f"{waiting} messages wait for the broker")

@@ -317,7 +317,7 @@ async def control_deaf(scene: Scene) -> None:
 
 
 def _page(scene: Scene) -> tuple[str, int]:
-    page = scene.stage.service.page
+    page = scene.stage.service.faces.page
     assert page is not None
     return "127.0.0.1", page._port
 

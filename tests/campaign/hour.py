@@ -136,13 +136,15 @@ async def _operate(stage: Stage, hour: Hour, minutes: float) -> None:
         await asyncio.gather(asking, return_exceptions=True)
         hour.samples.append(_sample(stage, minute, fault.name))
     await _to_rest(stage)
-    hour.calibrations = sum(record.state == "done" for record in stage.service.store.history())
+    hour.calibrations = sum(record.state == "done" for record in stage.service.calibrating.store.history())
     if await operator.ask(CALIBRATE) != ACCEPTED:
-        last = stage.service.conductor.last
+        last = stage.service.calibrating.conductor.last
         hour.problems.append(f"no calibration after the hour: {last.reason if last else None}")
     else:
-        assert stage.service.conductor.last is not None
-        hour.problems += [f"after the hour: {words}" for words in judge.off_truth(stage, stage.service.conductor.last)]
+        assert stage.service.calibrating.conductor.last is not None
+        hour.problems += [
+            f"after the hour: {words}" for words in judge.off_truth(stage, stage.service.calibrating.conductor.last)
+        ]
 
 
 async def _people(operator: Operator, hour: Hour, chance: random.Random) -> None:
@@ -154,10 +156,11 @@ async def _people(operator: Operator, hour: Hour, chance: random.Random) -> None
 
 
 async def _to_rest(stage: Stage) -> None:
-    conductor = stage.service.conductor
+    conductor = stage.service.calibrating.conductor
     await asyncio.sleep(5.0)
     await stage.until(
-        lambda: (conductor.job is None or conductor.job.finished.done()) and not stage.service.recovery.pending, 240.0
+        lambda: (conductor.job is None or conductor.job.finished.done()) and not stage.service.offsets.recovery.pending,
+        240.0,
     )
 
 
@@ -194,7 +197,7 @@ async def _control(stage: Stage) -> tuple[asyncio.StreamReader, asyncio.StreamWr
 
 
 async def _page(stage: Stage) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    page = stage.service.page
+    page = stage.service.faces.page
     assert page is not None
     reader, writer = await asyncio.open_connection("127.0.0.1", page._port)
     writer.write(f"GET /events HTTP/1.1\r\nHost: 127.0.0.1:{page._port}\r\n\r\n".encode())

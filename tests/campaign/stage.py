@@ -229,7 +229,7 @@ class Stage(Rig):
 
     async def _live(self) -> None:
         self.service = Service(self.config, link=self.link, offload=self.offload, imu_rate_hz=IMU_RATE_HZ)
-        machine = self.service.conductor._machine
+        machine = self.service.calibrating.conductor._machine
         on = machine.on
 
         def watched(event: Event) -> State:
@@ -241,7 +241,7 @@ class Stage(Rig):
         machine.on = watched  # type: ignore[method-assign]
         self.on_start()
         control = self.config.control
-        async with ControlServer(control.path, self.service.answers.answer):
+        async with ControlServer(control.path, self.service.faces.answers.answer):
             await self.service.serve(mavlink=False)
 
     async def stop(self) -> None:
@@ -289,7 +289,7 @@ class Stage(Rig):
 
     def census(self) -> Census:
         """Of the living daemon."""
-        handlers = sum(len(each) for each in self.link._handlers.values()) + len(self.service.vehicle._listeners)
+        handlers = sum(len(each) for each in self.link._handlers.values()) + len(self.service.core.vehicle._listeners)
         return Census(len(tasks_of(self.owner)), handlers, len(os.listdir("/proc/self/fd")))
 
     def words(self) -> Iterator[str]:
@@ -316,10 +316,10 @@ class Stage(Rig):
         """Wait until the daemon knows the autopilot, its offsets, and hears its own devices."""
 
         def is_ready() -> bool:
-            if "fc" not in getattr(self, "service", _NOTHING).imus:
+            if not hasattr(self, "service"):
                 return False
-            imu = self.service.imus["fc"]
-            heard = all(sensor.link.bytes_received for sensor in self.service.sensors)
+            imu = self.service.devices.imus["fc"]
+            heard = all(sensor.link.bytes_received for sensor in self.service.devices.sensors)
             return imu.calibration is not None and imu.stream.samples > 0 and heard
 
         deadline_s = self.now_s + 30.0
@@ -330,13 +330,6 @@ class Stage(Rig):
 
     def device(self, name: str) -> SerialDevice:
         return self.devices[name]
-
-
-class _Nothing:
-    imus: dict[str, Any] = {}  # noqa: RUF012
-
-
-_NOTHING = _Nothing()
 
 
 def _strings(value: Any) -> Iterator[str]:

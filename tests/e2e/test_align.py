@@ -68,7 +68,7 @@ async def follow(rig: Rig, hands: Hands, job: Job) -> JobResult:
 
 
 async def aligned(rig: Rig, hands: Hands, plan: Plan) -> JobResult:
-    return await follow(rig, hands, started(rig.service.conductor.start_alignment(plan, "test", 900.0)))
+    return await follow(rig, hands, started(rig.service.calibrating.conductor.start_alignment(plan, "test", 900.0)))
 
 
 @pytest.mark.parametrize("plan", [Plan("zero"), Plan("zero", headings=4)], ids=["there-and-back", "four"])
@@ -86,7 +86,7 @@ def test_the_horizontal_accelerometers_become_as_good_as_the_turn(tmp_path: Path
             assert 1.0 < off_mg < 2.5
             result = await aligned(made, hands, plan)
             assert result.outcome == "done", result
-            record = made.service.alignment.record
+            record = made.service.calibrating.alignment.record
             assert record is not None
             assert record.checked
             off = np.abs(np.subtract(record.offset_deg, ZERO_DEG))
@@ -115,14 +115,14 @@ def test_a_spot_that_moved_is_refused_in_words_and_the_old_zero_stays(tmp_path: 
     async def main() -> None:
         async with made.running():
             await made.ready()
-            job = started(made.service.conductor.start_alignment(Plan("zero"), "test", 900.0))
+            job = started(made.service.calibrating.conductor.start_alignment(Plan("zero"), "test", 900.0))
             await moved(made, hands, job, 2, 180.0)
             hands.bump(0.3, 0.0)
             await moved(made, hands, job, 3, 180.0)
             result = await job.finished
             assert result.outcome == "failed"
             assert "the spot moved" in result.reason
-            assert made.service.alignment.used is None
+            assert made.service.calibrating.alignment.used is None
             assert not (tmp_path / "alignment.json").exists()
             await asyncio.sleep(10.0)
             assert "the spot moved" in "".join(made.ground.texts())
@@ -137,7 +137,7 @@ def test_tilts_tell_bias_and_scale_apart(tmp_path: Path) -> None:
     async def main() -> None:
         async with made.running():
             await made.ready()
-            job = started(made.service.conductor.start_alignment(Plan("tilts"), "test", 900.0))
+            job = started(made.service.calibrating.conductor.start_alignment(Plan("tilts"), "test", 900.0))
             for stand in (2, 3, 4):
                 await moved(made, hands, job, stand, 90.0)
             said: list[str] = []
@@ -148,7 +148,7 @@ def test_tilts_tell_bias_and_scale_apart(tmp_path: Path) -> None:
             result = await job.finished
             assert result.outcome == "done", result
             assert "not nose up or right side down again" in said[2]
-            record = made.service.alignment.record
+            record = made.service.calibrating.alignment.record
             assert record is not None
             assert np.abs(np.subtract(record.offset_deg, ZERO_DEG)).max() < 2.5 * record.sigma_deg
             (imu,) = record.imus
@@ -172,7 +172,7 @@ def test_without_a_compass_the_gyros_tell_the_turn(tmp_path: Path) -> None:
     async def main() -> None:
         async with made.running():
             await made.ready()
-            job = started(made.service.conductor.start_alignment(Plan("zero"), "test", 900.0))
+            job = started(made.service.calibrating.conductor.start_alignment(Plan("zero"), "test", 900.0))
             await moved(made, hands, job, 2, 100.0)
             await made.until(lambda: "turn it by" in job.words and "deg more" in job.words, 60.0)
             assert re.search(r"stands (99|100|101) deg from where it stood first, should be 180", job.words)
@@ -180,7 +180,7 @@ def test_without_a_compass_the_gyros_tell_the_turn(tmp_path: Path) -> None:
             await moved(made, hands, job, 3, -180.0)
             result = await job.finished
             assert result.outcome == "done", result
-            record = made.service.alignment.record
+            record = made.service.calibrating.alignment.record
             assert record is not None
             headings = [stand.heading_deg for stand in record.stands]
             assert abs(headings[1] - 180.0) < 2.0
@@ -215,7 +215,9 @@ def test_it_outlives_a_restart_and_is_not_used_with_another_configuration(tmp_pa
             assert result.outcome == "done", result
             assert (record.alignment is None) == (words is not None)
             if forget:
-                replies = [r async for r in fresh.service.answers.answer({"command": "align", "action": "forget"})]
+                replies = [
+                    r async for r in fresh.service.faces.answers.answer({"command": "align", "action": "forget"})
+                ]
                 assert replies[-1]["state"] == "done"
                 assert fresh.service.status()["alignment"] is None
                 assert not (tmp_path / "alignment.json").exists()
@@ -234,7 +236,7 @@ def test_what_was_calibrated_with_the_old_zero_is_calibrated_anew_by_itself(tmp_
     async def main() -> None:
         async with made.running():
             await made.ready()
-            conductor, in_force = made.service.conductor, made.service.in_force
+            conductor, in_force = made.service.calibrating.conductor, made.service.arming.in_force
             await made.until(lambda: conductor.last is not None and not in_force.findings(made.now_s), 200.0)
             assert conductor.last is not None
             assert conductor.last.alignment is None
@@ -268,7 +270,7 @@ def test_who_may_start_one_and_how_it_ends(tmp_path: Path) -> None:
 
     async def main() -> None:
         async with made.running():
-            conductor = made.service.conductor
+            conductor = made.service.calibrating.conductor
             await made.ready()
             # A calibration and an alignment exclude each other.
             job = started(conductor.start_alignment(Plan("zero"), "test", 900.0))
@@ -309,15 +311,15 @@ def test_a_client_that_vanishes_stops_nothing(tmp_path: Path) -> None:
     async def main() -> None:
         async with made.running():
             await made.ready()
-            replies = made.service.answers.answer({"command": "align", "action": "zero"})
+            replies = made.service.faces.answers.answer({"command": "align", "action": "zero"})
             first = await anext(replies)
             assert first["kind"] == "progress"
             await replies.aclose()  # type: ignore[attr-defined]
-            job = made.service.conductor.job
+            job = made.service.calibrating.conductor.job
             assert job is not None
             result = await follow(made, hands, job)
             assert result.outcome == "done", result
-            shown = [r async for r in made.service.answers.answer({"command": "align", "action": "show"})]
+            shown = [r async for r in made.service.faces.answers.answer({"command": "align", "action": "show"})]
             assert shown[-1]["state"] == "in force"
 
     run_virtual(main())
@@ -330,7 +332,7 @@ def test_offsets_that_somebody_changes_in_between_are_noticed(tmp_path: Path, to
     async def main() -> None:
         async with made.running():
             await made.ready()
-            job = started(made.service.conductor.start_alignment(Plan("zero"), "test", 900.0))
+            job = started(made.service.calibrating.conductor.start_alignment(Plan("zero"), "test", 900.0))
             await made.until(lambda: "waiting for it to move" in job.words, 60.0)
             if told:
                 made.double.write_as_another_station(offset_names(1, "accel")[0], 0.03)
@@ -341,7 +343,7 @@ def test_offsets_that_somebody_changes_in_between_are_noticed(tmp_path: Path, to
             result = await job.finished
             assert result.outcome == "failed"
             assert "were changed in between: align again" in result.reason
-            assert made.service.alignment.record is None
+            assert made.service.calibrating.alignment.record is None
 
     run_virtual(main())
 
@@ -359,7 +361,7 @@ def test_px4_and_an_imu_of_our_own(tmp_path: Path, mounting_deg: tuple[float, fl
             await made.ready()
             result = await aligned(made, hands, Plan("zero"))
             assert result.outcome == "done", result
-            record = made.service.alignment.record
+            record = made.service.calibrating.alignment.record
             assert record is not None
             assert [imu.name for imu in record.imus] == ["fc", "own"]
             assert np.abs(np.subtract(record.offset_deg, ZERO_DEG)).max() < 2.5 * record.sigma_deg

@@ -60,7 +60,7 @@ def test_from_4_3_on_a_calibration_is_right_and_needs_no_name_that_4_7_changed(t
             result, record = await calibrated(rig, timeout_s=400.0)
             assert result.outcome == "done", result
             integers = version == "4.3"
-            kind = rig.service.imus["fc"].stream.kind
+            kind = rig.service.devices.imus["fc"].stream.kind
             assert kind is not None
             assert (kind.message == "HIGHRES_IMU") == (not integers)
             assert list(record.imus[0].written) == [*offset_names(1, "accel"), *offset_names(1, "gyro")]
@@ -84,7 +84,7 @@ def test_preflight_storage_is_never_sent_and_the_firmwares_gyro_calibration_at_m
         async with rig.running():
             await rig.ready()
             await calibrated(rig, timeout_s=200.0)
-            await started(rig.service.conductor.start_undo("test")).finished
+            await started(rig.service.calibrating.conductor.start_undo("test")).finished
         assert mavlink.MAV_CMD_PREFLIGHT_STORAGE not in traffic.commands
         assert traffic.commands.count(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION) == (firmware == "ardupilot")
         harmless = {
@@ -101,12 +101,12 @@ def test_streams_at_a_quarter_of_their_rate_during_a_parameter_transfer_do_no_ha
     async def main() -> None:
         async with Rig(tmp_path, max_s=20.0).running() as rig:
             await rig.ready()
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
             await asyncio.sleep(4.0)
-            seen = rig.service.imus["fc"].stream.samples
+            seen = rig.service.devices.imus["fc"].stream.samples
             rig.double.channels[0].listing = True  # on our own link somebody reads all parameters, by a slow radio
             await asyncio.sleep(6.0)
-            assert rig.service.imus["fc"].stream.samples - seen == pytest.approx(150, abs=10)
+            assert rig.service.devices.imus["fc"].stream.samples - seen == pytest.approx(150, abs=10)
             rig.double.channels[0].listing = False
             result = await job.finished
             assert result.outcome == "done", result

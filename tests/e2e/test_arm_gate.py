@@ -29,7 +29,7 @@ def px4(folder: Path, at_arm: AtArm = "gate", **parameters: float) -> Rig:
 
 
 async def ready(rig: Rig) -> None:
-    await rig.until(lambda: rig.service.readiness.answer().verdict == "accept", 100.0)
+    await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 100.0)
 
 
 async def try_to_arm(rig: Rig, force: float = 0.0) -> int:
@@ -54,7 +54,7 @@ def test_px4_arms_with_a_fresh_calibration_and_refuses_without_with_the_reason_o
 ) -> None:
     async def main() -> None:
         async with px4(tmp_path).running() as rig:
-            await rig.until(lambda: rig.service.in_force.reading() is None, 20.0)
+            await rig.until(lambda: rig.service.arming.in_force.reading() is None, 20.0)
             await asyncio.sleep(2.0)
             assert await try_to_arm(rig) == 1
             assert not armed(rig)
@@ -74,14 +74,14 @@ def test_after_a_large_accelerometer_step_px4_has_to_be_rebooted_before_the_gate
 
     async def main() -> None:
         async with px4(tmp_path, CAL_ACC0_XOFF=0.3).running() as rig:
-            readiness = rig.service.readiness
+            readiness = rig.service.arming.readiness
             await rig.until(lambda: readiness.answer().words.startswith("reboot first"), 100.0)
             assert float(np.degrees(np.hypot(*rig.px4.vehicle_imus[0].estimator.tilt_error_rad))) > 0.3
             assert await try_to_arm(rig) == 1
             assert re.search(r"Not armed: reboot first: tilt up to 1\.\d deg off", texts(rig))
             assert all(len(words) <= 50 for words in rig.ground.texts())
             rig.px4.reboot()
-            await rig.until(lambda: rig.service.vehicle.boots == 1, 20.0)
+            await rig.until(lambda: rig.service.core.vehicle.boots == 1, 20.0)
             await ready(rig)
             assert await try_to_arm(rig) == 0
 
@@ -107,9 +107,9 @@ def test_a_loop_that_stands_still_closes_the_gate(tmp_path: Path) -> None:
     async def main() -> None:
         async with px4(tmp_path).running() as rig:
             await ready(rig)
-            rig.service.readiness.look = lambda: None  # type: ignore[method-assign]
+            rig.service.arming.readiness.look = lambda: None  # type: ignore[method-assign]
             await asyncio.sleep(2.0)
-            assert rig.service.readiness.answer().verdict == "wait"
+            assert rig.service.arming.readiness.answer().verdict == "wait"
             assert await try_to_arm(rig) == 1
 
     run_virtual(main())
@@ -121,7 +121,7 @@ def test_moving_the_aircraft_closes_the_gate_and_two_seconds_of_rest_open_it(tmp
             await ready(rig)
             begin_s = rig.now_s
             rig.aircraft.add(Handling(start_s=rig.aircraft.time_at(begin_s), duration_s=6.0, seed=3))
-            await rig.until(lambda: rig.service.readiness.answer().verdict != "accept", 3.0)
+            await rig.until(lambda: rig.service.arming.readiness.answer().verdict != "accept", 3.0)
             assert await try_to_arm(rig) == 1
             assert "Not armed: hold still" in texts(rig)
             await rig.until(lambda: rig.now_s > begin_s + 6.0, 10.0)
@@ -135,7 +135,7 @@ def test_moving_the_aircraft_closes_the_gate_and_two_seconds_of_rest_open_it(tmp
 def test_forced_arming_does_not_pass_by_px4s_gate(tmp_path: Path) -> None:
     async def main() -> None:
         async with px4(tmp_path).running() as rig:
-            await rig.until(lambda: rig.service.in_force.reading() is None, 20.0)
+            await rig.until(lambda: rig.service.arming.in_force.reading() is None, 20.0)
             assert await try_to_arm(rig, FORCE) == 1
             assert not armed(rig)
 
@@ -156,7 +156,7 @@ def test_the_two_step_method_is_answered_as_well(tmp_path: Path) -> None:
 def test_warn_lets_it_arm_and_says_in_which_state(tmp_path: Path) -> None:
     async def main() -> None:
         async with px4(tmp_path, "warn").running() as rig:
-            await rig.until(lambda: rig.service.in_force.reading() is None, 20.0)
+            await rig.until(lambda: rig.service.arming.in_force.reading() is None, 20.0)
             await asyncio.sleep(1.0)
             assert await try_to_arm(rig) == 0
             assert armed(rig)
@@ -182,7 +182,7 @@ def test_warn_has_nothing_to_warn_of_when_a_calibrated_aircraft_is_moved(tmp_pat
 def test_off_leaves_px4_without_an_answer(tmp_path: Path) -> None:
     async def main() -> None:
         async with px4(tmp_path, "off").running() as rig:
-            await rig.until(lambda: rig.service.in_force.reading() is None, 20.0)
+            await rig.until(lambda: rig.service.arming.in_force.reading() is None, 20.0)
             assert await try_to_arm(rig) == 1
             assert "Arm auth: No response" in texts(rig)
             assert "companion" not in texts(rig).lower()
@@ -216,16 +216,16 @@ def test_a_dead_gradienter_is_a_fault_that_denies_and_is_named(tmp_path: Path) -
 def test_what_was_in_force_at_arming_is_kept_and_shown_with_its_record(tmp_path: Path) -> None:
     async def main() -> dict[str, Any]:
         async with px4(tmp_path, "warn").running() as rig:
-            await rig.until(lambda: rig.service.vehicle.system_id == 1, 20.0)
+            await rig.until(lambda: rig.service.core.vehicle.system_id == 1, 20.0)
             rig.px4.arm()
-            await rig.until(lambda: rig.service.armings.last is not None, 5.0)
+            await rig.until(lambda: rig.service.arming.armings.last is not None, 5.0)
             rig.px4.disarm()
-            await rig.until(lambda: len(rig.service.store.history()) == 1, 100.0)
+            await rig.until(lambda: len(rig.service.calibrating.store.history()) == 1, 100.0)
             await asyncio.sleep(90.0)
             rig.px4.arm()
             await asyncio.sleep(1.5)
             history: dict[str, Any] = {}
-            async for reply in rig.service.answers.answer({"command": "history"}):
+            async for reply in rig.service.faces.answers.answer({"command": "history"}):
                 history = reply
             return history
 
@@ -282,7 +282,7 @@ def test_ardupilots_script_hears_the_verdict_only_while_it_gates(tmp_path: Path,
             await asyncio.sleep(4.0)
             assert tunnelled(rig, rig.now_s - 0.6)[-1].startswith(b"CMPA\x01\x00hold still")
             # A pilot who switches the gate off at the flight line is let go.
-            rig.service.conductor.at_arm = "warn"
+            rig.service.calibrating.conductor.at_arm = "warn"
             await asyncio.sleep(1.0)
             assert tunnelled(rig, rig.now_s - 0.6)[-1][5] == 3
 
@@ -302,8 +302,8 @@ def test_a_px4_that_does_not_ask_is_found_and_what_to_set_is_said(
 ) -> None:
     async def main() -> None:
         async with px4(tmp_path, "gate", **parameters).running() as rig:
-            await rig.until(lambda: rig.service.gate_setup.known, 30.0)
-            assert rig.service.gate_setup.problem == problem
+            await rig.until(lambda: rig.service.arming.gate_setup.known, 30.0)
+            assert rig.service.arming.gate_setup.problem == problem
             await asyncio.sleep(3.0)
             assert ("NO GATE" in texts(rig)) == (problem is not None)
 
@@ -320,9 +320,9 @@ def test_an_ardupilot_without_the_script_is_found(tmp_path: Path, version: str, 
             store._types["CMPG_ENABLE"], store.values["CMPG_ENABLE"] = mavlink.MAV_PARAM_TYPE_REAL32, 1.0
             store.names += ("CMPG_ENABLE",)
         async with rig.running():
-            await rig.until(lambda: rig.service.gate_setup.known, 60.0)
+            await rig.until(lambda: rig.service.arming.gate_setup.known, 60.0)
             said = "the arming script does not run (see: companion lua)"
-            assert rig.service.gate_setup.problem == (None if script else said)
+            assert rig.service.arming.gate_setup.problem == (None if script else said)
 
     run_virtual(main())
 
@@ -331,11 +331,11 @@ def test_a_write_that_is_rolled_back_leaves_the_gate_shut(tmp_path: Path) -> Non
     async def main() -> None:
         async with Rig(tmp_path, at_arm="gate", max_s=12.0).running() as rig:
             rig.double.faults.refuse = {"INS_GYROFFS_Z"}
-            await rig.until(lambda: len(rig.service.store.history()) == 1, 100.0)
-            assert rig.service.store.history()[0].state == "failed"
+            await rig.until(lambda: len(rig.service.calibrating.store.history()) == 1, 100.0)
+            assert rig.service.calibrating.store.history()[0].state == "failed"
             for _ in range(100):
                 await asyncio.sleep(0.25)
-                assert rig.service.readiness.answer().verdict != "accept"
+                assert rig.service.arming.readiness.answer().verdict != "accept"
 
     run_virtual(main())
 
@@ -344,9 +344,9 @@ def test_a_change_that_is_not_seen_to_work_leaves_the_gate_shut(tmp_path: Path) 
     async def main() -> None:
         async with Rig(tmp_path, at_arm="gate", max_s=12.0).running() as rig:
             rig.double.faults.echo_without_effect = True
-            await rig.until(lambda: rig.service.conductor.state is State.VERIFYING, 100.0)
+            await rig.until(lambda: rig.service.calibrating.conductor.state is State.VERIFYING, 100.0)
             for _ in range(200):
                 await asyncio.sleep(0.25)
-                assert rig.service.readiness.answer().verdict != "accept"
+                assert rig.service.arming.readiness.answer().verdict != "accept"
 
     run_virtual(main())

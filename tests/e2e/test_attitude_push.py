@@ -42,8 +42,8 @@ class Flight:
 
     @property
     def attitude(self) -> AttitudeService:
-        assert self.rig.service.attitude is not None
-        return self.rig.service.attitude
+        assert self.rig.service.heading.attitude is not None
+        return self.rig.service.heading.attitude
 
     @property
     def true_yaw_rad(self) -> float:
@@ -64,7 +64,7 @@ class Flight:
         await self.rig.until(lambda: self.rig.now_s >= end_s, seconds + 1.0)
 
     async def calibrate(self) -> None:
-        job = self.rig.service.conductor.start_calibration(What.BOTH, "test")
+        job = self.rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
         assert isinstance(job, Job)
         assert (await job.finished).outcome == "done"
 
@@ -194,7 +194,7 @@ def test_full_shows_ground_stations_too(tmp_path: Path) -> None:
                 # The same rotation, reckoned by the other definition.
                 forward = [1 - 2 * (q[2] ** 2 + q[3] ** 2), 2 * (q[1] * q[2] + q[0] * q[3])]
                 assert math.atan2(forward[1], forward[0]) == pytest.approx(one.yaw, abs=1e-5)
-            pose = flying.rig.service.pose.now()
+            pose = flying.rig.service.heading.pose.now()
             assert pose is not None
             assert pose["source"] == "attitude"
 
@@ -456,7 +456,7 @@ def test_a_fault_of_ours_costs_the_push_and_nothing_else(tmp_path: Path, monkeyp
 
     async def main() -> None:
         async with flight(tmp_path) as flying:
-            (own,) = [device for device in flying.rig.service.sensors if device.name == "own"]
+            (own,) = [device for device in flying.rig.service.devices.sensors if device.name == "own"]
             estimator = flying.attitude.carrier.estimator
             monkeypatch.setattr(estimator, "update", lambda *_, **__: 1 / 0)
             before = own.decoder.accepted
@@ -467,7 +467,7 @@ def test_a_fault_of_ours_costs_the_push_and_nothing_else(tmp_path: Path, monkeyp
             assert len(flying.witness.of(Vision)) - last <= 2
             assert flying.attitude.carrier.estimator is not estimator
             assert own.decoder.accepted > before + 200
-            assert flying.rig.service.collector.glance(flying.rig.now_s).obstacle is None
+            assert flying.rig.service.core.collector.glance(flying.rig.now_s).obstacle is None
 
     async def rig_stops(flying: Flight) -> None:
         await flying.rig.until(lambda: not flying.attitude.health.pushing, 2.0)
@@ -488,7 +488,7 @@ def test_off_sends_nothing(tmp_path: Path) -> None:
         witness = Witness(rig)
         async with rig.running():
             await rig.ready()
-            assert rig.service.attitude is None
+            assert rig.service.heading.attitude is None
             assert rig.service.status()["attitude"] is None
             assert not witness.of(mavlink.MAVLink_timesync_message)
 

@@ -31,14 +31,14 @@ def values(rig: Rig) -> dict[str, float]:
 
 async def calibrated_by_itself(rig: Rig, more: int = 1) -> None:
     """Wait until so many automatic calibrations have been done."""
-    await rig.until(lambda: len(rig.service.store.history()) >= more, START_WITHIN_S)
-    record = rig.service.store.history(1)[0]
+    await rig.until(lambda: len(rig.service.calibrating.store.history()) >= more, START_WITHIN_S)
+    record = rig.service.calibrating.store.history(1)[0]
     assert record.state == "done", record
 
 
 async def started_by_itself(rig: Rig, state: State = State.VERIFYING) -> Job:
-    await rig.until(lambda: rig.service.conductor.state is state, START_WITHIN_S)
-    job = rig.service.conductor.job
+    await rig.until(lambda: rig.service.calibrating.conductor.state is state, START_WITHIN_S)
+    job = rig.service.calibrating.conductor.job
     assert job is not None
     assert job.automatic
     return job
@@ -67,7 +67,7 @@ def test_nothing_happens_by_itself_with_at_arm_off_or_without_push(tmp_path: Pat
         async with Rig(tmp_path, **more).running() as rig:  # type: ignore[arg-type]
             await asyncio.sleep(120.0)
             assert rig.double.writes == []
-            assert rig.service.store.history() == []
+            assert rig.service.calibrating.store.history() == []
 
     run_virtual(main())
 
@@ -80,8 +80,8 @@ def test_offsets_that_are_right_already_are_not_written_again_after_a_restart_of
         writes = len(rig.double.writes)
         again = Rig(tmp_path / "again", at_arm="gate", parameters=values(rig))
         async with again.running():
-            await again.until(lambda: again.service.readiness.answer().verdict == "accept", START_WITHIN_S)
-            assert "offsets checked" in again.service.readiness.answer().words
+            await again.until(lambda: again.service.arming.readiness.answer().verdict == "accept", START_WITHIN_S)
+            assert "offsets checked" in again.service.arming.readiness.answer().words
             await asyncio.sleep(120.0)
             assert again.double.writes == []
         assert writes == 9, "six offsets, and the gyros' again over the firmware's own calibration"
@@ -97,7 +97,7 @@ def test_a_quarter_of_an_hour_on_the_grass_keeps_the_gate_open_with_few_writes(t
             closed = 0
             for _ in range(900):
                 await asyncio.sleep(1.0)
-                closed += rig.service.readiness.answer().verdict != "accept"
+                closed += rig.service.arming.readiness.answer().verdict != "accept"
             # 6 parameters a write; ICM-42688-P wanders by some 5 deg/h in minutes: below its own sigma, seldom above.
             assert len(rig.double.writes) <= 6 * 2
             assert closed < 40
@@ -111,8 +111,8 @@ def test_a_boot_with_ins_gyr_cal_1_throws_the_values_away_and_they_are_pushed_ag
             await calibrated_by_itself(rig)
             first = values(rig)
             rig.double.reboot()
-            await rig.until(lambda: rig.service.vehicle.boots == 1, 10.0)
-            await rig.until(lambda: rig.service.in_force.reading() is None, 20.0)
+            await rig.until(lambda: rig.service.core.vehicle.boots == 1, 10.0)
+            await rig.until(lambda: rig.service.arming.in_force.reading() is None, 20.0)
             await asyncio.sleep(0.5)
             assert values(rig)["INS_GYROFFS_X"] != first["INS_GYROFFS_X"]
             rig.double.arm()  # what is said in between must not claim our calibration
@@ -131,12 +131,12 @@ def test_a_boot_that_keeps_the_values_is_checked_and_nothing_is_written(tmp_path
         async with Rig(tmp_path, at_arm="gate").running() as rig:
             await calibrated_by_itself(rig)
             writes = len(rig.double.writes)
-            await rig.until(lambda: rig.service.readiness.answer().verdict == "accept", 20.0)
+            await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 20.0)
             rig.double.reboot()
-            await rig.until(lambda: rig.service.vehicle.boots == 1, 10.0)
-            assert rig.service.readiness.answer().verdict != "accept"
-            await rig.until(lambda: rig.service.readiness.answer().verdict == "accept", START_WITHIN_S)
-            assert rig.service.readiness.answer().words.startswith("calibrated")
+            await rig.until(lambda: rig.service.core.vehicle.boots == 1, 10.0)
+            assert rig.service.arming.readiness.answer().verdict != "accept"
+            await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", START_WITHIN_S)
+            assert rig.service.arming.readiness.answer().words.startswith("calibrated")
             assert len(rig.double.writes) == writes
 
     run_virtual(main())
@@ -150,18 +150,18 @@ def test_values_changed_by_another_station_are_shown_and_not_overwritten(tmp_pat
             rig.double.write_as_another_station("INS_GYROFFS_X", 0.01)
             await asyncio.sleep(90.0)
             assert rig.double.parameter("INS_GYROFFS_X") == np.float32(0.01)
-            assert len(rig.service.store.history()) == 1
+            assert len(rig.service.calibrating.store.history()) == 1
             said = " | ".join(rig.ground.texts())
             assert "Auto calibration off until asked: fc was changed" in said
-            answer = rig.service.readiness.answer()
+            answer = rig.service.arming.readiness.answer()
             assert answer.verdict == "refuse"
             assert "changed by someone else" in answer.words
             # A request is a request: it calibrates, and from then on it goes on by itself.
-            job = rig.service.conductor.start_calibration(What.BOTH, "test")
+            job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
             assert isinstance(job, Job)
             await job.finished
-            assert rig.service.automatic.stopped is None
-            await rig.until(lambda: rig.service.readiness.answer().verdict == "accept", 10.0)
+            assert rig.service.arming.automatic.stopped is None
+            await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 10.0)
 
     run_virtual(main())
 
@@ -175,7 +175,7 @@ def test_a_change_that_nobody_announced_is_found_before_anything_is_written_over
             await asyncio.sleep(90.0)
             assert rig.double.parameter("INS_ACCOFFS_X") == np.float32(0.02)
             assert rig.double.writes == []
-            assert rig.service.automatic.stopped is not None
+            assert rig.service.arming.automatic.stopped is not None
 
     run_virtual(main())
 
@@ -190,12 +190,12 @@ def test_after_an_undo_nothing_is_written_until_the_next_request(tmp_path: Path)
             await asyncio.sleep(120.0)
             assert values(rig) == before
             assert "Auto calibration off until asked: undone" in " | ".join(rig.ground.texts())
-            assert rig.service.readiness.answer().words == "calibration was undone: calibrate"
-            assert rig.service.readiness.answer().verdict == "refuse"
+            assert rig.service.arming.readiness.answer().words == "calibration was undone: calibrate"
+            assert rig.service.arming.readiness.answer().verdict == "refuse"
             assert rig.service.status()["automatic"]["stopped"] == "undone"
             rig.ground.command(CALIBRATE, 0.0)
             await rig.until(lambda: rig.ground.finals(CALIBRATE) == [ACCEPTED], 60.0)
-            await rig.until(lambda: rig.service.readiness.answer().verdict == "accept", 15.0)
+            await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 15.0)
 
     run_virtual(main())
 
@@ -209,7 +209,7 @@ def test_a_request_during_an_automatic_calibration_takes_it_over_and_gets_its_fi
             assert rig.ground.finals(CALIBRATE) == [ACCEPTED]
             assert rig.ground.acks(CALIBRATE)[0] == 5  # IN_PROGRESS
             assert not job.automatic
-            assert len(rig.service.store.history()) == 1
+            assert len(rig.service.calibrating.store.history()) == 1
             await asyncio.sleep(2.0)
             assert any(text.startswith("Calibration done") for text in rig.ground.texts())
 
@@ -241,7 +241,7 @@ def test_cancelling_an_automatic_calibration_ends_it_for_good(tmp_path: Path) ->
             await rig.until(lambda: rig.ground.finals(CANCEL) == [ACCEPTED], 10.0)
             await asyncio.sleep(90.0)
             assert values(rig) == before
-            assert rig.service.automatic.stopped == "cancelled"
+            assert rig.service.arming.automatic.stopped == "cancelled"
             assert CANCELLED not in rig.ground.acks(CALIBRATE)
 
     run_virtual(main())
@@ -265,10 +265,10 @@ def test_failures_are_not_repeated_for_ever(tmp_path: Path) -> None:
         async with Rig(tmp_path, at_arm="gate", max_s=12.0, **SLOW).running() as rig:
             rig.double.faults.echo_without_effect = True
             await asyncio.sleep(500.0)
-            history = rig.service.store.history()
+            history = rig.service.calibrating.store.history()
             assert [record.state for record in history] == ["failed"] * automatic.FAILURES
-            assert rig.service.automatic.stopped is not None
-            assert rig.service.readiness.answer().verdict == "refuse"
+            assert rig.service.arming.automatic.stopped is not None
+            assert rig.service.arming.readiness.answer().verdict == "refuse"
 
     run_virtual(main())
 
@@ -281,9 +281,9 @@ def test_the_writes_of_a_day_are_bounded_also_over_restarts(tmp_path: Path, monk
             rig = Rig(tmp_path, at_arm="gate", max_s=12.0)  # an autopilot as it was: its offsets are wrong again
             async with rig.running():
                 await asyncio.sleep(40.0)
-                assert rig.service.automatic.status()["writes_today"] == expected
-                answer = rig.service.readiness.answer()
-                assert len(rig.service.store.history()) == expected
+                assert rig.service.arming.automatic.status()["writes_today"] == expected
+                answer = rig.service.arming.readiness.answer()
+                assert len(rig.service.calibrating.store.history()) == expected
         assert answer.verdict == "refuse"
         assert "flash spared" in answer.words
 
@@ -296,13 +296,13 @@ def test_a_bias_that_moves_is_seen_in_the_window_and_written_anew(tmp_path: Path
         async with rig.running():
             await calibrated_by_itself(rig)
             await asyncio.sleep(automatic.SPACING_S)
-            assert len(rig.service.store.history()) == 1
+            assert len(rig.service.calibrating.store.history()) == 1
             # 40 deg/h more on one axis, slowly enough for nobody to call it a movement.
             _creep(rig, 40.0 * DEG_H)
             await calibrated_by_itself(rig, more=2)
             left = rig.double.residual(1, rig.now_s)
             assert abs(left.gyro_rad_s[0]) < 20 * DEG_H
-            sigma = rig.service.store.history()[0].imus[0].gyro_sigma_use_rad_s
+            sigma = rig.service.calibrating.store.history()[0].imus[0].gyro_sigma_use_rad_s
             assert sigma is not None
             assert np.all(np.abs(left.gyro_rad_s) < 3.5 * np.array(sigma)), (left, sigma)
 
@@ -321,9 +321,9 @@ def _creep(rig: Rig, by_rad_s: float) -> None:
 def test_only_the_conductor_starts_what_a_check_must_not(tmp_path: Path) -> None:
     async def main() -> None:
         async with Rig(tmp_path, at_arm="gate").running() as rig:
-            rig.service.conductor.only_listening = "only a check is running"
+            rig.service.calibrating.conductor.only_listening = "only a check is running"
             await asyncio.sleep(60.0)
             assert rig.double.writes == []
-            assert isinstance(rig.service.conductor.start_undo("test"), Refusal)
+            assert isinstance(rig.service.calibrating.conductor.start_undo("test"), Refusal)
 
     run_virtual(main())

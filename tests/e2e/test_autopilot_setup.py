@@ -28,7 +28,7 @@ AFTER: dict[Firmware, dict[str, float]] = {
 
 async def ask(rig: Rig, action: str, **more: Any) -> dict[str, Any]:
     request = {"command": "autopilot-setup", "action": action, **more}
-    (reply,) = [reply async for reply in rig.service.answers.answer(request)]
+    (reply,) = [reply async for reply in rig.service.faces.answers.answer(request)]
     return reply
 
 
@@ -63,7 +63,7 @@ def test_show_apply_undo(tmp_path: Path, firmware: Firmware) -> None:
             assert values(rig, firmware) == before
             with pytest.raises(CompanionError, match="nothing to undo"):
                 await ask(rig, "undo")
-            assert rig.service.ledger.undoable  # the calibration's
+            assert rig.service.offsets.ledger.undoable  # the calibration's
 
     run_virtual(main())
 
@@ -77,7 +77,7 @@ def test_only_disarmed_and_only_with_a_stream_to_come(tmp_path: Path) -> None:
                 await ask(flying.rig, "apply")
             assert not [write for write in flying.rig.double.writes if "EK3" in write.name or "VISO" in write.name]
             flying.rig.autopilot.disarm()
-            await flying.rig.until(lambda: flying.rig.service.vehicle.arm_state is ArmState.DISARMED, 10.0)
+            await flying.rig.until(lambda: flying.rig.service.core.vehicle.arm_state is ArmState.DISARMED, 10.0)
             # Nothing was written, so nothing is looked after first.
             assert (await ask(flying.rig, "apply"))["state"] == "applied"
             assert not [text for text in flying.rig.ground.texts() if "Interrupted write" in text]
@@ -123,7 +123,7 @@ def test_the_set_up_and_the_stream_together(tmp_path: Path) -> None:
             rig = flying.rig
             await ask(rig, "apply")
             rig.double.reboot()
-            await rig.until(lambda: rig.service.vehicle.boots == 1, 20.0)
+            await rig.until(lambda: rig.service.core.vehicle.boots == 1, 20.0)
             assert rig.double.external_nav.selected
             await flying.sleep(15.0)
             await flying.calibrate()

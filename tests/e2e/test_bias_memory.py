@@ -50,7 +50,7 @@ def power_up(
             before(rig)
         records = []
         async with rig.running():
-            rig.service.memory.power_up = lambda name, unix_s: since(run)
+            rig.service.calibrating.memory.power_up = lambda name, unix_s: since(run)
             await rig.ready()
             for _ in range(times):
                 result, record = await calibrated(rig)
@@ -209,7 +209,7 @@ def test_no_more_is_held_in_memory_than_on_the_disk(tmp_path: Path) -> None:
         async with Rig(tmp_path, own_imu=False, **FEW).running() as rig:
             await rig.ready()
             await calibrated(rig)
-            memory = rig.service.memory
+            memory = rig.service.calibrating.memory
             (point,) = memory._known["fc"].points
             for k in range(KEEP_POINTS + 5):
                 await memory.keep({"fc": msgspec.structs.replace(point, started_at=str(k))})
@@ -230,7 +230,7 @@ def test_a_damaged_file_costs_one_line_and_what_is_undone_is_forgotten(
             result, _ = await calibrated(rig)
             assert result.outcome == "done"
             assert len(BiasStore(tmp_path).read()["fc"].points) == 1
-            job = rig.service.conductor.start_undo("test")
+            job = rig.service.calibrating.conductor.start_undo("test")
             assert isinstance(job, Job)
             assert (await job.finished).outcome == "done"
             assert BiasStore(tmp_path).read()["fc"].points == ()

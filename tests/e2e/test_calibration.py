@@ -30,7 +30,7 @@ def started(answer: Job | Refusal) -> Job:
 
 
 async def calibrated(rig: Rig, what: What = What.BOTH, timeout_s: float | None = None) -> tuple[JobResult, Record]:
-    job = started(rig.service.conductor.start_calibration(what, "test", timeout_s))
+    job = started(rig.service.calibrating.conductor.start_calibration(what, "test", timeout_s))
     result = await job.finished
     assert job.record is not None
     return result, job.record
@@ -61,8 +61,8 @@ def test_both_imus_are_calibrated_at_once_and_the_autopilot_is_right_afterwards(
             assert own.written == {}
             assert own.residual_gyro_rad_s is None
             # The seconds behind the figures lie beside the record: their mean is the residual and the Earth's rate.
-            (entry,) = rig.service.store.entries()
-            trace = rig.service.store.trace(entry)
+            (entry,) = rig.service.calibrating.store.entries()
+            trace = rig.service.calibrating.store.trace(entry)
             assert trace is not None
             assert trace.measured is not None
             first, last = trace.measured
@@ -84,7 +84,7 @@ def test_both_imus_are_calibrated_at_once_and_the_autopilot_is_right_afterwards(
             assert record.site is not None
             assert record.site.source is not None
             assert "autopilot" in record.site.source
-            assert rig.service.store.history() == [record]
+            assert rig.service.calibrating.store.history() == [record]
             # A second one starts from the first: the whole bias is the same, the residual small.
             result, again = await calibrated(rig)
             assert result.outcome == "done"
@@ -227,7 +227,7 @@ def test_done_is_a_hundred_per_cent_while_the_record_is_on_its_way_to_the_disk(t
 
         async def looking(function: Callable[..., Any], *arguments: Any) -> Any:
             if hasattr(rig, "service"):
-                status = rig.service.answers.status()
+                status = rig.service.faces.answers.status()
                 seen.add((status["state"], status["progress"]))
             return function(*arguments)
 

@@ -72,7 +72,7 @@ def test_a_daemon_that_writes_while_armed_is_caught() -> None:
         arm_state = ArmState.DISARMED
 
     def sabotage(stage: Stage) -> None:
-        stage.service.vehicle.__class__ = Reckless
+        stage.service.core.vehicle.__class__ = Reckless
 
     # One strike in some thirty comes after the last PARAM_SET.
     outcomes = [run_cell(FAULTS["arms"], "writing", SEED + k, sabotage=sabotage) for k in range(3)]
@@ -85,7 +85,7 @@ def test_a_daemon_that_does_not_mend_is_caught() -> None:
         await asyncio.Event().wait()
 
     def sabotage(stage: Stage) -> None:
-        stage.service.recovery._recover = never  # type: ignore[assignment,method-assign]
+        stage.service.offsets.recovery._recover = never  # type: ignore[assignment,method-assign]
 
     outcome = run_cell(FAULTS["arms-in-write"], "solving", SEED, sabotage=sabotage)
     assert any("still to be put back" in words for words in outcome.problems), outcome
@@ -111,7 +111,7 @@ def test_a_daemon_that_leaks_tasks_is_caught() -> None:
             if OWNER.get() == owner:
                 asyncio.get_running_loop().create_task(asyncio.sleep(1e6))
 
-        stage.service.vehicle.watch(leak)
+        stage.service.core.vehicle.watch(leak)
 
     outcome = run_cell(FAULTS["link-cut"], "done", SEED, sabotage=sabotage)
     assert any("not as before the fault" in words for words in outcome.problems), outcome
@@ -119,7 +119,7 @@ def test_a_daemon_that_leaks_tasks_is_caught() -> None:
 
 def test_a_daemon_that_stands_still_is_caught() -> None:
     def sabotage(stage: Stage) -> None:
-        component = stage.service.component
+        component = stage.service.faces.component
         step = component._step
 
         def slow(now_s: float) -> float:

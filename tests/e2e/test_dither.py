@@ -62,7 +62,7 @@ def second_imu_only(
 
 
 async def ready(rig: Rig) -> None:
-    imu = rig.service.imus["second"]
+    imu = rig.service.devices.imus["second"]
     await rig.until(lambda: imu.calibration is not None and imu.stream.samples > 0, 15.0)
 
 
@@ -97,8 +97,8 @@ async def once(rig: Rig) -> tuple[JobResult, Record, float]:
 def test_truncated_integers_with_noise_enough_are_within_15_deg_h_and_150_ug_after_a_minute(tmp_path: Path) -> None:
     async def main() -> None:
         async with second_imu_only(tmp_path, DITHERED).running() as rig:
-            await rig.until(lambda: rig.service.vehicle.system_id == 1, 10.0)
-            rig.service.conductor.retarget(gyro_sigma_rad_s=0.1 * DEG_H, accel_sigma_m_s2=0.001 * MG)
+            await rig.until(lambda: rig.service.core.vehicle.system_id == 1, 10.0)
+            rig.service.calibrating.conductor.retarget(gyro_sigma_rad_s=0.1 * DEG_H, accel_sigma_m_s2=0.001 * MG)
             result, record, naive = await once(rig)
             assert result.outcome == "done", result
             assert naive > 60.0
@@ -134,7 +134,7 @@ def test_with_push_dither_the_undithered_imu_comes_within_a_few_deg_h(tmp_path: 
     async def main() -> None:
         async with second_imu_only(tmp_path, UNDITHERED, dither=True).running() as rig:
             await ready(rig)
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
             seen: set[str] = set()
             while not job.finished.done():
                 seen.add(job.words)
@@ -161,7 +161,7 @@ def test_with_push_dither_the_undithered_imu_comes_within_a_few_deg_h(tmp_path: 
             off = np.abs(np.subtract(imu.gyro_bias_rad_s, true.gyro_rad_s))
             assert np.all(off < 3.5 * np.array(imu.gyro_sigma_use_rad_s))
             # What an undo would bring back is the old offsets, not a step of the dither.
-            undone = started(rig.service.conductor.start_undo("test"))
+            undone = started(rig.service.calibrating.conductor.start_undo("test"))
             assert (await undone.finished).outcome == "done"
             assert ChangeLog(tmp_path).journal.read() is None
 
@@ -226,18 +226,21 @@ def test_an_undithered_imu_does_not_keep_the_gate_shut_nor_calibrations_coming(t
             await ready(rig)
             verdicts = set()
             deadline_s = rig.now_s + 240.0
-            while rig.service.readiness.answer().verdict != "accept" and rig.now_s < deadline_s:
-                dithering = rig.service.conductor.job is not None and "dither" in rig.service.conductor.job.words
-                if dithering and not rig.service.conductor.job.finished.done():  # type: ignore[union-attr]
-                    verdicts.add(rig.service.readiness.answer().verdict)
+            while rig.service.arming.readiness.answer().verdict != "accept" and rig.now_s < deadline_s:
+                dithering = (
+                    rig.service.calibrating.conductor.job is not None
+                    and "dither" in rig.service.calibrating.conductor.job.words
+                )
+                if dithering and not rig.service.calibrating.conductor.job.finished.done():  # type: ignore[union-attr]
+                    verdicts.add(rig.service.arming.readiness.answer().verdict)
                 await asyncio.sleep(0.1)
-            assert rig.service.readiness.answer().verdict == "accept", rig.service.readiness.answer()
+            assert rig.service.arming.readiness.answer().verdict == "accept", rig.service.arming.readiness.answer()
             # With the offsets away from where they belong nobody may arm.
             assert verdicts == ({"wait"} if dither else set())
-            done = len(rig.service.store.history())
+            done = len(rig.service.calibrating.store.history())
             assert done <= 2
             await asyncio.sleep(30.0)
-            assert len(rig.service.store.history()) == done
+            assert len(rig.service.calibrating.store.history()) == done
 
     run_virtual(main())
 
@@ -279,7 +282,7 @@ def test_a_dither_that_is_interrupted_leaves_the_offsets_as_they_were(tmp_path: 
         async with second_imu_only(tmp_path, UNDITHERED, dither=True, max_s=3.0, coarse=True).running() as rig:
             await ready(rig)
             before = offsets(rig)
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
             await _until_step(rig, job, step)
             assert ChangeLog(tmp_path).journal.read() is not None
             assert step == 1 or offsets(rig) != before
@@ -287,7 +290,7 @@ def test_a_dither_that_is_interrupted_leaves_the_offsets_as_they_were(tmp_path: 
             result = await job.finished
             assert result.outcome == ("cancelled" if fate is cancelled else "failed"), result
             assert "put back" in result.reason or "NOT back" in result.reason
-            await rig.until(lambda: not rig.service.recovery.pending, 120.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 120.0)
             assert offsets(rig) == before
             assert ChangeLog(tmp_path).journal.read() is None
             if fate is cancelled:
@@ -307,7 +310,7 @@ def test_a_daemon_killed_in_the_middle_of_a_dither_puts_the_offsets_back_at_its_
         before = offsets(rig)
         async with rig.running():
             await ready(rig)
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
             await _until_step(rig, job, step)
             kept, in_force = journal.read_bytes(), offsets(rig)
         # The rig's end was orderly and a kill is not: what was on disk and in the autopilot at that instant.
@@ -316,7 +319,7 @@ def test_a_daemon_killed_in_the_middle_of_a_dither_puts_the_offsets_back_at_its_
         for name, value in in_force.items():
             again.double.set_parameter(name, value)
         async with again.running():
-            await again.until(lambda: not again.service.recovery.pending, 30.0)
+            await again.until(lambda: not again.service.offsets.recovery.pending, 30.0)
             assert offsets(again) == before
         assert not journal.exists()
 
@@ -331,7 +334,7 @@ def test_a_step_during_which_somebody_moves_the_aircraft_is_taken_again(
     async def main() -> None:
         async with second_imu_only(tmp_path, UNDITHERED, dither=True, max_s=3.0, coarse=True).running() as rig:
             await ready(rig)
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
             await _until_step(rig, job, 3)
             t_s = rig.aircraft.time_at(rig.now_s)
             rig.aircraft.add(Handling(start_s=t_s, duration_s=2.0))
@@ -350,12 +353,12 @@ def test_an_offset_that_somebody_else_sets_during_the_dither_stays_as_set(tmp_pa
         async with second_imu_only(tmp_path, UNDITHERED, dither=True, max_s=3.0, coarse=True).running() as rig:
             await ready(rig)
             before = offsets(rig)
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
             await _until_step(rig, job, 3)
             rig.double.write_as_another_station(NAMES[5], 0.0123)
             result = await job.finished
             assert result.outcome == "failed"
-            await rig.until(lambda: not rig.service.recovery.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 60.0)
             assert offsets(rig) == {**before, NAMES[5]: float(np.float32(0.0123))}
 
     run_virtual(main())

@@ -74,8 +74,8 @@ def test_an_autopilot_that_does_not_answer_for_one_parameter(tmp_path: Path, ver
         async with Rig(tmp_path, max_s=12.0, version=version).running() as rig:
             await rig.ready()
             before = values(rig.double)
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: rig.service.conductor.state is State.WRITING, 60.0)
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.calibrating.conductor.state is State.WRITING, 60.0)
             rig.double.faults.ignore = {"INS_ACCOFFS_Y"}
             result = await job.finished
             assert result.outcome == "failed"
@@ -83,7 +83,7 @@ def test_an_autopilot_that_does_not_answer_for_one_parameter(tmp_path: Path, ver
             assert "no answer" in result.reason
             rig.double.faults.ignore = set()
             await rig.until(lambda: values(rig.double) == before, 60.0)
-            await rig.until(lambda: not rig.service.recovery.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 60.0)
 
     run_virtual(main())
 
@@ -102,7 +102,7 @@ def test_an_autopilot_that_answers_nothing_is_a_fault_and_not_an_endless_wait(tm
         rig = Rig(tmp_path)
         rig.double.faults.silent = True
         async with rig.running():
-            await rig.until(lambda: rig.service.vehicle.system_id == 1, 10.0)
+            await rig.until(lambda: rig.service.core.vehicle.system_id == 1, 10.0)
             result, record = await calibrated(rig)
             assert record.imus == ()
             assert rig.double.writes == []
@@ -129,15 +129,15 @@ def test_arming_in_the_middle_of_the_write_is_reported_and_mended_once_disarmed(
                 assert name in result.reason
                 assert record.imus[0].written[name].outcome == "failed"
             assert len(rig.double.writes) == 2  # the arming came with the second write; there was no third
-            assert rig.service.recovery.pending
-            refusal = rig.service.conductor.start_calibration(What.BOTH, "test")
+            assert rig.service.offsets.recovery.pending
+            refusal = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
             assert isinstance(refusal, Refusal)
             assert refusal.kind == "armed"
             writes = len(rig.double.writes)
             await asyncio.sleep(20.0)
             assert len(rig.double.writes) == writes  # armed: hands off, however long it takes
             rig.double.disarm()
-            await rig.until(lambda: not rig.service.recovery.pending, 20.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 20.0)
             assert values(rig.double) == before
             await rig.until(lambda: any("put back" in text for text in rig.ground.texts()), 5.0)
 
@@ -154,7 +154,7 @@ def test_a_write_interrupted_by_a_power_cut_is_mended_at_the_next_start(tmp_path
     async def main() -> None:
         half_written = dict(zip(names[:2], afters[:2], strict=True))
         async with Rig(tmp_path, parameters={**dict.fromkeys(names, 0.0), **half_written}).running() as rig:
-            await rig.until(lambda: not rig.service.recovery.pending, 20.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 20.0)
             assert [rig.double.parameter(name) for name in names] == [0.0, 0.0, 0.0]
             assert ChangeLog(tmp_path).journal.read() is None
 
@@ -168,7 +168,7 @@ def test_values_that_somebody_else_has_set_since_are_left_alone(tmp_path: Path) 
 
     async def main() -> None:
         async with Rig(tmp_path, parameters=dict.fromkeys(names, 0.0025)).running() as rig:
-            await rig.until(lambda: not rig.service.recovery.pending, 20.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 20.0)
             assert rig.double.writes == []
             assert any("left alone" in text for text in rig.ground.texts())
 
@@ -182,7 +182,7 @@ def test_undo_is_refused_when_somebody_else_has_changed_a_value_since(tmp_path: 
             assert (await calibrated(rig))[0].outcome == "done"
             rig.double.write_as_another_station("INS_GYROFFS_Z", 0.001)
             now = values(rig.double)
-            job = started(rig.service.conductor.start_undo("test"))
+            job = started(rig.service.calibrating.conductor.start_undo("test"))
             result = await job.finished
             assert result.outcome == "failed"
             assert "INS_GYROFFS_Z" in result.reason
@@ -202,10 +202,10 @@ def test_undo_survives_a_restart_and_works_once(tmp_path: Path) -> None:
         rig.radio.__init__(rig.ground, rig.double.ground)  # type: ignore[misc]
         async with rig.running():
             await rig.ready()
-            result = await started(rig.service.conductor.start_undo("test")).finished
+            result = await started(rig.service.calibrating.conductor.start_undo("test")).finished
             assert result.outcome == "done", result
             assert values(rig.double) == before
-            refusal = rig.service.conductor.start_undo("test")
+            refusal = rig.service.calibrating.conductor.start_undo("test")
             assert isinstance(refusal, Refusal)
             assert refusal.kind == "nothing_to_undo"
 
@@ -216,8 +216,8 @@ def test_a_foreign_write_during_the_measurement_starts_it_afresh(tmp_path: Path)
     async def main() -> None:
         async with Rig(tmp_path, max_s=12.0).running() as rig:
             await rig.ready()
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: rig.service.conductor.state is State.COLLECTING, 30.0)
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.calibrating.conductor.state is State.COLLECTING, 30.0)
             rig.double.write_as_another_station("INS_GYROFFS_X", 0.003)
             result = await job.finished
             assert result.outcome == "done", result
@@ -233,7 +233,7 @@ def test_movement_is_waited_out_and_named(tmp_path: Path) -> None:
             await rig.ready()
             start_s = rig.aircraft.time_at(rig.now_s)
             rig.aircraft.add(Handling(start_s=start_s + 1.0, duration_s=15.0, seed=3))
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
             said: set[str] = set()
             while not job.finished.done():
                 said.add(job.words)
@@ -282,16 +282,16 @@ def test_cancelled_anywhere_nothing_is_left_changed(tmp_path: Path, state: State
         async with Rig(tmp_path, max_s=14.0).running() as rig:
             await rig.ready()
             before = values(rig.double)
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: rig.service.conductor.state is state, 60.0)
-            assert rig.service.conductor.cancel("the test")
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.calibrating.conductor.state is state, 60.0)
+            assert rig.service.calibrating.conductor.cancel("the test")
             result = await job.finished
             assert result.outcome == "cancelled"
             assert "the test" in result.reason
             assert values(rig.double) == before
-            assert not rig.service.recovery.pending
-            assert rig.service.conductor.state is State.CANCELLED
-            assert not rig.service.conductor.cancel("the test")
+            assert not rig.service.offsets.recovery.pending
+            assert rig.service.calibrating.conductor.state is State.CANCELLED
+            assert not rig.service.calibrating.conductor.cancel("the test")
 
     run_virtual(main())
 
@@ -301,19 +301,19 @@ def test_cancelled_and_armed_at_once_the_old_values_come_back_once_disarmed(tmp_
         async with Rig(tmp_path, max_s=14.0).running() as rig:
             await rig.ready()
             before = values(rig.double)
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: rig.service.conductor.state is State.VERIFYING, 60.0)
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.calibrating.conductor.state is State.VERIFYING, 60.0)
             rig.double.arm()
-            await rig.until(lambda: rig.service.vehicle.arm_state is ArmState.ARMED, 5.0)
-            assert rig.service.conductor.cancel("the test")
+            await rig.until(lambda: rig.service.core.vehicle.arm_state is ArmState.ARMED, 5.0)
+            assert rig.service.calibrating.conductor.cancel("the test")
             result = await job.finished
             assert result.outcome == "cancelled"
             assert "old values NOT back in INS_" in result.reason
             assert result.reason.endswith(": will be once disarmed")
             assert values(rig.double) != before
-            assert rig.service.recovery.pending
+            assert rig.service.offsets.recovery.pending
             rig.double.disarm()
-            await rig.until(lambda: not rig.service.recovery.pending, 20.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 20.0)
             assert values(rig.double) == before
 
     run_virtual(main())
@@ -347,7 +347,7 @@ def test_refusals_before_anything_starts(tmp_path: Path) -> None:
         rig = Rig(tmp_path, at_arm="warn")
         rig.double.faults.heartbeat_off = True
         async with rig.running():
-            early = rig.service.conductor.start_calibration(What.BOTH, "test")
+            early = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
             assert isinstance(early, Refusal)
             assert early.kind == "unknown"
             assert "no autopilot heard" in early.reason
@@ -355,20 +355,20 @@ def test_refusals_before_anything_starts(tmp_path: Path) -> None:
             await rig.ready()
             rig.double.arm()
             await asyncio.sleep(2.0)
-            armed = rig.service.conductor.start_calibration(What.BOTH, "test")
+            armed = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
             assert isinstance(armed, Refusal)
             assert armed.kind == "armed"
             assert any("Armed UNCALIBRATED: not calibrated yet" in text for text in rig.ground.texts())
             rig.double.disarm()
             rig.double.faults.heartbeat_off = True
             await asyncio.sleep(4.0)
-            lost = rig.service.conductor.start_calibration(What.BOTH, "test")
+            lost = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
             assert isinstance(lost, Refusal)
             assert lost.kind == "unknown"
             rig.double.faults.heartbeat_off = False
             await asyncio.sleep(3.0)
-            started(rig.service.conductor.start_calibration(What.BOTH, "test"))
-            busy = rig.service.conductor.start_calibration(What.GYROS, "another")
+            started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            busy = rig.service.calibrating.conductor.start_calibration(What.GYROS, "another")
             assert isinstance(busy, Refusal)
             assert busy.kind == "busy"
 
@@ -384,8 +384,8 @@ def test_on_a_board_with_integer_messages_only_what_the_noise_does_not_tell_is_l
         before = values(rig.double)
         rig.double.faults.int_only = True
         async with rig.running():
-            await rig.until(lambda: rig.service.imus["fc"].calibration is not None, 15.0)
-            await rig.until(lambda: rig.service.imus["fc"].stream.samples > 0, 30.0)
+            await rig.until(lambda: rig.service.devices.imus["fc"].calibration is not None, 15.0)
+            await rig.until(lambda: rig.service.devices.imus["fc"].stream.samples > 0, 30.0)
             result, record = await calibrated(rig, timeout_s=120.0)
             assert result.outcome == "done"
             assert "gyro fc" in result.reason
@@ -410,11 +410,11 @@ def test_a_storage_that_cannot_be_written_refuses_with_the_reason_before_anythin
 
     async def main() -> None:
         async with Rig(tmp_path / "file").running() as rig:
-            await rig.until(lambda: rig.service.vehicle.alive, 10.0)
-            refusal = rig.service.conductor.start_calibration(What.BOTH, "test")
+            await rig.until(lambda: rig.service.core.vehicle.alive, 10.0)
+            refusal = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
             assert isinstance(refusal, Refusal)
             assert "cannot be written" in refusal.reason
-            assert rig.service.conductor.mav_state == 5  # MAV_STATE_CRITICAL
+            assert rig.service.calibrating.conductor.mav_state == 5  # MAV_STATE_CRITICAL
 
     run_virtual(main())
 
@@ -426,8 +426,8 @@ def test_a_disk_that_fills_up_during_the_calibration_leaves_the_old_values(
         async with Rig(tmp_path, max_s=12.0).running() as rig:
             await rig.ready()
             before = values(rig.double)
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: rig.service.conductor.state is State.VERIFYING, 60.0)
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.calibrating.conductor.state is State.VERIFYING, 60.0)
             assert values(rig.double) != before
 
             def full(*_: object) -> None:
@@ -439,7 +439,7 @@ def test_a_disk_that_fills_up_during_the_calibration_leaves_the_old_values(
             assert "No space left on device" in result.reason
             assert job.record is not None
             assert outcomes(job.record) == {"rolled_back"}
-            await rig.until(lambda: values(rig.double) == before and not rig.service.recovery.pending, 30.0)
+            await rig.until(lambda: values(rig.double) == before and not rig.service.offsets.recovery.pending, 30.0)
 
     run_virtual(main())
 
@@ -449,8 +449,8 @@ def test_a_foreign_write_during_the_verification_is_never_called_verified(tmp_pa
         async with Rig(tmp_path, max_s=12.0).running() as rig:
             await rig.ready()
             before = values(rig.double)
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: rig.service.conductor.state is State.VERIFYING, 60.0)
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.calibrating.conductor.state is State.VERIFYING, 60.0)
             await asyncio.sleep(1.5)
             foreign = rig.double.parameter("INS_GYROFFS_X") + 6e-5
             rig.double.write_as_another_station("INS_GYROFFS_X", foreign)
@@ -474,9 +474,9 @@ def test_an_undo_that_a_power_cut_interrupted_is_finished_and_is_not_there_to_un
 
     async def main() -> None:
         async with Rig(tmp_path, parameters={names[0]: 0.0, names[1]: 0.0078125, names[2]: 0.0078125}).running() as rig:
-            await rig.until(lambda: not rig.service.recovery.pending, 20.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 20.0)
             assert [rig.double.parameter(name) for name in names] == [0.0, 0.0, 0.0]
-            refusal = rig.service.conductor.start_undo("test")
+            refusal = rig.service.calibrating.conductor.start_undo("test")
             assert isinstance(refusal, Refusal)
             assert refusal.kind == "nothing_to_undo"
 
@@ -487,10 +487,10 @@ def test_a_check_that_only_listens_starts_nothing(tmp_path: Path) -> None:
     async def main() -> None:
         async with Rig(tmp_path).running() as rig:
             await rig.ready()
-            rig.service.conductor.only_listening = "only a check is running"
+            rig.service.calibrating.conductor.only_listening = "only a check is running"
             for answer in (
-                rig.service.conductor.start_calibration(What.BOTH, "test"),
-                rig.service.conductor.start_undo("test"),
+                rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"),
+                rig.service.calibrating.conductor.start_undo("test"),
             ):
                 assert isinstance(answer, Refusal)
                 assert "check" in answer.reason
@@ -528,7 +528,7 @@ def test_a_daemon_that_died_while_the_firmware_calibrated_its_gyros_puts_their_o
             await asyncio.sleep(runs_s)
             for name in names:
                 rig.double.set_parameter(name, 0.001)
-            await rig.until(lambda: not rig.service.recovery.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 60.0)
             await asyncio.sleep(1.0)
             assert [rig.double.parameter(name) for name in names] == [0.0, 0.0, 0.0]
 

@@ -90,7 +90,7 @@ def test_accelerometers_then_the_firmwares_calibration_once_then_the_fine_gyro_o
             assert {"INS_GYR2OFFS_X", "INS4_GYROFFS_Z", "INS_GYR1_CALTEMP"} <= others
             words = " ".join(record.warnings)
             assert all(name in words for name in others)
-            started(rig.service.conductor.start_undo("test"))
+            started(rig.service.calibrating.conductor.start_undo("test"))
             await rig.until(lambda: imu_parameters(rig) == before, 20.0)
 
     run_virtual(main())
@@ -128,7 +128,7 @@ def test_with_a_temperature_calibration_on_any_imu_it_is_left_out_and_the_ekf_wa
             await rig.ready()
             sent = Sent(rig)
             words: set[str] = set()
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
             while not job.finished.done():
                 words.add(job.words)
                 await asyncio.sleep(0.5)
@@ -163,7 +163,7 @@ def test_arming_or_a_cancel_while_the_ekf_settles_ends_the_waiting_and_not_the_r
         async with make(folder, parameters={"INS_TCAL1_ENABLE": 1.0}).running() as rig:
             await rig.ready()
             before = imu_parameters(rig)
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
             await rig.until(lambda: job.words.startswith("EKF settling"), 90.0)
             act(rig)
             await rig.until(job.finished.done, 3.0)
@@ -173,7 +173,7 @@ def test_arming_or_a_cancel_while_the_ekf_settles_ends_the_waiting_and_not_the_r
     result, words, changed = run_virtual(settling(tmp_path / "armed", lambda rig: rig.double.arm()))
     assert (result.outcome, changed) == ("done", True)
     assert "armed while the EKF was still settling" in words
-    cancel = settling(tmp_path / "cancelled", lambda rig: rig.service.conductor.cancel("test"))
+    cancel = settling(tmp_path / "cancelled", lambda rig: rig.service.calibrating.conductor.cancel("test"))
     result, words, changed = run_virtual(cancel)
     assert (result.outcome, changed) == ("done", True)
     assert "the new offsets stay" in words
@@ -238,13 +238,13 @@ def test_a_small_step_is_not_worth_the_firmwares_calibration(tmp_path: Path) -> 
 
 
 PHASES: dict[str, Callable[[Rig, Sent], bool]] = {
-    "before the first write": lambda rig, sent: rig.service.conductor.state is State.WRITING,
+    "before the first write": lambda rig, sent: rig.service.calibrating.conductor.state is State.WRITING,
     "in the middle of the first write": lambda rig, sent: len(sent.log) == 3,
     "between it and the firmware's calibration": lambda rig, sent: len(sent.log) == 6,
     "during the firmware's calibration": lambda rig, sent: rig.double.calibrating,
     "before the fine offsets": lambda rig, sent: sent.commands == 1 and not rig.double.calibrating,
     "in the middle of the fine offsets": lambda rig, sent: sent.log[-2:-1] == [GYRO_CALIBRATION],
-    "while the effect is looked at": lambda rig, sent: rig.service.conductor.state is State.VERIFYING,
+    "while the effect is looked at": lambda rig, sent: rig.service.calibrating.conductor.state is State.VERIFYING,
 }
 
 
@@ -262,14 +262,14 @@ def test_a_reboot_in_any_phase_leaves_the_old_values_or_says_what_the_boot_has_m
             await asyncio.sleep(1.0)
             sent = Sent(rig)
             before = imu_parameters(rig)
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
             while not PHASES[phase](rig, sent):
                 await asyncio.sleep(0.005)
                 assert not job.finished.done(), job.finished.result()
             rig.double.reboot(down_s=1.0)
             result = await job.finished
             assert result.outcome == "failed", result
-            await rig.until(lambda: not rig.service.recovery.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 60.0)
             after = imu_parameters(rig)
             differ = {name for name in before if after[name] != before[name]}
             if gyr_cal:
@@ -281,7 +281,7 @@ def test_a_reboot_in_any_phase_leaves_the_old_values_or_says_what_the_boot_has_m
                 assert all(after[name] != written[name].after for name in written)
             else:
                 assert differ == set()
-            assert rig.service.recovery.why_no_undo() == "nothing to undo"
+            assert rig.service.offsets.recovery.why_no_undo() == "nothing to undo"
             assert sent.commands <= 1
 
     run_virtual(main())
@@ -296,7 +296,7 @@ def test_a_reboot_in_the_middle_of_the_calibration_itself(tmp_path: Path) -> Non
             result, _ = await calibrated(rig)
             assert result.outcome == "failed"
             assert "restarted" in result.reason or "rebooted" in result.reason
-            await rig.until(lambda: not rig.service.recovery.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 60.0)
             assert imu_parameters(rig) == before
 
     run_virtual(main())
@@ -309,7 +309,7 @@ def test_a_daemon_that_died_during_the_firmwares_calibration_puts_everything_bac
         async with make(tmp_path / "first", auxiliary=True).running() as rig:
             await rig.ready()
             before = imu_parameters(rig)
-            started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
             await rig.until(lambda: rig.double.calibrating, 90.0)
             return before, imu_parameters(rig), (tmp_path / "first" / "journal.json").read_bytes()
 
@@ -319,7 +319,7 @@ def test_a_daemon_that_died_during_the_firmwares_calibration_puts_everything_bac
         (folder / "journal.json").write_bytes(journal)
         left = {name: coarse if "GYR" in name and "OFFS" in name else value for name, value in left.items()}
         async with make(folder, auxiliary=True, parameters=left).running() as rig:
-            await rig.until(lambda: not rig.service.recovery.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 60.0)
             assert imu_parameters(rig) == before
             assert not (folder / "journal.json").exists()
 
@@ -335,8 +335,8 @@ def test_a_daemon_that_died_after_it_leaves_alone_what_others_have_changed_since
         async with make(first, auxiliary=True).running() as rig:
             await rig.ready()
             before = imu_parameters(rig)
-            started(rig.service.conductor.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: rig.service.conductor.state is State.VERIFYING, 90.0)
+            started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.calibrating.conductor.state is State.VERIFYING, 90.0)
             second.mkdir()
             (second / "journal.json").write_bytes((first / "journal.json").read_bytes())
             return before, imu_parameters(rig)
@@ -344,7 +344,7 @@ def test_a_daemon_that_died_after_it_leaves_alone_what_others_have_changed_since
     async def again(before: dict[str, float], left: dict[str, float]) -> None:
         assert left[foreign] != before[foreign]
         async with make(second, auxiliary=True, parameters={**left, foreign: 0.0025}).running() as rig:
-            await rig.until(lambda: not rig.service.recovery.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 60.0)
             assert imu_parameters(rig) == {**before, foreign: np.float32(0.0025)}
 
     run_virtual(again(*run_virtual(until_it_dies())))
@@ -359,7 +359,7 @@ def test_a_fifth_of_all_packets_lost_leaves_the_whole_result_or_the_old_values(t
             before = imu_parameters(rig)
             rig.wire.loss = 0.2
             result, _ = await calibrated(rig)
-            await rig.until(lambda: not rig.service.recovery.pending, 120.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 120.0)
             assert sent.commands <= 1
             if result.outcome == "done":
                 assert gyro_error_deg_h(rig) < FINE_DEG_H + 15.0
@@ -411,12 +411,12 @@ def test_an_undo_names_what_others_have_changed_since_and_restores_the_rest_only
             rig.double.write_as_another_station("INS_GYROFFS_Y", 0.003)
             await asyncio.sleep(2.0)
             calibrated_values = imu_parameters(rig)
-            refused = await started(rig.service.conductor.start_undo("test")).finished
+            refused = await started(rig.service.calibrating.conductor.start_undo("test")).finished
             assert refused.outcome == "failed"
             assert f"INS_GYROFFS_Y is 0.003, we had set {ours:.6g} (before: 0)" in refused.reason
             assert "INS_GYROFFS_X" not in refused.reason
             assert imu_parameters(rig) == calibrated_values
-            forced = await started(rig.service.conductor.start_undo("test", force=True)).finished
+            forced = await started(rig.service.calibrating.conductor.start_undo("test", force=True)).finished
             assert forced.outcome == "done", forced
             assert imu_parameters(rig) == {**before, "INS_GYROFFS_Y": np.float32(0.003)}
 
@@ -434,10 +434,10 @@ def test_an_undo_restores_exactly_after_the_daemon_has_started_again(tmp_path: P
     async def second(before: dict[str, float], after: dict[str, float]) -> None:
         async with make(tmp_path, parameters=after).running() as rig:
             await rig.ready()
-            undone = await started(rig.service.conductor.start_undo("test")).finished
+            undone = await started(rig.service.calibrating.conductor.start_undo("test")).finished
             assert undone.outcome == "done", undone
             assert imu_parameters(rig) == before
-            record = rig.service.store.history()[0]
+            record = rig.service.calibrating.store.history()[0]
             assert (record.state, record.system_id) == ("done", 1)
             assert record.undone_at is not None
 
@@ -454,7 +454,7 @@ def test_the_undo_of_one_vehicle_is_never_written_to_another_and_waits_for_its_o
     async def undo(system_id: int, after: dict[str, float]) -> None:
         async with make(tmp_path, system_id=system_id, parameters=after).running() as rig:
             await rig.ready()
-            answer = rig.service.conductor.start_undo("test")
+            answer = rig.service.calibrating.conductor.start_undo("test")
             if system_id == 3:
                 assert isinstance(answer, Refusal)
                 assert "only on system 1, 2" in answer.reason

@@ -148,13 +148,15 @@ async def _one(folder: Path, seed: int) -> tuple[int, int]:
         await rig.ready()
         forger = asyncio.create_task(_forge(rig, tape, chance, signed=signed))
         await asyncio.gather(people(rig, chance), _fly(rig, chance), people(rig, chance))
-        conflicts = int(rig.service.vehicle.conflict is not None)
+        conflicts = int(rig.service.core.vehicle.conflict is not None)
         forger.cancel()
         rig.autopilot.faults.arm_after_writes = None
         rig.autopilot.disarm()
         await asyncio.sleep(15.0)
-        job = rig.service.conductor.job
-        await rig.until(lambda: (job is None or job.finished.done()) and not rig.service.recovery.pending, 240.0)
+        job = rig.service.calibrating.conductor.job
+        await rig.until(
+            lambda: (job is None or job.finished.done()) and not rig.service.offsets.recovery.pending, 240.0
+        )
     assert judge.faults == [], f"seed {seed}"
     return judge.writes, conflicts
 

@@ -48,7 +48,7 @@ async def held_back(rig: Rig) -> dict[str, float]:
     await calibrated_by_itself(rig)
     before = accelerometers(rig)
     knocked(rig)
-    await rig.until(lambda: len(rig.service.store.history()) >= 2, AGAIN_WITHIN_S)
+    await rig.until(lambda: len(rig.service.calibrating.store.history()) >= 2, AGAIN_WITHIN_S)
     await asyncio.sleep(10.0)
     return before
 
@@ -60,7 +60,7 @@ def test_accelerometers_are_held_back_when_the_gradienter_has_moved_until_somebo
     async def main() -> None:
         async with Rig(tmp_path, at_arm=at_arm, **SLOW).running() as rig:
             before = await held_back(rig)
-            (record, first), said = rig.service.store.history(), "".join(rig.ground.texts())
+            (record, first), said = rig.service.calibrating.store.history(), "".join(rig.ground.texts())
             assert record.state == "done"
             assert record.reason.endswith("accelerometers of fc held back")
             fc = record.imus[0]
@@ -77,7 +77,7 @@ def test_accelerometers_are_held_back_when_the_gradienter_has_moved_until_somebo
             assert "the gradienter has moved by 0.3" in said
             assert "Held back: accelerometers of fc; calibrate on request to write it all the same" in said
             # With what is in force it may arm as ever, and everybody is told.
-            answer = rig.service.readiness.answer()
+            answer = rig.service.arming.readiness.answer()
             assert answer.verdict == "accept"
             told = "held back: accelerometers of fc (gradienter or its zero moved); calibrate to write it"
             assert answer.words.endswith(told)
@@ -85,20 +85,20 @@ def test_accelerometers_are_held_back_when_the_gradienter_has_moved_until_somebo
             # Nor does it call for another calibration; one that the gyros call for holds it back again.
             for _ in range(60):
                 await asyncio.sleep(1.0)
-                assert not any("accel" in found.words for found in rig.service.in_force.findings(rig.now_s))
-            await rig.until(lambda: rig.service.conductor.state is State.DONE, 60.0)
+                assert not any("accel" in found.words for found in rig.service.arming.in_force.findings(rig.now_s))
+            await rig.until(lambda: rig.service.calibrating.conductor.state is State.DONE, 60.0)
             assert accelerometers(rig) == before
-            assert rig.service.in_force.held_back is not None
-            job = rig.service.conductor.start_calibration(What.BOTH, "test")
+            assert rig.service.arming.in_force.held_back is not None
+            job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
             assert isinstance(job, Job)
             assert (await job.finished).outcome == "done"
-            asked = rig.service.store.history(1)[0]
+            asked = rig.service.calibrating.store.history(1)[0]
             assert {"GYR" in name for name in asked.imus[0].written} == {True, False}
             assert asked.imus[0].held_back == ()
             assert any(words.startswith("the gradienter has moved by 0.3") for words in asked.warnings)
             assert all(accelerometers(rig)[name] != value for name, value in before.items())
             await asyncio.sleep(10.0)
-            assert "held back" not in rig.service.readiness.answer().words
+            assert "held back" not in rig.service.arming.readiness.answer().words
 
     run_virtual(main())
 
@@ -107,7 +107,7 @@ def test_what_somebody_asked_for_is_true_from_then_on_also_for_calibrations_by_i
     async def main() -> None:
         async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
             before = await held_back(rig)
-            conductor, store = rig.service.conductor, rig.service.store
+            conductor, store = rig.service.calibrating.conductor, rig.service.calibrating.store
             job = conductor.start_calibration(What.BOTH, "test")
             assert isinstance(job, Job)
             assert (await job.finished).outcome == "done"
@@ -121,7 +121,7 @@ def test_what_somebody_asked_for_is_true_from_then_on_also_for_calibrations_by_i
                 record = store.history(1)[0]
                 assert "held back" not in record.reason
                 assert not any("gradienter" in words for words in record.warnings)
-                assert rig.service.in_force.held_back is None
+                assert rig.service.arming.in_force.held_back is None
                 now = accelerometers(rig)
                 assert all(abs(now[name] - value) < 0.5 * MG for name, value in asked.items()), (
                     "the gradienter slipped by 5 mg"
@@ -134,7 +134,7 @@ def test_an_undo_of_what_was_asked_for_makes_the_earlier_ones_count_again(tmp_pa
     async def main() -> None:
         async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
             before = await held_back(rig)
-            conductor, known = rig.service.conductor, rig.service.store
+            conductor, known = rig.service.calibrating.conductor, rig.service.calibrating.store
             job = conductor.start_calibration(What.BOTH, "test")
             assert isinstance(job, Job)
             assert (await job.finished).outcome == "done"
@@ -142,7 +142,7 @@ def test_an_undo_of_what_was_asked_for_makes_the_earlier_ones_count_again(tmp_pa
             assert isinstance(undo, Job)
             assert (await undo.finished).outcome == "done"
             assert accelerometers(rig) == before
-            for each in rig.service.memory._known.values():
+            for each in rig.service.calibrating.memory._known.values():
                 assert not any(point.accel is not None and point.accel.chosen for point in each.points)
             assert known.history(1)[0].undone_at is not None
 
@@ -153,10 +153,10 @@ def test_nothing_is_held_back_any_more_once_the_gradienter_is_where_it_was(tmp_p
     async def main() -> None:
         async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
             before = await held_back(rig)
-            assert rig.service.in_force.held_back is not None
+            assert rig.service.arming.in_force.held_back is not None
             put_back(rig)
-            await rig.until(lambda: rig.service.in_force.held_back is None, 60.0)
-            await rig.until(lambda: rig.service.readiness.answer().verdict == "accept", 60.0)
+            await rig.until(lambda: rig.service.arming.in_force.held_back is None, 60.0)
+            await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 60.0)
             assert accelerometers(rig) == before
 
     run_virtual(main())
@@ -167,10 +167,10 @@ def test_a_restart_that_keeps_the_offsets_keeps_what_is_held_back_and_the_gate_o
         async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
             before = await held_back(rig)
             rig.autopilot.reboot()
-            await rig.until(lambda: rig.service.vehicle.boots == 1, 10.0)
-            await rig.until(lambda: rig.service.readiness.answer().verdict == "accept", 40.0)
-            assert len(rig.service.store.history()) == 2, "nothing had to be measured anew"
-            assert rig.service.in_force.held_back is not None
+            await rig.until(lambda: rig.service.core.vehicle.boots == 1, 10.0)
+            await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 40.0)
+            assert len(rig.service.calibrating.store.history()) == 2, "nothing had to be measured anew"
+            assert rig.service.arming.in_force.held_back is not None
             assert accelerometers(rig) == before
 
     run_virtual(main())
@@ -181,8 +181,10 @@ def test_who_asks_in_the_middle_is_not_answered_with_half_of_it(tmp_path: Path) 
         async with Rig(tmp_path, at_arm="warn", **SLOW).running() as rig:
             await calibrated_by_itself(rig)
             knocked(rig)
-            conductor = rig.service.conductor
-            await rig.until(lambda: len(rig.service.store.history()) == 1 and conductor.state is State.VERIFYING, 150.0)
+            conductor = rig.service.calibrating.conductor
+            await rig.until(
+                lambda: len(rig.service.calibrating.store.history()) == 1 and conductor.state is State.VERIFYING, 150.0
+            )
             assert conductor.job is not None
             assert conductor.job.held_back
             refused = conductor.start_calibration(What.BOTH, "test")
@@ -192,7 +194,7 @@ def test_who_asks_in_the_middle_is_not_answered_with_half_of_it(tmp_path: Path) 
             job = conductor.start_calibration(What.BOTH, "test")
             assert isinstance(job, Job)
             assert (await job.finished).outcome == "done"
-            assert any("ACC" in name for name in rig.service.store.history(1)[0].imus[0].written)
+            assert any("ACC" in name for name in rig.service.calibrating.store.history(1)[0].imus[0].written)
 
     run_virtual(main())
 
@@ -204,7 +206,7 @@ def test_a_request_that_comes_first_is_written_with_the_warning(tmp_path: Path) 
             before = accelerometers(rig)
             knocked(rig)
             await asyncio.sleep(20.0)
-            job = rig.service.conductor.start_calibration(What.BOTH, "test")
+            job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
             assert isinstance(job, Job)
             assert (await job.finished).outcome == "done"
             assert all(accelerometers(rig)[name] != value for name, value in before.items())

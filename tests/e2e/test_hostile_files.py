@@ -56,11 +56,11 @@ def test_it_starts_says_so_and_writes_nothing(
             (said,) = [words for words in caplog.messages if path.name in words]
             assert said in rig.service.status()["warnings"]
             assert said.startswith(f"{path}: cannot be {'read' if what == 'a FIFO' else 'used'}: ")
-            assert rig.service.recovery.fault is None
-            assert not rig.service.recovery.pending
-            assert not rig.service.setup.recovery.pending
+            assert rig.service.offsets.recovery.fault is None
+            assert not rig.service.offsets.recovery.pending
+            assert not rig.service.heading.setup.recovery.pending
             if name == "undo-1.json":
-                answer = rig.service.conductor.start_undo("test")
+                answer = rig.service.calibrating.conductor.start_undo("test")
                 assert isinstance(answer, Refusal)
                 assert answer.reason == "nothing to undo; what was kept could not be used"
             else:
@@ -80,7 +80,7 @@ def test_nothing_else_in_the_storage_ends_or_hangs_the_start(tmp_path: Path, nam
     async def main() -> None:
         async with Rig(tmp_path).running() as rig:
             await rig.ready()
-            assert rig.service.recovery.fault is None
+            assert rig.service.offsets.recovery.fault is None
 
     run_virtual(main())
 
@@ -96,7 +96,7 @@ def test_a_journal_of_parameters_that_this_autopilot_has_not_is_brought_to_an_en
 
     async def main() -> None:
         async with Rig(tmp_path, version=version, parameters={"INS_GYROFFS_X": 0.001}).running() as rig:
-            await rig.until(lambda: not rig.service.recovery.pending, 20.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 20.0)
             ours = name.startswith("INS")
             assert rig.double.parameter("INS_GYROFFS_X") == pytest.approx(0.0 if ours else 0.001)
             assert len(rig.double.writes) == int(ours)
@@ -111,10 +111,10 @@ def test_whatever_the_fault_no_other_name_and_no_other_value_is_written(tmp_path
     async def main() -> None:
         async with Rig(tmp_path).running() as rig:
             await rig.ready()
-            undo = rig.service.ledger
+            undo = rig.service.offsets.ledger
             undo.undoable[1] = ChangeSet(1, (Changed("INS_GYROFFS_X", before=9.5, after=0.0),))
             rig.double.set_parameter("INS_GYROFFS_X", 0.0)
-            answer = rig.service.conductor.start_undo("test")
+            answer = rig.service.calibrating.conductor.start_undo("test")
             assert not isinstance(answer, Refusal)
             result = await answer.finished
             assert result.outcome == "failed"

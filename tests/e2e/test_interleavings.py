@@ -171,7 +171,7 @@ async def _one(folder: Path, seed: int) -> tuple[int, int, int]:
         await rig.ready()
         await asyncio.gather(people(rig, chance), _fate(rig, chance), _fate(rig, chance))
         # Now let everything come to rest.
-        double, conductor = rig.double, rig.service.conductor
+        double, conductor = rig.double, rig.service.calibrating.conductor
         faults = double.faults
         faults.silent = faults.heartbeat_off = False
         faults.arm_after_writes = faults.reboot_after_writes = None
@@ -179,9 +179,12 @@ async def _one(folder: Path, seed: int) -> tuple[int, int, int]:
         double.disarm()
         await asyncio.sleep(2.0)  # what is still on the wire, and the autopilot's reboot, if it is in one
         await rig.until(
-            lambda: (conductor.job is None or conductor.job.finished.done()) and not rig.service.recovery.pending, 240.0
+            lambda: (
+                (conductor.job is None or conductor.job.finished.done()) and not rig.service.offsets.recovery.pending
+            ),
+            240.0,
         )
-        records = rig.service.store.history()[::-1]
+        records = rig.service.calibrating.store.history()[::-1]
         now = {name: rig.double.parameter(name) for name in FC_PARAMETERS}
     assert witness.faults == [], f"seed {seed}"
     assert not witness.open_requests, f"seed {seed}: no final ACK for {witness.open_requests}"

@@ -33,11 +33,11 @@ GYRO_Y = offset_names(1, "gyro")[1]
 
 
 async def settling(rig: Rig) -> None:
-    await rig.until(lambda: rig.service.conductor.state is State.SETTLING, 90.0)
+    await rig.until(lambda: rig.service.calibrating.conductor.state is State.SETTLING, 90.0)
 
 
 def whys(rig: Rig) -> set[Why]:
-    return {finding.why for finding in rig.service.in_force.findings(rig.now_s)}
+    return {finding.why for finding in rig.service.arming.in_force.findings(rig.now_s)}
 
 
 def test_a_boot_that_measures_the_gyros_while_the_ekf_settles_is_not_called_calibrated(tmp_path: Path) -> None:
@@ -45,19 +45,19 @@ def test_a_boot_that_measures_the_gyros_while_the_ekf_settles_is_not_called_cali
         async with Rig(tmp_path, parameters={"INS_GYR_CAL": 1.0}, **QUICK).running() as rig:
             await settling(rig)
             rig.autopilot.reboot()
-            await rig.until(lambda: bool(rig.service.store.history(1)), 60.0)
-            (record,) = rig.service.store.history(1)
+            await rig.until(lambda: bool(rig.service.calibrating.store.history(1)), 60.0)
+            (record,) = rig.service.calibrating.store.history(1)
             assert record.state == "failed"
             assert record.reason.startswith("the autopilot restarted and replaced INS_GYROFFS_X")
             assert record.imus[0].written[GYRO_Y].outcome == "failed"
             assert record.imus[0].written[offset_names(1, "accel")[0]].outcome == "verified"
             await asyncio.sleep(1.0)
-            assert rig.service.readiness.answer().verdict != "accept"
-            assert rig.service.readiness.state(rig.now_s)[0] == "uncalibrated"
-            await rig.until(lambda: rig.service.readiness.answer().verdict == "accept", 200.0)
+            assert rig.service.arming.readiness.answer().verdict != "accept"
+            assert rig.service.arming.readiness.state(rig.now_s)[0] == "uncalibrated"
+            await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 200.0)
             # Either calibrated again, or what the boot has measured was seen to be good enough; it says which.
-            again = rig.service.store.history(1)[0].state == "done"
-            words = rig.service.readiness.answer().words
+            again = rig.service.calibrating.store.history(1)[0].state == "done"
+            words = rig.service.arming.readiness.answer().words
             assert words.startswith("calibrated" if again else "offsets checked"), words
             assert np.abs(rig.double.residual(1, rig.now_s).gyro_rad_s).max() < 30 * DEG_H
 
@@ -69,13 +69,13 @@ def test_what_another_station_writes_while_the_ekf_settles_shuts_the_gate_and_st
         async with Rig(tmp_path, **QUICK).running() as rig:
             await settling(rig)
             rig.double.write_as_another_station(GYRO_Y, 0.0123)
-            await rig.until(lambda: bool(rig.service.store.history(1)), 200.0)
+            await rig.until(lambda: bool(rig.service.calibrating.store.history(1)), 200.0)
             await asyncio.sleep(60.0)
             assert Why.CHANGED in whys(rig)
-            assert rig.service.readiness.answer().verdict == "refuse"
-            assert "changed by someone else" in rig.service.readiness.answer().words
+            assert rig.service.arming.readiness.answer().verdict == "refuse"
+            assert "changed by someone else" in rig.service.arming.readiness.answer().words
             assert rig.double.parameter(GYRO_Y) == pytest.approx(0.0123)
-            assert len(rig.service.store.history()) == 1
+            assert len(rig.service.calibrating.store.history()) == 1
 
     run_virtual(main())
 
@@ -83,14 +83,14 @@ def test_what_another_station_writes_while_the_ekf_settles_shuts_the_gate_and_st
 def test_what_another_station_writes_during_the_check_is_not_overwritten_by_the_next_try(tmp_path: Path) -> None:
     async def main() -> None:
         async with Rig(tmp_path, **QUICK).running() as rig:
-            await rig.until(lambda: rig.service.conductor.state is State.VERIFYING, 90.0)
+            await rig.until(lambda: rig.service.calibrating.conductor.state is State.VERIFYING, 90.0)
             rig.double.write_as_another_station(GYRO_Y, 0.0123)
-            await rig.until(lambda: bool(rig.service.store.history(1)), 200.0)
-            assert rig.service.store.history(1)[0].state == "failed"
+            await rig.until(lambda: bool(rig.service.calibrating.store.history(1)), 200.0)
+            assert rig.service.calibrating.store.history(1)[0].state == "failed"
             await asyncio.sleep(100.0)
             assert rig.double.parameter(GYRO_Y) == pytest.approx(0.0123)
             assert Why.CHANGED in whys(rig)
-            assert rig.service.automatic.stopped == "fc was changed"
+            assert rig.service.arming.automatic.stopped == "fc was changed"
 
     run_virtual(main())
 
@@ -99,9 +99,9 @@ def test_what_another_station_writes_during_the_check_is_not_overwritten_by_the_
 def test_the_gates_countdown_never_counts_up_and_is_kept(tmp_path: Path, firmware: Literal["ardupilot", "px4"]) -> None:
     async def main() -> None:
         async with Rig(tmp_path, **(QUICK if firmware == "ardupilot" else PX4_QUICK)).running() as rig:
-            await rig.until(lambda: rig.service.readiness.answer().words.startswith("hold still"), 10.0)
+            await rig.until(lambda: rig.service.arming.readiness.answer().words.startswith("hold still"), 10.0)
             began_s, said, counted, ends = rig.now_s, set(), [], []
-            while (answer := rig.service.readiness.answer()).verdict != "accept":
+            while (answer := rig.service.arming.readiness.answer()).verdict != "accept":
                 assert rig.now_s < began_s + 90.0
                 assert len(f"Not armed: {answer.words}") <= 50
                 said.add(answer.words.rpartition(": ")[2])
@@ -121,11 +121,11 @@ def test_the_gates_countdown_never_counts_up_and_is_kept(tmp_path: Path, firmwar
 def test_after_a_boot_that_keeps_the_offsets_the_gate_says_how_long_it_looks(tmp_path: Path) -> None:
     async def main() -> None:
         async with Rig(tmp_path, **QUICK).running() as rig:
-            await rig.until(lambda: rig.service.readiness.answer().verdict == "accept", 90.0)
+            await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 90.0)
             rig.autopilot.reboot()
             said = set()
-            await rig.until(lambda: rig.service.vehicle.boots == 1, 10.0)
-            while (answer := rig.service.readiness.answer()).verdict != "accept":
+            await rig.until(lambda: rig.service.core.vehicle.boots == 1, 10.0)
+            while (answer := rig.service.arming.readiness.answer()).verdict != "accept":
                 said.add(answer.words)
                 await asyncio.sleep(0.25)
             assert any(words.endswith("s: checking after restart") for words in said)
@@ -150,14 +150,14 @@ def test_a_second_autopilot_with_our_system_id_stops_everything_and_is_named(tmp
                 rig.wire.carry_from_other(other_autopilot(mavlink.MAV_AUTOPILOT_PX4))
                 await asyncio.sleep(1.0)
             assert rig.autopilot.writes == []
-            assert rig.service.vehicle.firmware == "ardupilot"
-            answer = rig.service.readiness.answer()
+            assert rig.service.core.vehicle.firmware == "ardupilot"
+            answer = rig.service.arming.readiness.answer()
             assert (answer.verdict, answer.words) == ("refuse", "two autopilots have system id 1")
-            refusal = rig.service.conductor.start_calibration(What.BOTH, "test")
+            refusal = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
             assert isinstance(refusal, Refusal)
             assert refusal.reason == "two autopilots have system id 1"
             # It goes away, and all goes on.
-            await rig.until(lambda: rig.service.readiness.answer().verdict == "accept", 90.0)
+            await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 90.0)
 
     run_virtual(main())
 
@@ -167,10 +167,10 @@ def test_a_device_that_poses_as_component_1_does_not_make_an_armed_aircraft_seem
         async with Rig(tmp_path, **QUICK).running() as rig:
             await rig.ready()
             rig.autopilot.arm()
-            await rig.until(lambda: rig.service.vehicle.arm_state is ArmState.ARMED, 3.0)
+            await rig.until(lambda: rig.service.core.vehicle.arm_state is ArmState.ARMED, 3.0)
             for _ in range(50):
                 rig.wire.carry_from_other(other_autopilot(mavlink.MAV_AUTOPILOT_GENERIC))
                 await asyncio.sleep(0.1)
-                assert rig.service.vehicle.arm_state is ArmState.ARMED
+                assert rig.service.core.vehicle.arm_state is ArmState.ARMED
 
     run_virtual(main())

@@ -64,7 +64,7 @@ def test_a_calibration_is_asked_for_watched_and_answered(tmp_path: Path) -> None
                 last = await watcher.until("companion/1/calibration/progress", says("done"))
                 assert last.json["percent"] == 100
                 await _the_pose(rig, watcher.heard)
-                assert len(rig.service.store.history()) == 1
+                assert len(rig.service.calibrating.store.history()) == 1
 
                 watcher.forget()
                 await watcher.publish("companion/1/request/undo", {"transaction": 3})
@@ -96,7 +96,7 @@ def test_a_cancel_from_another_face_is_seen_here(tmp_path: Path) -> None:
                 await rig.ready()
                 await watcher.publish("field/heron/request/calibrate", {"transaction": "x"})
                 await watcher.response("field/heron", "calibrate", "x", "accepted")
-                replies = [reply async for reply in rig.service.answers.answer({"command": "cancel"})]
+                replies = [reply async for reply in rig.service.faces.answers.answer({"command": "cancel"})]
                 assert replies[-1]["state"] == "cancelled"
                 ended = await watcher.response("field/heron", "calibrate", "x", "cancelled")
                 assert ended["reason"] == "cancelled by companion cancel"
@@ -162,7 +162,7 @@ def test_a_flood_of_requests_is_answered_and_disturbs_nothing(tmp_path: Path) ->
             async with rig.running(), peer(one) as watcher:
                 await until_connected(rig.service)
                 await rig.ready()
-                heartbeats = rig.service.vehicle.heartbeat_age_s
+                heartbeats = rig.service.core.vehicle.heartbeat_age_s
                 assert heartbeats is not None
                 for number in range(500):
                     await watcher.publish("companion/1/request/calibrate", {"transaction": number}, qos=0)
@@ -171,10 +171,10 @@ def test_a_flood_of_requests_is_answered_and_disturbs_nothing(tmp_path: Path) ->
                 answers = watcher.responses("companion/1", "calibrate")
                 assert [one["state"] for one in answers].count("accepted") == 1
                 assert {one["refusal"] for one in answers if one["state"] == "refused"} == {"busy"}
-                assert rig.service.conductor.cancel("test")
-                await rig.until(lambda: rig.service.conductor.state is State.CANCELLED, 10.0)
-                assert rig.service.store.history() == []  # nothing had been measured
-                mqtt = rig.service.mqtt
+                assert rig.service.calibrating.conductor.cancel("test")
+                await rig.until(lambda: rig.service.calibrating.conductor.state is State.CANCELLED, 10.0)
+                assert rig.service.calibrating.store.history() == []  # nothing had been measured
+                mqtt = rig.service.faces.mqtt
                 assert mqtt is not None
                 assert mqtt.link is not None
                 assert len(mqtt.link.outbox) < 100

@@ -153,8 +153,8 @@ def test_what_ended_while_the_broker_was_away_is_not_lost(tmp_path: Path) -> Non
                     await watcher.response("companion/1", "calibrate", "lost", "accepted")
                 one.kill()
                 await until_connected(rig.service, connected=False)
-                assert rig.service.conductor.cancel("somebody")
-                await rig.until(lambda: rig.service.conductor.state is State.CANCELLED, 10.0)
+                assert rig.service.calibrating.conductor.cancel("somebody")
+                await rig.until(lambda: rig.service.calibrating.conductor.state is State.CANCELLED, 10.0)
                 await one.start()
                 async with peer(one) as watcher:
                     record = (await watcher.until("companion/1/calibration/state")).json
@@ -174,7 +174,7 @@ def test_a_vehicle_that_is_heard_late_moves_to_its_own_topics(tmp_path: Path, mo
             task = asyncio.create_task(service.serve(mavlink=False, ports=False))
             await watcher.until("companion/1/status", is_(b"online"))
             await watcher.until("companion/1/state")
-            service.vehicle.system_id = 9
+            service.core.vehicle.system_id = 9
             await watcher.until("companion/9/status", is_(b"online"))
             for topic in ("status", "state"):
                 await watcher.until(f"companion/1/{topic}", is_(b""))

@@ -22,7 +22,7 @@ WEB = '[web]\nbind = "127.0.0.1:0"\n'
 
 async def press(rig: Rig, action: str, **body: Any) -> tuple[int, str]:
     """What somebody is told who presses a button."""
-    page = rig.service.page
+    page = rig.service.faces.page
     assert page is not None
     headers = {
         "host": "127.0.0.1",
@@ -37,7 +37,7 @@ async def press(rig: Rig, action: str, **body: Any) -> tuple[int, str]:
 async def at_the_socket(rig: Rig, command: str) -> str:
     """The reason that the control socket gives for the same."""
     try:
-        replies = [reply async for reply in rig.service.answers.answer({"command": command})]
+        replies = [reply async for reply in rig.service.faces.answers.answer({"command": command})]
     except Exception as error:  # noqa: BLE001 - refusals are exceptions there
         return str(error)
     return str(replies[-1]["reason"])
@@ -82,16 +82,16 @@ def test_buttons_do_what_the_command_line_does_and_are_refused_in_the_same_words
             assert await press(rig, "cancel") == (200, "nothing was running")
 
             rig.double.arm()
-            await rig.until(lambda: rig.service.vehicle.arm_state.value == "armed", 3.0)
+            await rig.until(lambda: rig.service.core.vehicle.arm_state.value == "armed", 3.0)
             status, words = await press(rig, "calibrate")
             assert (status, words) == (409, await at_the_socket(rig, "calibrate"))
             assert "armed" in words
             rig.double.disarm()
-            await rig.until(lambda: rig.service.vehicle.arm_state.value == "disarmed", 3.0)
+            await rig.until(lambda: rig.service.core.vehicle.arm_state.value == "disarmed", 3.0)
 
             assert await press(rig, "calibrate", what="nothing") == (409, "calibrate: 'NOTHING' is not understood")
             assert await press(rig, "calibrate") == (200, "calibration started")
-            job = rig.service.conductor.job
+            job = rig.service.calibrating.conductor.job
             assert job is not None
             assert job.what is What.BOTH
             busy = await press(rig, "calibrate")
@@ -102,7 +102,7 @@ def test_buttons_do_what_the_command_line_does_and_are_refused_in_the_same_words
 
             before = rig.double.parameter("INS_GYROFFS_X")
             assert await press(rig, "calibrate", what="gyros") == (200, "calibration started")
-            job = rig.service.conductor.job
+            job = rig.service.calibrating.conductor.job
             assert job is not None
             assert job.what is What.GYROS
             assert (await job.finished).outcome == "done"
@@ -141,7 +141,7 @@ def test_the_big_word_through_a_calibration_with_nervous_hands(tmp_path: Path) -
             rig.double.disarm()
             await rig.until(lambda: headline(rig)[1] == "READY", 3.0)
 
-            job = started(rig.service.conductor.start_undo("test"))
+            job = started(rig.service.calibrating.conductor.start_undo("test"))
             await rig.until(lambda: headline(rig)[1] == "PUTTING BACK", 3.0)
             assert (await job.finished).outcome == "done"
             await rig.until(lambda: headline(rig)[1] == "NOT CALIBRATED", 3.0)
@@ -195,8 +195,8 @@ def test_the_attitude_and_the_biases_that_are_shown_are_the_true_ones(tmp_path: 
             await rig.ready()
             magnetic = rig.service.status()["pose"]
             assert magnetic["north"] == "magnetic"
-            await rig.until(lambda: rig.service.vehicle.place.position is not None, 10.0)
-            true_north = (await rig.service.answers.look())["pose"]
+            await rig.until(lambda: rig.service.core.vehicle.place.position is not None, 10.0)
+            true_north = (await rig.service.faces.answers.look())["pose"]
             assert magnetic["pitch_deg"] == pytest.approx(POSE.pitch_deg, abs=0.05)
             assert magnetic["roll_deg"] == pytest.approx(POSE.roll_deg, abs=0.05)
             assert magnetic["heading_deg"] == pytest.approx(POSE.heading_deg - rig.site.declination_deg, abs=2.0)

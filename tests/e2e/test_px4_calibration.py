@@ -48,7 +48,7 @@ def started(answer: Job | Refusal) -> Job:
 
 
 async def calibrated(rig: Rig, *, reboot: bool = False) -> tuple[JobResult, Record]:
-    job = started(rig.service.conductor.start_calibration(What.BOTH, "test", reboot=reboot))
+    job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", reboot=reboot))
     result = await job.finished
     assert job.record is not None
     return result, job.record
@@ -87,7 +87,7 @@ def test_offsets_that_px4_would_ignore_are_in_use_after_a_calibration_and_out_af
             assert np.abs(left.gyro_rad_s / fc.gyro_sigma_use_rad_s).max() < 3.5
             assert np.abs(left.accel_m_s2 / fc.accel_sigma_use_m_s2).max() < 3.5
             assert any("reboot the autopilot before flight" in warning for warning in record.warnings)
-            undo = started(rig.service.conductor.start_undo("test"))
+            undo = started(rig.service.calibrating.conductor.start_undo("test"))
             assert (await undo.finished).outcome == "done"
             await asyncio.sleep(1.5)
             assert set(values(rig).values()) == {0.0}
@@ -194,7 +194,7 @@ def test_a_small_accelerometer_vector_is_brought_into_use_before_anything_is_mea
             left = rig.px4.residual(1, rig.now_s)
             assert fc.accel_sigma_use_m_s2 is not None
             assert np.abs(left.accel_m_s2 / fc.accel_sigma_use_m_s2).max() < 3.5
-            undo = started(rig.service.conductor.start_undo("test"))
+            undo = started(rig.service.calibrating.conductor.start_undo("test"))
             assert (await undo.finished).outcome == "done"
             assert values(rig)["CAL_ACC0_XOFF"] == np.float32(0.006)
 
@@ -213,7 +213,7 @@ def test_power_cut_of_the_companion_between_the_steps_is_mended(tmp_path: Path, 
         async with rig.running():
             await rig.ready()
             before |= values(rig)
-            started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
             await rig.until(lambda: len(rig.px4.writes) >= after, 60.0)
             rig.wire.cut = True  # the companion is gone for good
             journal = (tmp_path / "journal.json").read_bytes()
@@ -223,7 +223,7 @@ def test_power_cut_of_the_companion_between_the_steps_is_mended(tmp_path: Path, 
         for name in before:
             again.px4.set_parameter(name, rig.px4.parameter(name))
         async with again.running():
-            await again.until(lambda: not again.service.recovery.pending, 40.0)
+            await again.until(lambda: not again.service.offsets.recovery.pending, 40.0)
             await asyncio.sleep(1.5)
             assert values(again) == before
             assert in_use_as_stored(again)
@@ -237,7 +237,7 @@ def test_armed_between_the_steps_nothing_is_written_until_disarmed_and_then_the_
     async def main() -> None:
         async with px4_rig(tmp_path).running() as rig:
             await rig.ready()
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
             await rig.until(lambda: len(rig.px4.writes) == 6, 60.0)
             rig.px4.arm()
             result = await job.finished
@@ -248,7 +248,7 @@ def test_armed_between_the_steps_nothing_is_written_until_disarmed_and_then_the_
             await asyncio.sleep(5.0)
             assert not any(write.armed for write in rig.px4.writes)
             rig.px4.disarm()
-            await rig.until(lambda: not rig.service.recovery.pending, 30.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 30.0)
             await asyncio.sleep(1.5)
             assert set(values(rig).values()) == {0.0}
             assert in_use_as_stored(rig)
@@ -262,12 +262,12 @@ def test_a_reboot_at_any_phase_leaves_the_old_values_or_the_new_ones_in_use(tmp_
         async with px4_rig(tmp_path, parameters={"CAL_ACC0_ZOFF": 0.25}).running() as rig:
             await rig.ready()
             before = values(rig)
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
-            await rig.until(lambda: rig.service.conductor.state.value == "collecting", 30.0)
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
+            await rig.until(lambda: rig.service.calibrating.conductor.state.value == "collecting", 30.0)
             await rig.until(lambda: len(rig.px4.writes) >= writes, 60.0)
             rig.px4.reboot()
             result = await job.finished
-            await rig.until(lambda: not rig.service.recovery.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.recovery.pending, 60.0)
             await asyncio.sleep(3.0)
             if result.outcome == "done":
                 assert writes == 0
@@ -288,11 +288,11 @@ def test_the_autopilot_is_rebooted_only_when_asked_and_what_was_written_is_confi
             result, record = await calibrated(rig, reboot=True)
             assert result.outcome == "done", result
             assert "rebooted, offsets in force" in record.reason
-            assert rig.service.vehicle.boots == 1
+            assert rig.service.core.vehicle.boots == 1
             assert in_use_as_stored(rig)
             assert not any("attitude stays wrong" in warning for warning in record.warnings)
             result, record = await calibrated(rig)
-            assert rig.service.vehicle.boots == 1
+            assert rig.service.core.vehicle.boots == 1
 
     run_virtual(main())
 
@@ -304,7 +304,7 @@ def test_a_ground_station_may_ask_for_the_reboot_with_param2(tmp_path: Path) -> 
             await rig.until(lambda: any(m.get_srcComponent() == 191 for _, m in rig.ground.received), 10.0)
             rig.ground.command(CALIBRATE, 0.0, 1.0)
             await rig.until(lambda: rig.ground.finals(CALIBRATE) == [ACCEPTED], 120.0)
-            assert rig.service.vehicle.boots == 1
+            assert rig.service.core.vehicle.boots == 1
             assert in_use_as_stored(rig)
             rig.ground.command(UNDO)
             await rig.until(lambda: rig.ground.finals(UNDO) == [ACCEPTED], 30.0)
@@ -348,7 +348,7 @@ def test_rivals_are_stopped_with_the_biases_and_the_undo_starts_them_again(tmp_p
             await rig.until(lambda: any("gyro calibration still runs" in text for text in rig.ground.texts()), 10.0)
             (warning,) = rig.service.status()["warnings"]
             assert "IMU_GYRO_CAL_EN is off from the next boot on" in warning
-            undo = started(rig.service.conductor.start_undo("test"))
+            undo = started(rig.service.calibrating.conductor.start_undo("test"))
             assert (await undo.finished).outcome == "done"
             assert [rig.px4.parameter(name) for name in rivals] == [1, 1]
             assert set(values(rig).values()) == {0.0}
@@ -365,14 +365,14 @@ def test_a_rival_that_was_switched_off_acts_and_is_named_until_the_next_boot(tmp
                 lambda: any("Reboot PX4: its gyro calibration" in text for text in rig.ground.texts()), 10.0
             )
             rig.px4.write_as_another_station("CAL_GYRO0_XOFF", 0.05)
-            writes = rig.service.parameters.writes
+            writes = rig.service.core.parameters.writes
             await rig.until(lambda: abs(rig.px4.parameter("CAL_GYRO0_XOFF")) < 0.02, 60.0)
             await rig.until(lambda: any("(on until reboot) rewrote" in text for text in rig.ground.texts()), 10.0)
             await asyncio.sleep(30.0)
-            assert rig.service.parameters.writes == writes  # nobody fights
+            assert rig.service.core.parameters.writes == writes  # nobody fights
             rig.px4.reboot()
-            await rig.until(lambda: rig.service.vehicle.boots > 0, 30.0)
-            await rig.until(lambda: all(imu.calibration is not None for imu in rig.service.imus.values()), 30.0)
+            await rig.until(lambda: rig.service.core.vehicle.boots > 0, 30.0)
+            await rig.until(lambda: all(imu.calibration is not None for imu in rig.service.devices.imus.values()), 30.0)
             assert rig.service.status()["warnings"] == []
 
     run_virtual(main())

@@ -14,7 +14,7 @@ def test_a_rig_with_px4_flies_the_same_aircraft(tmp_path: Path) -> None:
     async def main() -> None:
         rig = Rig(tmp_path, firmware="px4", default_streams=True)
         async with rig.running():
-            await rig.until(lambda: rig.service.vehicle.firmware == "px4", 10.0)
+            await rig.until(lambda: rig.service.core.vehicle.firmware == "px4", 10.0)
             assert rig.px4.aircraft is rig.aircraft
             with pytest.raises(AssertionError):
                 _ = rig.double

@@ -58,7 +58,7 @@ def record(folder: Path, during: Callable[[Rig], Any] | None = None, **options: 
                 result, _ = await calibrated(rig)
                 assert result.outcome == "done", result
             await asyncio.sleep(2.5)
-        return rig.service.store.history()[::-1]
+        return rig.service.calibrating.store.history()[::-1]
 
     records = run_virtual(main())
     return ring(folder), records
@@ -96,7 +96,7 @@ def test_a_saved_profile_goes_along_with_the_recording(tmp_path: Path) -> None:
             result, _ = await calibrated(rig)
             assert result.outcome == "done", result
             await asyncio.sleep(2.5)
-        return rig.service.store.history()[::-1]
+        return rig.service.calibrating.store.history()[::-1]
 
     records = run_virtual(main())
     # A flicker of 2 mrad/s is far above every other profile's.
@@ -134,8 +134,8 @@ def test_a_replay_knows_who_shares_a_port(tmp_path: Path) -> None:
             result, _ = await calibrated(rig)
             assert result.outcome == "done", result
             await asyncio.sleep(2.5)
-        assert [sensor.name for sensor in rig.service.sensors] == ["own", "gradienter"]
-        return rig.service.store.history()
+        assert [sensor.name for sensor in rig.service.devices.sensors] == ["own", "gradienter"]
+        return rig.service.calibrating.store.history()
 
     records = run_virtual(main())
     path = ring(tmp_path)[0]  # behind the record the next one begins
@@ -162,7 +162,7 @@ def test_a_device_that_restarts_in_the_middle_is_replayed_alike_from_any_part(tm
             assert result.outcome == "done", result
             rig.devices["own"].power_on(rig.aircraft.time_at(rig.now_s))
             await asyncio.sleep(1.0)
-            clock = rig.service.sensors[0].decoder.times.clock
+            clock = rig.service.devices.sensors[0].decoder.times.clock
         assert clock.restarts == 2
         result, _ = await calibrated(rig)
         assert result.outcome == "done", result
@@ -253,12 +253,12 @@ def test_it_is_the_same_whatever_the_vehicle_and_the_link(tmp_path: Path, option
 
 def test_a_recording_may_begin_in_the_middle_of_a_calibration(tmp_path: Path) -> None:
     async def during(rig: Rig) -> None:
-        job = rig.service.conductor.start_calibration(What.BOTH, "test")
+        job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
         assert not hasattr(job, "code"), job
         for _ in range(4):
             await asyncio.sleep(5.37)
             rig.service.recorder._new_part = True
-        await rig.until(lambda: not rig.service.conductor.state.busy, 60.0)
+        await rig.until(lambda: not rig.service.calibrating.conductor.state.busy, 60.0)
 
     paths, records = record(tmp_path, during, own_imu=True, seed=7)
     assert len(paths) > 4
@@ -274,14 +274,14 @@ def test_moved_armed_and_twice(tmp_path: Path) -> None:
     async def during(rig: Rig) -> None:
         await asyncio.sleep(4.0)
         rig.double.arm()
-        await rig.until(lambda: rig.service.vehicle.arm_state is ArmState.ARMED, 5.0)
+        await rig.until(lambda: rig.service.core.vehicle.arm_state is ArmState.ARMED, 5.0)
         await asyncio.sleep(2.0)
         rig.double.disarm()
         rig.unplugged.add("own")
         await asyncio.sleep(4.0)
         rig.unplugged.clear()
         for _ in range(2):
-            await rig.until(lambda: rig.service.vehicle.arm_state is ArmState.DISARMED, 5.0)
+            await rig.until(lambda: rig.service.core.vehicle.arm_state is ArmState.DISARMED, 5.0)
             result, _ = await calibrated(rig)
             assert result.outcome == "done", result
 
@@ -311,7 +311,7 @@ def test_means_found_by_a_dither_are_taken_over(tmp_path: Path) -> None:
             rig.config, storage=msgspec.structs.replace(rig.config.storage, recordings_mb=64)
         )
         async with rig.running():
-            await rig.until(lambda: rig.service.imus["second"].calibration is not None, 15.0)
+            await rig.until(lambda: rig.service.devices.imus["second"].calibration is not None, 15.0)
             result, kept = await calibrated(rig)
             assert result.outcome == "done", result
             assert any("dithered" in warning for warning in kept.imus[0].warnings)
@@ -510,7 +510,7 @@ def foxglove_takes(schema: dict[str, Any]) -> None:
 
 
 async def asked(rig: Rig, **request: Any) -> list[Object]:
-    return [reply async for reply in rig.service.recorder.answer({"command": "record", **request})]
+    return [reply async for reply in rig.service.faces.answers.answer({"command": "record", **request})]
 
 
 def test_recording_on_request(tmp_path: Path) -> None:

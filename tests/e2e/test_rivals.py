@@ -25,7 +25,7 @@ def quick(folder: Path, **options: Any) -> Rig:
 
 
 async def calibrated(rig: Rig, *, reboot: bool = False, what: What = What.BOTH) -> tuple[JobResult, Record]:
-    job = rig.service.conductor.start_calibration(what, "test", reboot=reboot)
+    job = rig.service.calibrating.conductor.start_calibration(what, "test", reboot=reboot)
     assert isinstance(job, Job), job
     result = await job.finished
     assert job.record is not None
@@ -42,7 +42,7 @@ def test_no_reboot_into_a_gyro_calibration_that_would_throw_the_offsets_away(tmp
             await rig.ready()
             result, record = await calibrated(rig, reboot=True)
             assert result.outcome == "done", result
-            assert rig.service.vehicle.boots == 0
+            assert rig.service.core.vehicle.boots == 0
             assert any("not rebooted: INS_GYR_CAL = 1 would measure the gyros anew" in w for w in record.warnings)
             assert any("push.stop_rivals = true" in warning for warning in record.imus[0].warnings)
 
@@ -56,11 +56,11 @@ def test_with_the_rival_stopped_it_is_rebooted_and_the_offsets_are_confirmed(tmp
             result, record = await calibrated(rig, reboot=True)
             assert result.outcome == "done", result
             assert "rebooted, offsets in force" in record.reason
-            assert rig.service.vehicle.boots == 1
+            assert rig.service.core.vehicle.boots == 1
             assert rig.double.parameter("INS_GYR_CAL") == 0
             written = record.imus[0].written
             assert [written[name].after for name in offset_names(1, "gyro")] == pytest.approx(gyro(rig))
-            undo = rig.service.conductor.start_undo("test")
+            undo = rig.service.calibrating.conductor.start_undo("test")
             assert isinstance(undo, Job)
             assert (await undo.finished).outcome == "done"
             assert rig.double.parameter("INS_GYR_CAL") == 1
@@ -77,7 +77,7 @@ def test_a_start_that_measured_the_gyros_itself_is_told_as_such(tmp_path: Path) 
             await rig.ready()
             ours = gyro(rig)
             rig.double.reboot()
-            await rig.until(lambda: rig.service.vehicle.boots == 1, 60.0)
+            await rig.until(lambda: rig.service.core.vehicle.boots == 1, 60.0)
             await rig.until(
                 lambda: any("INS_GYR_CAL=1 rewrote gyro biases of fc" in text for text in rig.ground.texts()), 30.0
             )
@@ -102,7 +102,7 @@ def test_a_reboot_is_not_sent_to_an_aircraft_that_armed_meanwhile(tmp_path: Path
     async def main() -> None:
         async with quick(tmp_path).running() as rig:
             await rig.ready()
-            job = rig.service.conductor.start_calibration(What.BOTH, "test", reboot=True)
+            job = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", reboot=True)
             assert isinstance(job, Job), job
             await rig.until(lambda: "stored the new offsets" in job.words, 90.0)
             rig.double.arm()
@@ -111,7 +111,7 @@ def test_a_reboot_is_not_sent_to_an_aircraft_that_armed_meanwhile(tmp_path: Path
             assert job.record is not None
             assert any("not rebooted" in warning for warning in job.record.warnings)
             await asyncio.sleep(5.0)
-            assert rig.service.vehicle.boots == 0
+            assert rig.service.core.vehicle.boots == 0
 
     run_virtual(main())
 

@@ -23,14 +23,14 @@ from tests.support.virtual_time import run_virtual
 async def watched(rig: Rig) -> AsyncIterator[Rig]:
     """The rig, with its sensors looked after as if their ports were open."""
     async with rig.running():
-        for sensor in rig.service.sensors:
+        for sensor in rig.service.devices.sensors:
             sensor.link._descriptor = -1
-        watch = asyncio.create_task(rig.service.sensor_watch.run())
+        watch = asyncio.create_task(rig.service.devices.watch.run())
         try:
             yield await rig.ready()
         finally:
             watch.cancel()
-            for sensor in rig.service.sensors:
+            for sensor in rig.service.devices.sensors:
                 sensor.link._descriptor = None
 
 
@@ -49,13 +49,13 @@ def test_a_silent_gradienter_is_the_headline_with_what_to_look_at(tmp_path: Path
     async def main() -> None:
         async with watched(Rig(tmp_path, at_arm="warn")) as rig:
             rig.unplugged.add("gradienter")
-            answers = rig.service.answers
+            answers = rig.service.faces.answers
             await rig.until(lambda: "silent (power? wiring?" in answers.status()["headline"]["reason"], 10.0)
             headline = answers.status()["headline"]
             assert headline["word"] == "NOT CALIBRATED"
             assert headline["reason"].startswith("gradienter: /nowhere/gradienter at 9600 baud")
             rig.unplugged.clear()
-            await rig.until(lambda: "silent" not in rig.service.answers.status()["headline"]["reason"], 3.0)
+            await rig.until(lambda: "silent" not in rig.service.faces.answers.status()["headline"]["reason"], 3.0)
 
     run_virtual(main())
 
@@ -68,10 +68,10 @@ def test_no_calibration_is_made_with_a_gradienter_at_its_rail(tmp_path: Path, mo
         async with watched(Rig(tmp_path)) as rig:
             saying(rig, lambda n: f"X=-03.300\r\nY=+04.{990 + n % 10:03d}\r\n".encode())
             await asyncio.sleep(3.0)
-            job = started(rig.service.conductor.start_calibration(What.BOTH, "test"))
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
             await asyncio.sleep(60.0)
             assert not job.finished.done()
-            assert rig.service.conductor.state is State.WAITING
+            assert rig.service.calibrating.conductor.state is State.WAITING
             device = next(one for one in rig.service.status()["devices"] if one["name"] == "gradienter")
             assert device["trouble"] == "end of range"
             assert device["counts"]["end of range"] == 1

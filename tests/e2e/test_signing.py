@@ -135,7 +135,7 @@ def test_who_has_no_key_starts_nothing_and_changes_nothing(tmp_path: Path, attac
         async with rig.running():
             await rig.ready()
             await asyncio.sleep(2.0)
-            parameters = rig.service.component.parameters
+            parameters = rig.service.faces.component.parameters
             push = parameters.get("CMP_PUSH")
             for message in (
                 command_message(CALIBRATE, 0, target=(1, 191)),
@@ -146,7 +146,7 @@ def test_who_has_no_key_starts_nothing_and_changes_nothing(tmp_path: Path, attac
                 await asyncio.sleep(0.1)
                 rig.wire.carry_from_other(data)
                 await asyncio.sleep(1.5)
-            assert rig.service.conductor.job is None
+            assert rig.service.calibrating.conductor.job is None
             assert parameters.get("CMP_PUSH") == push
             assert rig.ground.acks() == []
             assert sum(rig.service.status()["vehicle"]["signing"]["doubted"].values()) == 3
@@ -175,7 +175,7 @@ def test_nobody_without_the_key_says_that_the_aircraft_is_armed_or_which_it_is(t
             for _ in range(20):
                 forge()
                 await asyncio.sleep(0.1)
-                seen.add(rig.service.vehicle.arm_state.value)
+                seen.add(rig.service.core.vehicle.arm_state.value)
             assert seen == {"disarmed"}
 
     run_virtual(main())
@@ -195,11 +195,11 @@ def test_an_autopilot_that_is_not_believed_is_said_and_why(tmp_path: Path, their
             rig.autopilot.require_signatures(theirs, now())
         async with rig.running():
             await asyncio.sleep(5.0)
-            assert rig.service.vehicle.system_id is None
+            assert rig.service.core.vehicle.system_id is None
             assert words in words_of(rig)
             assert words in rig.service.status()["headline"]["reason"]
             assert not rig.service.status()["vehicle"]["signing"]["good"]
-            assert rig.service.collector.status(rig.now_s).still_s == 0.0
+            assert rig.service.core.collector.status(rig.now_s).still_s == 0.0
 
     run_virtual(main())
 
@@ -239,7 +239,7 @@ def test_sign_alone_is_for_the_way_there(tmp_path: Path) -> None:
             verified = signing["verified"]
             await asyncio.sleep(3.0)
             assert rig.service.status()["vehicle"]["signing"]["verified"] > verified
-            assert rig.service.vehicle.alive
+            assert rig.service.core.vehicle.alive
 
     run_virtual(main())
 
@@ -312,7 +312,7 @@ def test_an_autopilot_that_signs_and_takes_unsigned_messages_is_not_complained_o
             for channel in rig.autopilot.channels:
                 channel._codec.signing.allow_unsigned_callback = lambda *_: True
             await asyncio.sleep(20.0)
-            assert rig.service.vehicle.signs
+            assert rig.service.core.vehicle.signs
             assert rig.service.status()["vehicle"]["signing"] is None
             assert lines(caplog, "answers nothing") == 0
 
@@ -392,7 +392,7 @@ def test_heartbeats_held_back_on_another_link_do_not_disarm(
         rig.ground.sign(KEY, ticks_of(START_S))
         async with rig.running():
             await rig.ready()
-            vehicle = rig.service.vehicle
+            vehicle = rig.service.core.vehicle
             await asyncio.sleep(2.0)
             # One of them has come in time, so that this link of the autopilot's is known.
             rig.wire.carry_from_other(heartbeats_of_autopilot(rig.ground.raw)[-1])

@@ -41,14 +41,14 @@ async def spoofed(rig: Rig, every_s: float, *messages: Callable[[], Message]) ->
 
 
 def calibrate(rig: Rig) -> Job:
-    answer = rig.service.conductor.start_calibration(What.BOTH, "a pilot")
+    answer = rig.service.calibrating.conductor.start_calibration(What.BOTH, "a pilot")
     assert not isinstance(answer, Refusal), answer.reason
     return answer
 
 
 def place(rig: Rig, latitude_deg: float, height_m: float) -> Callable[[], Message]:
     def message() -> Message:
-        boot_ms = round((rig.service.vehicle.boot_s or 0.0) * 1e3)
+        boot_ms = round((rig.service.core.vehicle.boot_s or 0.0) * 1e3)
         lat, lon, alt = round(latitude_deg * 1e7), round(rig.site.longitude_deg * 1e7), round(height_m * 1e3)
         return mavlink.MAVLink_global_position_int_message(boot_ms, lat, lon, alt, 0, 0, 0, 0, 0)
 

@@ -143,7 +143,7 @@ def test_a_calibration_and_its_undo_leave_the_other_aircraft_alone(
             before = values(rig.autopilot)
             rig.ground.command(CALIBRATE, target=(own_id, 191))
             await rig.until(lambda: rig.ground.acks(CALIBRATE)[-1:] == [0], 90.0)
-            record = rig.service.conductor.last
+            record = rig.service.calibrating.conductor.last
             assert record is not None
             assert record.state == "done"
             residual = rig.autopilot.residual(1, rig.now_s)
@@ -170,7 +170,7 @@ def test_commands_for_the_other_aircrafts_companion_are_none_of_ours(tmp_path: P
             for command in (CALIBRATE, CANCEL, UNDO, 241, 3001):
                 it.rig.ground.command(command, 1.0, target=(2, 191))
             await asyncio.sleep(5.0)
-            assert it.rig.service.conductor.job is None
+            assert it.rig.service.calibrating.conductor.job is None
             assert all(it.rig.ground.acks(command) == [] for command in (CALIBRATE, CANCEL, UNDO, 241, 3001))
             it.assert_untouched()
 
@@ -187,7 +187,7 @@ def test_ours_in_the_air_is_not_written_to_because_the_other_one_stands_disarmed
             await rig.ready()
             before = values(rig.autopilot)
             rig.autopilot.arm()
-            await rig.until(lambda: rig.service.vehicle.arm_state.name == "ARMED", 5.0)
+            await rig.until(lambda: rig.service.core.vehicle.arm_state.name == "ARMED", 5.0)
             rig.ground.command(CALIBRATE, target=(1, 191))
             await rig.until(lambda: rig.ground.acks(CALIBRATE) != [], 5.0)
             await asyncio.sleep(20.0)
@@ -206,7 +206,7 @@ def test_the_other_aircraft_arming_during_a_calibration_does_not_end_it(tmp_path
             asyncio.get_running_loop().call_later(6.0, it.other.reboot)
             result, _ = await calibrated(it.rig)
             assert result.outcome == "done", result
-            assert it.rig.service.vehicle.boots == 0
+            assert it.rig.service.core.vehicle.boots == 0
             it.assert_untouched()
 
     run_virtual(main())

@@ -18,7 +18,7 @@ from tests.support.virtual_time import run_virtual
 
 
 def ask(rig: Rig, requester: str) -> Job | Refusal:
-    return rig.service.conductor.start_calibration(What.BOTH, requester)
+    return rig.service.calibrating.conductor.start_calibration(What.BOTH, requester)
 
 
 async def done(rig: Rig) -> None:
@@ -33,14 +33,14 @@ def test_requests_and_cancels_in_a_loop_leave_the_history_as_it_was(tmp_path: Pa
         async with Rig(tmp_path).running() as rig:
             await rig.ready()
             await done(rig)
-            before = [entry.path.read_bytes() for entry in rig.service.store.entries()]
+            before = [entry.path.read_bytes() for entry in rig.service.calibrating.store.entries()]
             for _ in range(1000):
                 rig.ground.command(CALIBRATE)
                 await asyncio.sleep(0.005)
                 rig.ground.command(CANCEL)
                 await asyncio.sleep(0.005)
-            await rig.until(lambda: not rig.service.conductor.state.busy, 30.0)
-            assert [entry.path.read_bytes() for entry in rig.service.store.entries()] == before
+            await rig.until(lambda: not rig.service.calibrating.conductor.state.busy, 30.0)
+            assert [entry.path.read_bytes() for entry in rig.service.calibrating.store.entries()] == before
             assert len(before) == 1
             assert TEMPORARILY_REJECTED in rig.ground.finals(CALIBRATE)
             assert set(rig.ground.finals(CANCEL)) == {ACCEPTED}
@@ -56,10 +56,10 @@ def test_what_was_measured_before_the_cancel_is_a_record(tmp_path: Path) -> None
             await rig.ready()
             job = ask(rig, "a pilot")
             assert isinstance(job, Job)
-            await rig.until(lambda: rig.service.conductor.state.is_writing, 60.0)
-            rig.service.conductor.cancel("a pilot")
+            await rig.until(lambda: rig.service.calibrating.conductor.state.is_writing, 60.0)
+            rig.service.calibrating.conductor.cancel("a pilot")
             assert (await job.finished).outcome == "cancelled"
-            assert [record.state for record in rig.service.store.history()] == ["cancelled"]
+            assert [record.state for record in rig.service.calibrating.store.history()] == ["cancelled"]
 
     run_virtual(main())
 
@@ -108,7 +108,7 @@ def test_an_arming_that_flickers_does_not_wash_out_the_armings(tmp_path: Path) -
                 codec.seq = (codec.seq + 1) % 256
                 await asyncio.sleep(0.05)
             await asyncio.sleep(1.0)
-            assert len(rig.service.armings.history()) == 1
+            assert len(rig.service.arming.armings.history()) == 1
 
     run_virtual(main())
 
@@ -119,8 +119,8 @@ def test_alignments_have_the_same_limit(tmp_path: Path) -> None:
             await rig.ready()
             answers = []
             for _ in range(30):
-                answers.append(rig.service.conductor.start_alignment(Plan("zero", 2), "a script", 60.0))
-                rig.service.conductor.cancel("a script")
+                answers.append(rig.service.calibrating.conductor.start_alignment(Plan("zero", 2), "a script", 60.0))
+                rig.service.calibrating.conductor.cancel("a script")
                 if isinstance(job := answers[-1], Job):
                     await job.finished
             reasons = [answer.reason for answer in answers if isinstance(answer, Refusal)]

@@ -49,7 +49,7 @@ async def alone(folder: Path, section: str) -> AsyncIterator[Service]:
 
 
 async def until_connected(service: Service, *, connected: bool = True, within_s: float = 40.0) -> None:
-    assert service.mqtt is not None
+    assert service.faces.mqtt is not None
     async with asyncio.timeout(within_s):
         while service.status()["mqtt"]["connected"] != connected:
             await asyncio.sleep(0.02)

@@ -230,12 +230,12 @@ class Rig:
 
     async def ready(self) -> Rig:
         """Wait until the daemon knows the autopilot and its offsets."""
-        imu = self.service.imus["fc"]
+        imu = self.service.devices.imus["fc"]
         await self.until(lambda: imu.calibration is not None and imu.stream.samples > 0, 15.0)
         return self
 
     async def _feed(self) -> None:
-        sensors = {sensor.name: sensor for sensor in self.service.sensors}
+        sensors = {sensor.name: sensor for sensor in self.service.devices.sensors}
         for device in self.devices.values():
             device.power_on(self.aircraft.time_at(self.now_s))
         while True:

@@ -36,7 +36,7 @@ from tests.unit.test_config import GOOD
 
 def allowing(*entries: str) -> Callable[[Component], None]:
     def prepare(component: Component) -> None:
-        component.permission.senders = Senders(entries)
+        component.permission.allow(Senders(entries))
         component.parameters.define("CMP_PUSH", 1.0, 0.0, 1.0)
 
     return prepare
@@ -175,8 +175,7 @@ def test_nobody_sets_a_parameter_under_our_own_ids() -> None:
 
 
 def test_a_refusal_is_logged_once_for_each_sender_and_strangers_are_bounded(caplog: pytest.LogCaptureFixture) -> None:
-    permission = Permission()
-    permission.senders = Senders([])
+    permission = Permission(Senders([]))
     with caplog.at_level(logging.WARNING):
         for number in range(3 * 100):
             assert permission.refuses((number % 100, 190), "calibration") != ""
@@ -215,7 +214,7 @@ def test_a_key_file_alone_means_that_signatures_are_required(monkeypatch: pytest
 
 
 def test_a_reload_changes_who_may() -> None:
-    component = SimpleNamespace(permission=Permission())
-    RELOADABLE["mavlink.allow"](cast("Service", SimpleNamespace(component=component)), ("254",))
-    assert component.permission.refuses((255, 190), "undo") != ""
-    assert component.permission.refuses((254, 190), "undo") == ""
+    faces = SimpleNamespace(component=SimpleNamespace(permission=Permission()))
+    RELOADABLE["mavlink.allow"](cast("Service", SimpleNamespace(faces=faces)), ("254",))
+    assert faces.component.permission.refuses((255, 190), "undo") != ""
+    assert faces.component.permission.refuses((254, 190), "undo") == ""

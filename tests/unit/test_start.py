@@ -106,8 +106,8 @@ def test_the_record_waits_for_nothing_after_its_last_second(tmp_path: Path) -> N
         rig, waited_s = Rig(tmp_path, own_imu=True, feed_s=0.01, more="[push]\nparameters = false\n"), list[float]()
         rig.config = parse(re.sub(r"\[\[imu\]\]\nname = \"fc\"\n(?:[^\[\n].*\n)*", "", rig.text), "rig.toml")
         async with rig.running():
-            await rig.until(lambda: rig.service.vehicle.alive, 10.0)
-            collector, judged_s = rig.service.collector, 0.0
+            await rig.until(lambda: rig.service.core.vehicle.alive, 10.0)
+            collector, judged_s = rig.service.core.collector, 0.0
             evaluate = collector._evaluate
 
             def noted() -> None:
@@ -120,7 +120,7 @@ def test_the_record_waits_for_nothing_after_its_last_second(tmp_path: Path) -> N
             for pause_s in (5.0, 0.0, 0.37):
                 await asyncio.sleep(pause_s)
                 asked_s = rig.now_s
-                job = rig.service.conductor.start_calibration(What.GYROS, "test")
+                job = rig.service.calibrating.conductor.start_calibration(What.GYROS, "test")
                 assert isinstance(job, Job)
                 result = await job.finished
                 assert result.outcome == "done", result.reason

@@ -7,16 +7,15 @@ import contextlib
 import datetime
 import logging
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Final
 
 import msgspec
 
-from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
+from companion.autopilot.vehicle.vehicle import VehicleEvent
 from companion.calibration.solution.record import Arming, Record
-from companion.component.statustext import Say, Severity, Weight
+from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.readiness import Readiness
-from companion.daemon.offload import Offload
+from companion.daemon.core import Core
 from companion.errors import StorageError
 from companion.storage.bounded import BoundedList
 
@@ -30,12 +29,12 @@ QUEUE: Final = 16
 class Armings:
     """Watches for arming; `run` writes what was seen, off the loop."""
 
-    def __init__(self, vehicle: Vehicle, readiness: Readiness, directory: Path, say: Say, offload: Offload) -> None:
-        self._readiness, self._say, self._offload = readiness, say, offload
-        self._file = BoundedList(directory / "armings.json", Arming, KEEP)
+    def __init__(self, core: Core, readiness: Readiness) -> None:
+        self._readiness, self._say, self._offload = readiness, core.say, core.offload
+        self._file = BoundedList(core.config.storage.path / "armings.json", Arming, KEEP)
         self._queue: asyncio.Queue[Arming] = asyncio.Queue(QUEUE)
         self.last: Arming | None = None
-        self._unsubscribe = vehicle.watch(self._on_event)
+        self._unsubscribe = core.vehicle.watch(self._on_event)
 
     async def run(self) -> None:
         """Keep every arming until cancelled; what is still waiting then is written as well."""

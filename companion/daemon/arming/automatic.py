@@ -16,22 +16,20 @@ import datetime
 import logging
 import math
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Final
 
 import msgspec
 
-from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
-from companion.calibration.collector.rolling import RollingCollector
+from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.solution.validity import Why
 from companion.component.service import JobResult, Refusal
-from companion.component.statustext import Say, Severity, Weight
+from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.in_force import InForce
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.why_not import Rung
+from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.job import Job
-from companion.daemon.offload import Offload
+from companion.daemon.job import ALIGNMENT, Job
 from companion.errors import AutopilotError, StorageError
 from companion.storage.bounded import BoundedList
 
@@ -65,30 +63,16 @@ class Automatic:
     """Starts calibrations by itself; `run` decides when.
 
     Args:
-        vehicle: disarmed or not, which boot.
-        collector: whether the window is as good as it gets.
-        conductor: runs them, as for everybody else.
+        core: what all share; the writes are counted in its storage.
         imus: the autopilot's IMUs by name.
+        conductor: runs them, as for everybody else.
         in_force: what is in force, and whether better is to be had.
-        directory: of the storage; the writes are counted there.
-        say: to the ground stations.
-        offload: for the disk.
     """
 
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        collector: RollingCollector,
-        conductor: Conductor,
-        imus: Mapping[str, AutopilotImu],
-        in_force: InForce,
-        directory: Path,
-        say: Say,
-        offload: Offload,
-    ) -> None:
-        self._vehicle, self._collector, self._conductor = vehicle, collector, conductor
-        self._imus, self._in_force, self._say, self._offload = imus, in_force, say, offload
-        self._file = BoundedList(directory / "automatic.json", AutomaticWrite, PER_DAY + 8)
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], conductor: Conductor, in_force: InForce) -> None:
+        self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
+        self._imus, self._in_force, self._say, self._offload = imus, in_force, core.say, core.offload
+        self._file = BoundedList(core.config.storage.path / "automatic.json", AutomaticWrite, PER_DAY + 8)
         self._writes: list[AutomaticWrite] = []
         self._to_keep: list[AutomaticWrite] = []
         self._this_boot: tuple[int, int] = (0, 0)
@@ -99,6 +83,7 @@ class Automatic:
         """Called at every turn of `run`."""
         self.stopped: str | None = None
         """Why it waits for a request, for people; None while it works."""
+        conductor.watch(self._on_ended)
 
     # --- may it
 
@@ -186,8 +171,9 @@ class Automatic:
 
     # --- what comes of it
 
-    def on_ended(self, job: Job, result: JobResult) -> None:
-        """A calibration or an undo has come to its end."""
+    def _on_ended(self, job: Job, result: JobResult) -> None:
+        if job.kind == ALIGNMENT:
+            return
         now_s = asyncio.get_running_loop().time()
         if job.kind == "undo":
             if result.outcome == "done":

@@ -6,10 +6,10 @@ import asyncio
 import logging
 from typing import Final
 
-from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
-from companion.component.statustext import Say, Severity, Weight
+from companion.autopilot.vehicle.vehicle import VehicleEvent
+from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.readiness import Readiness
+from companion.daemon.core import Core
 from companion.errors import AutopilotError
 
 logger = logging.getLogger(__name__)
@@ -27,15 +27,15 @@ _SCRIPT: Final = "CMPG_ENABLE"
 class GateSetup:
     """Reads what decides whether the autopilot asks: at every start of it, and when one of it is changed."""
 
-    def __init__(self, vehicle: Vehicle, parameters: ParameterClient, readiness: Readiness, say: Say) -> None:
-        self._vehicle, self._parameters = vehicle, parameters
-        self._readiness, self._say = readiness, say
+    def __init__(self, core: Core, readiness: Readiness) -> None:
+        self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
+        self._readiness = readiness
         self._stale = asyncio.Event()
         self._said: str | None = None
         self.problem: str | None = None
         """What has to be set, for people; None while all is well or not known yet."""
         self.known = False
-        self._unsubscribe = (vehicle.watch(self._on_event), parameters.watch(self._on_parameter))
+        self._unsubscribe = (core.vehicle.watch(self._on_event), core.parameters.watch(self._on_parameter))
 
     async def run(self) -> None:
         """Look whenever there is something new, until cancelled."""

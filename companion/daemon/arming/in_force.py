@@ -10,19 +10,17 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 import msgspec
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.record import ImuRecord, Record
-from companion.calibration.solution.solve import GradienterModel, Solution, solve_at
+from companion.calibration.solution.solve import Solution, solve_at
 from companion.calibration.solution.validity import (
     Finding,
     Held,
@@ -38,10 +36,12 @@ from companion.component.service import JobResult
 from companion.config import Config, Imu
 from companion.configured import models
 from companion.daemon import offload as estimating
+from companion.daemon.calibrating.alignment import AlignmentInForce
+from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.held_back import HeldBack, Key
+from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import ALIGNMENT, Job
-from companion.daemon.offload import Offload
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import vector
 from companion.samples import Vector
@@ -68,25 +68,18 @@ class InForce:
     """The calibration in force; `poll` often, `measure` whenever there may be a new window.
 
     Args:
-        config: which IMUs, which limits.
-        vehicle: whether it restarted.
-        collector: gives the rolling window.
+        core: what all share.
         imus: the autopilot's IMUs by name.
-        offload: for the arithmetic, which would hold up an answer at arming.
+        conductor: what becomes of calibrations.
+        alignment: of the gradienter.
     """
 
     def __init__(
-        self,
-        config: Config,
-        vehicle: Vehicle,
-        collector: RollingCollector,
-        imus: Mapping[str, AutopilotImu],
-        offload: Offload,
+        self, core: Core, imus: Mapping[str, AutopilotImu], conductor: Conductor, alignment: AlignmentInForce
     ) -> None:
-        self._config, self._vehicle, self._collector = config, vehicle, collector
-        self._imus, self._offload = imus, offload
-        self.gradienter: Callable[[], GradienterModel | None] = lambda: models.gradienter_model(config.gradienter)
-        """The gradienter's model as it is in force."""
+        self._config = config = core.config
+        self._vehicle, self._collector, self._offload = core.vehicle, core.collector, core.offload
+        self._imus, self._alignment = imus, alignment
         wanted = config.calibration
         self._limits = Limits(
             max_age_s=60.0 * wanted.max_age_min, max_temperature_change_k=wanted.max_temperature_change_degc
@@ -119,6 +112,8 @@ class InForce:
         self.calibration: Record | None = None
         """The last finished calibration of this run, while at least one of its values is in force."""
         self.undone = False
+        conductor.watch(self._on_ended)
+        alignment.watch(self._realigned)
 
     # --- what is known
 
@@ -208,7 +203,7 @@ class InForce:
 
     # --- what happens
 
-    def on_ended(self, job: Job, result: JobResult) -> None:
+    def _on_ended(self, job: Job, result: JobResult) -> None:
         """A calibration or an undo has come to its end: what the autopilot has now is of our doing."""
         self._let_go()
         self._written = {}
@@ -231,7 +226,7 @@ class InForce:
                     self._take(imu, asyncio.get_running_loop().time(), job.held_back)
                     self._written[imu.name] = {name: one.after for name, one in imu.written.items()}
 
-    def realigned(self) -> None:
+    def _realigned(self) -> None:
         """The gradienter has another zero from now on: accelerometers calibrated with the old one must be seen anew."""
         for key, held in self._held.items():
             if key[1] == "accel" and isinstance(held, Held):
@@ -363,7 +358,7 @@ class InForce:
                 solve_at,
                 window,
                 models.whereabouts(self._config, self._vehicle),
-                self.gradienter(),
+                self._alignment.model(),
                 models.compass_model(self._config.compass),
                 self.what,
             )

@@ -12,16 +12,17 @@ import math
 from collections.abc import Callable
 from typing import Final, Literal
 
-from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.machine import State
 from companion.calibration.solution.validity import Why
 from companion.component.service import ArmAnswer
 from companion.config import AtArm
+from companion.daemon.arming.automatic import Automatic
 from companion.daemon.arming.forecast import Forecast
 from companion.daemon.arming.in_force import InForce
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.why_not import Rung
+from companion.daemon.core import Core
+from companion.daemon.offsets.reboot import Reboot
 from companion.physics.units import DEG_H, MG
 
 logger = logging.getLogger(__name__)
@@ -52,20 +53,19 @@ class Readiness:
     """The arm gate's answer, and what goes with it: `run` keeps it fresh.
 
     Args:
-        vehicle: armed or not, which autopilot.
-        collector: whether it stands still.
+        core: what all share.
+        reboot: whether the autopilot must be restarted although its offsets are right.
         conductor: what runs, and what is set for arming.
         in_force: what is in force, and what speaks against it.
+        automatic: whether a calibration will start by itself.
     """
 
-    def __init__(self, vehicle: Vehicle, collector: RollingCollector, conductor: Conductor, in_force: InForce) -> None:
-        self._vehicle, self._collector, self._conductor = vehicle, collector, conductor
-        self.in_force = in_force
-        self._forecast = Forecast(vehicle, collector, conductor)
-        self.why_not_by_itself: Callable[[], str | None] = lambda: "calibrate first"
-        """Why no calibration will start by itself, and what to do, or None when one will."""
-        self.reboot_owed: Callable[[], str | None] = lambda: None
-        """Why the autopilot must be restarted first although its offsets are right; None when it need not."""
+    def __init__(
+        self, core: Core, reboot: Reboot, conductor: Conductor, in_force: InForce, automatic: Automatic
+    ) -> None:
+        self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
+        self.in_force, self._automatic, self._reboot = in_force, automatic, reboot
+        self._forecast = Forecast(core.vehicle, core.collector, conductor)
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
         self._has_gated = False
@@ -143,11 +143,11 @@ class Readiness:
             left_s = max(1.0, self._conductor.settings.min_still_s + 1.0 - glance.still_s)
             return ArmAnswer("wait", f"hold still {left_s:.0f} s: checking after restart")
         if findings:
-            why_not = self.why_not_by_itself()
+            why_not = self._automatic.why_not()
             if why_not is None:
                 return ArmAnswer("wait", f"hold still {self.until_calibrated_s(now_s):.0f} s")
             return ArmAnswer("refuse", f"{findings[0].words}: {why_not}")
-        if (owed := self.reboot_owed()) is not None:
+        if (owed := self._reboot.owed) is not None:
             return ArmAnswer("refuse", owed)
         if glance.moving or glance.steady_s < STEADY_S:
             return ArmAnswer("wait", f"hold still {max(1.0, STEADY_S - glance.steady_s):.0f} s")

@@ -26,8 +26,15 @@ class AlignmentInForce:
         """What is kept, whether or not it is used."""
         self.unused: str | None = None
         """Why what is kept is not used, in one line; None while it is used, or nothing is kept."""
-        self.on_change: Callable[[], None] = lambda: None
-        """Told when another zero is in force."""
+        self._watchers: list[Callable[[], None]] = []
+
+    def watch(self, tell: Callable[[], None]) -> None:
+        """Tell when another zero is in force."""
+        self._watchers.append(tell)
+
+    def _tell(self) -> None:
+        for tell in self._watchers:
+            tell()
 
     def load(self) -> None:
         """Read what was kept before this start; blocking. What cannot be used is set aside and said."""
@@ -45,7 +52,7 @@ class AlignmentInForce:
         """
         await self._offload(self._store.write, record)
         self._take(record)
-        self.on_change()
+        self._tell()
 
     async def forget(self) -> bool:
         """Go back to what the configuration says; whether there was anything to forget.
@@ -57,7 +64,7 @@ class AlignmentInForce:
         await self._offload(self._store.clear)
         self._take(None)
         if was:
-            self.on_change()
+            self._tell()
         return was
 
     def settings(self) -> GradienterSettings | None:

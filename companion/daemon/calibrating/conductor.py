@@ -14,21 +14,21 @@ from collections.abc import Awaitable, Callable, Collection, Coroutine
 import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
-from companion.calibration.collector.rolling import RollingCollector, Settings
+from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
+from companion.calibration.collector.rolling import Settings
 from companion.calibration.machine import Event, State
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
-from companion.component.statustext import Say, Severity, Weight
-from companion.config import Config
+from companion.component.statustext import Severity, Weight
 from companion.daemon.calibrating.align_steps import Plan
 from companion.daemon.calibrating.aligner import Aligner
 from companion.daemon.calibrating.course import Course
 from companion.daemon.calibrating.results import Results, has_written
 from companion.daemon.calibrating.start_limit import StartLimit
 from companion.daemon.calibrating.why_not import Obstacle, Rung, obstacle
+from companion.daemon.core import Core
 from companion.daemon.job import ALIGNMENT, Job, JobCancelledError
 from companion.daemon.offsets.recovery import Recovery
 from companion.errors import CompanionError
@@ -41,31 +41,21 @@ OnEnded = Callable[[Job, JobResult], None]
 class Conductor:
     """The calibration service behind MAVLink, the control socket and whoever else asks."""
 
-    def __init__(
-        self,
-        config: Config,
-        vehicle: Vehicle,
-        collector: RollingCollector,
-        course: Course,
-        aligner: Aligner,
-        recovery: Recovery,
-        results: Results,
-        say: Say,
-    ) -> None:
-        self._vehicle, self._collector, self._recovery = vehicle, collector, recovery
-        self._course, self._aligner, self._results, self._say = course, aligner, results, say
-        self._has_gradienter = config.gradienter is not None
+    def __init__(self, core: Core, course: Course, aligner: Aligner, recovery: Recovery, results: Results) -> None:
+        self._vehicle, self._collector, self._say = core.vehicle, core.collector, core.say
+        self._course, self._aligner, self._recovery, self._results = course, aligner, recovery, results
+        self._has_gradienter = core.config.gradienter is not None
         self._machine = course.machine
         self._starts = StartLimit()
         self._task: asyncio.Task[None] | None = None
         self.job: Job | None = None
         self.reason = "ready"
         """What the present state means, in words."""
-        self.at_arm = config.calibration.at_arm
-        self.only_listening: str | None = None
+        self.at_arm = core.config.calibration.at_arm
+        self.only_listening = core.only_listening
         """Why nothing may be started although requests arrive: a check listens and must change nothing."""
         self._watchers: list[OnEnded] = []
-        self._unsubscribe = vehicle.watch(self._on_event)
+        self._unsubscribe = core.vehicle.watch(self._on_event)
         recovery.watch(self._recovered)
 
     def watch(self, on_ended: OnEnded) -> None:

@@ -41,6 +41,7 @@ from companion.daemon.offsets.plan import Plan
 from companion.daemon.offsets.push import Pusher
 from companion.daemon.offsets.reboot import Reboot
 from companion.errors import AutopilotError, CalibrationRefusedError
+from companion.links.system.listeners import Listeners
 from companion.recording.collector import RecordedCollector
 
 logger = logging.getLogger(__name__)
@@ -83,14 +84,16 @@ class Course:
         self.machine = machine
         self.settings = models.settings(config)
         """How good is good enough."""
-        self.on_solved: Callable[[Window, Window, Whereabouts, What, Expectation], None] = lambda *of_what: None
-        """Told of every solution: the window measured, the one used, the place, what was asked for, and what was known
-        from before."""
+        self._listeners: Listeners[Window, Window, Whereabouts, What, Expectation] = Listeners()
         self._written = {imu.name for imu in config.imu if imu.name in imus or imu.autopilot_instance is not None}
         """IMUs whose offsets are in the autopilot."""
         self._settled_by_s = 0.0
         self._upsets: dict[str, int] = {}
         """By IMU, how many there had been before this calibration."""
+
+    def watch(self, tell: Callable[[Window, Window, Whereabouts, What, Expectation], object]) -> None:
+        """Tell of every solution: the window measured and used, the place, what was asked for, what was known."""
+        self._listeners.add(tell)
 
     def retarget(self, settings: Settings) -> None:
         """Change how good is good enough."""
@@ -177,7 +180,10 @@ class Course:
         draft.alignment = self._alignment.used
         draft.measured_s = (measured.start_s, measured.end_s)
         solution = await self._weighed(
-            solution, job, draft, lambda expectation: self.on_solved(measured, window, where, job.what, expectation)
+            solution,
+            job,
+            draft,
+            lambda expectation: self._listeners.tell(measured, window, where, job.what, expectation),
         )
         plan = await self._pusher.plan(solution, draft)
         job.check_cancelled()

@@ -8,19 +8,21 @@ from __future__ import annotations
 import asyncio
 import math
 import re
-from collections.abc import Callable
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import msgspec
 
-from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
-from companion.calibration.collector.rolling import RollingCollector
+from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.machine import State
-from companion.daemon.arming.automatic import Automatic
-from companion.daemon.arming.readiness import Readiness
+from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.why_not import Rung
+from companion.daemon.core import Core
+from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import Job
+
+if TYPE_CHECKING:
+    from companion.daemon.heading.attitude_service import AttitudeService
 
 Tone = Literal["good", "wait", "busy", "bad"]
 """good: may fly. wait: the pilot's patience. busy: the companion works. bad: somebody has to do something."""
@@ -46,33 +48,22 @@ class Headlines:
     """Works out the headline from those who know; computes little."""
 
     def __init__(
-        self,
-        vehicle: Vehicle,
-        collector: RollingCollector,
-        conductor: Conductor,
-        readiness: Readiness,
-        automatic: Automatic,
-        mavlink_url: str,
-        trouble: Callable[[], str | None],
+        self, core: Core, devices: Devices, conductor: Conductor, arming: Arming, attitude: AttitudeService | None
     ) -> None:
-        self._vehicle, self._collector, self._conductor = vehicle, collector, conductor
-        self._readiness, self._automatic, self._mavlink_url = readiness, automatic, mavlink_url
-        self._trouble = trouble
-        """What is wrong with one of our own sensors, and with which; None while all do well."""
-        self.rejecting: Callable[[], str | None] = lambda: None
-        """Why what comes from the autopilot is not believed; None when it is."""
-        self.concern: Callable[[], str | None] = lambda: None
-        """What else the pilot should know of at once, where the rest is well."""
-
-    def why_rejecting(self) -> str:
-        """To be said behind "not heard yet on ...": why, where that is known."""
-        return f": {why}" if (why := self.rejecting()) else ""
+        self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
+        self._readiness, self._automatic = arming.readiness, arming.automatic
+        self._devices, self._attitude = devices, attitude
 
     def now(self) -> Headline:
         """The headline of this moment."""
         headline = self._now()
-        concern = self.concern() if headline.tone == "good" else None
+        concern = self._concern() if headline.tone == "good" else None
         return headline if concern is None else Headline(headline.word, f"{concern}; {headline.reason}", "wait")
+
+    def _concern(self) -> str | None:
+        """What else the pilot should know of at once, where the rest is well."""
+        attitude = None if self._attitude is None else self._attitude.concern
+        return self._devices.watch.implausible() or self._devices.signing.warning or attitude
 
     def _now(self) -> Headline:
         now_s = asyncio.get_running_loop().time()
@@ -102,8 +93,8 @@ class Headlines:
     def _no_autopilot(self) -> Headline:
         age_s = self._vehicle.heartbeat_age_s
         if age_s is None:
-            return Headline("NO AUTOPILOT", f"not heard yet on {self._mavlink_url}{self.why_rejecting()}", "bad")
-        why = self.rejecting() or "power? cable?"
+            return Headline("NO AUTOPILOT", self._devices.not_heard, "bad")
+        why = self._devices.signing.rejecting or "power? cable?"
         return Headline("NO AUTOPILOT", f"no heartbeat for {age_s:.0f} s: {why}", "bad")
 
     def _working(self, job: Job, now_s: float) -> Headline:
@@ -150,7 +141,7 @@ class Headlines:
         glance = self._collector.glance(now_s)
         if glance.obstacle is not None and not glance.moving:
             # The sensor's own trouble says what to do; that nothing comes from it is only what follows.
-            return Headline("NOT CALIBRATED", self._trouble() or glance.obstacle.words, "bad")
+            return Headline("NOT CALIBRATED", self._devices.watch.worst() or glance.obstacle.words, "bad")
         if glance.obstacle is not None:
             if (hold_s := glance.obstacle.hold_still_s) is not None:
                 return Headline(f"HOLD STILL {hold_s} s", "measuring begins then", "wait")

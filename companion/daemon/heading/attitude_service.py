@@ -5,29 +5,25 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.standing_requests import StandingRequests
 from companion.autopilot.vehicle.timesync import TimesyncResponder
-from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.calibration.collector.rolling import RollingCollector
-from companion.component.statustext import Say, Severity, Weight
-from companion.config import Config
+from companion.component.statustext import Severity, Weight
 from companion.configured import models
 from companion.daemon.arming.in_force import InForce
-from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.devices.sensors import SerialSensor
+from companion.daemon.calibrating.alignment import AlignmentInForce
+from companion.daemon.core import Core
+from companion.daemon.devices.subsystem import Devices
 from companion.daemon.heading.carrier import SLOWEST_AIRSPEED_M_S, Carrier
 from companion.daemon.heading.difference import Difference
 from companion.daemon.heading.external_estimate import ExternalEstimate
 from companion.daemon.heading.health import Health
 from companion.daemon.heading.sender import Sender, is_sane
 from companion.daemon.heading.source import carrying_imu, without_truncation
-from companion.daemon.offload import Offload
-from companion.links.mavlink.link import MavlinkLink
 from companion.physics.units import DEG
 from companion.samples import ImuSample, Sample
 
@@ -50,32 +46,17 @@ class AttitudeService:
     """Carries, pushes and watches the attitude; `run` it.
 
     Args:
-        config: with `push.attitude` "yaw" or "full".
-        link: the connection.
-        vehicle: to whom it is pushed.
-        collector: how still it is.
+        core: what all share; with `push.attitude` "yaw" or "full".
+        devices: which hand over what they read at once.
         in_force: what the last calibration found.
-        imus: the autopilot's.
-        sensors: our own, which hand over what they read at once.
-        say: STATUSTEXT.
-        offload: for what takes milliseconds.
+        alignment: of the gradienter.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        link: MavlinkLink,
-        vehicle: Vehicle,
-        collector: RollingCollector,
-        in_force: InForce,
-        imus: Mapping[str, AutopilotImu],
-        sensors: Sequence[SerialSensor],
-        say: Say,
-        offload: Offload,
-    ) -> None:
+    def __init__(self, core: Core, devices: Devices, in_force: InForce, alignment: AlignmentInForce) -> None:
+        config, link, vehicle = core.config, core.link, core.vehicle
         self.on_beat: Callable[[], None] = lambda: None
-        self._config, self._vehicle, self._say = config, vehicle, say
-        self.carrier = Carrier(config, carrying_imu(config), vehicle, collector, in_force, offload)
+        self._config, self._vehicle, self._say = config, vehicle, core.say
+        self.carrier = Carrier(core, carrying_imu(config), in_force, alignment)
         self.difference = Difference(link, vehicle, self.carrier.now, self.carrier.kept_at)
         self.health = Health(self.carrier, self.difference, vehicle)
         self.sender = Sender(link, models.attitude_rate_hz(config), full=config.push.attitude == "full")
@@ -98,11 +79,11 @@ class AttitudeService:
         self._warned: str | None = None
         self._telling: asyncio.Task[None] | None = None
         self._running = False
-        self._autopilot_imu = imus.get(self.carrier.imu.name)
+        self._autopilot_imu = devices.imus.get(self.carrier.imu.name)
         if self._autopilot_imu is not None:
             take = self._guarded(self._on_autopilot_samples)
             self._autopilot_imu.also = lambda sample: take((sample,), sample.t_s)
-        for sensor in sensors:
+        for sensor in devices.sensors:
             if any(role.name == self.carrier.imu.name for role in sensor.roles):
                 sensor.on_samples = self._guarded(self._on_imu)
             elif "compass" in sensor.kinds:

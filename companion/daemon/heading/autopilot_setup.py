@@ -5,25 +5,25 @@ A ledger of its own keeps the values from before: `companion undo` and this do n
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from typing import Final
 
 import msgspec
 
 from companion.autopilot.firmware.heading_parameters import RISKS, changes_for, wanted_for
-from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.firmware.written import HEADING_SETUP
 from companion.autopilot.parameters.float32 import same_float32
 from companion.autopilot.parameters.writer import Change, ParameterWriter
-from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.solution.record import WrittenParameter
-from companion.component.statustext import Say, Severity, Weight
-from companion.config import Config
+from companion.component.statustext import Severity, Weight
 from companion.daemon.calibrating.conductor import Conductor
+from companion.daemon.core import Core
 from companion.daemon.offsets.ledger import Ledger
 from companion.daemon.offsets.recovery import Recovery
 from companion.errors import AutopilotError, StorageError
 from companion.links.system.request import Object
-from companion.storage.changes import Changed, ChangeSet
+from companion.storage.changes import Changed, ChangeLog, ChangeSet
 
 logger = logging.getLogger(__name__)
 
@@ -33,31 +33,40 @@ REBOOT: Final = "restart the autopilot now: until then it goes on as before"
 class AutopilotSetup:
     """Shows, applies and takes back; one at a time, and never beside a calibration.
 
+    `run` puts back what was interrupted.
+
     Args:
-        config: whether there will be a stream at all.
-        vehicle: whose parameters they are.
-        parameters: to read.
+        core: what all share.
         writer: the guarded one, which everybody shares.
-        ledger: of these changes alone.
-        recovery: of that ledger.
         conductor: whether a calibration writes.
-        say: STATUSTEXT.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        vehicle: Vehicle,
-        parameters: ParameterClient,
-        writer: ParameterWriter,
-        ledger: Ledger,
-        recovery: Recovery,
-        conductor: Conductor,
-        say: Say,
-    ) -> None:
-        self._config, self._vehicle, self._parameters, self._writer = config, vehicle, parameters, writer
-        self._ledger, self._recovery, self._conductor, self._say = ledger, recovery, conductor, say
-        self._busy = False
+    def __init__(self, core: Core, writer: ParameterWriter, conductor: Conductor) -> None:
+        self._config, self._vehicle, self._parameters = core.config, core.vehicle, core.parameters
+        self._writer, self._conductor, self._say = writer, conductor, core.say
+        self._folder = core.config.storage.path / "setup"
+        self.ledger = Ledger(ChangeLog(self._folder, HEADING_SETUP), core.offload)
+        self.recovery = Recovery(
+            core.vehicle,
+            core.parameters,
+            writer,
+            self.ledger,
+            core.say,
+            contextlib.nullcontext,
+            command="companion autopilot-setup --undo",
+        )
+        self._busy = self._loaded = False
+
+    async def run(self) -> None:
+        """Put back what an earlier daemon has left half done, until cancelled."""
+        if self._folder.exists():
+            self._load()
+        await self.recovery.run()
+
+    def _load(self) -> None:
+        if not self._loaded:
+            self._loaded = True
+            self.ledger.load()
 
     async def answer(self, request: Object) -> Object:
         """Answer a request of the control socket.
@@ -65,6 +74,7 @@ class AutopilotSetup:
         Raises:
             CompanionError: refused, or failed; the reason in words.
         """
+        self._load()
         action = request.get("action", "show")
         if self._busy:
             raise AutopilotError("another autopilot-setup is under way")
@@ -82,9 +92,9 @@ class AutopilotSetup:
         raise AutopilotError(f"autopilot-setup: {action!r} is not understood; allowed: show, apply, undo")
 
     def _check_may_write(self) -> None:
-        if self._recovery.fault is not None:
-            raise StorageError(self._recovery.fault)
-        if self._recovery.pending:
+        if self.recovery.fault is not None:
+            raise StorageError(self.recovery.fault)
+        if self.recovery.pending:
             raise AutopilotError("an interrupted set-up is being put back first")
         if (job := self._conductor.running) is not None:
             raise AutopilotError(f"a {job.kind} is running: wait, or companion cancel")
@@ -121,7 +131,7 @@ class AutopilotSetup:
             "firmware": self._vehicle.firmware,
             "parameters": rows or [],
             "risks": list(RISKS.get(self._vehicle.firmware or "other", ())),
-            "can_undo": self._recovery.why_no_undo() is None,
+            "can_undo": self.recovery.why_no_undo() is None,
             **more,
         }
 
@@ -138,9 +148,9 @@ class AutopilotSetup:
         if not changes:
             return self._reply("applied", "the autopilot is set up already; nothing was written")
         kept = self._kept(changes)
-        async with self._ledger.transaction(ChangeSet.of(self._vehicle.system_id, changes)):
+        async with self.ledger.transaction(ChangeSet.of(self._vehicle.system_id, changes)):
             written = await self._writer.apply(changes)
-            await self._ledger.done(ChangeSet.of(self._vehicle.system_id, kept))
+            await self.ledger.done(ChangeSet.of(self._vehicle.system_id, kept))
         names = ", ".join(change.parameter for change in changes)
         logger.warning("autopilot-setup wrote %s", names)
         self._say(Severity.WARNING, "Heading set-up written: restart the autopilot", Weight.RESULT)
@@ -162,11 +172,11 @@ class AutopilotSetup:
         return kept
 
     def _undoable(self, system_id: int) -> tuple[Changed, ...]:
-        found = self._ledger.undoable.get(system_id)
+        found = self.ledger.undoable.get(system_id)
         return () if found is None else found.changes
 
     async def _undo(self, *, force: bool) -> Object:
-        written = await self._recovery.undo(force=force)
+        written = await self.recovery.undo(force=force)
         self._say(Severity.WARNING, "Heading set-up taken back: restart the autopilot", Weight.RESULT)
         return self._reply("undone", f"{len(written)} old values back; {REBOOT}", written=_plain(written))
 

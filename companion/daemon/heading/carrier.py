@@ -10,7 +10,7 @@ import dataclasses
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -18,18 +18,19 @@ import numpy as np
 from companion.attitude.estimator import Attitude, AttitudeEstimator, Phase
 from companion.attitude.quaternion import Quaternion, conjugate, from_matrix, rotate
 from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD
-from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
-from companion.calibration.collector.rolling import RollingCollector, Window
+from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
+from companion.calibration.collector.rolling import Window
 from companion.calibration.solution.record import ImuRecord
 from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.calibration.solution.solve import CompassModel, GradienterModel, truth_of, vehicle_heading_rad
-from companion.config import Config, Imu
+from companion.config import Imu
 from companion.configured import models
 from companion.daemon import offload as estimating
 from companion.daemon.arming.in_force import InForce
+from companion.daemon.calibrating.alignment import AlignmentInForce
+from companion.daemon.core import Core
 from companion.daemon.heading.difference import turn_between
 from companion.daemon.heading.source import settings_of
-from companion.daemon.offload import Offload
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Matrix
 from companion.physics.units import DEG
@@ -84,23 +85,13 @@ class Carrier:
     """Carries the attitude of one IMU.
 
     Args:
-        config: sensors and how they are mounted.
+        core: what all share.
         imu: which one carries.
-        vehicle: whether it is armed, where it is.
-        collector: whether it stands still, and how.
         in_force: what the last calibration found.
-        offload: for what takes milliseconds.
+        alignment: of the gradienter.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        imu: Imu,
-        vehicle: Vehicle,
-        collector: RollingCollector,
-        in_force: InForce,
-        offload: Offload,
-    ) -> None:
+    def __init__(self, core: Core, imu: Imu, in_force: InForce, alignment: AlignmentInForce) -> None:
         self.imu = imu
         self.estimator: AttitudeEstimator | None = None
         self.heard_s = -math.inf
@@ -116,18 +107,16 @@ class Carrier:
         """Of a stream of truncated integers."""
         self.waiting_for = "waiting for a calibration"
         """What an alignment needs."""
-        self._config, self._vehicle, self._collector = config, vehicle, collector
-        self._in_force, self._offload = in_force, offload
-        self.gradienter: Callable[[], GradienterModel | None] = lambda: models.gradienter_model(config.gradienter)
-        """As it is in force, with a zero that was measured."""
-        self._compass = models.compass_model(config.compass)
+        self._config, self._vehicle, self._collector = core.config, core.vehicle, core.collector
+        self._in_force, self._alignment, self._offload = in_force, alignment, core.offload
+        self._compass = models.compass_model(core.config.compass)
         self._local: LocalEarth | None = None
         self._record: ImuRecord | None = None
         self._recent: deque[Sequence[ImuSample]] = deque()
         """What came on the ground within `KEPT_S`, read by read."""
         self._wanted = False
         self._checked_s = -math.inf
-        self.close = vehicle.watch(self._on_event)
+        self.close = core.vehicle.watch(self._on_event)
 
     # --- what comes in, in the turn of the loop in which it was read
 
@@ -233,7 +222,7 @@ class Carrier:
         try:
             window = await estimating.window(self._collector, self._offload, since_s=now_s - STOOD_S)
             where = models.whereabouts(self._config, self._vehicle)
-            stand: Stand = await self._offload(stand_of, window, where, self.gradienter(), self._compass)
+            stand: Stand = await self._offload(stand_of, window, where, self._alignment.model(), self._compass)
         except CalibrationRefusedError as error:
             self.waiting_for = f"waiting for an alignment: {error}"
             return None

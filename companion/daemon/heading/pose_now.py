@@ -9,15 +9,14 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
-from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.solution.site import Whereabouts, local_earth
-from companion.calibration.solution.solve import GradienterModel, up_in_vehicle, vehicle_heading_rad
-from companion.config import Config
+from companion.calibration.solution.solve import up_in_vehicle, vehicle_heading_rad
 from companion.configured import models
-from companion.daemon.offload import Offload
+from companion.daemon.calibrating.alignment import AlignmentInForce
+from companion.daemon.core import Core
+from companion.links.system.request import Object
 from companion.physics.frames import roll_pitch_from_up
 from companion.physics.units import DEG
 from companion.samples import CompassSample, Sample, TiltSample
@@ -28,15 +27,17 @@ DECLINATION_EVERY_S: Final = 60.0
 
 
 class PoseNow:
-    """Takes samples, tells the pose."""
+    """Takes samples, tells the pose.
 
-    def __init__(self, config: Config, vehicle: Vehicle, collector: RollingCollector, offload: Offload) -> None:
-        self._config, self._vehicle, self._collector, self._offload = config, vehicle, collector, offload
-        self.gradienter: Callable[[], GradienterModel | None] = lambda: models.gradienter_model(config.gradienter)
-        """The gradienter's model as it is in force."""
-        self._compass = models.compass_model(config.compass)
-        self.carried: Callable[[], dict[str, Any] | None] = lambda: None
-        """The attitude that is right in flight, too, while one is carried."""
+    Args:
+        core: what all share.
+        alignment: of the gradienter.
+        carried: the attitude that is right in flight, too, while there is one; None: none is carried.
+    """
+
+    def __init__(self, core: Core, alignment: AlignmentInForce, carried: Callable[[], Object | None] | None) -> None:
+        self._core, self._alignment, self._carried = core, alignment, carried
+        self._compass = models.compass_model(core.config.compass)
         self._tilt: TiltSample | None = None
         self._heading: CompassSample | None = None
         self._declination_deg: float | None = None
@@ -49,22 +50,22 @@ class PoseNow:
         elif isinstance(sample, CompassSample):
             self._heading = sample
 
-    async def look(self) -> dict[str, Any] | None:
+    async def look(self) -> Object | None:
         """As `now`, with the declination of the place looked up when it is time to."""
         if self._compass is not None and self._compass.magnetic:
             await self._look_up(asyncio.get_running_loop().time())
         return self.now()
 
-    def now(self) -> dict[str, Any] | None:
+    def now(self) -> Object | None:
         """The pose as JSON can hold it; None without a fresh reading of the gradienter.
 
         The heading is magnetic as long as the declination has not been looked up.
         """
-        if (carried := self.carried()) is not None:
+        if self._carried is not None and (carried := self._carried()) is not None:
             return carried
         now_s = asyncio.get_running_loop().time()
         tilt, heading = self._tilt, self._heading
-        gradienter = self.gradienter()
+        gradienter = self._alignment.model()
         if gradienter is None or tilt is None or now_s - tilt.t_s > OLDEST_S:
             return None
         try:
@@ -72,13 +73,13 @@ class PoseNow:
         except ValueError:
             return None
         roll, pitch = roll_pitch_from_up(up)
-        pose: dict[str, Any] = {
+        pose: Object = {
             "roll_deg": round(roll / DEG, 3),
             "pitch_deg": round(pitch / DEG, 3),
             "heading_deg": None,
             "north": None,
             "source": "gradienter",
-            "still": self._collector.glance(now_s).obstacle is None,
+            "still": self._core.collector.glance(now_s).obstacle is None,
         }
         if self._compass is not None and heading is not None and now_s - heading.t_s <= OLDEST_S:
             heading_deg = vehicle_heading_rad(self._compass, heading.heading_deg, up) / DEG
@@ -107,7 +108,7 @@ class PoseNow:
     async def _look_up(self, now_s: float) -> None:
         """Looked up rarely: the aircraft does not get far in a minute, and the magnetic model takes its time."""
         if now_s - self._looked_up_s >= DECLINATION_EVERY_S or self._declination_deg is None:
-            where: Whereabouts = models.whereabouts(self._config, self._vehicle)
+            where: Whereabouts = models.whereabouts(self._core.config, self._core.vehicle)
             if where.latitude_deg is not None:
                 self._looked_up_s = now_s
-                self._declination_deg = (await self._offload(local_earth, where)).site.declination_deg
+                self._declination_deg = (await self._core.offload(local_earth, where)).site.declination_deg

@@ -108,11 +108,7 @@ def _gate(config: Config, setup: Object) -> Finding:
 
 async def _listen(config: Config, seconds: float) -> Object:
     """The status that a daemon would have after some seconds; writes nothing anywhere."""
-    service = Service(config)
-    try:
-        return await service.listen(seconds)
-    finally:
-        service.vehicle.close()
+    return await Service(config, only_listening="only a check is running: start companion run").listen(seconds)
 
 
 def _storage(directory: Path) -> Finding:

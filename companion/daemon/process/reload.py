@@ -30,31 +30,31 @@ Apply = Callable[[Service, Any], None]
 
 
 def _gyro_target(service: Service, deg_h: float) -> None:
-    service.conductor.retarget(gyro_sigma_rad_s=deg_h * DEG_H)
-    _show(service.component.parameters, "CMP_GYR_TGT", deg_h)
+    service.calibrating.conductor.retarget(gyro_sigma_rad_s=deg_h * DEG_H)
+    _show(service.faces.component.parameters, "CMP_GYR_TGT", deg_h)
 
 
 def _accel_target(service: Service, mg: float) -> None:
-    service.conductor.retarget(accel_sigma_m_s2=mg * MG)
-    _show(service.component.parameters, "CMP_ACC_TGT", mg)
+    service.calibrating.conductor.retarget(accel_sigma_m_s2=mg * MG)
+    _show(service.faces.component.parameters, "CMP_ACC_TGT", mg)
 
 
 def _at_arm(service: Service, value: Any) -> None:
-    service.conductor.at_arm = value
-    _show(service.component.parameters, "CMP_AT_ARM", float(AT_ARM.index(value)))
+    service.calibrating.conductor.at_arm = value
+    _show(service.faces.component.parameters, "CMP_AT_ARM", float(AT_ARM.index(value)))
 
 
 def _push(service: Service, value: bool) -> None:  # noqa: FBT001 - as all in the table
-    service.conductor.push_parameters = value
-    _show(service.component.parameters, "CMP_PUSH", float(value))
+    service.calibrating.conductor.push_parameters = value
+    _show(service.faces.component.parameters, "CMP_PUSH", float(value))
 
 
 def _stop_rivals(service: Service, value: bool) -> None:  # noqa: FBT001 - as all in the table
-    service.rivalry.stop_rivals = value
+    service.offsets.rivalry.stop_rivals = value
 
 
 def _allow(service: Service, value: tuple[str, ...]) -> None:
-    service.component.permission.senders = Senders(value)
+    service.faces.component.permission.allow(Senders(value))
 
 
 def _log_level(_service: Service, value: str) -> None:

@@ -58,12 +58,11 @@ class _Process:
         self._reloader = Reloader(service, path, asyncio.to_thread)
         self._reload_wanted = asyncio.Event()
         self._work: asyncio.Task[None] | None = None
-        service.on_ready = self._on_ready
 
     async def run(self) -> None:
         """Run until a signal or a fault."""
         loop = asyncio.get_running_loop()
-        self._work = loop.create_task(self._service.run(), name="service")
+        self._work = loop.create_task(self._service.run(self._manager.ready), name="service")
         beside = [
             loop.create_task(self._supervisor.run(), name="supervisor"),
             loop.create_task(self._reload(), name="reload"),
@@ -88,9 +87,6 @@ class _Process:
             if isinstance(error, Exception):
                 raise error
         logger.info("stopped")
-
-    def _on_ready(self) -> None:
-        self._manager.ready()
 
     def _stop(self, why: str) -> None:
         if self._work is None or self._supervisor.stopping:

@@ -51,15 +51,15 @@ class Supervisor:
 
     def _expect_all(self) -> None:
         service, link_s = self._service, bytestream.BEAT_WITHIN_S + MARGIN_S
-        service.component.on_beat = self._expect("MAVLink component", "component", COMPONENT_S)
-        service.link.on_beat = self._expect("MAVLink connection", "mavlink", link_s)
-        service.readiness.on_beat = self._expect("estimator", "readiness", ESTIMATOR_S)
-        service.automatic.on_beat = self._expect("automatic calibration", "automatic", AUTOMATIC_S)
-        if service.attitude is not None:
-            service.attitude.on_beat = self._expect("attitude", "attitude", ESTIMATOR_S)
-        for imu in service.imus.values():
+        service.faces.component.on_beat = self._expect("MAVLink component", "component", COMPONENT_S)
+        service.core.link.on_beat = self._expect("MAVLink connection", "mavlink", link_s)
+        service.arming.readiness.on_beat = self._expect("estimator", "readiness", ESTIMATOR_S)
+        service.arming.automatic.on_beat = self._expect("automatic calibration", "automatic", AUTOMATIC_S)
+        if service.heading.attitude is not None:
+            service.heading.attitude.on_beat = self._expect("attitude", "attitude", ESTIMATOR_S)
+        for imu in service.devices.imus.values():
             imu.stream.on_beat = self._expect(f"imu {imu.name}", f"{imu.name} telemetry", imu_stream.BEAT_WITHIN_S)
-        for sensor in service.sensors:
+        for sensor in service.devices.sensors:
             sensor.link.on_beat = self._expect(f"sensor {sensor.name}", sensor.name, link_s)
 
     def _expect(self, name: str, task: str, within_s: float) -> Callable[[], None]:

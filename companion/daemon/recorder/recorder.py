@@ -10,28 +10,26 @@ import asyncio
 import dataclasses
 import logging
 import time
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 import msgspec
 
-from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.collector.rolling import RollingCollector, Window
 from companion.calibration.request import What, is_time_limit
 from companion.calibration.solution.prior import Expectation
-from companion.calibration.solution.record import AlignmentUsed, Record
 from companion.calibration.solution.site import Whereabouts
-from companion.config import Config
-from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.devices.sensors import SerialSensor
-from companion.daemon.offload import Offload
+from companion.component.service import JobResult
+from companion.daemon.calibrating.subsystem import Calibrating
+from companion.daemon.core import Core, Handler, Subsystem, Task
+from companion.daemon.devices.subsystem import Devices
+from companion.daemon.job import Job
 from companion.daemon.recorder.surroundings import Surroundings
 from companion.errors import StorageError
-from companion.links.mavlink.link import Direction, MavlinkLink
+from companion.links.mavlink.link import Direction
 from companion.links.system.request import Object
 from companion.recording import topics
-from companion.recording.collector import RecordedCollector
 from companion.recording.files import FOLDER_MODE, RecordingFile, Ring, is_available, versions
 from companion.recording.journal import Beginning, Queue
 from companion.recording.redact import KeyFilter, without_key
@@ -64,26 +62,17 @@ class _OnRequest:
     ended: asyncio.Future[Object]
 
 
-class Recorder:
+class Recorder(Subsystem):
     """Taps everything that a replay needs."""
 
-    def __init__(
-        self,
-        config: Config,
-        collector: RecordedCollector,
-        link: MavlinkLink,
-        vehicle: Vehicle,
-        imus: Iterable[AutopilotImu],
-        sensors: Iterable[SerialSensor],
-        offload: Offload,
-    ) -> None:
-        self.is_busy: Callable[[], bool] = lambda: False
-        """Whether a calibration is under way, which had better lie in one file."""
+    def __init__(self, core: Core, devices: Devices, calibrating: Calibrating) -> None:
+        config, collector, link = core.config, core.collector, core.link
         self.fault: str | None = None
         """Why the ring is not written, in one line; None while all is well."""
         self._config, self._collector, self._journal = config, collector, collector.journal
-        self._link = link
-        self._sensors, self._offload = {sensor.name: sensor for sensor in sensors}, offload
+        self._link, self._offload = link, core.offload
+        self._alignment, self._conductor = calibrating.alignment, calibrating.conductor
+        self._sensors = {sensor.name: sensor for sensor in devices.sensors}
         self._folder = config.storage.path / "recordings"
         megabytes = config.storage.recordings_mb
         self._ring: Ring | None = None
@@ -97,13 +86,13 @@ class Recorder:
         self._on_request: _OnRequest | None = None
         self._flushing = asyncio.Lock()
         self._solved: object = None
-        self.alignment: Callable[[], AlignmentUsed | None] = lambda: None
-        """What is in force of the gradienter's alignment."""
-        self._around = Surroundings(config, vehicle, imus)
+        self._around = Surroundings(config, core.vehicle, devices.imus.values())
         self._no_keys = KeyFilter()
         link.tap = self._on_mavlink
         for sensor in self._sensors.values():
             sensor.tap = self._on_serial
+        calibrating.course.watch(self._on_solved)
+        calibrating.conductor.watch(self._on_ended)
 
     # --- what happens
 
@@ -120,7 +109,7 @@ class Recorder:
     def _on_serial(self, name: str, data: bytes | None, t_s: float) -> None:
         self._journal.raw(topics.SERIAL + name, t_s, data)
 
-    def on_solved(
+    def _on_solved(
         self, measured: Window, refined: Window, where: Whereabouts, what: What, expectation: Expectation
     ) -> None:
         """A calibration's biases have been worked out; what from, besides the readings."""
@@ -132,16 +121,17 @@ class Recorder:
                 "where": where,
                 "what": what.name,
                 "offsets": self._around.read_offsets(),
-                "alignment": None if (used := self.alignment()) is None else (*used.offset_deg, used.sigma_deg),
+                "alignment": None if (used := self._alignment.used) is None else (*used.offset_deg, used.sigma_deg),
                 # What is known from before lies on disk and changes with every calibration.
                 "expectation": expectation,
             }
         )
         self._journal.event(asyncio.get_running_loop().time(), "solved", self._solved)
 
-    def on_record(self, record: Record) -> None:
-        """A calibration has ended."""
-        self._journal.record(record, asyncio.get_running_loop().time())
+    def _on_ended(self, job: Job, _result: JobResult) -> None:
+        if job.record is None or not job.record.is_worth_keeping:
+            return
+        self._journal.record(job.record, asyncio.get_running_loop().time())
         self._solved = None
         self._new_part = True
 
@@ -205,7 +195,7 @@ class Recorder:
             if self.fault is not None:
                 logger.info("recordings: written again")
                 self.fault = None
-            if self._new_part or (ring.is_full and not self.is_busy()):
+            if self._new_part or (ring.is_full and not self._conductor.state.busy):
                 self._new_part = False
                 self._begin_part(queue)
 
@@ -279,8 +269,11 @@ class Recorder:
 
     # --- on request
 
-    async def answer(self, request: Object) -> AsyncIterator[Object]:
-        """Answer `companion record`: begin and tell how it goes until it ends, or end it.
+    def commands(self) -> Mapping[str, Handler]:  # noqa: D102 - as in the base class
+        return {"record": self._answer}
+
+    async def _answer(self, request: Object, _face: str) -> AsyncIterator[Object]:
+        """Begin, and tell how it goes until it ends; or end it.
 
         Raises:
             StorageError: the file cannot be created, or recording is not possible.
@@ -359,8 +352,13 @@ class Recorder:
             }
         )
 
-    def status(self) -> Object:
-        """For `companion status`."""
+    def tasks(self) -> Sequence[Task]:  # noqa: D102
+        return [("recorder", self.run)]
+
+    def status(self) -> Object:  # noqa: D102
+        return {"recording": self._status()}
+
+    def _status(self) -> Object:
         ring, asked = self._ring, self._on_request
         return {
             "fault": self.fault,

@@ -9,21 +9,20 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Awaitable, Callable
 from typing import Any, Final
 
 import msgspec
 
-from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.solution.record import to_json
 from companion.config import Mqtt
 from companion.daemon.calibrating.conductor import Conductor
+from companion.daemon.core import Core
 from companion.daemon.faces.answers import Answers
 from companion.daemon.faces.mqtt.discovery import discovery_message, discovery_topic
 from companion.daemon.faces.mqtt.requests import Requests
 from companion.daemon.faces.mqtt.summary import Pace, summary
 from companion.daemon.faces.mqtt.topics import OFFLINE, ONLINE, Topics, base_of, client_id_of
-from companion.daemon.offload import Offload
+from companion.daemon.heading.pose_now import PoseNow
 from companion.links.mqtt.client import Incoming, MqttLink
 
 logger = logging.getLogger(__name__)
@@ -45,32 +44,21 @@ class MqttFace:
     """One broker's view of the daemon; `run` it.
 
     Args:
+        core: what all share; while it only listens, the broker is reached and nothing is done there.
         settings: which broker, which topics.
         answers: the same that the command line gets.
         conductor: what runs.
-        vehicle: whose system id names the topics.
-        pose: the attitude, or None while there is none.
-        offload: runs a blocking call elsewhere.
+        pose: how the aircraft stands.
     """
 
-    def __init__(
-        self,
-        settings: Mqtt,
-        answers: Answers,
-        conductor: Conductor,
-        vehicle: Vehicle,
-        pose: Callable[[], Awaitable[Object | None]],
-        offload: Offload,
-        *,
-        system_id: int | None = None,
-    ) -> None:
-        self._settings, self._answers, self._conductor, self._vehicle = settings, answers, conductor, vehicle
-        self._pose, self._offload, self._system_id = pose, offload, system_id
+    def __init__(self, core: Core, settings: Mqtt, answers: Answers, conductor: Conductor, pose: PoseNow) -> None:
+        self._settings, self._answers, self._conductor = settings, answers, conductor
+        self._vehicle, self._offload, self._pose = core.vehicle, core.offload, pose
+        self._system_id = core.config.vehicle.system_id
+        self._only_listening = core.only_listening is not None
         self._faulty = False
         self.link: MqttLink | None = None
         self.topics: Topics | None = None
-        self.only_listening = False
-        """Reach the broker and do nothing there; for `companion check`."""
 
     def status(self) -> Object:
         """For `companion status` and `check`."""
@@ -90,7 +78,7 @@ class MqttFace:
 
     async def _wait_for_vehicle(self) -> None:
         deadline_s = asyncio.get_running_loop().time() + FOUND_WITHIN_S
-        named = self._settings.base_topic is not None or self.only_listening
+        named = self._settings.base_topic is not None or self._only_listening
         while not named and self._known_system_id is None and asyncio.get_running_loop().time() < deadline_s:
             await asyncio.sleep(LOOK_S)
 
@@ -105,7 +93,7 @@ class MqttFace:
         """Serve under a base topic until it is another one."""
         self.topics = topics = Topics(base)
         client_id = client_id_of(self._settings, base)
-        if self.only_listening:
+        if self._only_listening:
             self.link = link = MqttLink(self._settings, client_id=f"{client_id}-check", offload=self._offload)
             await link.run()
         self.link = link = MqttLink(
@@ -167,7 +155,7 @@ class MqttFace:
         if progress != self._progress and (now_s - self._progress_s >= PROGRESS_S or not self._is_busy):
             link.outbox.pass_on(topics.progress, progress)
             self._progress, self._progress_s = progress, now_s
-        pose = await self._pose()
+        pose = await self._pose.look()
         if pose is not None:
             link.outbox.pass_on(topics.attitude, _json(pose))
 

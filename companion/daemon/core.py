@@ -1,0 +1,94 @@
+"""What every subsystem of the daemon stands on, and what each is to the service that runs it."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
+from typing import Any
+
+from companion.autopilot.parameters.client import ParameterClient
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.component.statustext import Severity, StatusText, Weight
+from companion.config import Config
+from companion.configured import models
+from companion.daemon.offload import Offload
+from companion.links.mavlink.link import MavlinkLink
+from companion.links.system.request import Object
+from companion.recording.collector import RecordedCollector
+
+Handler = Callable[[Object, str], AsyncIterator[Object]]
+"""Answers a request that came by a face (second), with any number of replies."""
+Task = tuple[str, Callable[[], Coroutine[Any, Any, None]]]
+"""A name, and what runs under it until it is cancelled."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Core:
+    """The configuration, the autopilot's link and the collector, which all subsystems share."""
+
+    config: Config
+    offload: Offload
+    """Runs a blocking call elsewhere."""
+    link: MavlinkLink
+    vehicle: Vehicle
+    parameters: ParameterClient
+    collector: RecordedCollector
+    texts: StatusText
+    only_listening: str | None
+    """Why nothing may be started although requests arrive: a check listens and must change nothing."""
+
+    @classmethod
+    def of(cls, config: Config, link: MavlinkLink | None, offload: Offload, only_listening: str | None) -> Core:
+        """Make it; a test brings a link that is on a wire of its own."""
+        link = link or MavlinkLink(system_id=config.vehicle.system_id or 1, component_id=config.mavlink.component_id)
+        collector = RecordedCollector(
+            models.settings(config),
+            [models.imu_input(imu, None) for imu in config.imu],
+            gradienter=config.gradienter is not None,
+            compass=config.compass is not None,
+            gradienter_lag=models.lag("gradienter", config.gradienter),
+            compass_lag=models.lag("compass", config.compass),
+            field_by=models.field_by(config),
+        )
+
+        def is_carried() -> bool:
+            if vehicle.arm_state is ArmState.ARMED:
+                return True
+            return collector.glance(asyncio.get_running_loop().time()).moving
+
+        vehicle = Vehicle(link, system_id=config.vehicle.system_id, is_carried=is_carried)
+        parameters = ParameterClient(link, vehicle)
+        return cls(config, offload, link, vehicle, parameters, collector, StatusText(link), only_listening)
+
+    def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
+        """As `StatusText.say`: to the people at the ground stations."""
+        return self.texts.say(severity, text, weight)
+
+
+class Subsystem:
+    """A part of the daemon as the service sees it; each overrides what it has."""
+
+    def load(self) -> None:
+        """Read what was kept before this start, before anything runs; blocking."""
+
+    def status(self) -> Object:
+        """Its part of `companion status`, as JSON can hold it."""
+        return {}
+
+    def commands(self) -> Mapping[str, Handler]:
+        """What it answers, by the name of the command."""
+        return {}
+
+    def tasks(self) -> Sequence[Task]:
+        """What is to run for as long as the daemon does."""
+        return ()
+
+
+def joined(parts: Sequence[Object]) -> Object:
+    """The status of several as one; lists under the same key follow each other."""
+    whole: Object = {}
+    for part in parts:
+        for key, value in part.items():
+            whole[key] = whole[key] + value if key in whole else value
+    return whole

@@ -1,0 +1,124 @@
+"""The devices: the autopilot's IMUs, our own sensors, and whether what comes from them can be believed."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+
+from companion.autopilot.firmware.imu_calibration import accel_taken_off
+from companion.autopilot.firmware.px4_slots import SlotMemory
+from companion.autopilot.telemetry.imu_stream import StreamKind
+from companion.config import Imu
+from companion.configured import models
+from companion.configured.devices import Role, collect, serial_devices
+from companion.daemon.core import Core, Subsystem, Task
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.devices.reach import Reach
+from companion.daemon.devices.sensor_watch import UNTOUCHED, Corrected, SensorWatch
+from companion.daemon.devices.sensors import SensorRole, SerialSensor
+from companion.daemon.devices.signing import LinkSigning
+from companion.daemon.offload import keep_ticking
+from companion.links.system.request import Object
+from companion.protocols.roles import Part
+from companion.samples import ImuSample, Sample
+
+
+class Devices(Subsystem):
+    """Where samples come from.
+
+    Args:
+        core: what all share.
+        imu_rate_hz: asked of the autopilot for each IMU, which may grant less; None: what the connection can carry.
+    """
+
+    def __init__(self, core: Core, imu_rate_hz: float | None = None) -> None:
+        self._core = core
+        self.slots = SlotMemory()
+        self._imu_rate_hz = models.imu_rate_hz(core.config) if imu_rate_hz is None else imu_rate_hz
+        self.imus = {imu.name: self._autopilot_imu(imu) for imu in core.config.imu if imu.source == "autopilot"}
+        """The autopilot's IMUs, by name."""
+        self.sensors = [
+            SerialSensor(device, self._take, core.offload, core.link.together) for device in serial_devices(core.config)
+        ]
+        self.watch = SensorWatch(self.sensors, core.collector, self._corrected, core.say)
+        self.signing = LinkSigning(core.config, core.link, core.vehicle, core.say, core.offload)
+        self.reach = Reach(core.link, core.vehicle, core.parameters)
+        self._pose_watchers: list[Callable[[Sample], None]] = []
+
+    def watch_pose(self, take: Callable[[Sample], None]) -> None:
+        """Tell of every reading of gradienter and compass that counts."""
+        self._pose_watchers.append(take)
+
+    @contextlib.contextmanager
+    def changing(self) -> Iterator[None]:
+        """While we write offsets of any of the autopilot's IMUs ourselves."""
+        with contextlib.ExitStack() as stack:
+            for imu in self.imus.values():
+                stack.enter_context(imu.changing())
+            yield
+
+    def load(self) -> None:  # noqa: D102 - as in the base class
+        self.signing.load()
+
+    def status(self) -> Object:  # noqa: D102
+        sources = self._core.collector.status(asyncio.get_running_loop().time()).sources
+        counts = {source.name: {"lost": source.lost, "dropped": source.dropped} for source in sources}
+        found: list[AutopilotImu | SensorRole] = [
+            *self.imus.values(),
+            *(role for sensor in self.sensors for role in sensor.roles),
+        ]
+        return {
+            "devices": [device.status() | counts.get(device.name, {}) for device in found],
+            "profiles": models.profiles(self._core.config),
+            "ground_stations": dict(zip(("good", "summary"), self.reach.words(), strict=True)),
+        }
+
+    def tasks(self, *, ports: bool = True) -> Sequence[Task]:
+        """As in the base class; without ports somebody else hands their bytes to `sensors`."""
+        return [
+            ("collector", lambda: keep_ticking(self._core.collector)),
+            ("signing", self.signing.run),
+            ("reach", self.reach.run),
+            *((imu.name, imu.run) for imu in self.imus.values()),
+            *(((sensor.name, sensor.run) for sensor in self.sensors) if ports else ()),
+            *([("sensor-watch", self.watch.run)] if ports else []),
+        ]
+
+    def _autopilot_imu(self, imu: Imu) -> AutopilotImu:
+        core = self._core
+
+        def kind_changed(kind: StreamKind | None, grid: tuple[float, float]) -> None:
+            core.collector.set_imu(models.imu_input(imu, kind, grid), None if kind is None else kind.message)
+
+        def take(sample: ImuSample) -> None:
+            core.collector.add_imu(imu.name, sample)
+
+        def void(why: str) -> None:
+            core.collector.reset(why, imu.name)
+
+        return AutopilotImu(
+            imu.name,
+            imu.instance or 1,
+            core.link,
+            core.vehicle,
+            core.parameters,
+            take=take,
+            void=void,
+            kind_changed=kind_changed,
+            rate_hz=self._imu_rate_hz,
+            memory=self.slots,
+        )
+
+    def _take(self, role: Role, part: Part) -> None:
+        reading = collect(self._core.collector, role, part)
+        if reading is not None:
+            for take in self._pose_watchers:
+                take(reading)
+
+    def _corrected(self, name: str) -> Corrected | None:
+        imu = self.imus.get(name)
+        if imu is None:
+            return UNTOUCHED
+        known = imu.calibration
+        return None if known is None else Corrected(known.orientation.T, accel_taken_off(known))

@@ -1,0 +1,60 @@
+"""The heading: how the aircraft stands and turns, and what of it the autopilot is told."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from companion.daemon.arming.subsystem import Arming
+from companion.daemon.calibrating.subsystem import Calibrating
+from companion.daemon.core import Core, Handler, Subsystem, Task
+from companion.daemon.devices.subsystem import Devices
+from companion.daemon.heading.autopilot_setup import AutopilotSetup
+from companion.daemon.heading.pose_now import PoseNow
+from companion.daemon.offsets.subsystem import Offsets
+from companion.links.system.request import Object
+
+if TYPE_CHECKING:
+    from companion.daemon.heading.attitude_service import AttitudeService
+
+
+class Heading(Subsystem):
+    """The pose that people see, and the attitude that is pushed."""
+
+    def __init__(
+        self, core: Core, devices: Devices, offsets: Offsets, calibrating: Calibrating, arming: Arming
+    ) -> None:
+        self.attitude = _attitude(core, devices, calibrating, arming)
+        """None unless a heading is pushed."""
+        self.pose = PoseNow(core, calibrating.alignment, None if self.attitude is None else self.attitude.pose)
+        devices.watch_pose(self.pose.take)
+        self.setup = AutopilotSetup(core, offsets.writer, calibrating.conductor)
+
+    def commands(self) -> Mapping[str, Handler]:  # noqa: D102 - as in the base class
+        return {"autopilot-setup": self._answer_setup}
+
+    async def _answer_setup(self, request: Object, _face: str) -> AsyncIterator[Object]:
+        yield await self.setup.answer(request)
+
+    def status(self) -> Object:  # noqa: D102
+        attitude = self.attitude
+        return {
+            "pose": self.pose.now(),
+            "readings": self.pose.readings(),
+            "warnings": [*self.setup.ledger.unusable, *(attitude.warnings if attitude is not None else ())],
+            "attitude": None if attitude is None else attitude.view(),
+            "devices": [] if attitude is None else [attitude.status()],
+        }
+
+    def tasks(self) -> Sequence[Task]:  # noqa: D102
+        attitude: list[Task] = [] if self.attitude is None else [("attitude", self.attitude.run)]
+        return [("setup", self.setup.run), *attitude]
+
+
+def _attitude(core: Core, devices: Devices, calibrating: Calibrating, arming: Arming) -> AttitudeService | None:
+    if core.config.push.attitude == "off":
+        return None
+    # What nobody asked for costs the start nothing.
+    from companion.daemon.heading.attitude_service import AttitudeService
+
+    return AttitudeService(core, devices, arming.in_force, calibrating.alignment)

@@ -1,0 +1,67 @@
+"""The offsets in the autopilot: who writes them, who puts them back, and what else changes them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+
+from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.vehicle.ekf import EkfWatch
+from companion.daemon.core import Core, Subsystem, Task
+from companion.daemon.devices.subsystem import Devices
+from companion.daemon.offsets.far_step import FarStepWatch
+from companion.daemon.offsets.firmware_calibration import FirmwareCalibration
+from companion.daemon.offsets.ledger import Ledger
+from companion.daemon.offsets.plan import Planner
+from companion.daemon.offsets.push import Pusher
+from companion.daemon.offsets.px4_writes import Px4Writes
+from companion.daemon.offsets.reboot import Reboot
+from companion.daemon.offsets.recovery import Recovery
+from companion.daemon.offsets.rivalry import Rivalry
+from companion.links.system.request import Object
+from companion.storage.changes import ChangeLog
+
+logger = logging.getLogger(__name__)
+
+
+class Offsets(Subsystem):
+    """Writing, and what belongs to it."""
+
+    def __init__(self, core: Core, devices: Devices) -> None:
+        config, vehicle, parameters, imus = core.config, core.vehicle, core.parameters, devices.imus
+        self.ledger = Ledger(ChangeLog(config.storage.path), core.offload)
+        self.writer = ParameterWriter(parameters, vehicle)
+        self.rivalry = Rivalry(vehicle, imus, core.say, stop_rivals=config.push.stop_rivals)
+        far = FarStepWatch(core.link, vehicle, devices.slots)
+        self.pusher = Pusher(
+            config,
+            vehicle,
+            parameters,
+            imus,
+            core.collector,
+            self.writer,
+            self.ledger,
+            Px4Writes(vehicle, self.writer, self.ledger, far, devices.slots, core.say),
+            Planner(config, vehicle, parameters, imus, devices.slots, self.rivalry),
+            FirmwareCalibration(vehicle, parameters, self.writer, self.ledger, EkfWatch(core.link, vehicle)),
+            core.offload,
+        )
+        self.recovery = Recovery(vehicle, parameters, self.writer, self.ledger, core.say, devices.changing)
+        self.reboot = Reboot(vehicle, parameters, self.pusher, core.say)
+
+    def load(self) -> None:  # noqa: D102 - as in the base class
+        self.ledger.load()
+        if self.ledger.fault is not None:
+            # Stay and say so: a daemon that is gone is harder to understand from the field.
+            logger.error("%s", self.ledger.fault)
+
+    def status(self) -> Object:  # noqa: D102
+        return {
+            "fault": self.recovery.fault,
+            "putting_back": self.recovery.pending,
+            "why_no_undo": self.recovery.why_no_undo(),
+            "warnings": [*self.ledger.unusable, *self.rivalry.warnings],
+        }
+
+    def tasks(self) -> Sequence[Task]:  # noqa: D102
+        return [("recovery", self.recovery.run)]
