@@ -50,6 +50,13 @@ class Devices(Subsystem):
         """Tell of every reading of gradienter and compass that counts."""
         self._pose_watchers.append(take)
 
+    @property
+    def not_heard(self) -> str:
+        """That no autopilot has been heard, and why, where that is known."""
+        why = self.signing.rejecting
+        behind = f": {why}" if why else ""
+        return f"not heard yet on {self._core.config.mavlink.url}{behind}"
+
     @contextlib.contextmanager
     def changing(self) -> Iterator[None]:
         """While we write offsets of any of the autopilot's IMUs ourselves."""

@@ -39,7 +39,7 @@ class Faces(Subsystem):
         heading: Heading,
         recorder: Recorder,
     ) -> None:
-        self._core, self._signing = core, devices.signing
+        self._core, self._devices = core, devices
         self.component = Component(
             core.link,
             core.vehicle,
@@ -72,12 +72,12 @@ class Faces(Subsystem):
             "armed": vehicle.arm_state.value,
             "summary": f"{vehicle.name}, {vehicle.arm_state.value}"
             if vehicle.system_id is not None
-            else self._headlines.not_heard(),
+            else self._devices.not_heard,
             "heartbeat_age_s": None if age_s is None else round(age_s, 1),
             "messages": link.received.total() - link.received["bad"],
             "bad": link.received["bad"],
             "not_sent": link.dropped,
-            "signing": self._signing.status(),
+            "signing": self._devices.signing.status(),
             "refused": {f"{system}/{one}": count for (system, one), count in refused.items()},
         }
 
