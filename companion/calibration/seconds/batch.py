@@ -57,6 +57,44 @@ class Batch(msgspec.Struct, frozen=True):
     """Of a stream of integers; None for floats, and for a second that spans more than `MAX_LEVELS`."""
 
 
+def summary(
+    slot: int,
+    times: Floats,
+    rows: Floats,
+    stamps: Floats | None = None,
+    temperature_degc: float | None = None,
+    *,
+    circle: bool = False,
+    steps: Floats | None = None,
+) -> Batch:
+    """What (n, c) rows of one second, at least one, say; those of an angle are unrolled, `steps` are of integers."""
+    n = len(rows)
+    ordered = np.sort(rows, axis=0)
+    distinct = 1 + (ordered[1:] != ordered[:-1]).sum(axis=0)
+    # The very sums of `mean` and `var`, each once.
+    centre = np.add.reduce(rows, axis=0) / n
+    off, successive = rows - centre, rows[1:] - rows[:-1]
+    gaps = times[1:] - times[:-1]
+    edges = float(times[0]) - float(slot), slot + 1.0 - float(times[-1])
+    return Batch(
+        slot=slot,
+        n=n,
+        first_s=float(times[0]),
+        last_s=float(times[-1]),
+        mean=np.mod(centre, 360.0) if circle else centre,
+        variance=np.add.reduce(off * off, axis=0) / (n - 1) if n > 1 else np.zeros(rows.shape[1]),
+        white=np.add.reduce(successive * successive, axis=0) / (n - 1) / 2.0 if n > 1 else np.zeros(rows.shape[1]),
+        low=ordered[0],
+        high=ordered[-1],
+        distinct=np.asarray(distinct, dtype=np.int64),
+        clipped=is_clipped(ordered, distinct),
+        largest_gap_s=max(*edges, float(gaps.max()) if n > 1 else 0.0),
+        missing=None if stamps is None else missing_of(stamps),
+        temperature_degc=temperature_degc,
+        counts=None if steps is None else counts_of(rows, steps),
+    )
+
+
 def counts_of(rows: Floats, steps: Floats) -> Counts | None:
     """How often every integer came in (n, c) rows of so large steps; None where they span too much."""
     integers = np.rint(rows / steps).astype(np.int64)

@@ -18,10 +18,9 @@ from companion.calibration.seconds.batch import (
     MAX_LEVELS,
     Batch,
     Counts,
-    counts_of,
     first_of_each,
-    is_clipped,
     missing_of,
+    summary,
     unrolled,
 )
 
@@ -175,33 +174,17 @@ class BatchSource:
             if fresh is not None:
                 self.dropped["repeated"] += int((~fresh).sum())
                 rows, times, stamps = rows[fresh], times[fresh], stamps[fresh]
-        n = len(rows)
-        if n == 0:
+        if len(rows) == 0:
             return None
         if stamps is not None:
             self.lost += missing_of(np.concatenate(((self._last_stamp,), stamps)))
             self._last_stamp = stamps[-1]
-        ordered = np.sort(rows, axis=0)
-        distinct = 1 + (ordered[1:] != ordered[:-1]).sum(axis=0)
-        # The very sums of `mean` and `var`, each once.
-        centre = np.add.reduce(rows, axis=0) / n
-        off, steps = rows - centre, rows[1:] - rows[:-1]
-        gaps = times[1:] - times[:-1]
-        edges = float(times[0]) - float(slot), slot + 1.0 - float(times[-1])
-        return Batch(
-            slot=slot,
-            n=n,
-            first_s=float(times[0]),
-            last_s=float(times[-1]),
-            mean=np.mod(centre, 360.0) if self._circle else centre,
-            variance=np.add.reduce(off * off, axis=0) / (n - 1) if n > 1 else np.zeros(rows.shape[1]),
-            white=np.add.reduce(steps * steps, axis=0) / (n - 1) / 2.0 if n > 1 else np.zeros(rows.shape[1]),
-            low=ordered[0],
-            high=ordered[-1],
-            distinct=np.asarray(distinct, dtype=np.int64),
-            clipped=is_clipped(ordered, distinct),
-            largest_gap_s=max(*edges, float(gaps.max()) if n > 1 else 0.0),
-            missing=None if stamps is None else missing_of(stamps),
-            temperature_degc=self._temperature_sum / self._temperature_count if self._temperature_count else None,
-            counts=None if self.steps is None else counts_of(rows, self.steps),
+        return summary(
+            slot,
+            times,
+            rows,
+            stamps,
+            self._temperature_sum / self._temperature_count if self._temperature_count else None,
+            circle=self._circle,
+            steps=self.steps,
         )

@@ -1,7 +1,5 @@
 """What earlier calibrations found of one IMU, and which of it is worth a prior.
 
-from companion.samples import Vector
-
 Kept are whole biases as they were *measured*, never what a prior has made of them: a prior that learns from itself
 believes itself more with every calibration. One power-up is one point, however often was calibrated in it: the bias
 that the sensor has started with is in all of them.

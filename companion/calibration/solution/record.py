@@ -1,7 +1,5 @@
 """The record of one calibration: what was found, how well, and what was done with it.
 
-from companion.samples import Vector
-
 The keys are a surface that others rely on. What is unknown or does not apply is None (null in JSON), never absent
 and never zero. All axes are the vehicle's FRD.
 """
