@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -46,8 +45,8 @@ class Component:
         self._known_as = link.system_id
         """The system id under which we were heard last."""
         self._next_heartbeat_s = -math.inf
-        self.on_beat: Callable[[], None] = lambda: None
-        """Called at every turn of the working loop."""
+        self.turns = 0
+        """Of the working loop, so that it is seen to go on."""
         self.permission = Permission(senders)
         self.parameters = OwnParameters(link, self.texts.say, self._woken.set, self.permission)
         self._commands = CommandServer(link, service, self.texts.say, self._woken.set, self.permission)
@@ -66,7 +65,7 @@ class Component:
             while True:
                 self._woken.clear()
                 due_s = self._step(loop.time())
-                self.on_beat()
+                self.turns += 1
                 timer = loop.call_at(due_s, self._woken.set)
                 try:
                     await self._woken.wait()

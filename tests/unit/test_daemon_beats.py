@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-import pytest
+from companion.daemon.process.supervisor import Beats, Watched
 
-from companion.daemon.process.beats import Beats
+
+class Task:
+    turns = 0
 
 
 def test_who_is_silent_is_missed_and_who_comes_back_is_not() -> None:
-    beats = Beats()
-    imu = beats.expect("imu", 3.0)
-    compass = beats.expect("compass", 5.0)
+    imu, compass = Task(), Task()
+    beats = Beats([Watched("imu", "imu", 3.0, imu), Watched("compass", "compass", 5.0, compass)])
     for _ in range(4):
-        compass()
+        compass.turns += 1
         overdue = beats.look(1.0)
     assert overdue == {"imu": 4.0}
-    imu()
+    imu.turns += 1
     assert beats.look(1.0) == {}
 
 
 def test_a_task_that_never_began_is_missed_too() -> None:
-    beats = Beats()
-    beats.expect("imu", 1.0)
+    beats = Beats([Watched("imu", "imu", 1.0, Task())])
     assert beats.look(1.0) == {}
     assert beats.look(0.5) == {"imu": 1.5}
-
-
-def test_two_tasks_of_one_name_are_a_mistake() -> None:
-    beats = Beats()
-    beats.expect("imu", 1.0)
-    with pytest.raises(ValueError, match="two tasks are called imu"):
-        beats.expect("imu", 1.0)

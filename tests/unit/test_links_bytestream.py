@@ -190,9 +190,9 @@ def test_a_moment_without_bytes_does_not_end_the_collecting(path: Path, monkeypa
             async with running(path, FAST) as port:
                 await port.state(connected=True)
                 await collecting(port, pty)
-                turns = port.link._turns
+                turns = port.link._attempts
                 async with asyncio.timeout(40):
-                    while port.link._turns < turns + 3:  # nothing came
+                    while port.link._attempts < turns + 3:  # nothing came
                         await asyncio.sleep(0.001)
                 for number in range(5):
                     os.write(pty.master, bytes([number]))

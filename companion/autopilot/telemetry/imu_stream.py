@@ -106,8 +106,8 @@ class ImuStream:
         self.samples = 0
         self.problem = f"waiting for the autopilot to start IMU {instance}"
         """Why there are no samples, one line; empty while there are."""
-        self.on_beat: Callable[[], None] = lambda: None
-        """Called at every turn of `run`: at least every `BEAT_WITHIN_S`, whether samples come or not."""
+        self.turns = 0
+        """Of `run`, one at least every `BEAT_WITHIN_S`, whether samples come or not."""
         self.rejected: Counter[str] = Counter()
         """Messages that gave no sample, by reason."""
         self._vehicle, self._instance = vehicle, instance
@@ -172,7 +172,7 @@ class ImuStream:
 
     async def _until_found(self) -> None:
         while True:
-            self.on_beat()
+            self.turns += 1
             try:
                 async with asyncio.timeout(_TURN_S):
                     await self._vehicle.wait_found()
@@ -198,7 +198,7 @@ class ImuStream:
     async def _ask(self, source: _Source) -> int | None:
         """Ask for a message at the fastest rate that is not denied: the last answer, None when none came in time."""
         while True:
-            self.on_beat()
+            self.turns += 1
             rate_hz = source.rates_hz[source.rate]
             result = await self._vehicle.commands.request_message_interval(source.message.message.id, rate_hz)
             if result == mavlink.MAV_RESULT_DENIED and not self._restart.is_set():
@@ -292,7 +292,7 @@ class ImuStream:
         """Wait, but not beyond the loss or restart of the autopilot; True when that came."""
         deadline_s = asyncio.get_running_loop().time() + seconds
         while not self._restart.is_set():
-            self.on_beat()
+            self.turns += 1
             left_s = deadline_s - asyncio.get_running_loop().time()
             if left_s <= 0.0:
                 return False

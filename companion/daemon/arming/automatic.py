@@ -15,7 +15,7 @@ import asyncio
 import datetime
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 import msgspec
@@ -79,8 +79,8 @@ class Automatic:
         """Restarts of the autopilot seen, and automatic writes since the last one."""
         self._next_s = -math.inf
         self._failures = 0
-        self.on_beat: Callable[[], None] = lambda: None
-        """Called at every turn of `run`."""
+        self.turns = 0
+        """Of `run`, so that it is seen to go on."""
         self.stopped: str | None = None
         """Why it waits for a request, for people; None while it works."""
         conductor.watch(self._on_ended)
@@ -123,7 +123,7 @@ class Automatic:
         """Calibrate whenever it is worth it, until cancelled."""
         self._writes = await self._offload(self._file.read)
         while True:
-            self.on_beat()
+            self.turns += 1
             await asyncio.sleep(POLL_S)
             try:
                 await self._keep()

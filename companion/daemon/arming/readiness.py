@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Callable
 from typing import Final, Literal
 
 from companion.calibration.machine import State
@@ -70,8 +69,8 @@ class Readiness:
         self._answered_s = -math.inf
         self._has_gated = False
         self._woken = asyncio.Event()
-        self.on_beat: Callable[[], None] = lambda: None
-        """Called after every look that came to its end."""
+        self.turns = 0
+        """Looks that came to their end, so that it is seen to go on."""
 
     @property
     def at_arm(self) -> AtArm:
@@ -102,7 +101,7 @@ class Readiness:
                 # What a write under way makes of the output says nothing about what will be in force after it.
                 if not self._writing and await self.in_force.measure(loop.time()):
                     self.look()
-                self.on_beat()
+                self.turns += 1
             except Exception:
                 # Without a renewed answer the gate closes by itself.
                 logger.exception("looking whether it may arm failed")

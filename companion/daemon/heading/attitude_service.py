@@ -54,7 +54,8 @@ class AttitudeService:
 
     def __init__(self, core: Core, devices: Devices, in_force: InForce, alignment: AlignmentInForce) -> None:
         config, link, vehicle = core.config, core.link, core.vehicle
-        self.on_beat: Callable[[], None] = lambda: None
+        self.turns = 0
+        """Of `run`, so that it is seen to go on."""
         self._config, self._vehicle, self._say = config, vehicle, core.say
         self.carrier = Carrier(core, carrying_imu(config), in_force, alignment)
         self.difference = Difference(link, vehicle, self.carrier.now, self.carrier.kept_at)
@@ -161,7 +162,7 @@ class AttitudeService:
         self._running = True
         try:
             while True:
-                self.on_beat()
+                self.turns += 1
                 try:
                     await self._turn(loop.time())
                 except Exception:

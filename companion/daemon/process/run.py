@@ -94,8 +94,7 @@ class _Process:
             logger.warning("%s: stopping already; what was begun is put in order first", why)
             return
         logger.info("%s: stopping", why)
-        self._supervisor.stopping = True
-        self._manager.stopping()
+        self._supervisor.stop()
         self._work.cancel()
 
     async def _reload(self) -> None:
@@ -104,7 +103,7 @@ class _Process:
             self._reload_wanted.clear()
             self._manager.reloading()
             try:
-                self._supervisor.note = await self._reloader.reload()
+                self._supervisor.note(await self._reloader.reload())
             finally:
                 self._manager.ready()
 

@@ -9,13 +9,11 @@ from __future__ import annotations
 import asyncio
 import logging
 import types
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple, Protocol
 
 from companion.autopilot.telemetry import imu_stream
-from companion.daemon.process.beats import Beats
 from companion.daemon.process.service import Service
-from companion.daemon.process.status_line import status_line
 from companion.links.serial import bytestream
 from companion.links.system.service_manager import ServiceManager
 
@@ -34,37 +32,87 @@ AUTOMATIC_S: Final = 180.0
 """It may have to read a dozen parameters over a bad radio link, each with all its retries."""
 
 
+class Turning(Protocol):
+    """Whose work goes on by turns."""
+
+    turns: int
+    """How many it has begun."""
+
+
+class Watched(NamedTuple):
+    """A task that must go on."""
+
+    name: str
+    task: str
+    """As the service calls it."""
+    within_s: float
+    """How long a turn of it may take."""
+    who: Turning
+    """Runs in it."""
+
+
+class Beats:
+    """Who still goes on.
+
+    A loop that turns proves nothing of a task in it that waits for ever. So each task counts its turns, and how long
+    one has lasted counts in looks: while the whole loop stands still nobody ages, or every task would be blamed for
+    what one blocking call has done (and that the service manager sees by itself).
+    """
+
+    def __init__(self, watched: Sequence[Watched]) -> None:
+        self._watched = watched
+        self._last = {each.name: (each.who.turns, 0.0) for each in watched}
+        """By name: turns when somebody looked last, and how long it has been the same turn."""
+
+    def look(self, since_last_look_s: float) -> dict[str, float]:
+        """Let time pass; the tasks that are overdue, and for how many seconds they have not gone on."""
+        for each in self._watched:
+            turns, (before, age_s) = each.who.turns, self._last[each.name]
+            self._last[each.name] = (turns, age_s + since_last_look_s if turns == before else 0.0)
+        return {each.name: age_s for each in self._watched if (age_s := self._last[each.name][1]) > each.within_s}
+
+
+def watched_of(service: Service) -> list[Watched]:
+    """The tasks of a service that must go on."""
+    component, link, attitude = service.faces.component, service.core.link, service.heading.attitude
+    readiness, automatic = service.arming.readiness, service.arming.automatic
+    link_s = bytestream.BEAT_WITHIN_S + MARGIN_S
+    return [
+        Watched("MAVLink component", "component", COMPONENT_S, component),
+        Watched("MAVLink connection", "mavlink", link_s, link),
+        Watched("estimator", "readiness", ESTIMATOR_S, readiness),
+        Watched("automatic calibration", "automatic", AUTOMATIC_S, automatic),
+        *([] if attitude is None else [Watched("attitude", "attitude", ESTIMATOR_S, attitude)]),
+        *(
+            Watched(f"imu {name}", f"{name} telemetry", imu_stream.BEAT_WITHIN_S, imu.stream)
+            for name, imu in service.devices.imus.items()
+        ),
+        *(Watched(f"sensor {sensor.name}", sensor.name, link_s, sensor.link) for sensor in service.devices.sensors),
+    ]
+
+
 class Supervisor:
     """Looks after a service's tasks; `run` it beside `Service.run`."""
 
     def __init__(self, service: Service, manager: ServiceManager) -> None:
         self._service, self._manager = service, manager
-        self.beats = Beats()
-        self.note = ""
-        """What stands before everything else in the status; empty: nothing."""
+        watched = watched_of(service)
+        self.beats = Beats(watched)
+        self._tasks = {each.name: each.task for each in watched}
+        self._note = ""
         self.stopping = False
         """The tasks are being ended: nobody is missed any more."""
-        self._tasks: dict[str, str] = {}
         self._missed: set[str] = set()
         self._status_failed = False
-        self._expect_all()
 
-    def _expect_all(self) -> None:
-        service, link_s = self._service, bytestream.BEAT_WITHIN_S + MARGIN_S
-        service.faces.component.on_beat = self._expect("MAVLink component", "component", COMPONENT_S)
-        service.core.link.on_beat = self._expect("MAVLink connection", "mavlink", link_s)
-        service.arming.readiness.on_beat = self._expect("estimator", "readiness", ESTIMATOR_S)
-        service.arming.automatic.on_beat = self._expect("automatic calibration", "automatic", AUTOMATIC_S)
-        if service.heading.attitude is not None:
-            service.heading.attitude.on_beat = self._expect("attitude", "attitude", ESTIMATOR_S)
-        for imu in service.devices.imus.values():
-            imu.stream.on_beat = self._expect(f"imu {imu.name}", f"{imu.name} telemetry", imu_stream.BEAT_WITHIN_S)
-        for sensor in service.devices.sensors:
-            sensor.link.on_beat = self._expect(f"sensor {sensor.name}", sensor.name, link_s)
+    def note(self, words: str) -> None:
+        """Say this before everything else in the status; empty: nothing."""
+        self._note = words
 
-    def _expect(self, name: str, task: str, within_s: float) -> Callable[[], None]:
-        self._tasks[name] = task
-        return self.beats.expect(name, within_s)
+    def stop(self) -> None:
+        """The tasks are being ended from now on."""
+        self.stopping = True
+        self._manager.stopping()
 
     async def run(self) -> None:
         """Feed the watchdog and keep the status until cancelled."""
@@ -99,7 +147,7 @@ class Supervisor:
     def _words(self, overdue: dict[str, float]) -> str:
         if not self._manager.listens:
             return ""
-        notes = [self.note] if self.note else []
+        notes = [self._note] if self._note else []
         if self.stopping:
             notes.append("stopping")
         notes += [f"HUNG: {name}" for name in overdue]
@@ -124,3 +172,20 @@ def _where(task_name: str) -> str:
                 frame = inner.cr_frame
                 return f"waits in {inner.__qualname__}, {frame.f_code.co_filename}:{frame.f_lineno}"
     return "its task has ended"
+
+
+def status_line(status: Mapping[str, Any]) -> str:
+    """What a pilot wants to know, most important first; `status` is what `companion status --json` prints."""
+    parts = [f"FAULT: {status['fault']}"] if status["fault"] is not None else []
+    if status["putting_back"]:
+        parts.append("an interrupted write is being put back")
+    progress = "" if status["progress"] is None else f" {status['progress']} %"
+    parts.append(f"{status['state']}{progress}" + (f", {status['reason']}" if status["reason"] else ""))
+    parts.append(str(status["vehicle"]["summary"]))
+    parts.append(f"in force: {status['arming']['in_force']}")
+    devices = status["devices"]
+    good = [device["name"] for device in devices if device["good"]]
+    parts += [f"{device['name']}: {device['summary']}" for device in devices if not device["good"]]
+    if good:
+        parts.append(f"{', '.join(good)} good")
+    return "; ".join(parts)

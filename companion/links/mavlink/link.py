@@ -41,8 +41,8 @@ class MavlinkLink:
 
     def __init__(self, *, system_id: int = 1, component_id: int = 191) -> None:
         self.component_id = component_id
-        self.on_beat: Callable[[], None] = lambda: None
-        """Called again and again by whatever carries the link's bytes, as long as it works."""
+        self.turns = 0
+        """Of whatever carries the link's bytes, so that it is seen to go on."""
         self.received: Counter[str] = Counter()
         """Messages by type, plus "bad" (failed checks), "unknown" (not in the dialect) and "handler error"."""
         self.sent = 0
@@ -86,6 +86,10 @@ class MavlinkLink:
     def connected(self) -> bool:
         """Whether a transport is attached; says nothing of a peer behind it."""
         return self._transmit is not None
+
+    def turn(self) -> None:
+        """Whatever carries the link's bytes goes on."""
+        self.turns += 1
 
     def attach(self, transmit: Callable[[bytes], object] | None) -> None:
         """Give the function that sends bytes, or None while there is none. What was half received is forgotten.

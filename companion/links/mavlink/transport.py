@@ -60,8 +60,7 @@ async def run_transport(link: MavlinkLink, url: str, *, on_state: OnState | None
         if on_state is not None:
             on_state(connected, words)
 
-    stream = ByteLink(settings, link.receive, name="mavlink", on_state=state)
-    stream.on_beat = link.on_beat
+    stream = ByteLink(settings, link.receive, name="mavlink", on_state=state, on_turn=link.turn)
     await stream.run()
 
 
@@ -98,7 +97,7 @@ async def _run_udp(
         return _Listener(link) if listen else _Speaker(link)
 
     while True:
-        link.on_beat()
+        link.turn()
         try:
             async with asyncio.timeout(RESOLVE_DEADLINE_S):
                 if listen:
@@ -151,7 +150,7 @@ class _Udp(asyncio.DatagramProtocol):
     async def run(self) -> str:
         """Serve until the socket fails; returns why."""
         while not self._failed.done():
-            self.link.on_beat()
+            self.link.turn()
             await asyncio.wait([self._failed], timeout=_TURN_S)
             self._turn()
         return self._failed.result()

@@ -108,6 +108,7 @@ class ByteLink:
         on_state: Callable[[bool, str], None] | None = None,
         budget: Budget | None = None,
         together: Together | None = None,
+        on_turn: Callable[[], None] | None = None,
     ) -> None:
         self.settings = settings
         self.name = name
@@ -124,16 +125,16 @@ class ByteLink:
         """Bytes that `write` refused because the port was closed or the out-buffer full."""
         self.reconnects = 0
         """How often the port was opened again after it had been open."""
-        self.on_beat: Callable[[], None] = lambda: None
-        """Called at every turn of `run`: at least every `BEAT_WITHIN_S`, whether bytes come or not."""
+        self.turns = 0
+        """Of `run`, one at least every `BEAT_WITHIN_S`, whether bytes come or not."""
         self.last_byte_s: float | None = None
         """The loop's time of the last read that brought bytes."""
-        self._on_bytes, self._on_state = on_bytes, on_state
+        self._on_bytes, self._on_state, self._on_turn = on_bytes, on_state, on_turn
         self._descriptor: int | None = None
         self._reads = 0
         """That brought something since `_reads_since`, a time and the bytes received by then."""
         self._reads_since = (0.0, 0)
-        self._turns = 0
+        self._attempts = 0
         """Reads of a stream that is collected, since then too, whether they brought something or not."""
         self._collecting: asyncio.TimerHandle | None = None
         """The next read, while bytes are collected; None: each wakes the loop."""
@@ -167,7 +168,7 @@ class ByteLink:
         loop = asyncio.get_running_loop()
         try:
             while True:
-                self.on_beat()
+                self._turn()
                 try:
                     descriptor = await self._open()
                 except LinkError as error:
@@ -207,9 +208,14 @@ class ByteLink:
             self._flush()
         return self._descriptor is not None
 
+    def _turn(self) -> None:
+        self.turns += 1
+        if self._on_turn is not None:
+            self._on_turn()
+
     async def _until_lost(self, lost: asyncio.Future[str]) -> str:
         while not lost.done():
-            self.on_beat()
+            self._turn()
             await asyncio.wait([lost], timeout=BEAT_S)
         return lost.result()
 
@@ -223,7 +229,7 @@ class ByteLink:
         if self._opened_before:
             self.reconnects += 1
         self._opened_before = True
-        self._reads, self._turns, self._reads_since = 0, 0, (loop.time(), self.bytes_received)
+        self._reads, self._attempts, self._reads_since = 0, 0, (loop.time(), self.bytes_received)
         loop.add_reader(descriptor, self._readable)
         level = logging.DEBUG if self._quiet else logging.INFO
         logger.log(level, "%s: %s is %s", self.name, self.settings.url, "back" if self._warned else "open")
@@ -242,7 +248,7 @@ class ByteLink:
                 self._collecting = loop.call_at(now_s + COLLECT_S, self._collected)
                 if self.together is not None:
                     self.together.drive()
-            self._reads, self._turns, self._reads_since = 0, 0, (now_s, self.bytes_received)
+            self._reads, self._attempts, self._reads_since = 0, 0, (now_s, self.bytes_received)
 
     def _collected(self) -> None:
         """Read what has come in the meantime; where that is little, let the next byte wake the loop again."""
@@ -250,14 +256,14 @@ class ByteLink:
         now_s = loop.time()
         # First of all: whatever happens in this turn, there will be another.
         self._collecting = loop.call_at(now_s + COLLECT_S, self._collected)
-        self._turns += 1
+        self._attempts += 1
         if self.together is not None:
             self.together.turn(now_s)  # what waits came before what is read now
         self._reads += self._read(now_s)
         if self._descriptor is None or self._paused is not None or now_s - self._reads_since[0] < JUDGED_S:
             return
-        goes_on = 2 * self._reads > self._turns and self._fits_the_line(now_s)
-        self._reads, self._turns, self._reads_since = 0, 0, (now_s, self.bytes_received)
+        goes_on = 2 * self._reads > self._attempts and self._fits_the_line(now_s)
+        self._reads, self._attempts, self._reads_since = 0, 0, (now_s, self.bytes_received)
         if not goes_on:
             self._stop_collecting()
             loop.add_reader(self._descriptor, self._readable)
@@ -324,7 +330,7 @@ class ByteLink:
         except OSError:
             pass  # empty, or gone: the reader will find it
         self.on_gap()
-        self._reads, self._turns, self._reads_since = 0, 0, (loop.time(), self.bytes_received)
+        self._reads, self._attempts, self._reads_since = 0, 0, (loop.time(), self.bytes_received)
         loop.add_reader(self._descriptor, self._readable)
 
     def _flush(self) -> None:
