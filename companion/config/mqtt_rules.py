@@ -17,10 +17,8 @@ def check_mqtt(mqtt: Mqtt, name: str) -> None:
     Raises:
         ConfigError: one line that names the file, the key, what was found and what is allowed.
     """
-    for key in ("base_topic", "discovery"):
-        topic = getattr(mqtt, key)
-        if topic is not None:
-            _check_topic(topic, f"mqtt.{key}", name)
+    if mqtt.base_topic is not None:
+        _check_topic(mqtt.base_topic, "mqtt.base_topic", name)
     if mqtt.password_file is not None and mqtt.username is None:
         raise ConfigError(f"{name}: 'mqtt.username' is missing; allowed: a text, not empty (needed by password_file)")
     if mqtt.password_file is not None and "/" in mqtt.password_file and not mqtt.password_file.startswith("/"):

@@ -193,8 +193,6 @@ class Mqtt(Section, frozen=True):
     cert_file: NonEmpty | None = None
     key_file: NonEmpty | None = None
     keepalive_s: Annotated[int, Meta(ge=5, le=600)] = 15
-    discovery: NonEmpty | None = None
-    """Home Assistant's discovery prefix (its default is "homeassistant"); absent: no discovery messages."""
 
     @property
     def broker_port(self) -> int:

@@ -232,20 +232,3 @@ def test_the_check_and_the_status_tell_how_the_broker_is_reached(tmp_path: Path)
                 assert "next attempt in" in line
 
     asyncio.run(main())
-
-
-def test_discovery_for_home_assistant(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with broker(tmp_path) as one, peer(one) as watcher:
-            section = one.section(discovery="homeassistant")
-            async with alone(tmp_path, section) as service:
-                await until_connected(service)
-                found = (await watcher.until("homeassistant/device/companion_7/config")).json
-        assert found["availability_topic"] == f"{BASE}/status"
-        assert found["origin"]["name"]
-        for component in found["components"].values():
-            assert component["platform"] in ("sensor", "binary_sensor", "button")
-            assert component["unique_id"].startswith("companion_7_")
-            assert component.get("command_topic", f"{BASE}/request/").startswith(f"{BASE}/request/")
-
-    asyncio.run(main())

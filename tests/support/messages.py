@@ -37,7 +37,6 @@ ELSEWHERE = {
     "companion/config": "every line names file, key, what was found and what is allowed; one row tells so",
     "companion/component/requests.py": "likewise, of a MAVLink command's parameters",
     "companion/daemon/faces/mqtt/payloads.py": "likewise, of a request's payload",
-    "companion/daemon/faces/mqtt/discovery.py": "names for Home Assistant",
     "companion/installation": "printed by commands that are run at home, with what to do",
     "companion/cli/install.py": "printed by commands that are run at home, with what to do",
     "companion/cli/profile.py": "the table and its notes: docs/profiles.md",

@@ -170,7 +170,7 @@ bind = "127.0.0.1:8080"
         (MQTT + "tls = 'yes'", ["mqtt.tls", "found 'yes'", "true or false"]),
         (MQTT + "base_topic = 'field/#'", ["mqtt.base_topic", "found 'field/#'", "without + #"]),
         (MQTT + "base_topic = '/field'", ["mqtt.base_topic", "words with / between them"]),
-        (MQTT + "discovery = 'home assistant'", ["mqtt.discovery", "found 'home assistant'"]),
+        (MQTT + "base_topic = 'field station'", ["mqtt.base_topic", "found 'field station'"]),
         (MQTT + "client_id = 'a\\nb'".replace("'", '"'), ["mqtt.client_id", "printable"]),
         (MQTT + "password_file = '/etc/p'", ["mqtt.username", "missing", "needed by password_file"]),
         (MQTT + "username = 'u'\npassword_file = 'a/b'", ["mqtt.password_file", "begins with /", "credential"]),
@@ -292,7 +292,7 @@ def test_systemds_folders_are_the_defaults(monkeypatch: pytest.MonkeyPatch) -> N
 def test_the_broker_by_default_and_with_tls(monkeypatch: pytest.MonkeyPatch) -> None:
     mqtt = parse(GOOD + MQTT, "x.toml").mqtt
     assert mqtt is not None
-    assert (mqtt.broker_port, mqtt.base_topic, mqtt.password_path, mqtt.discovery) == (1883, None, None, None)
+    assert (mqtt.broker_port, mqtt.base_topic, mqtt.password_path) == (1883, None, None)
     mqtt = parse(GOOD + MQTT + "tls = true\nusername = 'u'\npassword_file = 'mqtt.password'", "x.toml").mqtt
     assert mqtt is not None
     assert mqtt.broker_port == 8883

@@ -27,7 +27,8 @@ class Daemon:
         self.end = asyncio.Event()
         self.running = False
         self.fault: Exception | None = None
-        self.requests = Requests(self.answer, self.respond)
+        self.retained: list[str] = []
+        self.requests = Requests(self.answer, self.respond, self.retained.append)
 
     async def answer(self, request: Object, face: str) -> AsyncIterator[Object]:
         self.asked.append(request)
@@ -157,11 +158,9 @@ def test_a_fault_of_the_program_is_answered_too() -> None:
 def test_a_retained_request_is_reported_once_and_its_deletion_is_no_request() -> None:
     async def main() -> None:
         daemon = Daemon()
-        told: list[str] = []
-        daemon.requests.on_retained = told.append
         for _ in range(3):  # three connections
             await daemon.take(b'{"transaction": "old"}', retained=True)
-        assert told == ["calibrate"]
+        assert daemon.retained == ["calibrate"]
         assert daemon.states() == ["refused"] * 3
         await daemon.take(b"")  # on MQTT 3.1.1 its deletion looks like this
         assert daemon.asked == []

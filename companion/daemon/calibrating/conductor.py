@@ -22,6 +22,7 @@ from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
+from companion.config import AtArm
 from companion.daemon.calibrating.align_steps import Plan
 from companion.daemon.calibrating.aligner import Aligner
 from companion.daemon.calibrating.course import Course
@@ -51,7 +52,7 @@ class Conductor:
         self.job: Job | None = None
         self.reason = "ready"
         """What the present state means, in words."""
-        self.at_arm = core.config.calibration.at_arm
+        self.at_arm: AtArm = core.config.calibration.at_arm
         self.only_listening = core.only_listening
         """Why nothing may be started although requests arrive: a check listens and must change nothing."""
         self._watchers: list[OnEnded] = []
@@ -195,9 +196,11 @@ class Conductor:
         """Whether results are written to the autopilot."""
         return self._course.push
 
-    @push_parameters.setter
-    def push_parameters(self, value: bool) -> None:
-        self._course.switch(push=value)
+    def switch(self, *, at_arm: AtArm | None = None, push: bool | None = None) -> None:
+        """Change what happens at arming, or whether results are written, as at the flight line."""
+        self.at_arm = self.at_arm if at_arm is None else at_arm
+        if push is not None:
+            self._course.switch(push=push)
 
     async def close(self) -> None:
         """Stop: cancel what runs and wait until it has left the autopilot in order."""

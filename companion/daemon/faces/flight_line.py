@@ -33,10 +33,10 @@ def define_parameters(parameters: OwnParameters, config: Config, conductor: Cond
         conductor.retarget(accel_sigma_m_s2=mg * MG)
 
     def set_push(value: float) -> None:
-        conductor.push_parameters = bool(_whole("CMP_PUSH", value))
+        conductor.switch(push=bool(_whole("CMP_PUSH", value)))
 
     def set_at_arm(value: float) -> None:
-        conductor.at_arm = AT_ARM[_whole("CMP_AT_ARM", value)]
+        conductor.switch(at_arm=AT_ARM[_whole("CMP_AT_ARM", value)])
 
     parameters.define("CMP_GYR_TGT", wanted.target_gyro_sigma_deg_h, 0.01, LARGEST, set_gyro_target)
     parameters.define("CMP_ACC_TGT", wanted.target_accel_sigma_mg, 0.0001, LARGEST, set_accel_target)

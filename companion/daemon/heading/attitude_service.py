@@ -63,7 +63,6 @@ class AttitudeService:
         self.sender = Sender(link, models.attitude_rate_hz(config), full=config.push.attitude == "full")
         self.timesync = TimesyncResponder(link, vehicle)
         self.external = ExternalEstimate(vehicle, self.difference)
-        self.external.on_outcome = lambda words: logger.info("attitude: %s", words)
         self._wanted = StandingRequests(vehicle.commands)
         self._wanted.add(mavlink.MAVLink_attitude_message, ATTITUDE_RATE_HZ)
         self._unsubscribe = [

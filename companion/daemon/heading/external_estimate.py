@@ -7,7 +7,7 @@ taken is told by the heading that the autopilot has afterwards.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import logging
 from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -16,6 +16,8 @@ from companion.attitude.estimator import Attitude
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.daemon.heading.difference import Difference
 from companion.physics.units import DEG
+
+logger = logging.getLogger(__name__)
 
 EXTERNAL_ATTITUDE_ESTIMATE: Final = 620
 """Of MAVLink's development dialect."""
@@ -29,8 +31,6 @@ class ExternalEstimate:
     def __init__(self, vehicle: Vehicle, difference: Difference) -> None:
         self.outcome: str | None = None
         """What became of the last one, for people; None: none was needed."""
-        self.on_outcome: Callable[[str], None] = lambda words: None
-        """Told of an outcome that is another than the one before."""
         self._vehicle, self._difference = vehicle, difference
         self._unsupported_at_boot: int | None = None
 
@@ -70,4 +70,4 @@ class ExternalEstimate:
     def _note(self, words: str) -> None:
         if words != self.outcome:
             self.outcome = words
-            self.on_outcome(words)
+            logger.info("attitude: %s", words)

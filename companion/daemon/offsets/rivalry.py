@@ -66,6 +66,10 @@ class Rivalry:
         stopped = {r.words for r in calibration.rivals if not r.until_boot} if self.stop_rivals else set()
         return [warning for warning in calibration.warnings if warning not in stopped]
 
+    def switch(self, *, stop_rivals: bool) -> None:
+        """Change whether rivals are switched off with the next write."""
+        self.stop_rivals = stop_rivals
+
     def close(self) -> None:
         """Stop listening."""
         self._unsubscribe()

@@ -40,17 +40,17 @@ def _accel_target(service: Service, mg: float) -> None:
 
 
 def _at_arm(service: Service, value: Any) -> None:
-    service.calibrating.conductor.at_arm = value
+    service.calibrating.conductor.switch(at_arm=value)
     _show(service.faces.component.parameters, "CMP_AT_ARM", float(AT_ARM.index(value)))
 
 
 def _push(service: Service, value: bool) -> None:  # noqa: FBT001 - as all in the table
-    service.calibrating.conductor.push_parameters = value
+    service.calibrating.conductor.switch(push=value)
     _show(service.faces.component.parameters, "CMP_PUSH", float(value))
 
 
 def _stop_rivals(service: Service, value: bool) -> None:  # noqa: FBT001 - as all in the table
-    service.offsets.rivalry.stop_rivals = value
+    service.offsets.rivalry.switch(stop_rivals=value)
 
 
 def _allow(service: Service, value: tuple[str, ...]) -> None:

@@ -18,7 +18,6 @@ from companion.config import Mqtt
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.core import Core
 from companion.daemon.faces.answers import Answers
-from companion.daemon.faces.mqtt.discovery import discovery_message, discovery_topic
 from companion.daemon.faces.mqtt.requests import Requests
 from companion.daemon.faces.mqtt.summary import Pace, summary
 from companion.daemon.faces.mqtt.topics import OFFLINE, ONLINE, Topics, base_of, client_id_of
@@ -104,8 +103,7 @@ class MqttFace:
             on_message=self._on_message,
             offload=self._offload,
         )
-        self._requests = Requests(self._answers.answer, self._respond)
-        self._requests.on_retained = self._on_retained
+        self._requests = Requests(self._answers.answer, self._respond, self._on_retained)
         self._pace, self._state_s, self._state = Pace(), -math.inf, ""
         self._progress, self._progress_s = b"", -math.inf
         link.outbox.keep(topics.status, ONLINE)
@@ -130,8 +128,6 @@ class MqttFace:
         """Have the broker forget everything under a topic that is ours no longer."""
         for topic in topics.kept:
             link.outbox.keep(topic, b"")
-        if self._settings.discovery is not None:
-            link.outbox.keep(discovery_topic(self._settings.discovery, topics), b"")
 
     async def _try_to_look(self, link: MqttLink, topics: Topics) -> None:
         try:
@@ -163,9 +159,6 @@ class MqttFace:
         """What costs more than a glance."""
         if self._conductor.last is not None:
             link.outbox.keep(topics.record, to_json(self._conductor.last))
-        if (prefix := self._settings.discovery) is not None:
-            message = discovery_message(topics, self._known_system_id)
-            link.outbox.keep(discovery_topic(prefix, topics), _json(message))
         said = summary(self._answers.status())
         if self._pace.is_due(said, now_s):
             link.outbox.keep(topics.state, _json(said))

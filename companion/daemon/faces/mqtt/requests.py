@@ -62,15 +62,14 @@ class Requests:
     Args:
         ask: who knows.
         respond: where responses go; those that may be dropped are refusals.
+        on_retained: told once of each command of which a retained request lies at the broker.
     """
 
-    def __init__(self, ask: Ask, respond: Respond) -> None:
-        self._ask, self._respond = ask, respond
+    def __init__(self, ask: Ask, respond: Respond, on_retained: Callable[[str], None]) -> None:
+        self._ask, self._respond, self._on_retained = ask, respond, on_retained
         self._tasks: set[asyncio.Task[None]] = set()
         self._known: OrderedDict[tuple[str, Transaction], _Known] = OrderedDict()
         self._retained: set[str] = set()
-        self.on_retained: Callable[[str], None] = lambda command: None
-        """Told once of each command of which a retained request lies at the broker."""
 
     def take(self, command: str, payload: bytes, *, retained: bool) -> None:
         """Take one request; its answer comes later."""
@@ -101,7 +100,7 @@ class Requests:
         if retained and payload:
             if command not in self._retained:
                 self._retained.add(command)
-                self.on_retained(command)
+                self._on_retained(command)
             return False
         if payload or not (retained or command in self._retained):
             return False
