@@ -11,6 +11,7 @@ from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.history import Triad
 from companion.calibration.solution.record import Record, WrittenParameter
 from companion.component.service import JobResult
+from companion.errors import CalibrationRefusedError
 
 ALIGNMENT: Final = "gradienter alignment"
 """The kind of job that calibrates nothing."""
@@ -51,6 +52,7 @@ class Job:
         self.words = ""
         """What is going on now, for people."""
         self._percent = 0
+        self._until_s = 0.0
         self._cancelled_by: str | None = None
         self._nudge = asyncio.Event()
 
@@ -68,6 +70,15 @@ class Job:
         """Say how far it is and what is going on."""
         self._percent = max(self._percent, min(99, int(percent)))
         self.words = words
+
+    def lasts(self, seconds: float) -> None:
+        """Say how long what is going on now will take."""
+        self._until_s = asyncio.get_running_loop().time() + seconds
+
+    @property
+    def left_s(self) -> float:
+        """How long it will take yet, about."""
+        return max(0.0, self._until_s - asyncio.get_running_loop().time())
 
     @property
     def cancelled(self) -> bool:
@@ -96,6 +107,15 @@ class Job:
         """
         if self._cancelled_by is not None:
             raise JobCancelledError(f"cancelled by {self._cancelled_by}")
+
+    def check_time(self) -> None:
+        """The end of its patience.
+
+        Raises:
+            CalibrationRefusedError: it has taken as long as it may.
+        """
+        if self.deadline_s is not None and asyncio.get_running_loop().time() >= self.deadline_s:
+            raise CalibrationRefusedError(f"not finished in the time given: {self.words}")
 
     async def pause(self, seconds: float) -> None:
         """Wait, but not past a cancel or a `look_again`.

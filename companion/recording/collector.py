@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from companion.calibration.collector.rolling import ImuInput, RollingCollector, Settings, Window
 from companion.calibration.means.pose_models import CompassModel, GradienterModel
 from companion.calibration.stillness.settling import AT_ONCE, Lag
+from companion.links.system.listeners import Listeners
 from companion.recording.journal import Journal
 from companion.samples import CompassSample, ImuSample, TiltSample
 
@@ -30,7 +31,7 @@ class RecordedCollector(RollingCollector):
         field_by: likewise.
     """
 
-    not_state: Final = frozenset({"journal", "windows", "on_second", "_messages", "_windows_made"})
+    not_state: Final = frozenset({"journal", "windows", "seconds", "_messages", "_windows_made"})
 
     def __init__(
         self,
@@ -46,8 +47,8 @@ class RecordedCollector(RollingCollector):
         self.journal = Journal()
         self.windows: deque[tuple[int, Window]] = deque(maxlen=WINDOWS_KEPT)
         """The latest windows of whole stretches, with their numbers."""
-        self.on_second: Callable[[], None] = lambda: None
-        """Called when every source has had its say on a second, from within whatever call brought that about: look
+        self.seconds: Listeners[[]] = Listeners()
+        """Told when every source has had its say on a second, from within whatever call brought that about: look
         later, not there."""
         self._messages: dict[str, str | None] = {}
         """By IMU, the autopilot's message that its samples come in."""
@@ -83,7 +84,7 @@ class RecordedCollector(RollingCollector):
         before = self._next
         super()._evaluate()
         if self._next != before:
-            self.on_second()
+            self.seconds.tell()
 
     def set_imu(self, imu: ImuInput, message: str | None = None) -> None:
         """As in the base class; `message` is the autopilot's that its samples come in, None for one of our own."""

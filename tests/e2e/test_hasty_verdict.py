@@ -11,7 +11,7 @@ import pytest
 
 from companion.autopilot.parameters.verify import Verdict
 from companion.calibration.machine import State
-from companion.daemon.offsets import effect, push
+from companion.daemon.offsets import effect
 from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
@@ -25,7 +25,7 @@ def refused_while(condition: Callable[[], bool], monkeypatch: pytest.MonkeyPatch
         verdicts = real(*what)
         return [dataclasses.replace(one, problems=("by chance",)) for one in verdicts] if condition() else verdicts
 
-    monkeypatch.setattr(push, "judge_vectors", judge)
+    monkeypatch.setattr(effect, "judge_vectors", judge)
 
 
 def test_what_a_second_look_shows_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,7 +65,7 @@ def test_what_ten_seconds_show_is_final(tmp_path: Path, monkeypatch: pytest.Monk
             result, _ = await calibrated(await rig.ready())
             assert result.outcome == "failed", result
             assert "old values put back" in result.reason
-            assert push.LOOK_S - 3.0 < looks[-1] - looks[0] < push.LOOK_S + 1.0
+            assert effect.LOOK_S - 3.0 < looks[-1] - looks[0] < effect.LOOK_S + 1.0
             assert any("does not show: looking longer" in each for each in words)
             assert rig.double.parameters.values == before
 

@@ -18,7 +18,6 @@ from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.daemon.offsets.far_step import FarStepWatch
 from companion.daemon.offsets.ledger import Ledger
 from companion.daemon.offsets.px4_writes import Px4Writes, step_from_far
 from companion.links.mavlink.link import MavlinkLink
@@ -66,7 +65,7 @@ async def aboard(px4: ScriptedPx4, folder: Path) -> AsyncIterator[Stage]:
 
     ledger = Ledger(ChangeLog(folder), inline)
     ledger.load()
-    writes = Px4Writes(vehicle, writer, ledger, FarStepWatch(link, vehicle, memory), memory, lambda *what: None)
+    writes = Px4Writes(link, vehicle, writer, ledger, memory, lambda *what: None)
     async with flying_on(link, px4):
         await vehicle.wait_found()
         await asyncio.sleep(1.0)

@@ -14,7 +14,7 @@ from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.machine import State
 from companion.daemon.calibrating.conductor import Conductor
-from companion.daemon.offsets.push import LOOK_S
+from companion.daemon.offsets.effect import LOOK_S
 
 WRITE_S: Final = 5.0
 """A dozen parameters: with ArduPilot's own gyro calibration in between, or with PX4's far step, 4 s on either."""
@@ -54,6 +54,11 @@ class Forecast:
     def _check_s(self) -> float:
         return settle_s(self._vehicle.firmware) + min(self._conductor.settings.min_still_s, LOOK_S) + LATE_S
 
+    @property
+    def _job_s(self) -> float:
+        job = self._conductor.running
+        return 0.0 if job is None else job.left_s
+
     def words(self, now_s: float) -> str:
         """What is going on and for how long yet, for somebody who may not arm because of it."""
         state = self._conductor.state
@@ -62,7 +67,7 @@ class Forecast:
         if state is State.RESTARTING:
             return "autopilot is being restarted: wait"
         if state is State.SETTLING:
-            return f"EKF settling: wait, {self._left_s(state, self._conductor.settling_s, now_s):.0f} s at most"
+            return f"EKF settling: wait, {self._left_s(state, self._job_s, now_s):.0f} s at most"
         if state not in _VERB:
             return "writing new offsets: wait"
         left_s = self._left_s(state, self._estimate_s(state, now_s), now_s)
@@ -73,7 +78,7 @@ class Forecast:
         if state is State.VERIFYING:
             return self._check_s - self._collector.glance(now_s).still_s + after_s
         if state is State.DITHERING:
-            return self._conductor.dither_s + self.whole_s
+            return self._job_s + self.whole_s
         return self.whole_s
 
     def _left_s(self, state: State, estimate_s: float, now_s: float) -> float:

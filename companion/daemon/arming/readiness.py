@@ -21,7 +21,7 @@ from companion.daemon.arming.in_force import InForce
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core
-from companion.daemon.offsets.reboot import Reboot
+from companion.daemon.offsets.conclusion import Conclusion
 from companion.physics.units import DEG_H, MG
 
 logger = logging.getLogger(__name__)
@@ -53,17 +53,17 @@ class Readiness:
 
     Args:
         core: what all share.
-        reboot: whether the autopilot must be restarted although its offsets are right.
+        conclusion: whether the autopilot must be restarted although its offsets are right.
         conductor: what runs, and what is set for arming.
         in_force: what is in force, and what speaks against it.
         automatic: whether a calibration will start by itself.
     """
 
     def __init__(
-        self, core: Core, reboot: Reboot, conductor: Conductor, in_force: InForce, automatic: Automatic
+        self, core: Core, conclusion: Conclusion, conductor: Conductor, in_force: InForce, automatic: Automatic
     ) -> None:
         self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
-        self.in_force, self._automatic, self._reboot = in_force, automatic, reboot
+        self.in_force, self._automatic, self._conclusion = in_force, automatic, conclusion
         self._forecast = Forecast(core.vehicle, core.collector, conductor)
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
@@ -146,7 +146,7 @@ class Readiness:
             if why_not is None:
                 return ArmAnswer("wait", f"hold still {self.until_calibrated_s(now_s):.0f} s")
             return ArmAnswer("refuse", f"{findings[0].words}: {why_not}")
-        if (owed := self._reboot.owed) is not None:
+        if (owed := self._conclusion.owed) is not None:
             return ArmAnswer("refuse", owed)
         if glance.moving or glance.steady_s < STEADY_S:
             return ArmAnswer("wait", f"hold still {max(1.0, STEADY_S - glance.steady_s):.0f} s")

@@ -28,7 +28,7 @@ class Arming(Subsystem):
         # In this order they hear of a calibration's end: who starts the next one asks what is in force.
         self.in_force = InForce(core, devices.imus, calibrating.conductor, calibrating.alignment)
         self.automatic = Automatic(core, devices.imus, calibrating.conductor, self.in_force)
-        self.readiness = Readiness(core, offsets.reboot, calibrating.conductor, self.in_force, self.automatic)
+        self.readiness = Readiness(core, calibrating.conclusion, calibrating.conductor, self.in_force, self.automatic)
         self.armings = Armings(core, self.readiness)
         self.gate_setup = GateSetup(core, self.readiness)
 

@@ -16,24 +16,23 @@ from typing import Final
 
 import numpy as np
 
-from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.alignment.align import Alignment, align, in_words
 from companion.calibration.alignment.align_model import Ground, ImuStand, Stand
 from companion.calibration.alignment.align_record import AlignmentRecord, imu_record, stand_record
-from companion.calibration.collector.rolling import RollingCollector, Window
-from companion.calibration.machine import Event, Machine, State
+from companion.calibration.collector.rolling import Window
+from companion.calibration.machine import Event, Machine
 from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.calibration.solution.solve import GradienterModel, up_in_vehicle, vehicle_heading_rad
-from companion.component.statustext import Say, Severity, Weight
-from companion.config import Config
+from companion.component.statustext import Severity
 from companion.configured import models
 from companion.daemon import offload as estimating
 from companion.daemon.calibrating import align_steps
 from companion.daemon.calibrating.align_steps import Plan, Seen
 from companion.daemon.calibrating.alignment import AlignmentInForce
-from companion.daemon.devices.autopilot_imu import AutopilotImu, not_ready
+from companion.daemon.calibrating.measuring import POLL_S, Measuring
+from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
-from companion.daemon.offload import Offload
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG
 from companion.samples import Vector
@@ -41,7 +40,6 @@ from companion.samples import Vector
 logger = logging.getLogger(__name__)
 
 
-POLL_S: Final = 0.2
 STAND_S: Final = 12.0
 """Of stillness a stand: averaging beyond 10 s buys an accelerometer nothing (method section 2.3)."""
 SETTLE_S: Final = 1.0
@@ -51,6 +49,9 @@ GYRO_TURN_SIGMA_DEG: Final = 3.0
 """Of a half turn by the gyros alone: scale errors of 1 %, and a turn about no vertical axis."""
 SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
+
+
+ARMED: Final = "armed during the alignment; the one before stays in force"
 
 
 def _changed(name: str) -> CalibrationRefusedError:
@@ -72,18 +73,16 @@ class Aligner:
 
     def __init__(
         self,
-        config: Config,
-        vehicle: Vehicle,
-        collector: RollingCollector,
-        imus: Mapping[str, AutopilotImu],
+        core: Core,
         machine: Machine,
+        imus: Mapping[str, AutopilotImu],
+        measuring: Measuring,
         alignment: AlignmentInForce,
-        say: Say,
-        offload: Offload,
     ) -> None:
-        self._config, self._vehicle, self._collector, self._imus = config, vehicle, collector, imus
-        self._machine, self.alignment, self._say, self._offload = machine, alignment, say, offload
-        self._stand_s = max(STAND_S, config.calibration.min_still_s)
+        self._config, self._vehicle, self._collector = core.config, core.vehicle, core.collector
+        self._offload, self._say = core.offload, core.say
+        self._machine, self._imus, self._measuring, self._alignment = machine, imus, measuring, alignment
+        self._stand_s = max(STAND_S, core.config.calibration.min_still_s)
 
     async def run(self, job: Job, plan: Plan) -> str:
         """Measure all stands, work out, keep; returns the result in one line.
@@ -93,7 +92,7 @@ class Aligner:
             JobCancelledError: cancelled; likewise.
         """
         model = models.gradienter_model(self._config.gradienter)
-        settings = self.alignment.settings()
+        settings = self._alignment.settings()
         if model is None or settings is None:
             raise CalibrationRefusedError("there is no gradienter to align: none is configured")
         local: LocalEarth | None = None
@@ -118,7 +117,7 @@ class Aligner:
         assert result is not None
         assert local is not None
         job.alignment = record = self._record(plan, result, taken, local)
-        await self.alignment.keep(record)
+        await self._alignment.keep(record)
         self._machine.on(Event.NOTHING_TO_WRITE)
         x_deg, y_deg = record.offset_deg
         return f"zero x {x_deg:+.3f} y {y_deg:+.3f} deg, sigma {record.sigma_deg:.3f}; now: companion calibrate"
@@ -135,21 +134,18 @@ class Aligner:
         loop = asyncio.get_running_loop()
         number, seen = len(taken) + 1, [one.seen for one in taken]
         wish = align_steps.request(plan, seen)
-        self._say(Severity.NOTICE, f"Align {number}/{plan.total}: {wish}", Weight.NEWS)
+        self._say(Severity.NOTICE, f"Align {number}/{plan.total}: {wish}")
         # Whoever asks may yet put it down on a better spot: what was before that does not count.
         since_s = taken[-1].window.end_s if taken else loop.time()
         moved, why = not taken, ""
         while True:
             now_s = loop.time()
-            self._check(job, taken, now_s)
-            await estimating.catch_up(self._collector, self._offload)
-            status = self._collector.status(now_s)
+            status, waiting_for = await self._measuring.look(job, ARMED)
+            self._check_offsets(taken)
             moving = self._collector.glance(now_s).moving
             if moving:
                 moved, since_s = True, now_s
             still_s = min(status.still_s, now_s - since_s - SETTLE_S)
-            doubt = models.place_doubt(self._config, self._vehicle)
-            waiting_for = not_ready(self._vehicle, self._imus) or doubt or status.waiting_for
             share = min(max(still_s, 0.0) / self._stand_s, 1.0) if moved and waiting_for is None else 0.0
             if not moved:
                 words = f"{why or f'{number - 1} done. Now {wish}'}; waiting for it to move"
@@ -159,7 +155,7 @@ class Aligner:
                 words = waiting_for if stands else f"{why or wish}; {waiting_for}"
             else:
                 words = f"measuring, {max(still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
-            self._show(measuring=share > 0.0)
+            self._measuring.show(measuring=share > 0.0)
             job.progress(100.0 * (number - 1 + share) / plan.total, f"{number} of {plan.total}: {words}")
             if moved and waiting_for is None and still_s >= self._stand_s:
                 found = await self._measure(model, taken, since_s)
@@ -167,25 +163,13 @@ class Aligner:
                 if objection is None:
                     return found
                 moved, why = False, objection
-                self._show(measuring=False)
-                self._say(Severity.NOTICE, f"Align: {objection}", Weight.NEWS)
+                self._measuring.show(measuring=False)
+                self._say(Severity.NOTICE, f"Align: {objection}")
             await job.pause(POLL_S)
 
-    def _show(self, *, measuring: bool) -> None:
-        """Let the state table follow."""
-        if measuring and self._machine.state is State.WAITING:
-            self._machine.on(Event.STILL)
-        elif not measuring and self._machine.state is State.COLLECTING:
-            self._machine.on(Event.MOVED)
-
-    def _check(self, job: Job, taken: list[_Taken], now_s: float) -> None:
-        if job.armed or self._vehicle.arm_state is ArmState.ARMED:
-            raise CalibrationRefusedError("armed during the alignment; the one before stays in force")
-        if job.deadline_s is not None and now_s >= job.deadline_s:
-            raise CalibrationRefusedError(f"not finished in the time given: {job.words}")
-        if not taken:
-            return
-        for name, offsets in self._offsets().items():
+    def _check_offsets(self, taken: list[_Taken]) -> None:
+        """Raises CalibrationRefusedError where what was measured before is void."""
+        for name, offsets in self._offsets().items() if taken else ():
             if taken[0].offsets.get(name, offsets) != offsets:
                 raise _changed(name)
 
@@ -289,7 +273,7 @@ class Aligner:
         return Ground(local.gravity_m_s2, local.gravity_sigma_m_s2, rate.mean, covariance)
 
     def _record(self, plan: Plan, result: Alignment, taken: list[_Taken], local: LocalEarth) -> AlignmentRecord:
-        settings = self.alignment.settings()
+        settings = self._alignment.settings()
         assert settings is not None
         names = [imu.name for imu in result.imus]
         stands = self._as_stands(plan, taken, names, local)

@@ -11,6 +11,7 @@ from companion.calibration.solution.solve import GradienterModel
 from companion.config import Config
 from companion.configured import models
 from companion.daemon.offload import Offload
+from companion.links.system.listeners import Listeners
 from companion.storage.alignment import AlignmentStore
 
 logger = logging.getLogger(__name__)
@@ -26,15 +27,11 @@ class AlignmentInForce:
         """What is kept, whether or not it is used."""
         self.unused: str | None = None
         """Why what is kept is not used, in one line; None while it is used, or nothing is kept."""
-        self._watchers: list[Callable[[], None]] = []
+        self._listeners: Listeners[[]] = Listeners()
 
     def watch(self, tell: Callable[[], None]) -> None:
         """Tell when another zero is in force."""
-        self._watchers.append(tell)
-
-    def _tell(self) -> None:
-        for tell in self._watchers:
-            tell()
+        self._listeners.add(tell)
 
     def load(self) -> None:
         """Read what was kept before this start; blocking. What cannot be used is set aside and said."""
@@ -52,7 +49,7 @@ class AlignmentInForce:
         """
         await self._offload(self._store.write, record)
         self._take(record)
-        self._tell()
+        self._listeners.tell()
 
     async def forget(self) -> bool:
         """Go back to what the configuration says; whether there was anything to forget.
@@ -64,7 +61,7 @@ class AlignmentInForce:
         await self._offload(self._store.clear)
         self._take(None)
         if was:
-            self._tell()
+            self._listeners.tell()
         return was
 
     def settings(self) -> GradienterSettings | None:

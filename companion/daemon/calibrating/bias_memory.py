@@ -16,7 +16,6 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
-from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.alignment.align_record import ImuAlignmentRecord
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.solution.doubt import Doubt
@@ -25,11 +24,11 @@ from companion.calibration.solution.joint import Whole, points
 from companion.calibration.solution.pose_effect import pose_effect
 from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, expect, expect_today
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
-from companion.config import Config, Noise
+from companion.config import Noise
 from companion.daemon.calibrating.alignment import AlignmentInForce
+from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.sensors import SerialSensor
-from companion.daemon.offload import Offload
 from companion.errors import StorageError
 from companion.physics.frames import vector
 from companion.storage.biases import KEEP_POINTS, BiasStore, KnownImu
@@ -63,28 +62,18 @@ class _Reference(msgspec.Struct):
 
 
 class BiasMemory:
-    """Asked before a result is used, and told of it afterwards.
-
-    Args:
-        config: which IMUs.
-        vehicle: since when the autopilot has been up.
-        imus: the autopilot's IMUs by name.
-        sensors: the serial devices.
-        alignment: the gradienter's zero in force, and what tilts have told of the IMUs.
-        offload: for the disk.
-    """
+    """Asked before a result is used, and told of it afterwards."""
 
     def __init__(
         self,
-        config: Config,
-        vehicle: Vehicle,
+        core: Core,
         imus: Mapping[str, AutopilotImu],
         sensors: Sequence[SerialSensor],
         alignment: AlignmentInForce,
-        offload: Offload,
     ) -> None:
-        self._config, self._vehicle, self._imus = config, vehicle, imus
-        self._alignment, self._offload = alignment, offload
+        config = core.config
+        self._config, self._vehicle, self._imus = config, core.vehicle, imus
+        self._alignment, self._offload = alignment, core.offload
         self._sensors = {role.name: sensor for sensor in sensors for role in sensor.roles if role.kind == "imu"}
         self._sources = {imu.name: imu for imu in config.imu}
         self._store = BiasStore(config.storage.path)

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
 from companion.calibration.collector.rolling import Settings
-from companion.calibration.machine import Event, State
+from companion.calibration.machine import Event, Machine, State
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.record import Record
@@ -26,6 +26,7 @@ from companion.config import AtArm
 from companion.daemon.calibrating.align_steps import Plan
 from companion.daemon.calibrating.aligner import Aligner
 from companion.daemon.calibrating.course import Course
+from companion.daemon.calibrating.measuring import Measuring
 from companion.daemon.calibrating.results import Results, has_written
 from companion.daemon.calibrating.start_limit import StartLimit
 from companion.daemon.calibrating.why_not import Obstacle, Rung, obstacle
@@ -33,6 +34,7 @@ from companion.daemon.core import Core
 from companion.daemon.job import ALIGNMENT, Job, JobCancelledError
 from companion.daemon.offsets.recovery import Recovery
 from companion.errors import CompanionError
+from companion.links.system.listeners import Listeners
 
 logger = logging.getLogger(__name__)
 
@@ -42,11 +44,20 @@ OnEnded = Callable[[Job, JobResult], None]
 class Conductor:
     """The calibration service behind MAVLink, the control socket and whoever else asks."""
 
-    def __init__(self, core: Core, course: Course, aligner: Aligner, recovery: Recovery, results: Results) -> None:
+    def __init__(
+        self,
+        core: Core,
+        machine: Machine,
+        measuring: Measuring,
+        course: Course,
+        aligner: Aligner,
+        recovery: Recovery,
+        results: Results,
+    ) -> None:
+        self._machine, self._measuring = machine, measuring
         self._vehicle, self._collector, self._say = core.vehicle, core.collector, core.say
         self._course, self._aligner, self._recovery, self._results = course, aligner, recovery, results
         self._has_gradienter = core.config.gradienter is not None
-        self._machine = course.machine
         self._starts = StartLimit()
         self._task: asyncio.Task[None] | None = None
         self.job: Job | None = None
@@ -55,13 +66,13 @@ class Conductor:
         self.at_arm: AtArm = core.config.calibration.at_arm
         self.only_listening = core.only_listening
         """Why nothing may be started although requests arrive: a check listens and must change nothing."""
-        self._watchers: list[OnEnded] = []
+        self._listeners: Listeners[Job, JobResult] = Listeners()
         self._unsubscribe = core.vehicle.watch(self._on_event)
         recovery.watch(self._recovered)
 
     def watch(self, on_ended: OnEnded) -> None:
         """Be told of every end, before the requester is."""
-        self._watchers.append(on_ended)
+        self._listeners.add(on_ended)
 
     # --- what others ask of it (component.service.CalibrationService)
 
@@ -80,7 +91,7 @@ class Conductor:
     @property
     def settings(self) -> Settings:
         """How good is good enough."""
-        return self._course.settings
+        return self._measuring.settings
 
     @property
     def running(self) -> Job | None:
@@ -95,16 +106,6 @@ class Conductor:
     def why_not(self, rungs: Collection[Rung] = tuple(Rung)) -> Obstacle | None:
         """What of these stands in the way of starting something."""
         return obstacle(self._vehicle, self._recovery, self.running, rungs)
-
-    @property
-    def settling_s(self) -> float:
-        """For how long the autopilot's EKF will be waited for yet, at most."""
-        return self._course.settling_s
-
-    @property
-    def dither_s(self) -> float:
-        """How long a dither under way will take yet."""
-        return self._course.dither_s
 
     @property
     def mav_state(self) -> int:
@@ -183,7 +184,7 @@ class Conductor:
     def retarget(self, *, gyro_sigma_rad_s: float | None = None, accel_sigma_m_s2: float | None = None) -> None:
         """Change how good is good enough, from the next look on."""
         changes = {"target_gyro_sigma_rad_s": gyro_sigma_rad_s, "target_accel_sigma_m_s2": accel_sigma_m_s2}
-        self._course.retarget(
+        self._measuring.retarget(
             msgspec.structs.replace(
                 self.settings, **{key: value for key, value in changes.items() if value is not None}
             )
@@ -246,8 +247,7 @@ class Conductor:
         if not (job.automatic and result.outcome == "failed" and self._vehicle.arm_state is ArmState.ARMED):
             # The pilot who has just armed has no use for the end of what nobody asked for.
             self._say(max(severity, Severity.WARNING) if job.automatic else severity, words, Weight.RESULT)
-        for watcher in self._watchers:
-            watcher(job, result)
+        self._listeners.tell(job, result)
         job.finish(result)
 
     def _on_event(self, event: VehicleEvent) -> None:

@@ -7,11 +7,10 @@ import logging
 
 import msgspec
 
-from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.solution.record import Record
-from companion.component.statustext import Say, Severity, Weight
+from companion.component.statustext import Severity
 from companion.daemon.calibrating.bias_memory import BiasMemory
-from companion.daemon.offload import Offload
+from companion.daemon.core import Core
 from companion.errors import StorageError
 from companion.storage.records import RecordStore
 
@@ -21,11 +20,9 @@ logger = logging.getLogger(__name__)
 class Results:
     """Keeps records, each with the readings that it was made of."""
 
-    def __init__(
-        self, store: RecordStore, collector: RollingCollector, memory: BiasMemory, say: Say, offload: Offload
-    ) -> None:
-        self._store, self._collector, self._memory = store, collector, memory
-        self._say, self._offload = say, offload
+    def __init__(self, core: Core, store: RecordStore, memory: BiasMemory) -> None:
+        self._store, self._memory = store, memory
+        self._collector, self._say, self._offload = core.collector, core.say, core.offload
         self.last: Record | None = None
 
     def load(self) -> None:
@@ -54,7 +51,7 @@ class Results:
                 await self._offload(save)
         except StorageError as error:
             logger.error("%s", error)  # noqa: TRY400 - the traceback tells nothing more
-            self._say(Severity.WARNING, f"Record not kept: {error}", Weight.NEWS)
+            self._say(Severity.WARNING, f"Record not kept: {error}")
 
     async def undone(self, system_id: int) -> None:
         """What the last calibration of this vehicle has written is in force no more."""

@@ -15,9 +15,12 @@ from companion.daemon.calibrating.bias_memory import BiasMemory
 from companion.daemon.calibrating.commands import Commands
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.course import Course
+from companion.daemon.calibrating.measuring import Measuring
 from companion.daemon.calibrating.results import Results
+from companion.daemon.calibrating.solving import Solving
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
+from companion.daemon.offsets.conclusion import Conclusion
 from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.subsystem import Offsets
 from companion.links.system.request import Object
@@ -33,33 +36,17 @@ class Calibrating(Subsystem):
         machine = Machine()
         self.store = RecordStore(config.storage.path)
         self.alignment = AlignmentInForce(config, core.offload)
-        self.memory = BiasMemory(config, core.vehicle, imus, devices.sensors, self.alignment, core.offload)
-        self.course = Course(
-            config,
-            machine,
-            core.vehicle,
-            core.collector,
-            imus,
-            offsets.pusher,
-            core.say,
-            core.offload,
-            offsets.reboot,
-            Ditherer(
-                config,
-                core.vehicle,
-                core.parameters,
-                imus,
-                core.collector,
-                offsets.writer,
-                offsets.ledger,
-                machine,
-            ),
-            self.alignment,
-            self.memory,
+        self.memory = BiasMemory(core, imus, devices.sensors, self.alignment)
+        measuring = Measuring(core, machine, imus)
+        self.solving = Solving(core, self.alignment, self.memory)
+        ditherer = Ditherer(core, machine, imus, offsets.writer, offsets.ledger)
+        self.conclusion = Conclusion(core, machine, offsets.effect, offsets.firmware)
+        course = Course(
+            core, machine, measuring, self.solving, ditherer, offsets.planner, offsets.pusher, self.conclusion
         )
-        aligner = Aligner(config, core.vehicle, core.collector, imus, machine, self.alignment, core.say, core.offload)
-        self._results = Results(self.store, core.collector, self.memory, core.say, core.offload)
-        self.conductor = Conductor(core, self.course, aligner, offsets.recovery, self._results)
+        aligner = Aligner(core, machine, imus, measuring, self.alignment)
+        self._results = Results(core, self.store, self.memory)
+        self.conductor = Conductor(core, machine, measuring, course, aligner, offsets.recovery, self._results)
 
     def load(self) -> None:  # noqa: D102 - as in the base class
         self.alignment.load()

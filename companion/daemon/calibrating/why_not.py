@@ -62,7 +62,7 @@ def _obstacles(vehicle: Vehicle, recovery: Recovery, job: Job | None) -> Iterato
     if vehicle.conflict is not None:
         yield Obstacle(Rung.CONFLICT, vehicle.conflict)
     if job is not None and job.is_running:
-        yield Obstacle(Rung.BUSY, f"a {job.kind} is running ({job.words or 'starting'})")
+        yield Obstacle(Rung.BUSY, f"a {job.kind} is running ({job.words or 'waiting'})")
     if vehicle.arm_state is ArmState.ARMED:
         yield Obstacle(Rung.ARMED, "armed: disarm first")
     if vehicle.arm_state is ArmState.UNKNOWN:

@@ -104,7 +104,7 @@ class Headlines:
         state = self._conductor.state
         if state is State.SETTLING:
             reason = "new offsets are in; the autopilot's EKF settles, at most so long"
-            return Headline(f"SETTLING {math.ceil(self._conductor.settling_s)} s", reason, "busy")
+            return Headline(f"SETTLING {math.ceil(job.left_s)} s", reason, "busy")
         if state is State.UNDOING:
             return Headline("PUTTING BACK", "the old values are being written", "busy")
         if state in _WRITING:

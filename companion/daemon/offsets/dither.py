@@ -17,11 +17,10 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.pace import has_passed, moment
 from companion.autopilot.parameters.writer import Change, ParameterWriter
-from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
-from companion.calibration.collector.rolling import RollingCollector, Window
+from companion.autopilot.vehicle.vehicle import ArmState
+from companion.calibration.collector.rolling import Window
 from companion.calibration.collector.sources import integer_batches
 from companion.calibration.machine import Event, Machine
 from companion.calibration.means.dither import SECONDS, STEPS, Dithered, Step, combine, shifts_lsb, why_void
@@ -29,7 +28,7 @@ from companion.calibration.means.windows import ImuWindow
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.seconds.batches import Batch
 from companion.calibration.solution.draft import Draft
-from companion.config import Config
+from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job, JobCancelledError
 from companion.daemon.offsets.ledger import Ledger
@@ -74,22 +73,12 @@ class Ditherer:
     """Replaces the means of IMUs whose integers do not tell, where the user has allowed it."""
 
     def __init__(
-        self,
-        config: Config,
-        vehicle: Vehicle,
-        parameters: ParameterClient,
-        imus: Mapping[str, AutopilotImu],
-        collector: RollingCollector,
-        writer: ParameterWriter,
-        ledger: Ledger,
-        machine: Machine,
+        self, core: Core, machine: Machine, imus: Mapping[str, AutopilotImu], writer: ParameterWriter, ledger: Ledger
     ) -> None:
-        self.enabled = config.push.dither and config.push.parameters
-        self.left_s = 0.0
-        """How long it will take yet, about; each IMU that needs it has a dither of its own."""
-        self._vehicle, self._parameters, self._imus = vehicle, parameters, imus
-        self._collector, self._writer, self._ledger, self._machine = collector, writer, ledger, machine
-        self._profiles = {imu.name: noise_profile(imu.profile) for imu in config.imu}
+        self.enabled = core.config.push.dither and core.config.push.parameters
+        self._vehicle, self._parameters, self._collector = core.vehicle, core.parameters, core.collector
+        self._machine, self._imus, self._writer, self._ledger = machine, imus, writer, ledger
+        self._profiles = {imu.name: noise_profile(imu.profile) for imu in core.config.imu}
         self._horizon_s = 180.0
 
     async def refine(self, window: Window, job: Job, draft: Draft, progress: Callable[[str], None]) -> Window:
@@ -150,7 +139,7 @@ class Ditherer:
         voids = 0
         while len(done) < STEPS:
             progress(f"dithering IMU {work.imu.instance}: step {len(done) + 1}/{STEPS}")
-            self.left_s = (STEPS - len(done)) * self._step_s()
+            job.lasts((STEPS - len(done)) * self._step_s())
             self._check(job, work)
             wanted = work.values[len(done)]
             await self._writer.apply([Change(name, in_force[name], wanted[name]) for name in wanted])
@@ -200,8 +189,7 @@ class Ditherer:
             raise CalibrationRefusedError("armed while the offsets dithered")
         if self._vehicle.boots != work.boots:
             raise AutopilotError("the autopilot rebooted while the offsets dithered")
-        if job.deadline_s is not None and asyncio.get_running_loop().time() >= job.deadline_s:
-            raise CalibrationRefusedError(f"not finished in the time given: {job.words}")
+        job.check_time()
 
     async def _collect(self, work: _Job, values: Mapping[str, float], job: Job) -> tuple[Step, str | None]:
         """The seconds of one step, after the telemetry has had time to show it, and who says that it moved."""

@@ -6,6 +6,7 @@ is of plain means.
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
@@ -13,24 +14,133 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from companion.autopilot.firmware.firmwares import settle_s
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
 from companion.autopilot.firmware.px4_slots import Sensor
+from companion.autopilot.parameters.pace import has_passed, moment
 from companion.autopilot.parameters.verify import Observation, Verdict, judge
 from companion.autopilot.parameters.writer import Change
 from companion.autopilot.telemetry.imu_stream import StreamKind
-from companion.calibration.collector.rolling import MIN_BATCHES, ImuWindow
+from companion.autopilot.vehicle.vehicle import ArmState
+from companion.calibration.collector.rolling import MIN_BATCHES, ImuWindow, Window
 from companion.calibration.noise.allan import AllanModel, floor_variance, noise_profile
 from companion.config import Noise
-from companion.daemon.offsets.far_step import FarMean
+from companion.daemon import offload as estimating
+from companion.daemon.core import Core
+from companion.daemon.offsets.plan import Plan, Target
+from companion.daemon.offsets.px4_writes import FarMean, Px4Writes, step_from_far
+from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array
 from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
+
+VERIFY_MAX_S: Final = 60.0
+"""How long the aircraft may move after the write before its effect counts as not seen."""
+LOOK_S: Final = 10.0
+"""Seconds that show a step, where a calibration must be still for longer."""
+LOOK_LONGER_S: Final = 30.0
+"""The longest look at a change that a few seconds do not show; beyond it flicker hides more than averaging shows."""
+TELEMETRY_S: Final = 2.0
+"""How long after a write the telemetry may seem to be missing."""
+POLL_S: Final = 0.2
+
+Verdicts = Mapping[str, list[Verdict]]
+"""By IMU."""
 
 # Between two neighbouring windows of some ten seconds an unnamed part is taken for an ordinary one (floors of 8 deg/h
 # and 50 micro-g), not for the worst there is as over the minutes of sigma_use: else no step could ever be seen.
 ORDINARY_FLICKER: Final = (8.0 / 0.664 * DEG_H, 0.05 / 0.664 * MG)
 TOLERANCE_SIGMAS: Final = 2.0
 """What may remain besides noise: nobody claims the bias better than by its sigma_use."""
+
+
+class EffectWatch:
+    """Waits for a still stretch of telemetry after a write, and judges it."""
+
+    def __init__(self, core: Core, px4: Px4Writes) -> None:
+        self._vehicle, self._collector, self._offload, self._px4 = core.vehicle, core.collector, core.offload, px4
+        self._profiles = {imu.name: imu.profile for imu in core.config.imu}
+        self._look_s = min(LOOK_S, core.config.calibration.min_still_s)
+
+    async def look(
+        self, plan: Plan, before: Window, go_on: Callable[[str], None], boots: int
+    ) -> tuple[Verdicts | None, str]:
+        """Verdicts by IMU, or why there were none to be had; a step that only just cannot be seen is looked at longer.
+
+        Args:
+            plan: what was written.
+            before: the telemetry until then.
+            go_on: told now and then what is going on; what it raises ends the look.
+            boots: of the autopilot, as many as before.
+        """
+        watched = [target for target in plan.targets if target.watched]
+        if not watched:
+            return None, "no autopilot IMU is in the telemetry"
+        loop = asyncio.get_running_loop()
+        written = moment(self._vehicle)
+        words = "waiting for the telemetry"
+        while not has_passed(self._vehicle, written, settle_s(self._vehicle.firmware)):
+            go_on(words)
+            await asyncio.sleep(POLL_S)
+        since_s = loop.time()
+        verdicts: Verdicts | None = None
+        while (looked_s := loop.time() - since_s) < VERIFY_MAX_S:
+            go_on(words)
+            if self._vehicle.arm_state is ArmState.ARMED:
+                return verdicts, "armed right after the write"
+            if self._vehicle.boots != boots:
+                return None, "the autopilot rebooted right after the write"
+            words = self._in_the_way(looked_s)
+            if not words:
+                try:
+                    after = await estimating.window(self._collector, self._offload, since_s=since_s)
+                except CalibrationRefusedError as error:
+                    words = str(error)
+                else:
+                    verdicts = {target.name: self._judge(target, before, after) for target in watched}
+                    words = _inconclusive(verdicts, loop.time() - since_s)
+                    if not words:
+                        return verdicts, ""
+            await asyncio.sleep(POLL_S)
+        return verdicts, f"not still within {VERIFY_MAX_S:.0f} s after the write ({words})"
+
+    def _in_the_way(self, looked_s: float) -> str:
+        """What is waited for before there is something to judge; empty when there is."""
+        now_s = asyncio.get_running_loop().time()
+        status = self._collector.status(now_s)
+        words = status.waiting_for or ""
+        if words and status.still_s > 0.0:
+            # How long a calibration must be still says nothing about how long a step takes to show.
+            moves = self._collector.glance(now_s).obstacle
+            words = "" if moves is None else moves.words
+            if not words and status.still_s < self._look_s:
+                words = f"hold still {self._look_s - status.still_s:.0f} s more"
+        if words and looked_s < TELEMETRY_S:
+            return "waiting for the telemetry"  # which was not taken during the write
+        return f"checking the new offsets: {words}" if words else ""
+
+    def _judge(self, target: Target, before: Window, after: Window) -> list[Verdict]:
+        sides = Sides(
+            before=next(imu for imu in before.imus if imu.name == target.name),
+            after=next(imu for imu in after.imus if imu.name == target.name),
+            gyro_residual=target.solution.gyro_rad_s,
+            accel_residual=target.solution.accel_m_s2,
+        )
+        on_the_way = OnTheWay(
+            self._px4.seen_far(target.calibration), *step_from_far(target.calibration, target.changes)
+        )
+        profile = self._profiles[target.name]
+        return judge_vectors(sides, target.calibration, list(target.changes), target.kind, profile, on_the_way)
+
+
+def _inconclusive(verdicts: Verdicts, looked_s: float) -> str:
+    """Why the look goes on; empty when what was seen is the last word."""
+    found = [verdict for each in verdicts.values() for verdict in each]
+    # The scatter of two seconds says little of their mean: nothing is called wrong on so little.
+    hasty = looked_s < LOOK_S and not all(verdict.ok for verdict in found)
+    if looked_s > LOOK_LONGER_S or not (hasty or any(nearly_visible(verdict) for verdict in found)):
+        return ""
+    return f"the change {'does not show' if hasty else 'is small'}: looking longer"
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

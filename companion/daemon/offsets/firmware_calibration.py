@@ -20,6 +20,8 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import Final
 
+import msgspec
+
 from companion.autopilot.firmware.gyro_calibration import (
     GyroParameters,
     Outcome,
@@ -130,7 +132,7 @@ class FirmwareCalibration:
             await self._put_back(changes, before, boots, error)
             raise
         # What was in force before all this is what the record says, not the firmware's coarse value in between.
-        written |= {c.parameter: _with_before(fine[c.parameter], c.before) for c in gyros}
+        written |= {c.parameter: msgspec.structs.replace(fine[c.parameter], before=c.before) for c in gyros}
         warnings = [calibration.words] if calibration.words else []
         if collateral:
             warnings.append(
@@ -200,10 +202,6 @@ class FirmwareCalibration:
 def settles_within_s(outcome: Outcome | None) -> float:
     """How long the EKF is waited for after a write, at most, by what became of the firmware's calibration."""
     return SETTLE_RESET_S if outcome == "reset" else SETTLE_ALONE_S
-
-
-def _with_before(written: WrittenParameter, before: float) -> WrittenParameter:
-    return WrittenParameter(before=before, after=written.after, read_back=written.read_back, outcome=written.outcome)
 
 
 def _outcomes(changes: Sequence[Change], left: Sequence[str]) -> dict[str, WrittenParameter]:

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Final
 
+import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.firmwares import read_calibration, warnings_about
 from companion.autopilot.firmware.gyro_calibration import Outcome as FirmwareOutcome
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for, whole_of
 from companion.autopilot.firmware.px4_slots import SlotMemory
-from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.writer import Change
 from companion.autopilot.telemetry.imu_stream import StreamKind
-from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.solution.draft import Draft
+from companion.calibration.solution.record import Outcome, WrittenParameter
 from companion.calibration.solution.solve import ImuSolution, Solution
-from companion.config import Config
+from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.offsets.rivalry import Rivalry
 from companion.errors import AutopilotError
@@ -70,6 +70,19 @@ class Plan:
             if change.parameter in target.calibration.parameters.gyro_offset
         )
 
+    def note(self, draft: Draft, written: Mapping[str, WrittenParameter]) -> None:
+        """Enter what became of the parameters."""
+        for target in self.targets:
+            kept = draft.written.setdefault(target.name, {})
+            kept.update({c.parameter: written[c.parameter] for c in target.changes if c.parameter in written})
+
+    def mark(self, draft: Draft, parameters: Collection[str], outcome: Outcome) -> None:
+        """Change what was entered of these."""
+        for target in self.targets:
+            kept = draft.written.get(target.name, {})
+            for name in kept.keys() & set(parameters):
+                kept[name] = msgspec.structs.replace(kept[name], outcome=outcome)
+
     @property
     def everything(self) -> tuple[Change, ...]:
         """All that has changed, in the order in which it did."""
@@ -79,18 +92,10 @@ class Plan:
 class Planner:
     """Works out what a solution means for the parameters of the autopilot."""
 
-    def __init__(
-        self,
-        config: Config,
-        vehicle: Vehicle,
-        parameters: ParameterClient,
-        imus: Mapping[str, AutopilotImu],
-        memory: SlotMemory,
-        rivalry: Rivalry,
-    ) -> None:
-        self._vehicle, self._parameters, self._imus = vehicle, parameters, imus
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], memory: SlotMemory, rivalry: Rivalry) -> None:
+        self._vehicle, self._parameters, self._imus = core.vehicle, core.parameters, imus
         self._memory, self._rivalry = memory, rivalry
-        self._sources = {imu.name: imu for imu in config.imu}
+        self._sources = {imu.name: imu for imu in core.config.imu}
 
     async def plan(self, solution: Solution, draft: Draft, *, push: bool) -> Plan:
         """Work out which parameter gets which value; fills the draft's whole biases and warnings.
@@ -178,9 +183,6 @@ def _residual_of_consumer(calibration: ImuCalibration, found: ImuSolution) -> tu
         board = rotation.T @ found.accel_m_s2
         accel = rotation @ (scale * (board - np.asarray(calibration.accel_offset_m_s2)))
     return gyro, accel
-
-
-_ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 
 
 def _vector(values: Array | None) -> Vector | None:

@@ -1,57 +1,238 @@
-"""What a write to PX4 needs besides the writing: whose output it moves, and which offsets are in use at all."""
+"""What a write to PX4 needs besides the writing: whose output it moves, and which offsets are in use at all.
+
+Which slot belongs to which SCALED_IMU is a guess (autopilot.px4_slots) until a far value is in force and seen in the
+telemetry of all IMUs. The far step is large beside noise and truncation, and each IMU that is written makes another
+one, so a second of samples tells them apart; the small change itself often could not be seen at all.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import dataclasses
+import functools
 import logging
+import math
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step, vector_changes
-from companion.autopilot.firmware.px4_slots import Sensor, SlotMemory
+from companion.autopilot.firmware.px4_slots import NO_IMU, WORDS, Sensor, SlotMemory
 from companion.autopilot.parameters.change import Change, WriteFailedError
+from companion.autopilot.parameters.pace import let_pass, moment
 from companion.autopilot.parameters.writer import ParameterWriter
+from companion.autopilot.telemetry import imu_messages
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.offsets.far_step import FarMean, FarStep, FarStepWatch
 from companion.daemon.offsets.ledger import Ledger
+from companion.links.mavlink.link import MavlinkLink, Message
+from companion.physics.frames import Array
 from companion.samples import Vector
 from companion.storage.changes import ChangeSet
 
 logger = logging.getLogger(__name__)
 
 SENSORS: Final[tuple[Sensor, Sensor]] = ("accel", "gyro")
+RATE_HZ: Final = 50.0
+"""Asked of the IMUs that nobody listens to otherwise."""
+HEAR_S: Final = 0.4
+BEFORE_S: Final = 1.0
+SETTLE_S: Final = 1.3
+"""PX4 looks at its parameters at most once a second (autopilots 9.2)."""
+LOOK_S: Final = 1.2
+LEAST_SAMPLES: Final = 5
+MATCH: Final = 0.4
+"""Of the expected step: so far may what was seen be from it. PX4 may have used other offsets than its parameters say,
+by up to 0.01 of the 0.035 rad/s (0.087 m/s^2) that a far step has at least."""
 
 Look = Callable[[], Awaitable[str | None]]
 
 
-class Px4Writes:
-    """Stands by while parameters are written; of ArduPilot's it has nothing to say.
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class FarStep:
+    """What the output of one IMU must do when a far value comes into force in the slot of one of its sensors."""
 
-    Args:
-        vehicle: the autopilot.
-        writer: of its parameters.
-        ledger: where the old values are kept.
-        watch: of the telemetry.
-        memory: of what was learned about slots.
-        say: words for the ground stations.
-    """
+    instance: int
+    sensor: Sensor
+    device_id: int
+    slot: str
+    """For people: CAL_GYRO0."""
+    step: Array
+    """(3,), rad/s or m/s^2, vehicle FRD."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class FarMean:
+    """An output while a far value was in force: mean and its sigma, (3,), rad/s or m/s^2, vehicle FRD."""
+
+    mean: Array
+    sigma: Array
+
+
+class _Sums:
+    """Samples of all IMUs over one stretch."""
+
+    def __init__(self) -> None:
+        self._sums: dict[tuple[int, Sensor], list[Array]] = {}
+
+    def add(self, instance: int, reading: imu_messages.Reading) -> None:
+        self._sums.setdefault((instance, "gyro"), []).append(np.array(reading.gyro_rad_s))
+        self._sums.setdefault((instance, "accel"), []).append(np.array(reading.accel_m_s2))
+
+    def mean(self, instance: int, sensor: Sensor) -> FarMean | None:
+        samples = self._sums.get((instance, sensor), ())
+        if len(samples) < LEAST_SAMPLES:
+            return None
+        values = np.array(samples)
+        return FarMean(values.mean(axis=0), values.std(axis=0, ddof=1) / math.sqrt(len(samples)))
+
+
+class _FarStepWatch:
+    """Watches the telemetry of all IMUs over a write in two steps, and tells the memory what was seen."""
+
+    def __init__(self, link: MavlinkLink, vehicle: Vehicle, memory: SlotMemory) -> None:
+        self.means: Mapping[tuple[int, Sensor], FarMean] = {}
+        """By instance, from the last look: only of what moved as it should."""
+        self._link, self._vehicle, self._memory = link, vehicle, memory
+        self.learned = False
+        """Whether the last look has told anything of the slots that was not known."""
+        self._sums: _Sums | None = None
+        self._heard: set[int] = set()
+        self._unknown: set[int] = set()
+        """IMUs of which nobody could say whether there is such a one."""
+
+    @contextlib.asynccontextmanager
+    async def watching(self, steps: Sequence[FarStep]) -> AsyncIterator[Callable[[], Awaitable[str | None]] | None]:
+        """Collect from now on; gives what to call while the far values are in force (None: there are none)."""
+        self.means, self.learned = {}, False
+        if not steps:
+            yield None
+            return
+        self._heard.clear()
+        self._unknown.clear()
+        boots = self._vehicle.boots
+        subscriptions = [self._subscribe(instance) for instance in imu_messages.PX4]
+        asked: list[int] = []
+        try:
+            await asyncio.sleep(HEAR_S)
+            for instance, (message, *_) in imu_messages.PX4.items():
+                if instance not in self._heard:
+                    asked.append(message.message.id)
+                    self._unknown.add(instance)
+                    answer = self._vehicle.commands.request_message_interval(message.message.id, RATE_HZ)
+                    answer.add_done_callback(functools.partial(self._answered, instance))
+            self._sums = before = _Sums()
+            await let_pass(self._vehicle, moment(self._vehicle), BEFORE_S)
+            self._sums = None
+
+            async def look() -> str | None:
+                await let_pass(self._vehicle, moment(self._vehicle), SETTLE_S)
+                self._sums = during = _Sums()
+                await let_pass(self._vehicle, moment(self._vehicle), LOOK_S)
+                self._sums = None
+                # A restart brings other offsets into use by itself: whoever moved or did not, it says nothing.
+                return None if self._vehicle.boots != boots else self._judge(steps, before, during)
+
+            yield look
+        finally:
+            self._sums = None
+            for unsubscribe in subscriptions:
+                unsubscribe()
+            for message_id in asked:
+                self._vehicle.commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 0.0)
+
+    def _answered(self, instance: int, answer: asyncio.Future[int | None]) -> None:
+        if answer.result() is not None:
+            self._unknown.discard(instance)
+
+    def _subscribe(self, instance: int) -> Callable[[], None]:
+        kind = imu_messages.PX4[instance][0]
+
+        def take(message: Message, _t_s: float) -> None:
+            reading = kind.decode(message) if self._vehicle.sent(message) else ""
+            if not isinstance(reading, str) and not reading.all_zero:
+                self._heard.add(instance)
+                if self._sums is not None:
+                    self._sums.add(instance, reading)
+
+        return self._link.subscribe(kind.message, take)
+
+    def _judge(self, steps: Sequence[FarStep], before: _Sums, during: _Sums) -> str | None:
+        """Remember whose output moved; why this is not as it was believed, if so."""
+        wrong: list[str] = []
+        means: dict[tuple[int, Sensor], FarMean] = {}
+        for step in steps:
+            rivals = [each for each in steps if each.sensor == step.sensor]
+            moved: list[int] = []
+            still: list[int] = []
+            for instance in imu_messages.PX4:
+                was, now = before.mean(instance, step.sensor), during.mean(instance, step.sensor)
+                if was is None or now is None:
+                    continue
+                made = now.mean - was.mean
+                cause = _cause(made, rivals)
+                if cause is step:
+                    moved.append(instance)
+                    if instance == step.instance:
+                        means[instance, step.sensor] = now
+                elif cause is not None or np.linalg.norm(made) < MATCH * np.linalg.norm(step.step):
+                    still.append(instance)
+            words = self._conclude(step, moved, still)
+            if words is not None:
+                wrong.append(words)
+        self.means = means
+        return "; ".join(wrong) or None
+
+    def _conclude(self, step: FarStep, moved: list[int], still: list[int]) -> str | None:
+        word = WORDS[step.sensor]
+        if moved == [step.instance]:
+            self._memory.learn(step.sensor, step.device_id, step.instance)
+            return None
+        if len(moved) == 1 and step.instance in still:
+            self._learn(step, moved[0])
+            return f"the offsets in {step.slot} act on the {word} of IMU {moved[0]}, not of IMU {step.instance}"
+        if not moved and step.instance in still:
+            words = f"the offsets in {step.slot} do not act on the {word} of IMU {step.instance}"
+            if self._memory.holds_strangers(step.sensor, len(self._heard | self._unknown)):
+                self._learn(step, NO_IMU)
+                return words
+            # Every slot is somebody's: there is another reason, and what would be tried next is another IMU's.
+            return f"{words}: PX4 does not use what it has stored, or it moved"
+        if len(moved) > 1:
+            return f"the offsets in {step.slot} seem to act on IMU {' and '.join(map(str, moved))} at once"
+        logger.warning("%s: it cannot be told yet which IMU its offsets act on", step.slot)
+        return None
+
+    def _learn(self, step: FarStep, instance: int) -> None:
+        self.learned = True
+        self._memory.learn(step.sensor, step.device_id, instance)
+
+
+def _cause(made: Array, steps: Sequence[FarStep]) -> FarStep | None:
+    """The step that an output made, if it made one."""
+    nearest = min(steps, key=lambda step: float(np.linalg.norm(made - step.step)))
+    off = float(np.linalg.norm(made - nearest.step))
+    return nearest if off < MATCH * float(np.linalg.norm(nearest.step)) else None
+
+
+class Px4Writes:
+    """Stands by while parameters are written; of ArduPilot's it has nothing to say."""
 
     def __init__(
         self,
+        link: MavlinkLink,
         vehicle: Vehicle,
         writer: ParameterWriter,
         ledger: Ledger,
-        watch: FarStepWatch,
         memory: SlotMemory,
         say: Say,
     ) -> None:
         self._vehicle, self._writer, self._ledger = vehicle, writer, ledger
-        self._watch, self._memory, self._say = watch, memory, say
+        self._watch, self._memory, self._say = _FarStepWatch(link, vehicle, memory), memory, say
 
     @contextlib.asynccontextmanager
     async def standing_by(

@@ -17,6 +17,7 @@ from companion.calibration.solution.record import WrittenParameter
 from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.offsets.ledger import Ledger
 from companion.errors import AutopilotError, ParameterRefusedError, StorageError
+from companion.links.system.listeners import Listeners
 from companion.storage.changes import Changed, ChangeSet
 
 logger = logging.getLogger(__name__)
@@ -44,11 +45,11 @@ class Recovery:
         self._ledger, self._say, self._changing = ledger, say, changing
         self._command = command
         """By which people ask for an undo."""
-        self._watchers: list[Callable[[str], None]] = []
+        self._listeners: Listeners[str] = Listeners()
 
     def watch(self, on_recovered: Callable[[str], None]) -> None:
         """Be told, in words, of what was put in order."""
-        self._watchers.append(on_recovered)
+        self._listeners.add(on_recovered)
 
     @property
     def fault(self) -> str | None:
@@ -109,8 +110,7 @@ class Recovery:
         if foreign:
             words += f"; changed by others, left alone: {', '.join(foreign)}"
         logger.warning("%s", words)
-        for watcher in self._watchers:
-            watcher(words)
+        self._listeners.tell(words)
         self._say(Severity.WARNING, words, Weight.RESULT)
 
     async def undo(self, *, force: bool = False) -> dict[str, WrittenParameter]:

@@ -9,13 +9,12 @@ from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.ekf import EkfWatch
 from companion.daemon.core import Core, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.offsets.far_step import FarStepWatch
+from companion.daemon.offsets.effect import EffectWatch
 from companion.daemon.offsets.firmware_calibration import FirmwareCalibration
 from companion.daemon.offsets.ledger import Ledger
 from companion.daemon.offsets.plan import Planner
 from companion.daemon.offsets.push import Pusher
 from companion.daemon.offsets.px4_writes import Px4Writes
-from companion.daemon.offsets.reboot import Reboot
 from companion.daemon.offsets.recovery import Recovery
 from companion.daemon.offsets.rivalry import Rivalry
 from companion.links.system.request import Object
@@ -32,22 +31,12 @@ class Offsets(Subsystem):
         self.ledger = Ledger(ChangeLog(config.storage.path), core.offload)
         self.writer = ParameterWriter(parameters, vehicle)
         self.rivalry = Rivalry(vehicle, imus, core.say, stop_rivals=config.push.stop_rivals)
-        far = FarStepWatch(core.link, vehicle, devices.slots)
-        self.pusher = Pusher(
-            config,
-            vehicle,
-            parameters,
-            imus,
-            core.collector,
-            self.writer,
-            self.ledger,
-            Px4Writes(vehicle, self.writer, self.ledger, far, devices.slots, core.say),
-            Planner(config, vehicle, parameters, imus, devices.slots, self.rivalry),
-            FirmwareCalibration(vehicle, parameters, self.writer, self.ledger, EkfWatch(core.link, vehicle)),
-            core.offload,
-        )
+        px4 = Px4Writes(core.link, vehicle, self.writer, self.ledger, devices.slots, core.say)
+        self.firmware = FirmwareCalibration(vehicle, parameters, self.writer, self.ledger, EkfWatch(core.link, vehicle))
+        self.effect = EffectWatch(core, px4)
+        self.planner = Planner(core, imus, devices.slots, self.rivalry)
+        self.pusher = Pusher(core, imus, self.writer, self.ledger, px4, self.firmware, self.effect)
         self.recovery = Recovery(vehicle, parameters, self.writer, self.ledger, core.say, devices.changing)
-        self.reboot = Reboot(vehicle, parameters, self.pusher, core.say)
 
     def load(self) -> None:  # noqa: D102 - as in the base class
         self.ledger.load()

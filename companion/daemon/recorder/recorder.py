@@ -91,7 +91,7 @@ class Recorder(Subsystem):
         link.tap = self._on_mavlink
         for sensor in self._sensors.values():
             sensor.tap = self._on_serial
-        calibrating.course.watch(self._on_solved)
+        calibrating.solving.watch(self._on_solved)
         calibrating.conductor.watch(self._on_ended)
 
     # --- what happens

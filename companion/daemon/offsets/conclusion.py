@@ -1,4 +1,4 @@
-"""Restarting the autopilot, when asked to, and seeing that it came back with what was written."""
+"""After the write: restarting the autopilot when asked to, and seeing that it came back with what was written."""
 
 from __future__ import annotations
 
@@ -12,15 +12,17 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.firmware.firmwares import needs_reboot, stale_tilt_deg
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.float32 import same_float32
-from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.collector.rolling import Window
+from companion.calibration.machine import Event, Machine
 from companion.calibration.solution.draft import Draft
-from companion.component.statustext import Say, Severity, Weight
+from companion.component.statustext import Severity, Weight
+from companion.daemon.core import Core
 from companion.daemon.job import Job, JobCancelledError
+from companion.daemon.offsets.effect import EffectWatch, in_short
+from companion.daemon.offsets.firmware_calibration import FirmwareCalibration, settles_within_s
 from companion.daemon.offsets.plan import Plan
-from companion.daemon.offsets.push import Pusher
 from companion.errors import AutopilotError, AutopilotRebootedError, ParameterTimeoutError
 
 logger = logging.getLogger(__name__)
@@ -31,7 +33,7 @@ STORED_AFTER_S: Final = 3.0
 """PX4 saves its parameters up to 2 s after a change, ArduPilot from a queue (autopilots section 8)."""
 ANSWER_S: Final = 3.0
 BACK_WITHIN_S: Final = 60.0
-REBOOTING_PERCENT: Final = 95.0
+CONCLUDING_PERCENT: Final = 95.0
 POLL_S: Final = 0.2
 GATED_TILT_DEG: Final = 0.3
 """Tilt that an autopilot may have kept from before a write, above which the arm gate waits for its restart. A smaller
@@ -57,18 +59,12 @@ def why_not(calibrations: Sequence[ImuCalibration], changes: Sequence[Change]) -
     return None
 
 
-class Reboot:
-    """Restarts one autopilot.
+class Conclusion:
+    """What follows a write that is done and stays: a restart where one was asked for, or the settling of the EKF."""
 
-    Args:
-        vehicle: it.
-        parameters: its parameters.
-        pusher: whose writes are to be seen again afterwards.
-        say: words for the ground stations.
-    """
-
-    def __init__(self, vehicle: Vehicle, parameters: ParameterClient, pusher: Pusher, say: Say) -> None:
-        self._vehicle, self._parameters, self._pusher, self._say = vehicle, parameters, pusher, say
+    def __init__(self, core: Core, machine: Machine, effect: EffectWatch, firmware: FirmwareCalibration) -> None:
+        self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
+        self._machine, self._effect, self._firmware = machine, effect, firmware
         self._stale: tuple[int, float] | None = None
         """Boots seen when a write left a stale tilt behind, and its size in degrees."""
 
@@ -80,36 +76,62 @@ class Reboot:
         return f"reboot first: tilt up to {self._stale[1]:.1f} deg off"
 
     async def conclude(self, job: Job, plan: Plan, before: Window, draft: Draft) -> None:
-        """After a write that is done and stays: restart the autopilot if that was asked for, else say if it is needed.
+        """See to it that what was written is used, and say what the pilot still has to do.
 
         Raises:
-            AutopilotError: it has not come back, or not with what was written.
+            AutopilotError: the autopilot has not come back, or not with what was written.
         """
-
-        def go_on(words: str) -> None:
-            job.check_cancelled()
-            job.progress(REBOOTING_PERCENT, words or "watching the telemetry after the reboot")
-
-        if job.reboot:
-            try:
-                draft.notes.append(await self._after(plan, before, draft.warnings.append, go_on))
-            except NotRebootedError as error:
-                why_not = str(error)
-            except JobCancelledError as cancelled:
-                why_not = f"{cancelled} before the reboot was confirmed; the new offsets stay"
-            else:
-                return
-            draft.warnings.append(why_not)
-            self._say(Severity.WARNING, why_not, Weight.NEWS)
-        if needs_reboot(plan.changes):
+        boots = self._vehicle.boots
+        not_rebooted = await self._restart(job, plan, before, draft) if job.reboot else ""
+        if not_rebooted:
+            draft.warnings.append(not_rebooted)
+            self._say(Severity.WARNING, not_rebooted, Weight.NEWS)
+        if needs_reboot(plan.changes) and not (job.reboot and not not_rebooted):
             self._stale = (self._vehicle.boots, stale_tilt_deg(plan.changes))
             draft.warnings.append(
                 "PX4's attitude stays wrong for minutes after new accelerometer offsets: reboot the autopilot before"
                 " flight (companion calibrate --reboot does)"
             )
             self._say(Severity.WARNING, "Reboot the autopilot before flight", Weight.RESULT)
+        self._machine.on(Event.VERIFIED)
+        if self._vehicle.boots == boots:  # after a restart the EKF has started afresh
+            await self._settle(job, plan, draft)
+            if self._vehicle.boots != boots:
+                await self._survived(plan, draft)
 
-    async def survived(self, plan: Plan, draft: Draft) -> None:
+    async def _restart(self, job: Job, plan: Plan, before: Window, draft: Draft) -> str:
+        """Restart it; why that was not done or not seen to its end, or empty."""
+
+        def go_on(words: str) -> None:
+            job.check_cancelled()
+            job.progress(CONCLUDING_PERCENT, words or "watching the telemetry after the reboot")
+
+        self._machine.on(Event.REBOOT)
+        try:
+            draft.notes.append(await self._after(plan, before, draft.warnings.append, go_on))
+        except NotRebootedError as error:
+            return str(error)
+        except JobCancelledError as cancelled:
+            return f"{cancelled} before the reboot was confirmed; the new offsets stay"
+        return ""
+
+    async def _settle(self, job: Job, plan: Plan, draft: Draft) -> None:
+        """The write is done and stays; a cancel ends only the waiting for the autopilot's EKF."""
+
+        def go_on(words: str) -> None:
+            job.check_cancelled()
+            job.progress(CONCLUDING_PERCENT, words)
+
+        job.lasts(settles_within_s(plan.firmware))
+        try:
+            words = await self._firmware.settle(plan.gyros, plan.firmware, go_on)
+        except JobCancelledError as cancelled:
+            words = f"{cancelled} while the EKF was settling: the new offsets stay, wait 2 min before take-off"
+        if words is not None:
+            draft.warnings.append(words)
+            self._say(Severity.WARNING, words, Weight.NEWS)
+
+    async def _survived(self, plan: Plan, draft: Draft) -> None:
         """After a restart that nobody here asked for: see that what was written is still there.
 
         Raises:
@@ -120,7 +142,7 @@ class Reboot:
             await asyncio.sleep(POLL_S)
         changed = await self._changed(plan.changes)
         if changed:
-            self._pusher.mark_lost(plan, draft, changed)
+            plan.mark(draft, changed, "failed")
             raise AutopilotError(f"the autopilot restarted and replaced {', '.join(changed)}: calibrate again")
 
     async def _after(self, plan: Plan, before: Window, warn: Callable[[str], None], go_on: GoOn) -> str:
@@ -132,7 +154,9 @@ class Reboot:
         changed = await self._changed(plan.changes)
         if changed:
             raise AutopilotError("; ".join(changed.values()))
-        problems, unseen = await self._pusher.look_again(plan, before, go_on)
+        verdicts, unseen = await self._effect.look(plan, before, go_on, self._vehicle.boots)
+        found = (verdicts or {}).items()
+        problems = [f"imu {name}: {in_short(verdict)}" for name, each in found for verdict in each if not verdict.ok]
         if problems:
             raise AutopilotError(f"after the reboot: {'; '.join(problems)}")
         if unseen:
