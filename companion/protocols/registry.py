@@ -66,7 +66,7 @@ PROTOCOLS: dict[Kind, dict[str, ProtocolInfo]] = {
         "inclinometer_xy": ProtocolInfo(
             "inclinometer_xy", 9600, "none", InclinometerXyDecoder, InclinometerXyDialogue, lag_s=0.43
         ),
-        # MD900-T; a LILY comes set to 19200 baud. How long its fluid takes is not documented.
+        # MD900-T. How long its fluid takes is not documented.
         "jewell": ProtocolInfo("jewell", 9600, "none", JewellDecoder, JewellDialogue),
         # Honeywell: null 0.4 deg, 0.5 deg to 30 deg of tilt. Not in it: 1 deg of thermal hysteresis at the most.
         "hmr3300": ProtocolInfo(

@@ -30,10 +30,6 @@ NEAR_DEG: Final = 0.5
 """Far less than what would have to be seen of a tilt or a turn. Whoever takes the aircraft in hand may be the cause of
 the hang: then the first of the equal readings comes in the middle of the motion, and the pose before it counts."""
 
-RAILS_DEG: Final = {"jewell": (math.degrees(330e-6), "330 microradians, the end of a LILY's range")}
-"""Readings that look like data and are the end of the range (OOI's logs of a Jewell LILY: -202.490,-330.000)."""
-_RAIL_SAMPLES: Final = 3
-_RAIL_TOLERANCE_DEG: Final = 1e-6
 _HARMLESS: Final = frozenset(
     {
         reasons.CALIBRATING,
@@ -100,7 +96,6 @@ class StreamHealth:
         self._reading: object = None
         self._near: tuple[float, ...] | None = None
         self._same = 0
-        self._rail = 0
         self._clock_s: float | None = None
         self._period_s = 0.0
         self._marks: deque[_Mark] = deque()
@@ -112,7 +107,7 @@ class StreamHealth:
         self._tail, self._first_bad_s, self._clock_s = b"", None, None
         self.last_byte_s = self.unchanged_since_s = self._reading = None
         self.near_since_s = self._near = None
-        self._same = self._rail = 0
+        self._same = 0
         self.speaks, self._guess, self._guessed_s = None, "", -math.inf
 
     def excuse(self) -> None:
@@ -154,7 +149,6 @@ class StreamHealth:
         elif isinstance(sample, TiltSample):
             reading = (sample.x_deg, sample.y_deg)
             self._look_whether_near(reading, t_s)
-            self._look_at_rail(sample)
         elif isinstance(sample, CompassSample):
             reading = (sample.heading_deg, sample.pitch_deg, sample.roll_deg)
             self._look_whether_near((sample.heading_deg,), t_s)
@@ -182,13 +176,6 @@ class StreamHealth:
             return
         words = f"its clock went back from {before_s:.1f} s to {clock_s:.1f} s: it has started anew"
         self.events.append(Trouble("clock back", words))
-
-    def _look_at_rail(self, sample: TiltSample) -> None:
-        rail = RAILS_DEG.get(self._protocol)
-        if rail is None:
-            return
-        at_end = any(abs(abs(axis) - rail[0]) < _RAIL_TOLERANCE_DEG for axis in (sample.x_deg, sample.y_deg))
-        self._rail = self._rail + 1 if at_end else 0
 
     def trouble(self, now_s: float) -> Trouble | None:
         """What is wrong with what comes, or with nothing coming, at `now_s` on an open port."""
@@ -223,9 +210,6 @@ class StreamHealth:
         return ""
 
     def _lying(self) -> Trouble | None:
-        if self._rail >= _RAIL_SAMPLES:
-            words = f"reads exactly {RAILS_DEG[self._protocol][1]}: level its base"
-            return Trouble("end of range", words, implausible=True)
         since_s, last_s = self.unchanged_since_s, self.last_sample_s
         if since_s is None or last_s is None or self._same < STUCK_SAMPLES or last_s - since_s < STUCK_S:
             return None

@@ -7,14 +7,7 @@ import contextlib
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
-import pytest
-
-from companion.calibration.machine import State
-from companion.calibration.request import What
-from companion.protocols import stream_health
-from companion.protocols.stream_health import RAILS_DEG
 from sim.devices import Frame
-from tests.e2e.test_calibration import started
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -56,28 +49,5 @@ def test_a_silent_gradienter_is_the_headline_with_what_to_look_at(tmp_path: Path
             assert headline["reason"].startswith("gradienter: /nowhere/gradienter at 9600 baud")
             rig.unplugged.clear()
             await rig.until(lambda: "silent" not in rig.service.faces.answers.status()["headline"]["reason"], 3.0)
-
-    run_virtual(main())
-
-
-def test_no_calibration_is_made_with_a_gradienter_at_its_rail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # The rail of a device whose family is here: what a LILY does in microradians.
-    monkeypatch.setattr(stream_health, "RAILS_DEG", {"inclinometer_xy": (3.3, RAILS_DEG["jewell"][1])})
-
-    async def main() -> None:
-        async with watched(Rig(tmp_path)) as rig:
-            saying(rig, lambda n: f"X=-03.300\r\nY=+04.{990 + n % 10:03d}\r\n".encode())
-            await asyncio.sleep(3.0)
-            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
-            await asyncio.sleep(60.0)
-            assert not job.finished.done()
-            assert rig.service.calibrating.conductor.state is State.WAITING
-            device = next(one for one in rig.service.status()["devices"] if one["name"] == "gradienter")
-            assert device["trouble"] == "end of range"
-            assert device["counts"]["end of range"] == 1
-            saying(rig, lambda n: f"X=-03.{n % 10:03d}\r\nY=+04.{990 + n % 10:03d}\r\n".encode())
-            await rig.until(job.finished.done, 60.0)
-            assert job.record is not None
-            assert job.record.imus[0].accel_bias_m_s2 is not None
 
     run_virtual(main())

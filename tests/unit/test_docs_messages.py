@@ -29,7 +29,7 @@ NOT_MESSAGES = {
     # When a rival acts, and whether a rival does: keys, not words for people.
     "at a start", "while still", "after a flight",
     # Keys of `counts` in `status --json`: their words have rows.
-    "slow bridge", "clock back", "end of range",
+    "slow bridge", "clock back",
     # Lines of a configuration, which `companion ports --listen` prints.
     'name = "own"', 'source = "serial"',
     # What an error of the operating system is recognised by.

@@ -79,10 +79,6 @@ def xdr(n: int) -> bytes:
     return sentence(f"YXXDR,A,-00.084,D,N,A,{n / 100:07.3f},D,E,C,018.910,C,T-N1234")
 
 
-def lily(n: int) -> bytes:
-    return f"LILY,2013/06/24 23:22:00,{n / 2:8.3f},  25.666,194.25, 26.01,11.96,N9655\r\n".encode()
-
-
 DEVICES = [
     Device("imu", "imu_line", lambda n: imu_line(n, n * 2500, accel=(n / 100, 0, -9.8)), lambda n: n / 100, 1),
     Device("imu", "vectornav", lambda n: vectornav_imu(accel=(n / 4, 0, -9.75)), lambda n: n / 4, crc=True),
@@ -102,7 +98,6 @@ DEVICES = [
     Device("compass", "os5000", tagged, lambda n: n / 10, 1),
     Device("gradienter", "jewell", sim, lambda n: n / 100),
     Device("gradienter", "jewell", xdr, lambda n: n / 100),
-    Device("gradienter", "jewell", lily, lambda n: math.degrees(n / 2 * 1e-6)),
 ]
 
 

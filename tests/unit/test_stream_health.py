@@ -2,39 +2,18 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 
 from companion.protocols.decoding import reasons
 from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
-from companion.protocols.stream_health import RAILS_DEG, SILENT_AFTER_S, StreamHealth
+from companion.protocols.stream_health import SILENT_AFTER_S, StreamHealth
 from companion.samples import CompassSample, ImuSample, TiltSample
 from tests.support.chatter import imu_frame, tilt_frame
 
 
 def imu(t_s: float, clock_s: float | None = None, x: float = 0.0) -> ImuSample:
     return ImuSample(t_s, (x, 0.0, 0.0), (0.0, 0.0, -9.8), None, None, clock_s)
-
-
-def test_a_lily_at_its_rail_is_no_tilt() -> None:
-    rail_deg = math.degrees(330e-6)
-    health = StreamHealth("jewell", InclinometerXyDecoder())
-    for second in range(4):
-        # As in the log of a LILY: -202.490,-330.000 microradians.
-        health.took(b"x", [TiltSample(second, math.degrees(-202.49e-6) + second * 1e-5, -rail_deg)], float(second))
-    found = health.trouble(3.1)
-    assert found is not None
-    assert (found.key, found.implausible) == ("end of range", True)
-    assert "330 microradians" in found.words
-    health.took(b"x", [TiltSample(4.0, 0.001, -rail_deg + 5e-5)], 4.0)
-    assert health.trouble(4.1) is None
-    other = StreamHealth("inclinometer_xy", InclinometerXyDecoder())
-    for second in range(4):
-        other.took(b"x", [TiltSample(second, 0.1 * second, -rail_deg)], float(second))
-    assert other.trouble(3.1) is None, "only a LILY has that rail"
-    assert set(RAILS_DEG) == {"jewell"}
 
 
 def test_equal_digits_of_a_still_gradienter_or_compass_prove_nothing() -> None:

@@ -199,11 +199,7 @@ def _out_of_range(value: float) -> RejectedError:
 
 
 def _full_circle(heading_deg: float) -> float:
-    """The same heading, where a device has rounded 359.96 to 360.0.
-
-    Raises:
-        RejectedError: it is no heading.
-    """
+    """The same heading, where a device has rounded 359.96 to 360.0."""
     if heading_deg == 360.0:
         return 0.0
     if not 0.0 <= heading_deg < 360.0:

@@ -156,11 +156,7 @@ def _possible(names: list[int], values: tuple[float, ...]) -> bool:
 
 
 def _components(buffer: bytes, at: int, end: int) -> list[tuple[int, int]]:
-    """Component and place of its value, as far as they have arrived, of the data frame from `at` to `end`.
-
-    Raises:
-        RejectedError: a component of unknown length, or they do not fill the frame.
-    """
+    """Component and place of its value, as far as they have arrived, of the data frame from `at` to `end`."""
     here, last = at + 4, end - 2
     parts: list[tuple[int, int]] = []
     if at + 3 >= len(buffer):

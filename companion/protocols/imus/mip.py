@@ -58,11 +58,7 @@ def fletcher(data: bytes) -> bytes:
 
 
 def _decode(buffer: bytes, at: int, stop: int, t_s: float) -> list[Sample]:
-    """The samples in a packet that begins at `at`, whose checksum is right and begins at `stop`.
-
-    Raises:
-        RejectedError: a field without its length, a value that cannot be, or nothing of use.
-    """
+    """The samples in a packet that begins at `at`, whose checksum is right and begins at `stop`."""
     if buffer[at + 2] != _SENSOR_DATA:
         raise RejectedError(reasons.REPLY if buffer[at + 2] < _SENSOR_DATA else reasons.NOTHING_OF_USE)
     accel_g: Vector | None = None

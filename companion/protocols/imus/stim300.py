@@ -221,11 +221,7 @@ class Stim300Decoder(FrameDecoder):
         self._inclination_unit_right = frame[_INCLINATION_UNIT] & 0x0D == 0
 
     def _decode(self, layout: Layout, frame: bytes, t_s: float) -> list[Sample]:
-        """The samples in one normal mode datagram.
-
-        Raises:
-            RejectedError: the status says that it is not to be used, a value that cannot be, or nothing of use.
-        """
+        """The samples in one normal mode datagram."""
         values = layout.values.unpack_from(frame)
         counter, latency_us = values[layout.counter], values[layout.counter + 1]
         t_s -= latency_us * 1e-6
@@ -264,11 +260,7 @@ class Stim300Decoder(FrameDecoder):
         return ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, counter)
 
     def _judge_range(self, rate_deg_s: float, magnitude: float, counter: int) -> None:
-        """Take one reading as evidence of the range, from its magnitude in counts.
-
-        Raises:
-            RejectedError: in the range that is assumed it is far from gravity, so it may well be another.
-        """
+        """Take one reading as evidence of the range, from its magnitude in counts."""
         at_rest = next((bits for bits in _BITS if 0.9 < magnitude / (1 << bits) < 1.1), 0)
         if not at_rest or rate_deg_s > REST_DEG_S or at_rest != self._rest_bits:
             self._rest_bits, self._rest_ticks = at_rest, 0
@@ -313,11 +305,7 @@ def _temperature(values: tuple[int, ...], at: int | None) -> float | None:
 
 
 def _check_status(status: int) -> None:
-    """Table 5-23.
-
-    Raises:
-        RejectedError: the data are not to be used; the gravest reason.
-    """
+    """Table 5-23."""
     if status & _START_UP:
         raise RejectedError(STARTING)
     if status & (_SYSTEM | _CHANNEL):

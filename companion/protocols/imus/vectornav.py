@@ -80,11 +80,7 @@ _PARTS = {
 
 
 def header_bytes(groups: int) -> int:
-    """The length of a header, from the sync byte to the last mask, that announces these groups.
-
-    Raises:
-        RejectedError: a group that is not known here, or none.
-    """
+    """The length of a header, from the sync byte to the last mask, that announces these groups."""
     if groups == 0 or groups & ~_KNOWN_GROUPS:
         raise RejectedError(reasons.UNKNOWN_GROUP)
     return 2 + 2 * groups.bit_count()
@@ -104,11 +100,7 @@ class Layout:
     mag: int | None
 
     def samples(self, frame: bytes, start: int, t_s: float) -> list[Sample]:
-        """The samples in a frame that begins at `start` and has passed its CRC.
-
-        Raises:
-            RejectedError: a value is not finite or out of range, or there is nothing of use in it.
-        """
+        """The samples in a frame that begins at `start` and has passed its CRC."""
         values = self.payload.unpack_from(frame, start + self.payload_offset)
         samples: list[Sample] = []
         if self.imu is not None:
@@ -133,11 +125,7 @@ class Layout:
 
 
 def layout_of(header: bytes) -> Layout:
-    """Read a whole header.
-
-    Raises:
-        RejectedError: a field that is not known here, or a group without fields.
-    """
+    """Read a whole header."""
     places: dict[str, int] = {}
     code, count = "<", 0
     masks = iter(struct.unpack_from(f"<{len(header) // 2 - 1}H", header, 2))
@@ -266,11 +254,7 @@ class VectorNavDecoder(FrameDecoder):
 
 
 def _decode(sentence: bytes, t_s: float) -> list[Sample]:
-    """The samples in one sentence, `$VN...*hh`.
-
-    Raises:
-        RejectedError: wrong checksum, not a measurement that is used here, or values that cannot be.
-    """
+    """The samples in one sentence, `$VN...*hh`."""
     fields = body_of_sentence(sentence).split(b",")
     head = fields[0]
     if head == b"VNYMR":

@@ -83,11 +83,7 @@ class XsensDecoder(FrameDecoder):
         return self._accept(samples, self._decode, buffer, data, end - 1, self._time_of(origin + end), end=end)
 
     def _decode(self, buffer: bytes, field: int, stop: int, t_s: float) -> list[Sample]:
-        """The samples in the fields from `field` to `stop` of a message whose checksum is right.
-
-        Raises:
-            RejectedError: a field without its size, a value that cannot be or was clipped, or nothing of use.
-        """
+        """The samples in the fields from `field` to `stop` of a message whose checksum is right."""
         vectors: dict[int, Vector] = {}
         counter: int | None = None
         t_device_s: float | None = None
@@ -146,11 +142,7 @@ def _unsigned(data: bytes, size: int) -> int:
 
 
 def _numbers(data: bytes, number_format: int, count: int) -> list[float]:
-    """So many numbers in one of the four formats.
-
-    Raises:
-        RejectedError: there is no such format, or the size is not that of so many numbers in it.
-    """
+    """So many numbers in one of the four formats."""
     if number_format == 2:
         if len(data) != 6 * count:
             raise RejectedError(reasons.FIELD_COUNT)

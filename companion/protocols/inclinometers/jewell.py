@@ -1,18 +1,15 @@
-r"""Jewell Instruments (Applied Geomechanics) electrolytic tiltmeters: Tuff Tilt Digital, MD900-T, D700 series, LILY.
+r"""Jewell Instruments (Applied Geomechanics) electrolytic tiltmeters: Tuff Tilt Digital, MD900-T, D700 series.
 
     $-00.619,000.023,018.910,N0000\r\n                                    SIM (default): X, Y, temperature, serial
     $YXXDR,A,000.034,D,N,A,-00.625,D,E,C,021.651,C,T-N0000*47\r\n         XDR: Y (N, north) first, then X (E, east)
     $PASHS,XDR,A,004.261,D,N,A,004.280,D,E,C,021.288,C,T-N1346\r\n        ASH: the same, without a checksum
     $P-00.907R002.186*1C\r\n                                              TCM: pitch is Y, roll is X
-    LILY,2013/06/24 23:22:00,-236.026,  25.666,194.25, 26.01,11.96,N9655   microradians, compass, temperature, supply
-    IRIS,2013/05/29 00:25:34, -0.0882, -0.7524,28.45,N8642                 degrees, temperature
 
-Sources: Tuff Tilt Digital manual B-06-1006 rev. E, p. 12 and 15; D700 manual B-03-1006 rev. K, p. 14; the last two as
-seafloor observatories have logged them (Ocean Observatories Initiative). Tilts are degrees (unit D) or microradians
-(M) in XDR and ASH; SIM does not say its unit and is read as degrees, its default: a device set to microradians has to
-send XDR. A LILY at its end stop goes on sending 330 microradians. No other rail is documented.
+Sources: Tuff Tilt Digital manual B-06-1006 rev. E, p. 12 and 15; D700 manual B-03-1006 rev. K, p. 14. Tilts are degrees
+(unit D) or microradians (M) in XDR and ASH; SIM does not say its unit and is read as degrees, its default: a device set
+to microradians has to send XDR.
 
-Where there is no checksum the shape of a line must be whole: all numbers padded with zeros, or none; aligned tilts.
+Where there is no checksum the shape of a line must be whole: all numbers padded with zeros, or none.
 """
 
 from __future__ import annotations
@@ -27,13 +24,9 @@ from companion.protocols.decoding.checks import TEMPERATURE_LIMIT_DEGC
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import TiltSample
 
-LILY_RAIL_URAD: Final = 330.0
-
 _PADDED: Final = rb"([-+0-9]\d\d\.\d{3})"
 _PLAIN: Final = rb"([-+]?(?:0|[1-9]\d{0,2})\.\d{3})"
 _MICRORADIANS: Final = rb"([-+]?\d{1,6}\.\d{3})"
-_ALIGNED: Final = rb"(?=[^,]{8},) *([-+]?\d{1,3}\.\d{3,4})"
-_PLACES_2: Final = rb" *([-+]?\d{1,3}\.\d\d)"
 _SERIAL: Final = rb"N\d{1,5}"
 
 _SIM: Final = tuple(re.compile(rb"\$%b,%b,%b,%b" % (number, number, number, _SERIAL)) for number in (_PADDED, _PLAIN))
@@ -42,11 +35,8 @@ _XDR: Final = re.compile(
 )
 _TCM: Final = re.compile(rb"\$P%bR%b\*.." % (_PADDED, _PADDED))
 _TILTS: Final = {b"D": re.compile(rb"%b|%b" % (_PADDED, _PLAIN)), b"M": re.compile(_MICRORADIANS)}
-_CLOCK: Final = rb"\d{4}/\d\d/\d\d \d\d:\d\d:\d\d"
-_LILY: Final = re.compile(rb"LILY,%b,%b,%b,%b,%b,%b,%b" % (_CLOCK, *(_ALIGNED,) * 2, *(_PLACES_2,) * 3, _SERIAL))
-_IRIS: Final = re.compile(rb"IRIS,%b,%b,%b,%b,%b" % (_CLOCK, *(_ALIGNED,) * 2, _PLACES_2, _SERIAL))
 
-_START: Final = re.compile(rb".*(?=\$|LILY,|IRIS,)", re.DOTALL)
+_START: Final = re.compile(rb".*(?=\$)", re.DOTALL)
 _DAMAGED: Final = re.compile(rb"[\x00\x80-\xff]")
 
 
@@ -77,7 +67,7 @@ def _why(text: bytes, *, cut: bool) -> str:
         return reasons.TOO_LONG
     if text.startswith(b"ERR "):
         return reasons.COMMAND_REFUSED
-    return reasons.CUT_SHORT if text.startswith((b"$", b"LILY,", b"IRIS,")) else reasons.NOT_A_MEASUREMENT
+    return reasons.CUT_SHORT if text.startswith(b"$") else reasons.NOT_A_MEASUREMENT
 
 
 def _reading(text: bytes, t_s: float) -> TiltSample:
@@ -98,31 +88,14 @@ def _reading(text: bytes, t_s: float) -> TiltSample:
     if match := _TCM.fullmatch(text):
         body_of_sentence(text)
         return _sample(t_s, float(match[2]), float(match[1]), None)
-    if match := _LILY.fullmatch(text):
-        x_urad, y_urad, _, temperature_degc, _ = map(float, match.groups())
-        if max(abs(x_urad), abs(y_urad)) >= LILY_RAIL_URAD:
-            raise RejectedError(reasons.OVER_RANGE)
-        return _sample(t_s, math.degrees(x_urad * 1e-6), math.degrees(y_urad * 1e-6), temperature_degc)
-    if match := _IRIS.fullmatch(text):
-        return _sample(t_s, *map(float, match.groups()))
     raise RejectedError(reasons.NOT_A_MEASUREMENT)
 
 
 def _degrees(field: bytes, unit: bytes) -> float:
-    """A tilt of an XDR sentence.
-
-    Raises:
-        RejectedError: it is not written like one, or it is the rail of a LILY.
-    """
+    """A tilt of an XDR sentence."""
     if _TILTS[unit].fullmatch(field) is None:
         raise RejectedError(reasons.NOT_A_MEASUREMENT)
-    value = float(field)
-    if unit == b"D":
-        return value
-    # Other models measure far more; of theirs one reading in many thousands is lost.
-    if abs(value) == LILY_RAIL_URAD:
-        raise RejectedError(reasons.OVER_RANGE)
-    return math.degrees(value * 1e-6)
+    return float(field) if unit == b"D" else math.degrees(float(field) * 1e-6)
 
 
 def _sample(t_s: float, x_deg: float, y_deg: float, temperature_degc: float | None) -> TiltSample:
