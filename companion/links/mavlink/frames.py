@@ -26,48 +26,16 @@ _EXTRA: Final[dict[Kind, bytes]] = {}
 _PLANS: Final[dict[Kind, tuple[struct.Struct, Callable[[Any], tuple[Any, ...]] | None] | None]] = {}
 """How the payload is unpacked and in which order its fields are given; None: it has text or arrays in it."""
 _ZEROS: Final = bytes(256)
-STREAMS: Final = frozenset(
-    {
-        mavlink.MAVLINK_MSG_ID_AHRS,
-        mavlink.MAVLINK_MSG_ID_AHRS2,
-        mavlink.MAVLINK_MSG_ID_AIRSPEED_AUTOCAL,
-        mavlink.MAVLINK_MSG_ID_ALTITUDE,
-        mavlink.MAVLINK_MSG_ID_ATTITUDE,
-        mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
-        mavlink.MAVLINK_MSG_ID_ATTITUDE_TARGET,
-        mavlink.MAVLINK_MSG_ID_BATTERY_STATUS,
-        mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
-        mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
-        mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
-        mavlink.MAVLINK_MSG_ID_GPS2_RAW,
-        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
-        mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
-        mavlink.MAVLINK_MSG_ID_HWSTATUS,
-        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
-        mavlink.MAVLINK_MSG_ID_MEMINFO,
-        mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
-        mavlink.MAVLINK_MSG_ID_ODOMETRY,
-        mavlink.MAVLINK_MSG_ID_POSITION_TARGET_GLOBAL_INT,
-        mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED,
-        mavlink.MAVLINK_MSG_ID_POWER_STATUS,
-        mavlink.MAVLINK_MSG_ID_RANGEFINDER,
-        mavlink.MAVLINK_MSG_ID_RAW_IMU,
-        mavlink.MAVLINK_MSG_ID_RC_CHANNELS,
-        mavlink.MAVLINK_MSG_ID_RC_CHANNELS_RAW,
-        mavlink.MAVLINK_MSG_ID_SCALED_IMU,
-        mavlink.MAVLINK_MSG_ID_SCALED_IMU2,
-        mavlink.MAVLINK_MSG_ID_SCALED_IMU3,
-        mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,
-        mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE2,
-        mavlink.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW,
-        mavlink.MAVLINK_MSG_ID_SYS_STATUS,
-        mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT,
-        mavlink.MAVLINK_MSG_ID_VFR_HUD,
-        mavlink.MAVLINK_MSG_ID_VIBRATION,
-        mavlink.MAVLINK_MSG_ID_WIND,
-        mavlink.MAVLINK_MSG_ID_WIND_COV,
-    }
-)
+_STREAM_NAMES: Final = (
+    "AHRS", "AHRS2", "AIRSPEED_AUTOCAL", "ALTITUDE", "ATTITUDE", "ATTITUDE_QUATERNION", "ATTITUDE_TARGET",
+    "BATTERY_STATUS", "EKF_STATUS_REPORT", "ESTIMATOR_STATUS", "GLOBAL_POSITION_INT", "GPS2_RAW", "GPS_RAW_INT",
+    "HIGHRES_IMU", "HWSTATUS", "LOCAL_POSITION_NED", "MEMINFO", "NAV_CONTROLLER_OUTPUT", "ODOMETRY",
+    "POSITION_TARGET_GLOBAL_INT", "POSITION_TARGET_LOCAL_NED", "POWER_STATUS", "RANGEFINDER", "RAW_IMU",
+    "RC_CHANNELS", "RC_CHANNELS_RAW", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "SCALED_PRESSURE",
+    "SCALED_PRESSURE2", "SERVO_OUTPUT_RAW", "SYS_STATUS", "TERRAIN_REPORT", "VFR_HUD", "VIBRATION", "WIND",
+    "WIND_COV",
+)  # fmt: skip
+STREAMS: Final = frozenset(getattr(mavlink, f"MAVLINK_MSG_ID_{name}") for name in _STREAM_NAMES)
 """Sent again and again, each the successor of the one before: nobody asks something with them or waits for one."""
 AHEAD: Final = frozenset(
     {mavlink.MAVLINK_MSG_ID_TIMESYNC, mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT}
@@ -93,25 +61,30 @@ def goes_ahead(datagram: bytes) -> bool:
 
 
 def _holds_only(datagram: bytes, numbers: frozenset[int]) -> bool:
-    at, size = 0, len(datagram)
-    while size - at >= HEADER_BYTES + CHECKSUM_BYTES:
-        if datagram[at] != MARKER or datagram[at + 2]:
+    at = 0
+    while (found := _frame_at(datagram, at)) is not None:
+        number, at = found
+        if number not in numbers:
             return False
-        if datagram[at + 7] | datagram[at + 8] << 8 | datagram[at + 9] << 16 not in numbers:
-            return False
-        at += HEADER_BYTES + datagram[at + 1] + CHECKSUM_BYTES
-    return 0 < at == size
+    return 0 < at == len(datagram)
 
 
-def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:
-    """Which message begins there and where it ends; None where it is not the common case."""
+def _frame_at(data: bytes, at: int) -> tuple[int, int] | None:
+    """The message's number and the end of a whole unsigned frame of version 2; nobody has checked its sum."""
     size = len(data)
     if size - at < HEADER_BYTES + CHECKSUM_BYTES or data[at] != MARKER or data[at + 2]:
         return None
     end = at + HEADER_BYTES + data[at + 1] + CHECKSUM_BYTES
-    if end > size:
+    return None if end > size else (data[at + 7] | data[at + 8] << 8 | data[at + 9] << 16, end)
+
+
+def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:
+    """Which message begins there and where it ends; None where it is not the common case."""
+    found = _frame_at(data, at)
+    if found is None:
         return None
-    kind = KINDS.get(data[at + 7] | data[at + 8] << 8 | data[at + 9] << 16)
+    number, end = found
+    kind = KINDS.get(number)
     if kind is None:
         return None
     extra = _EXTRA.get(kind)

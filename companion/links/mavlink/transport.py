@@ -12,13 +12,12 @@ import errno
 import functools
 import logging
 import re
-from collections.abc import Callable
 from typing import Any, Protocol, cast
 
 from companion.errors import LinkError
 from companion.links.mavlink.link import MavlinkLink, Sender
 from companion.links.serial.bytestream import ByteLink, PortSettings
-from companion.links.system.backoff import Backoff
+from companion.links.system.backoff import Backoff, OnState, Reconnection
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +35,6 @@ _URL = re.compile(r"(?P<kind>udpin|udpout|tcp|serial):(?P<where>.+):(?P<number>\
 # The target's host is up but nobody listens yet (or it restarts): keep sending, it will come.
 _PASSING_ERRORS = frozenset({errno.ECONNREFUSED, errno.ENOBUFS, errno.EAGAIN})
 
-OnState = Callable[[bool, str], None]
 Peer = tuple[Any, ...]
 """An address as the socket gives it."""
 
@@ -81,51 +79,32 @@ def parse_url(url: str) -> tuple[str, str, int]:
 async def _run_udp(
     link: MavlinkLink, url: str, address: tuple[str, int], *, listen: bool, on_state: OnState | None
 ) -> None:
-    """Open the socket again with back-off whenever it fails or its local address is gone."""
-    loop = asyncio.get_running_loop()
-    backoff = Backoff()
-    warned = False
-    said: tuple[bool, str] | None = None
-
-    def say(words: str, *, connected: bool) -> None:
-        nonlocal said
-        if on_state is not None and (connected, words) != said:
-            said = (connected, words)
-            on_state(connected, words)
+    """Open the socket again whenever it fails or its local address is gone."""
+    reconnection = Reconnection("mavlink", Backoff(), worth_s=_TURN_S, on_state=on_state)
 
     def factory() -> _Udp:
         return _Listener(link) if listen else _Speaker(link)
 
-    while True:
+    async def once() -> str:
         link.turn()
+        end = {"local_addr": address} if listen else {"remote_addr": address}
         try:
             async with asyncio.timeout(RESOLVE_DEADLINE_S):
-                if listen:
-                    transport, udp = await loop.create_datagram_endpoint(factory, local_addr=address)
-                else:
-                    transport, udp = await loop.create_datagram_endpoint(factory, remote_addr=address)
+                transport, udp = await asyncio.get_running_loop().create_datagram_endpoint(factory, **end)  # type: ignore[arg-type]
         except TimeoutError:
-            reason = f"{url}: the name is not resolved within {RESOLVE_DEADLINE_S:g} s"
+            return f"{url}: the name is not resolved within {RESOLVE_DEADLINE_S:g} s"
         except (OSError, UnicodeError) as error:
-            reason = f"{url}: {getattr(error, 'strerror', None) or error}"
-        else:
-            host, port = transport.get_extra_info("sockname")[:2]
-            logger.info("mavlink: %s is open at %s:%s", url, host, port)
-            say(f"{url} is open at {host}:{port}", connected=True)
-            warned = False
-            since_s = loop.time()
-            try:
-                reason = f"{url}: {await udp.run()}"
-            finally:
-                transport.abort()
-                link.attach(None)
-                await udp.closed
-            if loop.time() - since_s > _TURN_S:
-                backoff.reset()
-        logger.log(logging.DEBUG if warned else logging.WARNING, "mavlink: %s", reason)
-        warned = True
-        say(reason, connected=False)
-        await asyncio.sleep(backoff.next_s())
+            return f"{url}: {getattr(error, 'strerror', None) or error}"
+        host, port = transport.get_extra_info("sockname")[:2]
+        reconnection.up(f"{url} is open at {host}:{port}")
+        try:
+            return f"{url}: {await udp.run()}"
+        finally:
+            transport.abort()
+            link.attach(None)
+            await udp.closed
+
+    await reconnection.keep(once)
 
 
 class _DatagramOut(Protocol):

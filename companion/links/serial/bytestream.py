@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import logging
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,12 +16,10 @@ from urllib.parse import urlsplit
 
 from companion.errors import LinkError
 from companion.links.serial.port import SerialOpener, close_serial
-from companion.links.system.backoff import Backoff
+from companion.links.system.backoff import Backoff, OnState, Reconnection
 from companion.links.system.budget import Budget
 from companion.links.system.tcp import connect_tcp, words_of
 from companion.links.system.together import Together
-
-logger = logging.getLogger(__name__)
 
 READ_BYTES = 4096
 """As much as a tty buffers: one wake-up empties the port, so one time stamp holds for all that it brought."""
@@ -105,7 +102,7 @@ class ByteLink:
         on_bytes: Callable[[bytes, float], None],
         *,
         name: str,
-        on_state: Callable[[bool, str], None] | None = None,
+        on_state: OnState | None = None,
         budget: Budget | None = None,
         together: Together | None = None,
         on_turn: Callable[[], None] | None = None,
@@ -118,18 +115,15 @@ class ByteLink:
         """What waits for the next read, whenever this stream is collected; None: nothing."""
         self.on_gap: Callable[[], None] = lambda: None
         """Called when bytes were thrown away between the last ones and the next ones."""
-        self.last_error = ""
-        """Why the port is, or last was, not open; one line for people."""
         self.bytes_received = 0
-        self.bytes_dropped = 0
-        """Bytes that `write` refused because the port was closed or the out-buffer full."""
         self.reconnects = 0
         """How often the port was opened again after it had been open."""
         self.turns = 0
         """Of `run`, one at least every `BEAT_WITHIN_S`, whether bytes come or not."""
         self.last_byte_s: float | None = None
         """The loop's time of the last read that brought bytes."""
-        self._on_bytes, self._on_state, self._on_turn = on_bytes, on_state, on_turn
+        self._on_bytes, self._on_turn = on_bytes, on_turn
+        self._reconnection = Reconnection(name, Backoff(cap_s=LONGEST_PAUSE_S), worth_s=WORTH_S, on_state=on_state)
         self._descriptor: int | None = None
         self._reads = 0
         """That brought something since `_reads_since`, a time and the bytes received by then."""
@@ -141,17 +135,18 @@ class ByteLink:
         self._lost: asyncio.Future[str] | None = None
         self._out = bytearray()
         self._opener = SerialOpener(settings.url, settings.baud, settings.parity)
-        self._backoff = Backoff(cap_s=LONGEST_PAUSE_S)
-        self._warned = False
-        self._quiet = False
         self._paused: asyncio.TimerHandle | None = None
         self._opened_before = False
-        self._said: tuple[bool, str] | None = None
 
     @property
     def connected(self) -> bool:
         """Whether the port is open; says nothing of a device that keeps silent."""
         return self._descriptor is not None
+
+    @property
+    def last_error(self) -> str:
+        """Why the port is, or last was, not open; one line for people."""
+        return self._reconnection.last_error
 
     @property
     def collecting(self) -> bool:
@@ -165,27 +160,27 @@ class ByteLink:
 
     async def run(self) -> None:
         """Keep the port open until cancelled; a loss is an event to report, never an exception."""
-        loop = asyncio.get_running_loop()
         try:
-            while True:
-                self._turn()
-                try:
-                    descriptor = await self._open()
-                except LinkError as error:
-                    self._report_down(str(error))
-                else:
-                    since_s, before = loop.time(), self.bytes_received
-                    self._lost = loop.create_future()
-                    self._attach(loop, descriptor)
-                    reason = await self._until_lost(self._lost)
-                    if self.bytes_received > before or loop.time() - since_s >= WORTH_S or self._quiet:
-                        self._backoff.reset()
-                    self._report_down(reason)
-                await asyncio.sleep(self._backoff.next_s())
+            await self._reconnection.keep(self._once)
         finally:
             if self._descriptor is not None:
                 self._close()
-                self._say(connected=False, reason="stopped")
+                self._reconnection.end()
+
+    async def _once(self) -> str:
+        """Open the port and wait for its loss; why it is lost."""
+        self._turn()
+        descriptor = await self._open()
+        before = self.bytes_received
+        lost: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._lost = lost
+        self._attach(asyncio.get_running_loop(), descriptor)
+        while not lost.done():
+            self._turn()
+            await asyncio.wait([lost], timeout=BEAT_S)
+        if self.bytes_received > before:
+            self._reconnection.backoff.reset()
+        return lost.result()
 
     def confirm(self) -> None:
         """What is open is the right device: after a loss it is looked for by its lasting name first."""
@@ -194,13 +189,12 @@ class ByteLink:
     def renew(self, reason: str) -> None:
         """Open it anew: a peer that vanished without a word keeps its connection open for ever. Not worth a warning."""
         if self._descriptor is not None:
-            self._quiet = True
+            self._reconnection.excuse()
             self._lose(f"{self.settings.url}: {reason}")
 
     def write(self, data: bytes) -> bool:
         """Send, or keep in the bounded out-buffer; False when closed or full: then nothing of `data` is sent."""
         if self._descriptor is None or len(self._out) + len(data) > OUT_BUFFER_BYTES:
-            self.bytes_dropped += len(data)
             return False
         waiting = bool(self._out)
         self._out += data
@@ -212,12 +206,6 @@ class ByteLink:
         self.turns += 1
         if self._on_turn is not None:
             self._on_turn()
-
-    async def _until_lost(self, lost: asyncio.Future[str]) -> str:
-        while not lost.done():
-            self._turn()
-            await asyncio.wait([lost], timeout=BEAT_S)
-        return lost.result()
 
     async def _open(self) -> int:
         if self.settings.is_tcp:
@@ -231,10 +219,7 @@ class ByteLink:
         self._opened_before = True
         self._reads, self._attempts, self._reads_since = 0, 0, (loop.time(), self.bytes_received)
         loop.add_reader(descriptor, self._readable)
-        level = logging.DEBUG if self._quiet else logging.INFO
-        logger.log(level, "%s: %s is %s", self.name, self.settings.url, "back" if self._warned else "open")
-        self._warned = self._quiet = False
-        self._say(connected=True, reason=f"{self.settings.url} is open")
+        self._reconnection.up(f"{self.settings.url} is open")
 
     def _readable(self) -> None:
         loop = asyncio.get_running_loop()
@@ -376,14 +361,3 @@ class ByteLink:
         loop.remove_reader(descriptor)
         loop.remove_writer(descriptor)
         close_serial(descriptor)
-
-    def _report_down(self, reason: str) -> None:
-        self.last_error = reason
-        logger.log(logging.DEBUG if self._warned or self._quiet else logging.WARNING, "%s: %s", self.name, reason)
-        self._warned = self._warned or not self._quiet
-        self._say(connected=False, reason=reason)
-
-    def _say(self, *, connected: bool, reason: str) -> None:
-        if self._on_state is not None and (connected, reason) != self._said:
-            self._said = (connected, reason)
-            self._on_state(connected, reason)

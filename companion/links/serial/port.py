@@ -16,7 +16,8 @@ import pwd
 import stat
 import termios
 import threading
-from typing import Literal
+from collections.abc import Callable
+from typing import Literal, NamedTuple
 
 from companion.errors import LinkError
 from companion.links.serial.ports import find_holders, lasting_name, latency_timer_ms
@@ -26,7 +27,7 @@ Parity = Literal["none", "even", "odd"]
 OPEN_DEADLINE_S = 5.0
 """A healthy USB port opens in some milliseconds; a driver that hangs must not hang the daemon."""
 FAITHFUL_S = 20.0
-"""So long after its loss a device is waited for by its lasting name, whatever bears its old one meanwhile."""
+"""How long after its loss a device is waited for by its lasting name, whatever bears its old one meanwhile."""
 
 
 def open_serial(path: str, baud: int, parity: Parity) -> int:
@@ -114,34 +115,24 @@ def _errno_of(error: Exception) -> int | None:
 
 
 def _who_may(path: str) -> str:
-    user = _user_name(os.geteuid())
+    user = _name_of(pwd.getpwuid, os.geteuid())
     try:
         status = os.stat(path)
     except OSError:
         return f"user {user} may not look into the folder"
-    group = _group_name(status.st_gid)
+    group = _name_of(grp.getgrgid, status.st_gid)
     mode = stat.S_IMODE(status.st_mode)
     if mode & stat.S_IRGRP and mode & stat.S_IWGRP and status.st_gid != 0:
         return f"user {user} is not in group {group} (usermod -aG {group} {user}, then log in again)"
-    return f"user {user} may not read and write it (owner {_user_name(status.st_uid)}:{group}, mode {mode:04o})"
+    owner = _name_of(pwd.getpwuid, status.st_uid)
+    return f"user {user} may not read and write it (owner {owner}:{group}, mode {mode:04o})"
 
 
-def _user_name(number: int) -> str:
+def _name_of(look_up: Callable[[int], pwd.struct_passwd | grp.struct_group], number: int) -> str:
     try:
-        return pwd.getpwuid(number).pw_name
+        return str(look_up(number)[0])
     except KeyError:
         return str(number)
-
-
-def _group_name(number: int) -> str:
-    try:
-        return grp.getgrgid(number).gr_name
-    except KeyError:
-        return str(number)
-
-
-def _exists(path: str) -> bool:
-    return os.path.exists(path)
 
 
 def _is_character_device(path: str) -> bool:
@@ -179,7 +170,7 @@ class SerialOpener:
         loop = asyncio.get_running_loop()
         if self._since_s is None:
             self._since_s = loop.time()
-        if loop.time() - self._since_s > FAITHFUL_S and not _exists(self._known):
+        if loop.time() - self._since_s > FAITHFUL_S and not os.path.exists(self._known):
             return self._path, None  # somebody has put another one in its place
         return self._known, self._path
 
@@ -195,77 +186,60 @@ class SerialOpener:
         if self._thread is not None and self._thread.is_alive():
             raise LinkError(f"{self._path}: the driver still hangs in the last attempt to open; replug the device")
         path, instead_of = self._names()
-        attempt = _Attempt(asyncio.get_running_loop(), path, self._baud, self._parity)
-        self._thread = threading.Thread(target=attempt.run, name=f"open {self._path}", daemon=True)
+        loop = asyncio.get_running_loop()
+        opened: asyncio.Future[_Opened] = loop.create_future()
+        self._thread = threading.Thread(
+            target=_attempt, args=(loop, opened, path, self._baud, self._parity), name=f"open {self._path}", daemon=True
+        )
         self._thread.start()
+        found: _Opened | None = None
         try:
             async with asyncio.timeout(OPEN_DEADLINE_S):
-                descriptor = await attempt.result()
+                found = await opened
         except TimeoutError:
             raise LinkError(f"{path}: the driver has not opened it within {OPEN_DEADLINE_S:g} s") from None
         except LinkError as error:
-            if instead_of is None or not _exists(instead_of):
+            if instead_of is None or not os.path.exists(instead_of):  # noqa: ASYNC240 - a look into /dev
                 raise
             raise LinkError(f"{error}; {instead_of} is another device now") from None
-        else:
-            self._seen, self.latency_timer_ms = attempt.lasting_name, attempt.latency_timer_ms
-            return descriptor
         finally:
-            attempt.abandon()
+            # Cancelled between the thread's word and our turn: it is nobody's otherwise.
+            if found is None and opened.done() and not opened.cancelled() and opened.exception() is None:
+                close_serial(opened.result().descriptor)
+        self._seen, self.latency_timer_ms = found.lasting_name, found.latency_timer_ms
+        return found.descriptor
 
 
-class _Attempt:
-    """One opening in a thread; its descriptor has exactly one owner at any time: thread, this object, or caller."""
+class _Opened(NamedTuple):
+    descriptor: int
+    lasting_name: str | None
+    latency_timer_ms: int | None
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, path: str, baud: int, parity: Parity) -> None:
-        self._loop, self._path, self._baud, self._parity = loop, path, baud, parity
-        self._finished: asyncio.Future[None] = loop.create_future()
-        self._lock = threading.Lock()
-        self._abandoned = False
-        self._descriptor: int | None = None
-        self._error: LinkError | None = None
-        self.lasting_name: str | None = None
-        self.latency_timer_ms: int | None = None
 
-    def run(self) -> None:
-        """Open the port (in the thread)."""
-        descriptor: int | None = None
-        error: LinkError | None = None
-        try:
-            descriptor = open_serial(self._path, self._baud, self._parity)
-            self.lasting_name, self.latency_timer_ms = lasting_name(self._path), latency_timer_ms(self._path)
-        except LinkError as cause:
-            error = cause
-        except Exception as cause:  # noqa: BLE001 - a thread that died silently would leave its caller waiting
-            error = LinkError(f"{self._path}: cannot be opened: {cause!r}")
-        with self._lock:
-            if self._abandoned:
-                if descriptor is not None:
-                    close_serial(descriptor)
-                return
-            self._descriptor, self._error = descriptor, error
-        try:
-            self._loop.call_soon_threadsafe(self._finish)
-        except RuntimeError:
-            self.abandon()  # the loop has been closed meanwhile
+def _attempt(
+    loop: asyncio.AbstractEventLoop, opened: asyncio.Future[_Opened], path: str, baud: int, parity: Parity
+) -> None:
+    """Open a port (in a thread), and hand it over on the loop; what nobody waits for any more is closed."""
+    found: _Opened | LinkError
+    try:
+        descriptor = open_serial(path, baud, parity)
+        found = _Opened(descriptor, lasting_name(path), latency_timer_ms(path))
+    except LinkError as error:
+        found = error
+    except Exception as error:  # noqa: BLE001 - a thread that died silently would leave its caller waiting
+        found = LinkError(f"{path}: cannot be opened: {error!r}")
 
-    def _finish(self) -> None:
-        if not self._finished.done():
-            self._finished.set_result(None)
+    def hand_over() -> None:
+        if isinstance(found, LinkError):
+            if not opened.done():
+                opened.set_exception(found)
+        elif opened.done():
+            close_serial(found.descriptor)
+        else:
+            opened.set_result(found)
 
-    async def result(self) -> int:
-        """Wait for the thread and take the descriptor over."""
-        await self._finished
-        with self._lock:
-            descriptor, self._descriptor = self._descriptor, None
-        if descriptor is None:
-            raise self._error or LinkError(f"{self._path}: cannot be opened")
-        return descriptor
-
-    def abandon(self) -> None:
-        """Close what nobody has taken, now or when the thread comes back with it."""
-        with self._lock:
-            self._abandoned = True
-            descriptor, self._descriptor = self._descriptor, None
-        if descriptor is not None:
-            close_serial(descriptor)
+    try:
+        loop.call_soon_threadsafe(hand_over)
+    except RuntimeError:  # the loop has been closed meanwhile
+        if isinstance(found, _Opened):
+            close_serial(found.descriptor)

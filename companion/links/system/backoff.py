@@ -1,6 +1,19 @@
-"""How long to wait before the next attempt: doubling up to a cap."""
+"""Opening a connection again after every loss: how long to wait before, and what is said of it."""
 
 from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Awaitable, Callable
+from typing import NoReturn
+
+from companion.errors import LinkError
+
+logger = logging.getLogger(__name__)
+
+OnState = Callable[[bool, str], object]
+"""Told whether there is a connection, and where, or why not."""
 
 
 class Backoff:
@@ -23,3 +36,74 @@ class Backoff:
     def reset(self) -> None:
         """Begin again at the first delay."""
         self._next_s = self._first_s
+
+
+class Reconnection:
+    """One connection that is opened again for as long as it takes; a loss is warned of once, until it is back.
+
+    Args:
+        name: for the log.
+        backoff: the pauses between attempts.
+        worth_s: a connection that lasted so long starts the pauses afresh.
+        on_state: told of every change, of the reason too while attempts go on; must neither block nor raise.
+    """
+
+    def __init__(self, name: str, backoff: Backoff, *, worth_s: float, on_state: OnState | None = None) -> None:
+        self.backoff = backoff
+        self.last_error = ""
+        """Why there is, or last was, no connection; one line for people."""
+        self.retry_s: float | None = None
+        """When it is tried again, by the loop's clock; None: it is being tried, or there."""
+        self._name, self._worth_s, self._on_state = name, worth_s, on_state
+        self._warned = self._excused = False
+        self._up_s = math.inf
+        self._told: tuple[bool, str] | None = None
+
+    async def keep(self, once: Callable[[], Awaitable[str]]) -> NoReturn:
+        """Have one connection after another, until cancelled.
+
+        `once` opens one, calls `up`, and returns at its end with the reason, or raises it as a LinkError.
+        """
+        loop = asyncio.get_running_loop()
+        while True:
+            self._up_s = math.inf
+            try:
+                reason = await once()
+            except LinkError as error:
+                reason = str(error)
+            if loop.time() - self._up_s >= self._worth_s:
+                self.backoff.reset()
+            self.down(reason)
+            delay_s = self.backoff.next_s()
+            self.retry_s = loop.time() + delay_s
+            await asyncio.sleep(delay_s)
+            self.retry_s = None
+
+    def excuse(self) -> None:
+        """The loss that comes now is our own doing: not worth a warning, nor a pause."""
+        self._excused = True
+        self.backoff.reset()
+
+    def up(self, words: str) -> None:
+        """There is a connection."""
+        level = logging.DEBUG if self._excused else logging.INFO
+        logger.log(level, "%s: %s%s", self._name, words, " again" if self._warned else "")
+        self._up_s = asyncio.get_running_loop().time()
+        self._warned = self._excused = False
+        self._say(True, words)  # noqa: FBT003
+
+    def down(self, reason: str) -> None:
+        """There is none."""
+        self.last_error = reason
+        logger.log(logging.DEBUG if self._warned or self._excused else logging.WARNING, "%s: %s", self._name, reason)
+        self._warned = self._warned or not self._excused
+        self._say(False, reason)  # noqa: FBT003
+
+    def end(self) -> None:
+        """It is not wanted any more."""
+        self._say(False, "stopped")  # noqa: FBT003
+
+    def _say(self, connected: bool, words: str) -> None:  # noqa: FBT001
+        if self._on_state is not None and (connected, words) != self._told:
+            self._told = (connected, words)
+            self._on_state(connected, words)
