@@ -3,14 +3,20 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# Tests run in two processes: the boards and machines this is made for have at least two cores.
+# Tests run in two processes: the boards and machines this is made for have at least two cores. Those of the real clock
+# wait more than they work: several at once.
 JOBS ?= 2
+WAITING ?= 6
+# Where it is set, every process of every test compiles the whole program anew.
+unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test check format bench accuracy campaign deb deb-test lock sbom audit clean
+.PHONY: help demo quick test long check format bench accuracy campaign deb deb-test lock sbom audit clean
 
 help:
 	@echo 'make demo    watch a virtual aircraft being calibrated (about a minute)'
-	@echo 'make test    run all tests (about 14 minutes on two cores)'
+	@echo 'make quick   unit and property tests without real clock and processes (under a minute on two cores)'
+	@echo 'make test    all tests (about 6 minutes on two cores); DURATIONS=1 notes how long each takes'
+	@echo 'make long    the whole of what make test plays a slice of, with new dice (about XX minutes on two cores)'
 	@echo 'make check   formatting, lint, types, import directions'
 	@echo 'make format  put the code into the one format'
 	@echo 'make bench   speed, as ratios within one run'
@@ -40,8 +46,18 @@ $(VENV)/.dev: $(VENV)/.run
 demo: $(VENV)/.run
 	@$(BIN)/python -m sim demo
 
+PYTEST = $(BIN)/python -m pytest -q --dist worksteal
+
+quick: $(VENV)/.dev
+	@$(PYTEST) -n $(JOBS) --quick
+
+# Both parts always run, and both have to be green. Real autopilots (sitl) want a core of their own.
 test: $(VENV)/.dev
-	@$(BIN)/python -m pytest -q -n $(JOBS) --dist worksteal
+	@$(PYTEST) -n $(WAITING) -m 'real_clock and not sitl' $(if $(DURATIONS),--write-durations); waiting=$$?; \
+	$(PYTEST) -n $(JOBS) -m 'not real_clock or sitl' $(if $(DURATIONS),--write-durations) && exit $$waiting
+
+long: $(VENV)/.dev
+	@TESTS=long $(PYTEST) -n $(JOBS)
 
 check: $(VENV)/.dev
 	@$(BIN)/ruff format --check .

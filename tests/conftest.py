@@ -1,21 +1,133 @@
-"""What holds for all tests."""
+"""What holds for all tests: which are quick, which wait for a clock, and how long each took."""
 
 from __future__ import annotations
 
+import functools
 import gc
+import json
+import os
+import re
 import signal
+import sys
+from collections.abc import Callable, Generator
+from pathlib import Path
+from typing import Any, Final
 
 import hypothesis
 import pytest
 
-# How long an example takes says something of the machine, not of the code.
-hypothesis.settings.register_profile("anywhere", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
-hypothesis.settings.load_profile("anywhere")
+from tests.support.extent import LONG
+
+# How long an example takes says something of the machine, not of the code. Every day the examples are the same for
+# everybody: a suite is green or red, and no matter of dice. Those of `make long` are new every time.
+hypothesis.settings.register_profile(
+    "anywhere",
+    max_examples=80,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)
+hypothesis.settings.register_profile(
+    "long", hypothesis.settings.get_profile("anywhere"), derandomize=False, max_examples=1000
+)
+hypothesis.settings.load_profile("long" if LONG else "anywhere")
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # So it is under `nohup` and in the background of a script, and every command that a test starts would inherit it:
     # what is told to stop by Ctrl-C would never stop.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+TESTS: Final = Path(__file__).parent
+DURATIONS: Final = TESTS / "durations.json"
+"""Processor time of every test that takes more than a second, by its name, in seconds."""
+WORTH_NOTING_S: Final = 1.0
+QUICK_S: Final = 2.0
+"""The most processor time of a test that `make quick` runs."""
+QUICK_ROOMS: Final = ("unit", "property")
+WAITS: Final = re.compile(
+    r"\basyncio\.run\(|\bsubprocess\.|\bcreate_subprocess|\blive_aircraft\(|\btime\.sleep\(|\bopenpty\(|\bPtyDevice\("
+)
+"""What makes a test one of the real clock: a loop on it, a process, or a line of the operating system."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--quick", action="store_true", help="unit and property tests without real clock and processes")
+    parser.addoption("--write-durations", action="store_true", help=f"note in {DURATIONS.name} how long tests took")
+
+
+@functools.cache
+def _blocks(module: str) -> dict[str, str]:
+    """The text of each function and class at the top of a module of the tests."""
+    text = Path(str(sys.modules[module].__file__)).read_text(encoding="utf-8")
+    parts = re.split(r"^(?:async )?(?:def|class) (\w+)", text, flags=re.MULTILINE)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+@functools.cache
+def _reached(module: str, name: str) -> frozenset[tuple[str, str]]:
+    """What of the tests a function or class of the tests names."""
+    known, reached = vars(sys.modules[module]), set()
+    for word in set(re.findall(r"[A-Za-z_]\w+", _blocks(module).get(name, ""))) & known.keys():
+        home = getattr(known[word], "__module__", None) or ""
+        if home.startswith("tests.") and (found := getattr(known[word], "__name__", "")) in _blocks(home):
+            reached.add((home, found))
+    return frozenset(reached)
+
+
+def waits(function: Callable[..., Any]) -> bool:
+    """Whether a function of the tests, or whatever of the tests it reaches, waits for the real clock."""
+    seen, ahead = set(), [(function.__module__, function.__name__)]
+    while ahead:
+        if (here := ahead.pop()) in seen:
+            continue
+        seen.add(here)
+        if WAITS.search(_blocks(here[0]).get(here[1], "")):
+            return True
+        ahead += _reached(*here)
+    return False
+
+
+def _functions(item: pytest.Item) -> list[Callable[..., Any]]:
+    """The test, and the fixtures that it uses."""
+    assert isinstance(item, pytest.Function)
+    test = item.function
+    # Hypothesis wraps what it is given.
+    test = getattr(getattr(test, "hypothesis", None), "inner_test", test)
+    fixtures = [each[-1].func for each in item._fixtureinfo.name2fixturedefs.values()]
+    return [test, *(each for each in fixtures if each.__module__.startswith("tests."))]
+
+
+def durations() -> dict[str, float]:
+    read: dict[str, float] = json.loads(DURATIONS.read_text(encoding="utf-8")) if DURATIONS.exists() else {}
+    return read
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.get_closest_marker("real_clock") is None and any(map(waits, _functions(item))):
+            item.add_marker("real_clock")
+    if LONG:
+        _choose(config, items, lambda item: "extent" in vars(item.module) or hasattr(item.function, "hypothesis"))
+    if config.getoption("quick"):
+        took_s = durations()
+        _choose(config, items, lambda item: _is_quick(item, took_s))
+
+
+def _is_quick(item: pytest.Function, took_s: dict[str, float]) -> bool:
+    return (
+        item.path.relative_to(TESTS).parts[0] in QUICK_ROOMS
+        and item.get_closest_marker("real_clock") is None
+        and took_s.get(item.nodeid, 0.0) <= QUICK_S
+    )
+
+
+def _choose(config: pytest.Config, items: list[pytest.Item], wanted: Callable[[Any], bool]) -> None:
+    chosen: list[pytest.Item] = []
+    others: list[pytest.Item] = []
+    for item in items:
+        (chosen if wanted(item) else others).append(item)
+    items[:] = chosen
+    config.hook.pytest_deselected(items=others)
 
 
 @pytest.hookimpl(trylast=True)
@@ -23,3 +135,62 @@ def pytest_collection_finish() -> None:
     """Two thousand collected tests never become garbage: do not look through them at every collection."""
     gc.collect()
     gc.freeze()
+
+
+def _no_process(event: str, _arguments: object) -> None:
+    if _began_s and event in ("subprocess.Popen", "os.fork", "os.posix_spawn"):
+        msg = f"{event} in a test of `make quick`: mark it real_clock, or name it in WAITS of tests/conftest.py"
+        raise RuntimeError(msg)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("quick"):
+        sys.addaudithook(_no_process)
+
+
+def _processor_s() -> float:
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+_began_s: dict[str, float] = {}
+"""The processor time at the start of the test that runs."""
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> Generator[None, None, None]:
+    _began_s[item.nodeid] = _processor_s()
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    if report.when == "teardown":
+        report.user_properties.append(("processor_s", _processor_s() - _began_s.pop(item.nodeid)))
+    return report
+
+
+_took_s: dict[str, float] = {}
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    for name, value in report.user_properties:
+        if name == "processor_s":
+            _took_s[report.nodeid] = float(str(value))
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """Name what is too slow for `make quick`; it is left out from the next time on that durations are noted."""
+    if config.getoption("quick"):
+        slow = sorted(((took_s, name) for name, took_s in _took_s.items() if took_s > QUICK_S), reverse=True)
+        if slow:
+            terminalreporter.section(f"more than {QUICK_S:g} s of processor time: too slow for `make quick`")
+        for took_s, name in slow:
+            terminalreporter.line(f"{took_s:6.1f} s  {name}")
+    if config.getoption("write_durations"):
+        noted = {name: took_s for name, took_s in durations().items() if name not in _took_s}
+        noted |= {name: round(took_s, 1) for name, took_s in _took_s.items() if took_s > WORTH_NOTING_S}
+        alive = {name: noted[name] for name in sorted(noted) if (TESTS.parent / name.split("::")[0]).exists()}
+        DURATIONS.write_text(json.dumps(alive, indent=0) + "\n", encoding="utf-8")
+        terminalreporter.line(f"{sum(_took_s.values()):.0f} s of processor time; {DURATIONS.name} written")

@@ -20,10 +20,11 @@ from companion.links.mavlink.signing import ticks_of
 from sim.px4.double import PX4Double
 from tests.e2e.test_interleavings import people
 from tests.e2e.test_signing import KEY, START_S, signed_rig, virtual_clock
+from tests.support.extent import extent
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
-CASES = 100
+CASES = extent(whole=1000, a_slice=50)
 CASES_A_TEST = 25
 ACTS_S = 10.0
 WIRE_S = 0.05
@@ -161,7 +162,7 @@ async def _one(folder: Path, seed: int) -> tuple[int, int]:
     return judge.writes, conflicts
 
 
-@pytest.mark.parametrize("first", range(0, int(os.environ.get("INTERLEAVINGS", CASES)), CASES_A_TEST))
+@pytest.mark.parametrize("first", range(0, CASES, CASES_A_TEST))
 def test_nothing_is_written_to_an_armed_aircraft_whoever_says_disarmed(
     tmp_path: Path, first: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

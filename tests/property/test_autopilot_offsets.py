@@ -58,7 +58,7 @@ angles = st.floats(-180, 180)
 scales = st.floats(0.8, 1.2).map(f32)
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(
     mounting=st.tuples(angles, angles, angles),
     tilt=st.tuples(angles, angles, angles),
@@ -116,7 +116,7 @@ def test_after_the_write_the_output_is_the_truth(
     np.testing.assert_allclose(bias_accel, bare_accel - force, atol=1e-12)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(
     before=vectors(0.3),
     change=vectors(0.05),

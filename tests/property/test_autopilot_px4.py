@@ -39,7 +39,7 @@ def vectors(limit: float) -> st.SearchStrategy[Vector]:
     return st.tuples(number, number, number)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     number=st.sampled_from(sorted(ORIENTATIONS)),
     other=st.sampled_from(sorted(ORIENTATIONS)),

@@ -63,7 +63,7 @@ async def chaos(autopilot: ScriptedAutopilot, rng: random.Random, *, arming: boo
             await autopilot.reboot(rng.uniform(0.5, 6))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
     loss=st.sampled_from([0.0, 0.1, 0.4]),
@@ -128,7 +128,7 @@ def check_report(autopilot: ScriptedAutopilot, error: WriteFailedError) -> None:
     assert all(name in str(error) for name in error.left_changed)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1), loss=st.sampled_from([0.0, 0.2]), after_s=st.floats(0, 2))
 def test_a_cancel_at_any_moment_leaves_the_old_values(seed: int, loss: float, after_s: float) -> None:
     async def main() -> None:

@@ -33,7 +33,7 @@ EVENTS = st.one_of(
 )
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(st.lists(EVENTS, max_size=25))
 def test_nothing_that_arrives_raises(events: list[object]) -> None:
     collector = RollingCollector(still.settings(max_s=20.0), [still.imu()], gradienter=True, compass=True)
@@ -80,7 +80,7 @@ def check(collector: RollingCollector, now_s: float) -> None:
             assert all(sigma >= 0.0 for sigma in imu.gyro_sigma_stat_rad_s + imu.gyro_sigma_use_rad_s)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(st.lists(st.tuples(TIMES, FLOATS, st.none() | FLOATS), max_size=60), FLOATS)
 def test_a_source_survives_any_stream(stream: list[tuple[float, float, float | None]], now_s: float) -> None:
     for circle in (False, True):
@@ -98,7 +98,7 @@ def test_a_source_survives_any_stream(stream: list[tuple[float, float, float | N
 VALUES = st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=40)
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(VALUES, st.floats(-1e4, 1e4), st.floats(0.01, 100.0))
 def test_huber_moves_with_its_values(values: list[float], shift: float, scale: float) -> None:
     column = np.array(values)[:, None]
@@ -109,7 +109,7 @@ def test_huber_moves_with_its_values(values: list[float], shift: float, scale: f
     assert column.min() - 1e-9 <= here[0] <= column.max() + 1e-9
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(VALUES, st.floats(-10.0, 10.0))
 def test_a_line_gains_the_slope_that_is_added(values: list[float], slope: float) -> None:
     times = np.arange(len(values), dtype=np.float64)
@@ -123,7 +123,7 @@ def test_a_line_gains_the_slope_that_is_added(values: list[float], slope: float)
     assert np.isfinite(tilted.end_leverage).all()
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(st.tuples(*[st.floats(-0.1, 0.1)] * 3), st.tuples(*[st.floats(-1.0, 1.0)] * 3))
 def test_what_is_added_to_the_readings_is_added_to_the_means(
     rate: tuple[float, float, float], force: tuple[float, float, float]
@@ -138,7 +138,7 @@ def test_what_is_added_to_the_readings_is_added_to_the_means(
     assert shifted.gyro_sigma_use_rad_s == pytest.approx(plain.gyro_sigma_use_rad_s, rel=1e-3)
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(st.sampled_from(ROTATION_NAMES))
 def test_the_mounting_turns_the_means_and_keeps_the_total_variance(name: str) -> None:
     rotation = rotation_matrix(name)

@@ -58,7 +58,7 @@ def _vectors(imu: ImuSolution) -> tuple[Array, Array]:
     return imu.gyro_rad_s, imu.accel_m_s2
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(laws, tilts, tilts, headings, latitudes, gyros, accels, turns)
 def test_ideal_sensors_give_the_true_biases_for_every_pose_law_and_mounting(
     law: Law, pitch: float, roll: float, heading: float, latitude: float, gyro: Array, accel: Array, mounting: Array
@@ -82,7 +82,7 @@ def test_ideal_sensors_give_the_true_biases_for_every_pose_law_and_mounting(
     assert solution.pose.gamma_deg == pytest.approx(roll, abs=1e-9)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(laws, tilts, tilts, headings, gyros, accels, turns)
 def test_turning_the_vehicle_axes_with_all_sensors_turns_the_biases(
     law: Law, pitch: float, roll: float, heading: float, gyro: Array, accel: Array, turn: Array
@@ -108,7 +108,7 @@ def test_turning_the_vehicle_axes_with_all_sensors_turns_the_biases(
         np.testing.assert_allclose(turned, turn @ straight, rtol=0, atol=1e-9)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(tilts, tilts, headings, gyros, accels)
 def test_a_constant_added_to_the_readings_is_added_to_the_bias(
     pitch: float, roll: float, heading: float, gyro: Array, accel: Array

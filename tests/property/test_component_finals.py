@@ -222,7 +222,7 @@ def test_with_loss_a_press_never_starts_two_jobs_nor_ends_in_two_ways(block: int
     assert total["jobs"] > total["ended"] / 4
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(
     command=st.sampled_from([CALIBRATE, CANCEL, UNDO, PREFLIGHT, 512, 520, 3001]) | st.integers(0, 65535),
     parameters=st.lists(st.floats(width=32) | st.sampled_from([0.0, 1.0, 2.0]), min_size=7, max_size=7),
@@ -258,7 +258,7 @@ def test_only_exact_parameters_start_something(command: int, parameters: list[fl
             )  # fmt: skip
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(st.lists(st.binary(max_size=60), max_size=30), st.integers(0, 2**32))
 def test_garbage_between_the_packets_does_no_harm(garbage: list[bytes], seed: int) -> None:
     async def main() -> None:

@@ -18,6 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.calibration.request import What
 from companion.component.service import Refusal
 from companion.daemon.job import Job
+from tests.support.extent import extent
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -111,7 +112,7 @@ async def _survives(folder: Path, firmware: Literal["ardupilot", "px4"], seed: i
 
 
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-@settings(max_examples=2, deadline=None)
+@settings(max_examples=extent(whole=20, a_slice=1))
 @given(seed=st.integers(0, 2**32))
 def test_no_value_of_any_message_ends_status_recordings_or_calibrations(
     firmware: Literal["ardupilot", "px4"], seed: int

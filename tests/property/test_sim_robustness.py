@@ -27,7 +27,7 @@ HEADING = st.floats(0.0, 359.99)
 LATITUDE = st.floats(-89.0, 89.0)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(TILT, TILT, HEADING, LATITUDE)
 def test_the_truth_has_the_right_length_and_the_right_angle(
     pitch: float, roll: float, heading: float, latitude: float
@@ -41,7 +41,7 @@ def test_the_truth_has_the_right_length_and_the_right_angle(
     assert sine == pytest.approx(math.sin(math.radians(latitude)), abs=1e-9)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(TILT, TILT, HEADING)
 def test_angles_come_back_from_their_matrix(pitch: float, roll: float, heading: float) -> None:
     angles = angles_of(body_from_ned(math.radians(roll), math.radians(pitch), math.radians(heading)))
@@ -49,7 +49,7 @@ def test_angles_come_back_from_their_matrix(pitch: float, roll: float, heading: 
     assert (math.degrees(angles[2]) - heading + 180.0) % 360.0 == pytest.approx(180.0, abs=1e-9)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(TILT, TILT, HEADING)
 def test_a_compass_always_says_three_numbers_in_range(pitch: float, roll: float, heading: float) -> None:
     compass = HMR3300(VirtualAircraft(Pose(pitch, roll, heading)), heading_noise_deg=0.0)
@@ -69,7 +69,7 @@ def all_devices() -> list[SerialDevice]:
     ]
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.lists(st.binary(max_size=300), max_size=8))
 def test_devices_survive_any_command(chunks: list[bytes]) -> None:
     for device in all_devices():
@@ -79,7 +79,7 @@ def test_devices_survive_any_command(chunks: list[bytes]) -> None:
 
 
 @pytest.mark.parametrize(("kind", "name"), [(ArduPilotDouble, "INS_GYR_CAL"), (PX4Double, "IMU_GYRO_CAL_EN")])
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(chunks=st.lists(st.binary(max_size=300), max_size=20))
 def test_the_doubles_survive_any_bytes_and_still_answer(
     kind: type[ArduPilotDouble | PX4Double], name: str, chunks: list[bytes]
@@ -99,7 +99,7 @@ def test_the_doubles_survive_any_bytes_and_still_answer(
     run_virtual(main())
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.floats(0.001, 3.0), st.lists(st.floats(0.0, 3.0), max_size=10))
 def test_frames_come_once_each_and_in_order_however_often_one_asks(rate_scale: float, asks: list[float]) -> None:
     device = Gradienter(VirtualAircraft(), rate_hz=10.0 * rate_scale)

@@ -177,6 +177,12 @@ def right_pni_data(data: bytes) -> list[Found]:
     return found
 
 
+def right_rion_sums(data: bytes) -> list[Found]:
+    """Whatever has a RION device's first byte, a length and the right sum, be it a frame or chance."""
+    ends = [(at, at + 1 + data[at + 1]) for at in range(len(data) - 1) if data[at] == 0x68 and data[at + 1] >= 4]
+    return [Found(at, end) for at, end in ends if end <= len(data) and sum8(data[at + 1 : end - 1]) == data[end - 1]]
+
+
 def right_rion_angles(data: bytes) -> list[Found]:
     """Every answer with angles whose sum is right and whose digits are digits; of two that overlap the first."""
     found: list[Found] = []

@@ -68,7 +68,7 @@ def test_sigma_covers_the_error_for_any_noise(sigma: float) -> None:
     assert sigma < 0.05 or rms > 0.5
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(reading=st.floats(-2000.0, 2000.0), off=st.floats(-1.0, 1.0), alternate=st.booleans())
 def test_no_shifted_reading_comes_near_zero(reading: float, off: float, *, alternate: bool) -> None:
     shifts = shifts_lsb(np.full(6, reading), alternate=alternate)

@@ -139,7 +139,7 @@ def test_two_integers_are_not_enough_without_a_sigma_and_are_with_one() -> None:
 
 
 @example(lowest=0, counts=[1, 1, *[0] * 17], sigma=1.0000000000000002e-06)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     lowest=st.integers(-40000, 40000),
     counts=st.lists(st.integers(0, 5000), min_size=1, max_size=40),
@@ -157,7 +157,7 @@ def test_nothing_is_ever_nan(lowest: int, counts: list[int], sigma: float | None
         assert values[0] - 1.0 <= found.mean[0] <= values[-1] + 1.0
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(mean=st.floats(-3.0, 3.0), sigma=st.floats(0.3, 2.0), seed=st.integers(0, 10**6))
 def test_the_mirror_image_has_the_mirrored_mean(mean: float, sigma: float, seed: int) -> None:
     exact = np.random.default_rng(seed).normal(mean, sigma, (4000, 1))

@@ -123,7 +123,7 @@ def test_chance_seldom_makes_a_slope_of_ten_seconds() -> None:
     assert float(np.mean(np.abs(line.t_statistic) > 5.0)) > 2e-3
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(
     st.integers(1, 9).flatmap(
         lambda rows: arrays(np.float64, st.sampled_from([(rows,), (rows, 3)]), elements=st.floats(width=64))

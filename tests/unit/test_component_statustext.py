@@ -73,7 +73,7 @@ def test_a_text_too_long_loses_its_tail_and_says_so() -> None:
     run_virtual(main())
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(st.text(max_size=300))
 def test_any_text_is_cut_into_chunks_that_can_be_put_together(text: str) -> None:
     chunks = split_chunks(text)

@@ -272,7 +272,7 @@ EVENTS = st.lists(
 
 @pytest.mark.parametrize("info", TALKATIVE.values(), ids=list(TALKATIVE))
 @given(events=EVENTS)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_with_read_only_not_one_byte_leaves(info: ProtocolInfo, events: list[tuple[str, Any]]) -> None:
     async def main(*, read_only: bool) -> int:
         sensor, port, _ = opened(dataclasses.replace(device(*BOTH, read_only=read_only), info=info))

@@ -107,7 +107,7 @@ KEYS = st.sampled_from(
 )  # fmt: skip
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.lists(st.tuples(KEYS, VALUES), min_size=1, max_size=4))
 @example([("mavlink.signing", "[[0x" + "f" * 4000 + ", nan]]")])
 def test_no_value_does_more_than_end_in_one_line(pairs: list[tuple[str, str]]) -> None:
@@ -121,7 +121,7 @@ def test_no_value_does_more_than_end_in_one_line(pairs: list[tuple[str, str]]) -
         assert len(words) < 700
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.binary(max_size=300))
 def test_no_bytes_do_either(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
     path = tmp_path_factory.getbasetemp() / "any.toml"

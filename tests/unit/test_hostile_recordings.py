@@ -157,7 +157,7 @@ def test_bytes_that_look_like_messages_hide_none(tmp_path: Path) -> None:
     assert [len(item.data) for item in Recording(path) if isinstance(item, Message)] == sizes
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.data())
 def test_no_bytes_do_more_than_end_a_recording(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     sound = MAGIC + record(1, text(b"") * 2) + packed(channel(1, b"/a") + message(b"one") * 3) + record(12, text(b"m"))

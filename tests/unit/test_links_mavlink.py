@@ -36,7 +36,7 @@ def listening(link: MavlinkLink) -> list[tuple[int, float]]:
     return heard
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(st.lists(st.binary(max_size=400) | st.binary(max_size=40).map(lambda data: b"\xfd" + data), max_size=20))
 def test_garbage_never_raises_and_good_packets_after_it_are_heard(chunks: list[bytes]) -> None:
     link = MavlinkLink()
@@ -51,7 +51,7 @@ def test_garbage_never_raises_and_good_packets_after_it_are_heard(chunks: list[b
     assert link.received["handler error"] == 0
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(st.data())
 def test_however_the_bytes_are_split_every_message_is_heard_once_in_order(data: st.DataObject) -> None:
     stream = b"".join(heartbeats(10))
@@ -65,7 +65,7 @@ def test_however_the_bytes_are_split_every_message_is_heard_once_in_order(data: 
     assert link.last_received_s == float(cuts[-1])
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(position=st.integers(1, 20), bit=st.integers(0, 7))
 def test_a_flipped_bit_is_a_counted_loss_and_never_a_wrong_message(position: int, bit: int) -> None:
     good, broken, *rest = heartbeats(20)

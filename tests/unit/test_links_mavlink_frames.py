@@ -73,7 +73,7 @@ def test_a_message_is_the_one_that_the_codec_reads(message_id: int) -> None:
             assert everything(found) == everything(expected)
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(seed=st.integers(0, 2**32), position=st.integers(0, 40), bit=st.integers(0, 7), cut=st.integers(1, 40))
 def test_what_is_damaged_signed_or_not_whole_is_left_to_the_codec(seed: int, position: int, bit: int, cut: int) -> None:
     dice = random.Random(seed)
@@ -85,7 +85,7 @@ def test_what_is_damaged_signed_or_not_whole_is_left_to_the_codec(seed: int, pos
     assert kind_at(bytes(damaged), 0) is None
 
 
-@settings(deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(seed=st.integers(0, 2**32), wanted=st.sets(st.sampled_from(MIXTURE)), cuts=st.integers(0, 12))
 def test_the_link_hears_what_the_codec_alone_would_in_any_split(seed: int, wanted: set[Any], cuts: int) -> None:
     dice = random.Random(seed)

@@ -76,7 +76,7 @@ def hears(link: MavlinkLink) -> list[int]:
     return heard
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**48 - 1), st.integers(0, 255), st.binary(min_size=32, max_size=32), st.binary(max_size=50))
 def test_what_we_sign_is_what_pymavlink_signs(ticks: int, link_id: int, key: bytes, words: bytes) -> None:
     theirs = mavlink.MAVLink_statustext_message(6, words).pack(peer(key, ticks, link_id=link_id))

@@ -16,7 +16,7 @@ OTHERS = [
 ] + [mavlink.MAVLink_param_value_message(b"A\x00\x01\x00", 1.0, 9, 256, 256).pack(peer(None)), b"\x00\x01\x00noise"]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     st.lists(st.sampled_from([SETUP, SIGNED, *OTHERS]), max_size=6),
     st.lists(st.integers(1, 40), min_size=1, max_size=60),

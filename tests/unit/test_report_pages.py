@@ -462,7 +462,7 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     axes=st.lists(_axes, min_size=6, max_size=6),
     temperatures=st.lists(st.none() | _floats, min_size=3, max_size=3),

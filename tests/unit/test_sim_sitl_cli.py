@@ -61,6 +61,7 @@ def test_px4_without_its_etc_folder_says_which_one_is_missing(
     )
 
 
+@pytest.mark.real_clock
 def test_a_firmware_that_dies_at_once_is_told_with_its_last_words(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,0 +1,15 @@
+"""How much a test does: a slice of it in `make test`, the whole of it in `make long`."""
+
+from __future__ import annotations
+
+import os
+from typing import Final, TypeVar
+
+T = TypeVar("T")
+
+LONG: Final = os.environ.get("TESTS") == "long"
+
+
+def extent(*, whole: T, a_slice: T) -> T:
+    """The size of a test that is too long for every day: `make long` sets `TESTS=long`."""
+    return whole if LONG else a_slice
