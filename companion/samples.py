@@ -13,6 +13,7 @@ from typing import Literal
 import msgspec
 
 Vector = tuple[float, float, float]
+Triad = Literal["gyro", "accel"]
 
 
 class ImuSample(msgspec.Struct, frozen=True, gc=False):

@@ -266,23 +266,23 @@ class AttitudeEstimator:
 
     def add_heading(self, t_s: float, heading_true_rad: float, sigma_rad: float) -> bool:
         """Take the heading that a self-levelling compass had at `t_s`; returns whether it was used."""
-        found = self._sensor_to_ned_at(t_s)
+        found = self.kept_at(t_s)
         if found is None or self._leveller.doubt > STEADY_SHARE:
             return False
         rx, ry, rz = self._strapdown.last_rate_rad_s
         if rx * rx + ry * ry + rz * rz > STEADY_RAD_S**2:
             return False
-        _, pitch, yaw = roll_pitch_yaw(multiply(found, self._sensor_from_vehicle))
+        _, pitch, yaw = roll_pitch_yaw(found[1])
         if abs(pitch) > STEEP_RAD:
             return False
         return self._turn(t_s, innovation_of_heading(heading_true_rad, yaw), sigma_rad)
 
     def add_field(self, t_s: float, field_frd: Triple, declination_rad: float, sigma_rad: float) -> bool:
         """Take the magnetic field vector, vehicle FRD and any unit, at `t_s`; returns whether it was used."""
-        found = self._sensor_to_ned_at(t_s)
+        found = self.kept_at(t_s)
         if found is None:
             return False
-        innovation = innovation_of_field(field_frd, multiply(found, self._sensor_from_vehicle), declination_rad)
+        innovation = innovation_of_field(field_frd, found[1], declination_rad)
         return innovation is not None and self._turn(t_s, innovation, sigma_rad)
 
     def kept_at(self, t_s: float) -> tuple[float, Quaternion] | None:
@@ -290,24 +290,10 @@ class AttitudeEstimator:
 
         With the instant, up to a stretch before, of which it is; None when nothing of then is.
         """
-        if not self.aligned:
-            return None
-        for then_s, orientation in reversed(self._history):
+        for then_s, orientation in reversed(self._history if self.aligned else ()):
             if then_s <= t_s:
-                turn = multiply(multiply(self._leveller.ned_from_e, orientation), self._sensor_from_vehicle)
-                return then_s, turn
+                return then_s, multiply(multiply(self._leveller.ned_from_e, orientation), self._sensor_from_vehicle)
         return None
-
-    def _sensor_to_ned_at(self, t_s: float) -> Quaternion | None:
-        """The orientation then, by the leveller's present opinion; None when it is not remembered."""
-        if not self.aligned:
-            return None
-        orientation: Quaternion | None = None
-        for then_s, kept in reversed(self._history):
-            if then_s <= t_s:
-                orientation = kept
-                break
-        return None if orientation is None else multiply(self._leveller.ned_from_e, orientation)
 
     def _turn(self, t_s: float, innovation_rad: float, sigma_rad: float) -> bool:
         gain = self._heading.gain(t_s, innovation_rad, self._uncertainty.heading_sigma_rad, sigma_rad)
@@ -335,7 +321,7 @@ class AttitudeEstimator:
         return Attitude(t_s, (w, x, y, z), roll, pitch, yaw, rate, self._sigmas(pitch, yaw))
 
     def _sigmas(self, pitch_rad: float, yaw_rad: float) -> Triple:
-        nn, ee, ne, dd = self._uncertainty.attitude_terms
+        (nn, ne, _), (_, ee, _), (_, _, dd) = self._uncertainty.attitude.tolist()
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         about_forward = max(c * c * nn + 2.0 * c * s * ne + s * s * ee, 0.0)
         about_right = max(s * s * nn - 2.0 * c * s * ne + c * c * ee, 0.0)

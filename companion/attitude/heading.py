@@ -12,6 +12,7 @@ from typing import Final
 from companion.attitude.quaternion import Quaternion, Triple, rotate
 
 TAU_S: Final = 9.0
+"""Time constant of the correction; the first readings after an alignment without heading count more."""
 GATE_SIGMAS: Final = 4.0
 GATE_LEAST_RAD: Final = math.radians(10.0)
 STEEP_RAD: Final = math.radians(60.0)
@@ -38,24 +39,17 @@ def innovation_of_field(field: Triple, ned_from_body: Quaternion, declination_ra
 
 
 class HeadingAid:
-    """Decides what of an innovation is believed.
+    """Decides what of an innovation is believed."""
 
-    Args:
-        tau_s: time constant of the correction; the first readings after an alignment without heading count more.
-    """
-
-    def __init__(self, tau_s: float = TAU_S) -> None:
-        self.tau_s = tau_s
+    def __init__(self) -> None:
         self.refused = 0
         self.used = 0
-        self.disagrees_rad: float | None = None
-        """The innovation that was last refused, until one is used again."""
         self._last_s: float | None = None
         self._refused_since_s: float | None = None
 
     def restart(self) -> None:
         """After an alignment."""
-        self.disagrees_rad = self._last_s = self._refused_since_s = None
+        self._last_s = self._refused_since_s = None
 
     def gain(self, t_s: float, innovation_rad: float, sigma_rad: float, compass_sigma_rad: float) -> float:
         """The share of the innovation to turn by; 0 when it is refused.
@@ -69,16 +63,15 @@ class HeadingAid:
         gate = max(GATE_LEAST_RAD, GATE_SIGMAS * math.hypot(sigma_rad, compass_sigma_rad))
         if not abs(innovation_rad) <= gate:
             self.refused += 1
-            self.disagrees_rad = innovation_rad
             if self._refused_since_s is None:
                 self._refused_since_s = t_s
             return 0.0
         since_s = 0.0 if self._last_s is None else max(0.0, t_s - self._last_s)
-        self._last_s, self._refused_since_s, self.disagrees_rad = t_s, None, None
+        self._last_s, self._refused_since_s = t_s, None
         self.used += 1
         # What is known badly is told by the first reading at once; after that the time constant rules.
         trust = sigma_rad**2 / (sigma_rad**2 + compass_sigma_rad**2) if sigma_rad > compass_sigma_rad else 0.0
-        return max(trust, min(1.0, since_s / self.tau_s))
+        return max(trust, min(1.0, since_s / TAU_S))
 
     def refused_for_s(self, t_s: float) -> float:
         """How long it has been refused without a break."""

@@ -11,7 +11,16 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from companion.attitude.quaternion import IDENTITY, Quaternion, Triple, multiply, normalised, rotate, shortest_arc
+from companion.attitude.quaternion import (
+    IDENTITY,
+    Quaternion,
+    Triple,
+    about_down,
+    multiply,
+    normalised,
+    rotate,
+    shortest_arc,
+)
 
 FORCE_SMOOTHED_S: Final = 1.0
 """Over so long the force's length is looked at: vibration and gusts are shorter."""
@@ -22,11 +31,7 @@ _UP: Final = (0.0, 0.0, -1.0)
 
 
 class Leveller:
-    """Keeps the turn from E to NED that puts the mean specific force upright.
-
-    Args:
-        gravity_m_s2: local.
-    """
+    """Keeps the turn from E to NED that puts the mean specific force upright."""
 
     def __init__(self, gravity_m_s2: float) -> None:
         self.gravity_m_s2 = gravity_m_s2
@@ -75,5 +80,4 @@ class Leveller:
 
     def turn_heading(self, angle_rad: float) -> None:
         """Turn everything clockwise by so much about the vertical."""
-        half = 0.5 * angle_rad
-        self.ned_from_e = normalised(multiply((math.cos(half), 0.0, 0.0, math.sin(half)), self.ned_from_e))
+        self.ned_from_e = normalised(multiply(about_down(angle_rad), self.ned_from_e))

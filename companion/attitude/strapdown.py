@@ -10,7 +10,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from companion.attitude.quaternion import IDENTITY, Quaternion, Triple, from_rotation_vector, multiply, normalised
+from companion.attitude.quaternion import (
+    IDENTITY,
+    Quaternion,
+    Triple,
+    from_rotation_vector,
+    multiply,
+    normalised,
+    rotate,
+)
 from companion.samples import ImuSample
 
 STEP_S: Final = 0.02
@@ -60,8 +68,6 @@ class Strapdown:
         self.last_rate_rad_s: Triple = (0.0, 0.0, 0.0)
         self.out_of_order = 0
         """Samples that were not later than the one before: left out."""
-        self.implausible = 0
-        """Samples that no sensor can mean: left out."""
         self.lost = False
         """Nothing came for longer than `LOST_S`: `orientation` means nothing until it is set again."""
         self._previous: Triple = (0.0, 0.0, 0.0)
@@ -87,85 +93,63 @@ class Strapdown:
         How the samples are cut into calls changes nothing.
         """
         done: list[Stretch] = []
-        last_s = self.last_s
-        bx, by, bz = self.bias_rad_s
-        ex, ey, ez = self.frame_rate_rad_s
-        cx, cy, cz = self.force_bias_m_s2
-        px, py, pz = self._previous
-        w, x, y, z = self.orientation
-        span, missing = self._span_s, self._missing_s
-        ux, uy, uz = self._angle
-        vx, vy, vz = self._velocity
-        sx, sy, sz = self._unturned
-        turn_s = self._turn_s
         for sample in samples:
-            t_s = sample.t_s
-            if last_s is None:
-                last_s = t_s
+            if (dt := self._since_last(sample)) is None:
                 continue
-            dt = t_s - last_s
-            if not dt > 0.0:
-                self.out_of_order += 1
-                continue
-            last_s = t_s
-            if dt > GAP_S:
-                missing += dt
-                if dt > LOST_S:
-                    self.lost = True
-                    px = py = pz = 0.0
-                    continue
-            gx, gy, gz = sample.gyro_rad_s
-            fx, fy, fz = sample.accel_m_s2
+            (gx, gy, gz), (bx, by, bz) = sample.gyro_rad_s, self.bias_rad_s
+            (fx, fy, fz), (cx, cy, cz) = sample.accel_m_s2, self.force_bias_m_s2
+            (px, py, pz), (ux, uy, uz), (sx, sy, sz) = self._previous, self._angle, self._unturned
             ax, ay, az = (gx - bx) * dt, (gy - by) * dt, (gz - bz) * dt
-            rx = ax + (py * az - pz * ay) * 0.08333333333333333
-            ry = ay + (pz * ax - px * az) * 0.08333333333333333
-            rz = az + (px * ay - py * ax) * 0.08333333333333333
-            square = rx * rx + ry * ry + rz * rz
-            if not (square < _ANGLE_SQUARE and fx * fx + fy * fy + fz * fz < _FORCE_SQUARE):
-                self.implausible += 1
-                missing += dt
+            rx = ax + (py * az - pz * ay) / 12.0
+            ry = ay + (pz * ax - px * az) / 12.0
+            rz = az + (px * ay - py * ax) / 12.0
+            if not (rx * rx + ry * ry + rz * rz < _ANGLE_SQUARE and fx * fx + fy * fy + fz * fz < _FORCE_SQUARE):
+                self._missing_s += dt  # no sensor can mean that
                 continue
-            px, py, pz = ax, ay, az
-            if square < 0.04:
-                # cos and half the sinc of the half angle; the next terms are below 2e-9.
-                c = 1.0 - square * (0.125 - square * 0.0026041666666666665)
-                s = 0.5 - square * (0.020833333333333332 - square * 0.00026041666666666666)
-                rx, ry, rz = s * rx, s * ry, s * rz
-            else:
-                c, rx, ry, rz = from_rotation_vector((rx, ry, rz))
-            w, x, y, z = (
-                w * c - x * rx - y * ry - z * rz,
-                w * rx + x * c + y * rz - z * ry,
-                w * ry - x * rz + y * c + z * rx,
-                w * rz + x * ry - y * rx + z * c,
-            )
-            ux += ax
-            uy += ay
-            uz += az
-            sx += (fx - cx) * dt
-            sy += (fy - cy) * dt
-            sz += (fz - cz) * dt
-            turn_s += dt
-            span += dt
-            if turn_s > TURN_S - _ROUNDING_S:
-                # `rotate`, written out: this is the inside of the hottest loop of all.
-                tx, ty, tz = 2.0 * (y * sz - z * sy), 2.0 * (z * sx - x * sz), 2.0 * (x * sy - y * sx)
-                vx += sx + w * tx + y * tz - z * ty
-                vy += sy + w * ty + z * tx - x * tz
-                vz += sz + w * tz + x * ty - y * tx
-                sx = sy = sz = turn_s = 0.0
-                if span > STEP_S - _ROUNDING_S:
-                    half = -0.5 * span
-                    w, x, y, z = normalised(multiply((1.0, half * ex, half * ey, half * ez), (w, x, y, z)))
-                    mean = 1.0 / span
-                    force, rate = (vx * mean, vy * mean, vz * mean), (ux * mean, uy * mean, uz * mean)
-                    done.append(Stretch(t_s, span, force, rate, missing, (w, x, y, z)))
-                    ux = uy = uz = vx = vy = vz = span = missing = 0.0
-        self.orientation = (w, x, y, z)
-        self.last_s, self._previous = last_s, (px, py, pz)
-        self._unturned, self._turn_s = (sx, sy, sz), turn_s
-        self._span_s, self._missing_s, self._angle, self._velocity = span, missing, (ux, uy, uz), (vx, vy, vz)
+            self._previous = (ax, ay, az)
+            self.orientation = multiply(self.orientation, from_rotation_vector((rx, ry, rz)))
+            self._angle = (ux + ax, uy + ay, uz + az)
+            self._unturned = (sx + (fx - cx) * dt, sy + (fy - cy) * dt, sz + (fz - cz) * dt)
+            self._turn_s += dt
+            self._span_s += dt
+            if self._turn_s > TURN_S - _ROUNDING_S:
+                self._turn()
+                if self._span_s > STEP_S - _ROUNDING_S:
+                    done.append(self._finished(sample.t_s))
         if samples:
-            gx, gy, gz = samples[-1].gyro_rad_s
+            (gx, gy, gz), (bx, by, bz) = samples[-1].gyro_rad_s, self.bias_rad_s
             self.last_rate_rad_s = (gx - bx, gy - by, gz - bz)
+        return done
+
+    def _since_last(self, sample: ImuSample) -> float | None:
+        """Seconds since the sample before; None where this one tells nothing."""
+        if self.last_s is None:
+            self.last_s = sample.t_s
+            return None
+        dt = sample.t_s - self.last_s
+        if not dt > 0.0:
+            self.out_of_order += 1
+            return None
+        self.last_s = sample.t_s
+        if dt > GAP_S:
+            self._missing_s += dt
+        if dt > LOST_S:
+            self.lost, self._previous = True, (0.0, 0.0, 0.0)
+            return None
+        return dt
+
+    def _turn(self) -> None:
+        """Turn the specific force since the last time into E."""
+        (vx, vy, vz), (fx, fy, fz) = self._velocity, rotate(self.orientation, self._unturned)
+        self._velocity = (vx + fx, vy + fy, vz + fz)
+        self._unturned, self._turn_s = (0.0, 0.0, 0.0), 0.0
+
+    def _finished(self, t_s: float) -> Stretch:
+        """The stretch that is complete; the next one begins."""
+        (ex, ey, ez), half = self.frame_rate_rad_s, -0.5 * self._span_s
+        self.orientation = normalised(multiply((1.0, half * ex, half * ey, half * ez), self.orientation))
+        (vx, vy, vz), (ux, uy, uz), mean = self._velocity, self._angle, 1.0 / self._span_s
+        force, rate = (vx * mean, vy * mean, vz * mean), (ux * mean, uy * mean, uz * mean)
+        done = Stretch(t_s, self._span_s, force, rate, self._missing_s, self.orientation)
+        self._clear()
         return done

@@ -49,9 +49,6 @@ class Uncertainty:
         self._covariance = np.zeros((6, 6))
         self._levelled = 0.0
         self._turned = np.zeros(3)
-        self._seen: Matrix | None = None
-        """`attitude`, until something changes: it is asked for many times as often."""
-        self._terms: tuple[float, float, float, float] | None = None
         self.restart(np.eye(3) * HEADING_UNKNOWN_RAD**2)
 
     def restart(self, attitude_covariance: Matrix) -> None:
@@ -61,10 +58,6 @@ class Uncertainty:
         self._covariance[3:, 3:] = self._bias_start
         self._levelled = 0.0
         self._turned = np.zeros(3)
-        self._changed()
-
-    def _changed(self) -> None:
-        self._seen = self._terms = None
 
     def propagate(self, span_s: float, ned_from_sensor: Matrix, turned_rad: Array, missing_s: float) -> None:
         """Let `span_s` pass at this attitude, having turned by `turned_rad` (3,) about the sensor's axes."""
@@ -77,7 +70,6 @@ class Uncertainty:
         guessed = (GAP_RATE_RAD_S * missing_s) ** 2
         wander = (self._noise.walk**2 + self._noise.floor**2 / _BIAS_WANDERS_S) * span_s
         self._covariance[range(6), range(6)] += [white + guessed] * 3 + [wander] * 3
-        self._changed()
 
     def level(self, span_s: float, tau_s: float, believed: float, doubt: float, phase: str) -> None:
         """The leveller has worked for `span_s`, believing so much."""
@@ -90,7 +82,6 @@ class Uncertainty:
         self._covariance[range(2), range(2)] += gain**2 * variance
         self._turned[:2] *= 1.0 - gain
         self._levelled += (1.0 - self._levelled) * gain
-        self._changed()
 
     def head(self, gain: float, sigma_rad: float) -> None:
         """The heading was turned towards a reading with this sigma."""
@@ -101,7 +92,6 @@ class Uncertainty:
         # A compass is wrong in the same way for minutes: its share of the error is sigma, however often it is read.
         known = math.sqrt(max(self._covariance[2, 2], 0.0))
         self._covariance[2, 2] = (known + gain * sigma_rad) ** 2
-        self._changed()
 
     def _rest_variance(self, seconds: float) -> float:
         """Of one axis' mean rate over so many seconds."""
@@ -118,42 +108,18 @@ class Uncertainty:
         gain = np.linalg.solve(self._covariance[3:, 3:] + np.eye(3) * variance, part.T).T
         self._covariance = self._covariance - gain @ part.T
         self._covariance = 0.5 * (self._covariance + self._covariance.T)
-        self._changed()
         return np.asarray(gain)
 
     @property
     def attitude(self) -> Matrix:
         """(3, 3) covariance of the attitude error in NED, rad^2."""
-        if self._seen is None:
-            result = self._covariance[:3, :3].copy()
-            result[range(2), range(2)] += self._levelled**2 * self._level_variance
-            result[range(3), range(3)] += np.square(SCALE_SHARE * self._turned)
-            result.flags.writeable = False
-            self._seen = result
-        return self._seen
-
-    @property
-    def attitude_terms(self) -> tuple[float, float, float, float]:
-        """Of `attitude`: about north, about east, the two together, about down."""
-        if self._terms is None:
-            value = self._covariance.item
-            level = self._levelled**2 * self._level_variance
-            about_north, about_east, about_down = (SCALE_SHARE * turned for turned in self._turned.tolist())
-            self._terms = (
-                value(0, 0) + level + about_north**2,
-                value(1, 1) + level + about_east**2,
-                value(0, 1),
-                value(2, 2) + about_down**2,
-            )
-        return self._terms
+        result = self._covariance[:3, :3].copy()
+        result[range(2), range(2)] += self._levelled**2 * self._level_variance
+        result[range(3), range(3)] += np.square(SCALE_SHARE * self._turned)
+        return result
 
     @property
     def heading_sigma_rad(self) -> float:
         """Of the heading alone; at most that of an unknown one."""
         variance = float(self._covariance[2, 2]) + (SCALE_SHARE * float(self._turned[2])) ** 2
         return min(math.sqrt(max(variance, 0.0)), HEADING_UNKNOWN_RAD)
-
-    @property
-    def bias_sigma_rad_s(self) -> Array:
-        """(3,) of the gyro biases, sensor axes."""
-        return np.sqrt(np.maximum(np.diag(self._covariance)[3:], 0.0))

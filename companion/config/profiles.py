@@ -57,11 +57,6 @@ def none_saved(_directory: Path) -> SavedProfiles:
 def with_saved_profiles(config: Config, name: str, saved: Saved) -> Config:
     """The configuration with the figures of saved profiles in the place of their names.
 
-    Args:
-        config: as read.
-        name: of its file, for messages.
-        saved: where to look.
-
     Raises:
         ConfigError: one line that names file and key: an unknown name, or a profile that cannot be read.
     """

@@ -8,10 +8,10 @@ from typing import Final
 from companion.calibration.alignment.align_record import AlignmentRecord
 from companion.calibration.request import What
 from companion.calibration.solution.doubt import Doubt
-from companion.calibration.solution.history import Triad
 from companion.calibration.solution.record import Record, WrittenParameter
 from companion.component.service import JobResult
 from companion.errors import CalibrationRefusedError
+from companion.samples import Triad
 
 ALIGNMENT: Final = "gradienter alignment"
 """The kind of job that calibrates nothing."""

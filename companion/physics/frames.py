@@ -1,7 +1,7 @@
 """Frames and rotations.
 
 Body: FRD (x forward, y right, z down), as on the MAVLink wire. Navigation: NED. The paper writes RFU (x right,
-y forward, z up) and ENU instead; `FRD_FROM_RFU` is the bridge, its own inverse, and the same matrix takes ENU to NED.
+y forward, z up) and ENU instead.
 Angles: theta is pitch (nose up +), gamma is roll (right side down +), psi is heading, clockwise from true north;
 they are the aerospace 3-2-1 angles (method section 1.1).
 """
@@ -20,8 +20,6 @@ from companion.samples import Vector
 Floats = NDArray[np.float64]
 Matrix = Floats
 Array = Floats
-
-FRD_FROM_RFU: Matrix = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Matrix:

@@ -12,9 +12,8 @@ import msgspec
 
 from companion.calibration.collector.trace import MAX_SECONDS, ImuTrace, Trace, VerdictTrace
 from companion.calibration.solution.record import Record
-from companion.samples import Vector
+from companion.samples import Triad, Vector
 
-Triad = Literal["gyro", "accel"]
 State = Literal["still", "moving", "fault", "unknown"]
 
 LEAST_SECONDS: Final = 10

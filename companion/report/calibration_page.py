@@ -12,7 +12,7 @@ from companion.calibration.collector.trace import Trace
 from companion.calibration.noise.allan import AllanModel
 from companion.calibration.solution.record import Arming, ImuRecord, Outcome, Record
 from companion.report import svg
-from companion.report.analysis import Triad, history
+from companion.report.analysis import history
 from companion.report.markup import Child, Markup, join, number, tag
 from companion.report.page import (
     AXES,
@@ -34,7 +34,7 @@ from companion.report.page import (
     written_count,
 )
 from companion.report.seconds import allan_figure, stillness
-from companion.samples import Vector
+from companion.samples import Triad, Vector
 
 MAX_WRITTEN: Final = 60
 

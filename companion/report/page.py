@@ -13,8 +13,9 @@ from companion.calibration.solution.record import Arming, Record
 from companion.physics.units import DEG_H, MG
 from companion.report import svg
 from companion.report.advice import advice
-from companion.report.analysis import Point, Triad, clock_is_sound, slope
+from companion.report.analysis import Point, clock_is_sound, slope
 from companion.report.markup import Child, Markup, join, number, tag
+from companion.samples import Triad
 
 UNITS: Final[Mapping[Triad, tuple[float, str]]] = {"gyro": (DEG_H, "deg/h"), "accel": (MG, "mg")}
 NAMES: Final[Mapping[Triad, str]] = {"gyro": "Gyro", "accel": "Accelerometer"}

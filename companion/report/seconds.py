@@ -7,9 +7,10 @@ from typing import Final
 
 from companion.calibration.collector.trace import ImuTrace, Trace
 from companion.report import svg
-from companion.report.analysis import Run, Triad, allan, runs
+from companion.report.analysis import Run, allan, runs
 from companion.report.markup import Child, Markup, tag
 from companion.report.page import AXES, CLASSES, NAMES, UNITS, card
+from companion.samples import Triad
 
 MAX_SOURCES: Final = 8
 MAX_RUNS: Final = 300

@@ -13,7 +13,7 @@ from companion.calibration.means import estimates
 from companion.calibration.noise.allan import AllanModel, NoiseProfile
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG, DEG_H, MG
-from companion.samples import CompassSample, ImuSample, TiltSample
+from companion.samples import ImuSample, TiltSample
 from tests.support.still_aircraft import (
     BIAS,
     FORCE,
@@ -282,14 +282,6 @@ def test_no_imu_at_all_still_gives_the_pose() -> None:
 
 
 # ------------------------------------------------------------------------------------------------------- dirty input
-
-
-def test_samples_of_unknown_sources_are_counted() -> None:
-    collector = RollingCollector(settings(), [imu()], gradienter=False, compass=False)
-    collector.add_imu("other", ImuSample(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, -9.8)))
-    collector.add_tilt(TiltSample(0.0, 0.0, 0.0))
-    collector.add_compass(CompassSample(0.0, 0.0))
-    assert collector.unknown_samples == 3
 
 
 def test_two_imus_of_one_name_are_a_mistake() -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from companion.calibration.solution.bias import accelerometer_bias, gyro_bias
 from companion.physics import earth
-from companion.physics.frames import FRD_FROM_RFU, body_from_ned, roll_pitch_from_up, rotation_matrix, skew
+from companion.physics.frames import body_from_ned, roll_pitch_from_up, rotation_matrix, skew
 from companion.physics.gradienter import Law, attitude_from_readings, readings_from_up, up_in_sensor, up_jacobian
 from companion.physics.units import DEG, DEG_H, MG
 from companion.rotations import ROTATION_NAMES
@@ -46,6 +46,10 @@ def test_known_poses_return_the_documented_biases(case: dict[str, Any]) -> None:
 def test_there_are_vectors_of_both_laws_that_they_tell_apart() -> None:
     assert {case["gradienter_law"] for case in CASES} == {"axis", "slope"}
     assert len(CASES) == 60
+
+
+# Its own inverse.
+FRD_FROM_RFU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 def test_body_matrix_is_the_corrected_equation_5_in_rfu() -> None:

@@ -13,6 +13,7 @@ import pytest
 from companion.physics.units import DEG_H
 from companion.report import analysis
 from companion.report.analysis import Point, allan, clock_is_sound, history, runs, slope
+from companion.samples import Triad
 from tests.support.histories import PER_K_DEG_H, record, white_trace
 
 
@@ -52,7 +53,7 @@ def test_the_interval_holds_the_truth_about_two_times_in_three() -> None:
 
 
 @pytest.mark.parametrize("triad", ["gyro", "accel"])
-def test_it_is_the_overlapping_deviation_of_allantools(triad: analysis.Triad) -> None:
+def test_it_is_the_overlapping_deviation_of_allantools(triad: Triad) -> None:
     trace = white_trace(record(), 200)
     imu = trace.imus[1]
     found = allan(trace, imu, triad)

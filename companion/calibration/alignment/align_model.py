@@ -122,15 +122,7 @@ class Unknowns:
 
 
 class Model:
-    """Residuals and their derivatives, every one divided by its sigma.
-
-    Args:
-        law: of the gradienter.
-        vehicle_from_sensor: its mounting.
-        stands: at least one; every one has the same IMUs in the same order.
-        ground: where it stands.
-        priors: what is known before.
-    """
+    """Residuals and their derivatives, every one divided by its sigma."""
 
     def __init__(
         self, law: Law, vehicle_from_sensor: Matrix, stands: Sequence[Stand], ground: Ground, priors: Priors

@@ -99,12 +99,6 @@ class AlignmentRecord(msgspec.Struct, frozen=True, kw_only=True):
     imus: tuple[ImuAlignmentRecord, ...]
     warnings: tuple[str, ...] = ()
 
-    @property
-    def total_offset_deg(self) -> Pair:
-        """The whole zero: the configured offset and what was measured on top of it."""
-        configured = self.gradienter.offset_deg
-        return configured[0] + self.offset_deg[0], configured[1] + self.offset_deg[1]
-
 
 def check(record: AlignmentRecord) -> None:
     """Whether a record can be used.

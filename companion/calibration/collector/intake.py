@@ -16,15 +16,7 @@ from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 
 
 class Intake(ABC):
-    """The streams, and what is known of each. Nothing that a sample holds makes it raise.
-
-    Args:
-        keep: batches of every stream that are kept.
-        gradienter: whether a gradienter is expected.
-        compass: whether a compass is expected.
-        lags: how gradienter and compass follow the truth.
-        field_by: how to make a heading of the compass' field vector; None: fields are dropped.
-    """
+    """The streams, and what is known of each. Nothing that a sample holds makes it raise."""
 
     _field: FieldHeading | None = None
 
@@ -45,7 +37,6 @@ class Intake(ABC):
         self._heading = compass_source(keep, lags[1]) if compass else None
         self._breaks: dict[str, int] = {}
         self._field = None if field_by is None else FieldHeading(*field_by, keep)
-        self.unknown_samples = 0
 
     @abstractmethod
     def _evaluate(self) -> None:
@@ -62,10 +53,9 @@ class Intake(ABC):
     # ------------------------------------------------------------------------------------------------- samples in
 
     def add_imu(self, name: str, sample: ImuSample) -> None:
-        """Take one sample of the IMU of that name; of an unknown name it is counted and dropped."""
+        """Take one sample of the IMU of that name; of an unknown name it is dropped."""
         source = self._imus.get(name)
         if source is None:
-            self.unknown_samples += 1
             return
         if sample.breaks != self._breaks.get(name, 0):
             self._breaks[name] = sample.breaks
@@ -79,9 +69,9 @@ class Intake(ABC):
         """Take one reading of the gradienter; dropped when none is expected."""
         if self._field is not None:
             self._field.take_tilt(sample)
-        if self._tilt is None:
-            self.unknown_samples += 1
-        elif self._tilt.batches.add(sample.t_s, (sample.x_deg, sample.y_deg), sample.temperature_degc):
+        if self._tilt is not None and self._tilt.batches.add(
+            sample.t_s, (sample.x_deg, sample.y_deg), sample.temperature_degc
+        ):
             self._evaluate()
 
     def add_compass(self, sample: CompassSample) -> bool:
@@ -94,7 +84,6 @@ class Intake(ABC):
     def add_field(self, sample: MagSample) -> CompassSample | None:
         """Take the compass' field; the heading that came of it, where that is the one that counts."""
         if self._heading is None or self._field is None:
-            self.unknown_samples += 1
             return None
         heading = self._field.take(sample)
         self._heading.hint = self._field.hint
@@ -103,9 +92,7 @@ class Intake(ABC):
         return heading
 
     def _take_heading(self, sample: CompassSample) -> None:
-        if self._heading is None:
-            self.unknown_samples += 1
-        elif self._heading.batches.add(sample.t_s, (sample.heading_deg,)):
+        if self._heading is not None and self._heading.batches.add(sample.t_s, (sample.heading_deg,)):
             self._evaluate()
 
     def set_imu(self, imu: ImuInput) -> None:

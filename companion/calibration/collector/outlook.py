@@ -56,14 +56,7 @@ class Glance(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def obstacle(sources: Sequence[Source], now_s: float, *, good_now: bool, min_good: int) -> Obstacle | None:
-    """A silent source, or the latest second was not still; None when nothing is in the way.
-
-    Args:
-        sources: in the order in which they are named.
-        now_s: the samples' clock.
-        good_now: the latest second was still for all of them.
-        min_good: still seconds that are needed.
-    """
+    """A silent source, or the latest second was not still; None when nothing is in the way."""
     if (silence := next(filter(None, (source.silence(now_s) for source in sources)), None)) is not None:
         return Obstacle(silence)
     if good_now:

@@ -57,15 +57,6 @@ class RollingCollector(Intake):
     Pure: no clock and no I/O. Nothing that a sample holds makes it raise; what is dropped is counted by reason.
     Memory is bounded: `max_s` and a margin of one-second batches a source.
 
-    Args:
-        settings: how long and how good.
-        imus: in the order of the result; names are unique.
-        gradienter: whether a gradienter is expected.
-        compass: whether a compass is expected.
-        gradienter_lag: how the gradienter follows the truth.
-        compass_lag: likewise.
-        field_by: how to make a heading of the compass' field vector; None: fields are dropped.
-
     Raises:
         ValueError: two IMUs of one name.
     """

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
-from typing import Final
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final, TypeVar
 
 import msgspec
 import numpy as np
@@ -19,8 +19,12 @@ from companion import formats
 from companion.calibration.collector.sources import Kind, Source
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import AllanModel
+from companion.calibration.seconds.batch import Batch
+from companion.calibration.stillness.gates import Verdict
 from companion.physics.frames import Floats
 from companion.samples import Vector
+
+T = TypeVar("T")
 
 FORMAT_VERSION: Final = 1
 
@@ -114,17 +118,12 @@ def from_json(data: bytes) -> Trace:
 
 
 class _Seen(msgspec.Struct, frozen=True):
-    """One source in one second; the arrays are the batch's own."""
+    """One source in one second."""
 
     kind: Kind
     name: str
-    still: bool
-    words: str
-    fault: bool
-    n: int
-    mean: Floats | None
-    variance: Floats | None
-    temperature_degc: float | None
+    verdict: Verdict
+    batch: Batch | None
 
 
 class Snapshot(msgspec.Struct, frozen=True):
@@ -137,11 +136,7 @@ class Snapshot(msgspec.Struct, frozen=True):
     cut: bool
 
     def trace(self, started_at: str) -> Trace:
-        """Pack it; takes milliseconds.
-
-        Args:
-            started_at: of the record that it will lie beside.
-        """
+        """Pack it; takes milliseconds."""
         origin = math.floor(self.started_s)
         names: dict[tuple[Kind, str], None] = {}
         for _, _, seen in self.seconds:
@@ -162,7 +157,7 @@ class Snapshot(msgspec.Struct, frozen=True):
                     kind=kind,
                     name=name,
                     words=tuple(_words(one) for one in column),
-                    fault=tuple(one is not None and one.fault for one in column),
+                    fault=tuple(one is not None and one.verdict.fault for one in column),
                 )
                 for (kind, name), column in columns.items()
             ),
@@ -200,38 +195,24 @@ class TraceLog:
 
 
 def _seen(source: Source, slot: int) -> _Seen:
-    verdict, batch = source.verdict, source.batches.batches.get(slot)
-    if batch is None:
-        return _Seen(source.kind, source.name, verdict.still, verdict.words, verdict.fault, 0, None, None, None)
-    return _Seen(
-        source.kind,
-        source.name,
-        verdict.still,
-        verdict.words,
-        verdict.fault,
-        batch.n,
-        batch.mean,
-        batch.variance,
-        batch.temperature_degc,
-    )
+    return _Seen(source.kind, source.name, source.verdict, source.batches.batches.get(slot))
 
 
 def _words(seen: _Seen | None) -> str | None:
     if seen is None:
         return ""
-    return None if seen.still else seen.words[:MAX_WORDS]
+    return None if seen.verdict.still else seen.verdict.words[:MAX_WORDS]
 
 
 def _imu(imu: ImuInput, column: Sequence[_Seen | None]) -> ImuTrace:
     rotation = np.asarray(imu.rotation, dtype=np.float64)
-    means: list[Floats | None] = []
-    variances: list[Floats | None] = []
-    for seen in column:
-        known = seen is not None and seen.mean is not None and seen.variance is not None
-        means.append(seen.mean if seen is not None and known else None)
-        variances.append(seen.variance if seen is not None and known else None)
-    # Vector are taken as independent, as everywhere: only their variances turn.
-    turned = np.square(rotation)
+    # Axes are taken as independent, as everywhere: only their variances turn.
+    squared = np.square(rotation)
+    batches = [None if seen is None else seen.batch for seen in column]
+
+    def each(figure: Callable[[Batch], T]) -> tuple[T | None, ...]:
+        return tuple(None if batch is None else figure(batch) for batch in batches)
+
     return ImuTrace(
         name=imu.name,
         profile=imu.profile.name,
@@ -239,18 +220,19 @@ def _imu(imu: ImuInput, column: Sequence[_Seen | None]) -> ImuTrace:
         accel_noise=imu.profile.accel,
         gyro_step_rad_s=imu.gyro_step_rad_s,
         accel_step_m_s2=imu.accel_step_m_s2,
-        samples=tuple(seen.n if seen is not None else 0 for seen in column),
-        temperature_degc=tuple(
-            None if seen is None or seen.temperature_degc is None else round(seen.temperature_degc, 3)
-            for seen in column
-        ),
-        gyro_rad_s=tuple(None if mean is None else _axes(rotation @ mean[:3]) for mean in means),
-        gyro_variance_rad2_s2=tuple(None if one is None else _axes(turned @ one[:3]) for one in variances),
-        accel_m_s2=tuple(None if mean is None else _axes(rotation @ mean[3:]) for mean in means),
-        accel_variance_m2_s4=tuple(None if one is None else _axes(turned @ one[3:]) for one in variances),
+        samples=tuple(0 if batch is None else batch.n for batch in batches),
+        temperature_degc=tuple(None if degc is None else round(degc, 3) for degc in each(_temperature)),
+        gyro_rad_s=each(lambda batch: _rounded(rotation @ batch.mean[:3])),
+        gyro_variance_rad2_s2=each(lambda batch: _rounded(squared @ batch.variance[:3])),
+        accel_m_s2=each(lambda batch: _rounded(rotation @ batch.mean[3:])),
+        accel_variance_m2_s4=each(lambda batch: _rounded(squared @ batch.variance[3:])),
     )
 
 
-def _axes(values: Floats) -> Vector:
+def _temperature(batch: Batch) -> float | None:
+    return batch.temperature_degc
+
+
+def _rounded(values: Floats) -> Vector:
     x, y, z = (float(f"{value:.{_DIGITS}g}") for value in values.tolist())
     return x, y, z

@@ -27,13 +27,7 @@ _LIMITS: Final = (1e6,) * 3
 
 
 class FieldHeading:
-    """Takes tilts and fields, gives headings of the compass' own forward axis from magnetic north.
-
-    Args:
-        compass: how it is mounted, and what its counts are.
-        gradienter: whose tilt; None: there is none.
-        keep: seconds of field that are kept.
-    """
+    """Takes tilts and fields, gives headings of the compass' own forward axis from magnetic north."""
 
     def __init__(self, compass: CompassModel, gradienter: GradienterModel | None, keep: int) -> None:
         self._compass, self._gradienter = compass, gradienter

@@ -75,12 +75,7 @@ class AxisFit(msgspec.Struct, frozen=True):
 
 
 def curve(slots: Slots, values: Floats) -> Curve | None:
-    """The Allan variances of one stretch; None where it is too short.
-
-    Args:
-        slots: (m,) seconds, ascending, perhaps with holes.
-        values: (m, c) means of these seconds.
-    """
+    """The Allan variances of one stretch; None where it is too short."""
     if len(slots) < LEAST_SLOTS:
         return None
     length = int(slots[-1] - slots[0]) + 1
@@ -97,10 +92,6 @@ def curve(slots: Slots, values: Floats) -> Curve | None:
 
 def fit_axis(curves: Sequence[Curve], column: int) -> AxisFit:
     """N, B and K of one column over all stretches, each of which had its own noise of the same kind.
-
-    Args:
-        curves: at least one.
-        column: which.
 
     Raises:
         ValueError: no curve, or a column that never changes.

@@ -15,10 +15,11 @@ import numpy as np
 from companion.calibration.means.windows import ImuInput, estimates
 from companion.calibration.noise.allan import NoiseProfile, allan_variance
 from companion.calibration.noise.robust import median
-from companion.calibration.profiling.profile_fit import LEAST_STILL_S, TRIADS, Triad, fit_profile
+from companion.calibration.profiling.profile_fit import LEAST_STILL_S, TRIADS, fit_profile
 from companion.calibration.profiling.rest import CHANNELS, MIN_SECONDS, Rest
 from companion.calibration.seconds.batches import Batch
 from companion.physics.frames import Floats
+from companion.samples import Triad
 
 MEANS_S: Final = (10, 30, 60)
 NEXT_S: Final = 60
@@ -66,10 +67,6 @@ class _Misses(msgspec.Struct):
 
 def coverage(recordings: Sequence[Sequence[Rest]], fallback: NoiseProfile) -> list[Kept]:
     """Fit on all recordings but one, predict in that one, in turn; of a single one, halves in the place of recordings.
-
-    Args:
-        recordings: the stretches of each.
-        fallback: as for `fit_profile`; and the one to compare with.
 
     Returns:
         A line for each triad and length of window; none where no recording has room for a window and its minute.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -20,8 +20,7 @@ from companion.calibration.noise.allan_fit import AxisFit, Curve, curve, fit_axi
 from companion.calibration.profiling.rest import CHANNELS, Rest
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Floats
-
-Triad = Literal["gyro", "accel"]
+from companion.samples import Triad
 
 TRIADS: Final[tuple[tuple[Triad, slice], ...]] = (("gyro", slice(0, 3)), ("accel", slice(3, 6)))
 LEAST_STILL_S: Final = 60
@@ -70,11 +69,6 @@ def stretch_curves(rests: Sequence[Rest]) -> list[Curve]:
 
 def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Finding:
     """The noise of one IMU from all its stretches at rest.
-
-    Args:
-        name: of the profile.
-        rests: of all recordings.
-        fallback: whose figures stand for those that the recordings do not tell.
 
     Raises:
         CalibrationRefusedError: too little at rest, or an axis that never changes.

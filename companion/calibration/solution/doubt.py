@@ -14,9 +14,9 @@ from typing import Final, Literal
 
 import numpy as np
 
-from companion.calibration.solution.history import Triad
 from companion.physics.frames import Array, Matrix
 from companion.physics.units import DEG, DEG_H, MG
+from companion.samples import Triad
 
 Cause = Literal["gradienter", "gravity", "turn", "imu", "unclear"]
 

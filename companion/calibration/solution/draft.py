@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from companion.calibration.solution.doubt import Doubt
-from companion.calibration.solution.history import Point, Triad
+from companion.calibration.solution.history import Point
 from companion.calibration.solution.record import (
     AlignmentUsed,
     CrossCovariance,
@@ -20,7 +20,7 @@ from companion.calibration.solution.record import (
 from companion.calibration.solution.solve import ImuSolution, Solution
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG_H, MG
-from companion.samples import Vector
+from companion.samples import Triad, Vector
 
 
 @dataclasses.dataclass(slots=True)

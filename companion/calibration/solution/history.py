@@ -8,13 +8,11 @@ that the sensor has started with is in all of them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Final
 
 import msgspec
 
-from companion.samples import Vector
-
-Triad = Literal["gyro", "accel"]
+from companion.samples import Triad, Vector
 
 MOST_RAD_S: Final = 10.0
 MOST_M_S2: Final = 100.0

@@ -24,11 +24,12 @@ from typing import Final
 import numpy as np
 
 from companion.calibration.solution.doubt import Doubt, Witness, doubts
-from companion.calibration.solution.history import Measured, Point, PowerUp, Triad
+from companion.calibration.solution.history import Measured, Point, PowerUp
 from companion.calibration.solution.prior import Expectation, Expected, ExpectedImu
 from companion.calibration.solution.record import AccelPrior, GyroPrior, Prior
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 from companion.physics.frames import Array, Matrix, vector
+from companion.samples import Triad
 
 Whole = Mapping[str, tuple[Array | None, Array | None]]
 """By IMU: whole gyro and accelerometer bias by the readings alone, (3,) each, vehicle FRD."""
@@ -73,13 +74,7 @@ class _Known:
 
 
 def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed:
-    """Take in what was known from before: guard against it, and let it take part where it may.
-
-    Args:
-        solution: by the readings alone.
-        whole: likewise, of every IMU.
-        expectation: what earlier calibrations say of today.
-    """
+    """Take in what was known from before: guard against it, and let it take part where it may."""
     shared = solution.shared
     if shared is None:
         return Weighed(solution, ())
@@ -135,17 +130,7 @@ def points(
     power_ups: Mapping[str, PowerUp],
     zero: str | None,
 ) -> dict[str, Point]:
-    """By IMU, what later calibrations may know of this one.
-
-    Args:
-        solution: by the readings alone.
-        whole: likewise.
-        found: what contradicted.
-        started_at: of the record.
-        unix_s: now.
-        power_ups: since when each IMU has been powered.
-        zero: which zero of the gradienter was in force.
-    """
+    """By IMU, what later calibrations may know of this one."""
     shared = solution.shared
     if shared is None:
         return {}

@@ -75,11 +75,7 @@ class PoseEffect:
 
 
 def pose_effect(aligned: ImuAlignmentRecord | None) -> PoseEffect:
-    """What is known of one IMU's scale, shear and misalignment.
-
-    Args:
-        aligned: from an alignment with tilts; what its stands have not determined is as assumed without one.
-    """
+    """What is known of one IMU's scale, shear and misalignment."""
     none: Determined | None = None
     scale, scale_sigma = _known(aligned.accel_scale if aligned else none, 1.0, _PRIORS.scale)
     shear, shear_sigma = _known(aligned.accel_shear if aligned else none, 1.0, _PRIORS.shear)

@@ -18,11 +18,11 @@ import msgspec
 import numpy as np
 
 from companion.calibration.noise.allan import AllanModel, floor_variance
-from companion.calibration.solution.history import Measured, Point, PowerUp, Triad, believed
+from companion.calibration.solution.history import Measured, Point, PowerUp, believed
 from companion.calibration.solution.pose_effect import PoseEffect
 from companion.physics.frames import Array, Floats, vector
 from companion.physics.units import DEG_H, MG
-from companion.samples import Vector
+from companion.samples import Triad, Vector
 
 GUARDS_FROM: Final = 3
 """Power-ups."""
@@ -113,14 +113,7 @@ def student_limit(freedom: float) -> float:
 
 
 def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect) -> Expected | None:
-    """What the earlier power-ups say of today; None where they are too few.
-
-    Args:
-        points: of this IMU, as they were measured, oldest first; today's power-up may be among them and is left out.
-        triad: which half.
-        now: today.
-        effect: how the accelerometers' bias moves with the attitude.
-    """
+    """What the earlier power-ups say of today; None where they are too few."""
     chosen = [
         _nearest(group, now.temperature_degc)
         for group in believed(points, triad)
@@ -157,15 +150,7 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect) 
 
 
 def expect_today(last: Point, triad: Triad, now: Now, effect: PoseEffect, model: AllanModel) -> Expected | None:
-    """What an earlier calibration in this very power-up says of now; None where it did not measure this.
-
-    Args:
-        last: that calibration.
-        triad: which half.
-        now: at this moment.
-        effect: how the accelerometers' bias moves with the attitude.
-        model: of the triad's noise, which says how it drifts.
-    """
+    """What an earlier calibration in this very power-up says of now; None where it did not measure this."""
     found = last.of(triad)
     if found is None:
         return None

@@ -21,13 +21,13 @@ from companion.calibration.means.pose_models import CompassModel, GradienterMode
 from companion.calibration.request import What
 from companion.calibration.solution import magnetic
 from companion.calibration.solution.bias import accelerometer_bias, attitude_error_jacobian, bias_covariance, gyro_bias
-from companion.calibration.solution.history import Triad
 from companion.calibration.solution.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site
 from companion.calibration.solution.site import IN_CONFIGURATION, LocalEarth, Remedies, Whereabouts, local_earth
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
 from companion.physics.gradienter import up_jacobian
 from companion.physics.units import DEG
+from companion.samples import Triad
 
 __all__ = [
     "CompassModel",

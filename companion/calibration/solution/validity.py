@@ -18,15 +18,13 @@ from __future__ import annotations
 import enum
 import functools
 import math
-from typing import Final, Literal
+from typing import Final
 
 import msgspec
 
 from companion.calibration.noise.allan import AllanModel, floor_variance
 from companion.physics.units import DEG_H, MG
-from companion.samples import Vector
-
-Triad = Literal["gyro", "accel"]
+from companion.samples import Triad, Vector
 
 DRIFT_SIGMAS: Final = 2.0
 RESIDUAL_SIGMAS: Final = 3.0
@@ -132,18 +130,7 @@ def judge(
     temperature_degc: float | None,
     present: Present | None,
 ) -> list[Finding]:
-    """Everything that speaks against one triad's calibration now; empty while it is good.
-
-    Args:
-        triad: which half of the IMU.
-        name: of the IMU.
-        held: what was found right.
-        model: the noise of this triad.
-        limits: of age and temperature.
-        now_s: the clock of `held`.
-        temperature_degc: of the IMU now, if known.
-        present: from a still window, if there is one.
-    """
+    """Everything that speaks against one triad's calibration now; empty while it is good."""
     found: list[Finding] = []
     if not held.seen:
         found.append(Finding(Why.UNSEEN, f"{triad} {name}: new offsets not seen to work"))

@@ -26,7 +26,6 @@ from companion.calibration.solution.validity import (
     Held,
     Limits,
     Present,
-    Triad,
     Why,
     judge,
     worst_axis,
@@ -44,7 +43,7 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import ALIGNMENT, Job
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import vector
-from companion.samples import Vector
+from companion.samples import Triad, Vector
 
 logger = logging.getLogger(__name__)
 

@@ -19,7 +19,7 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_o
 from companion.calibration.alignment.align_record import ImuAlignmentRecord
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.solution.doubt import Doubt
-from companion.calibration.solution.history import Point, PowerUp, Triad
+from companion.calibration.solution.history import Point, PowerUp
 from companion.calibration.solution.joint import Whole, points
 from companion.calibration.solution.pose_effect import pose_effect
 from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, expect, expect_today
@@ -31,6 +31,7 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.sensors import SerialSensor
 from companion.errors import StorageError
 from companion.physics.frames import vector
+from companion.samples import Triad
 from companion.storage.biases import KEEP_POINTS, BiasStore, KnownImu
 
 logger = logging.getLogger(__name__)

@@ -9,7 +9,7 @@ import msgspec
 from companion.calibration.collector.rolling import Window
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.history import Point, Triad
+from companion.calibration.solution.history import Point
 from companion.calibration.solution.joint import Weighed, weigh
 from companion.calibration.solution.prior import Expectation
 from companion.calibration.solution.site import Whereabouts
@@ -22,6 +22,7 @@ from companion.daemon.calibrating.bias_memory import BiasMemory
 from companion.daemon.core import Core
 from companion.daemon.job import Job
 from companion.links.system.listeners import Listeners
+from companion.samples import Triad
 
 
 class Solving:
