@@ -11,6 +11,7 @@ from typing import Literal
 
 from companion.calibration.collector.rolling import RollingCollector
 from companion.config import Compass, Config, Gradienter, Imu
+from companion.links.serial.bytestream import PortSettings
 from companion.protocols.registry import PROTOCOLS, Kind, ProtocolInfo
 from companion.protocols.roles import Part, part_for
 from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
@@ -40,6 +41,11 @@ class SerialDevice:
     parity: Literal["none", "even", "odd"]
     read_only: bool
     roles: tuple[Role, ...]
+
+    @property
+    def settings(self) -> PortSettings:
+        """Of its port."""
+        return PortSettings(self.port, self.baud, self.parity)
 
     @property
     def name(self) -> str:

@@ -11,6 +11,7 @@ from companion.calibration.collector.rolling import ImuInput, RollingCollector, 
 from companion.calibration.means.pose_models import CompassModel, GradienterModel
 from companion.calibration.stillness.settling import AT_ONCE, Lag
 from companion.links.system.listeners import Listeners
+from companion.recording.details import Means
 from companion.recording.journal import Journal
 from companion.samples import CompassSample, ImuSample, TiltSample
 
@@ -30,8 +31,6 @@ class RecordedCollector(RollingCollector):
         compass_lag: likewise.
         field_by: likewise.
     """
-
-    not_state: Final = frozenset({"journal", "windows", "seconds", "_messages", "_windows_made"})
 
     def __init__(
         self,
@@ -68,8 +67,8 @@ class RecordedCollector(RollingCollector):
         return next((number for number, each in self.windows if each is window), None)
 
     def add_imu(self, name: str, sample: ImuSample) -> None:  # noqa: D102 - as in the base class
-        if self.journal.queues:
-            self.journal.imu(name, sample, self._messages.get(name), sample.t_s)
+        if self.journal.is_on:
+            self.journal.imu(name, sample, self._messages.get(name))
         super().add_imu(name, sample)
 
     def add_tilt(self, sample: TiltSample) -> None:  # noqa: D102
@@ -89,24 +88,20 @@ class RecordedCollector(RollingCollector):
     def set_imu(self, imu: ImuInput, message: str | None = None) -> None:
         """As in the base class; `message` is the autopilot's that its samples come in, None for one of our own."""
         self._messages[imu.name] = message
-        if self.journal.queues:
-            self.journal.event(asyncio.get_running_loop().time(), "imu", imu)
+        self.journal.set_in_force(self._loop_s(), "imu", imu)
         super().set_imu(imu)
 
-    def retarget(self, settings: Settings) -> None:  # noqa: D102
-        if self.journal.queues:
-            self.journal.event(asyncio.get_running_loop().time(), "retarget", settings)
-        super().retarget(settings)
-
     def expect(self, *, gradienter: bool, compass: bool) -> None:  # noqa: D102
-        if self.journal.queues:
-            self.journal.event(asyncio.get_running_loop().time(), "expect", (gradienter, compass))
+        self.journal.set_in_force(self._loop_s(), "expect", (gradienter, compass))
         super().expect(gradienter=gradienter, compass=compass)
 
     def reset(self, why: str, imu: str | None = None) -> None:  # noqa: D102
-        if self.journal.queues:
-            self.journal.event(asyncio.get_running_loop().time(), "reset", (why, imu))
+        self.journal.event(self._loop_s(), "reset", (why, imu))
         super().reset(why, imu)
+
+    def _loop_s(self) -> float:
+        """Before the journal begins, when nothing of this is written with its time, there may be no loop yet."""
+        return asyncio.get_running_loop().time() if self.journal.is_on else 0.0
 
     def tick(self, now_s: float) -> None:  # noqa: D102
         self.journal.event(now_s, "tick")
@@ -118,7 +113,7 @@ class RecordedCollector(RollingCollector):
             return super().window(now_s, since_s=since_s)
         self._windows_made += 1
         number = self._windows_made
-        self.journal.event(now_s, "window", number)
+        self.journal.event(now_s, "window", Means(number, self.wander_deg))
         window = super().window(now_s)
         self.windows.append((number, window))
         return window

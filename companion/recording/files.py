@@ -8,12 +8,12 @@ the event loop.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import errno
 import logging
 import os
 import re
 import shutil
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Any, Final
@@ -22,17 +22,12 @@ import msgspec
 
 from companion.errors import StorageError
 from companion.recording import topics
-from companion.recording.journal import Beginning, Entry
-from companion.recording.state import to_json
+from companion.recording.past import Message, Past, breathing
 
 logger = logging.getLogger(__name__)
 
 CHUNK_BYTES: Final = 256 * 1024
 """A second of a busy aircraft has less."""
-BREATH: Final = 64
-"""So many messages are made before the event loop gets a chance, should it wait for the interpreter's lock."""
-BREATH_S: Final = 2e-4
-"""Not zero: who lets go of the lock for no time at all gets it back before anybody else wakes up."""
 RESERVE_BYTES: Final = 32 * 1024 * 1024
 """Left free on the disk: the values for undo and the records are worth more than any recording."""
 PARTS: Final = 8
@@ -41,6 +36,20 @@ PARTS: Final = 8
 FOLDER_MODE: Final = 0o700
 
 _NAME = re.compile(r"(\d{6,})\.mcap")
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Beginning:
+    """What a file says first, should it begin now."""
+
+    t_s: float
+    unix_s: float
+    """The host's clock at `t_s`."""
+    versions: dict[str, str]
+    config: bytes
+    """JSON."""
+    past: Past
+
 
 Opener = Callable[[Path], IO[bytes]]
 FreeBytes = Callable[[Path], int]
@@ -83,6 +92,8 @@ class RecordingFile:
 
         self.path = path
         self.messages = 0
+        self.past_bytes = 0
+        """How much of it is of before it was begun, about."""
         self._free_bytes = free_bytes
         self._file: IO[bytes] | None = None
         try:
@@ -108,8 +119,8 @@ class RecordingFile:
         """Its size so far."""
         return 0 if self._file is None else int(self._file.tell())
 
-    def write(self, items: Sequence[Entry | Beginning]) -> None:
-        """Add messages, finish the chunk and bring it to the disk.
+    def write(self, messages: Sequence[Message], beginning: Beginning) -> None:
+        """Add messages, finish the chunk and bring it to the disk; the past comes before the first.
 
         Raises:
             StorageError: the disk refuses; the file ends here, and what it has can be replayed.
@@ -119,14 +130,10 @@ class RecordingFile:
         try:
             if self._free_bytes(self.path.parent) < RESERVE_BYTES:
                 raise OSError(errno.ENOSPC, f"less than {RESERVE_BYTES >> 20} MB free on the disk")
-            for number, item in enumerate(items):
-                if isinstance(item, Beginning):
-                    self._begin(item)
-                elif self._begun is not None:
-                    topic, t_s, function, arguments = item
-                    self._add(topic, t_s, function(*arguments))
-                if number % BREATH == BREATH - 1:
-                    time.sleep(BREATH_S)
+            if self._begun is None:
+                self._begin(beginning)
+            for message in breathing(messages):
+                self._add(*message)
             self._writer.flush()
             self._sync()
         except OSError as error:
@@ -153,15 +160,15 @@ class RecordingFile:
             self._abandon()
 
     def _begin(self, beginning: Beginning) -> None:
-        if self._begun is None:
-            self._begun = beginning
-            self._writer.start(profile="", library=f"companion {beginning.versions['companion']}")
-            started_ns = self._ns(beginning.t_s)
-            versions = {**beginning.versions, "t_s": repr(beginning.t_s), "unix_s": repr(beginning.unix_s)}
-            self._writer.add_metadata(topics.METADATA, versions)
-            self._writer.add_attachment(started_ns, started_ns, topics.CONFIG, "application/json", beginning.config)
-        entry = topics.StateEntry(beginning.t_s, beginning.lost, to_json(beginning.state).decode())
-        self._add(topics.STATE, beginning.t_s, msgspec.json.encode(entry))
+        self._begun = beginning
+        self._writer.start(profile="", library=f"companion {beginning.versions['companion']}")
+        started_ns = self._ns(beginning.t_s)
+        versions = {**beginning.versions, "t_s": repr(beginning.t_s), "unix_s": repr(beginning.unix_s)}
+        self._writer.add_metadata(topics.METADATA, versions)
+        self._writer.add_attachment(started_ns, started_ns, topics.CONFIG, "application/json", beginning.config)
+        for message in breathing(beginning.past.beginning(beginning.t_s)):
+            self._add(*message)
+        self.past_bytes = self.bytes_written
 
     def _ns(self, t_s: float) -> int:
         """UTC in nanoseconds of a time on the loop's clock; a host's clock that is set meanwhile changes nothing."""
@@ -222,7 +229,6 @@ class Ring:
         self.bytes_in_all = 0
         self._opener, self._free_bytes = opener, free_bytes
         self._current: RecordingFile | None = None
-        self._head_bytes = 0
 
     @property
     def path(self) -> Path | None:
@@ -231,28 +237,24 @@ class Ring:
 
     @property
     def is_full(self) -> bool:
-        """Whether the present file has had its share, beside the state that it begins with."""
+        """Whether the present file has had its share, beside the past that it begins with."""
         if self._current is None:
             return False
-        return self._current.bytes_written - self._head_bytes >= self.most_bytes // PARTS
+        return self._current.bytes_written - self._current.past_bytes >= self.most_bytes // PARTS
 
-    def write(self, items: Sequence[Entry | Beginning]) -> None:
-        """Add messages; every `Beginning` begins a file.
+    def write(self, messages: Sequence[Message], beginning: Beginning) -> None:
+        """Add messages to the present file; after `close` to the next one.
 
         Raises:
             StorageError: the disk refuses; the file ends here.
         """
-        part: list[Entry | Beginning] = []
         try:
-            if self._current is not None:
+            if self._current is None:
+                self._next()
+            else:
                 self._make_room()
-            for item in items:
-                if isinstance(item, Beginning):
-                    self._put(part)
-                    part = []
-                    self._next()
-                part.append(item)
-            self._put(part)
+            if self._current is not None:
+                self._current.write(messages, beginning)
             self._make_room()
         except StorageError:
             self._current = None
@@ -271,12 +273,6 @@ class Ring:
         current, self._current = self._current, None
         if current is not None:
             current.close()
-
-    def _put(self, items: Sequence[Entry | Beginning]) -> None:
-        if self._current is not None and items:
-            self._current.write(items)
-            if isinstance(items[0], Beginning):
-                self._head_bytes = self._current.bytes_written
 
     def _next(self) -> None:
         self.close()

@@ -48,8 +48,3 @@ class KeyFilter:
             place = known.find(_ID, place + 1)
         self._left = max(0, end - len(known))
         return bytes(out[behind:])
-
-
-def without_key(half_received: bytes) -> bytes:
-    """The beginning of a message, as the link holds it, without a key."""
-    return KeyFilter()(half_received)

@@ -15,18 +15,18 @@ import msgspec
 from companion.calibration.solution.record import ImuRecord, Record, to_json
 from companion.samples import CompassSample, ImuSample, TiltSample
 
-FORMAT_VERSION: Final = "1"
+FORMAT_VERSION: Final = "2"
 METADATA: Final = "companion"
 """Name of the metadata record with versions and times."""
 CONFIG: Final = "configuration.json"
 """Name of the attachment with the configuration in force."""
-STATE, JOURNAL, RECORD = "/companion/state", "/companion/journal", "/companion/record"
+START, JOURNAL, RECORD = "/companion/start", "/companion/journal", "/companion/record"
 MAVLINK_IN, MAVLINK_OUT = "/mavlink/in", "/mavlink/out"
 SERIAL, IMU = "/serial/", "/imu/"
 """Topics of raw bytes and of samples begin so; the device's or the IMU's name follows."""
 GRADIENTER, COMPASS = "/gradienter", "/compass"
 
-JournalEvent = Literal["tick", "window", "reset", "imu", "retarget", "expect", "place", "offsets", "solved"]
+JournalEvent = Literal["tick", "window", "reset", "imu", "expect", "place", "offsets", "solved"]
 
 
 class RawBytes(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
@@ -41,17 +41,17 @@ class JournalEntry(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
 
     t_s: float
     event: JournalEvent
-    detail: str = ""
-    """JSON of `state.to_json`; what it is depends on the event."""
+    detail: bytes = b""
+    """As `details.encode` made it; what it is depends on the event."""
 
 
-class StateEntry(msgspec.Struct, frozen=True, gc=False):
-    """Everything that was known when this part of the recording began; `state` is JSON of `state.to_json`."""
+class StartEntry(msgspec.Struct, frozen=True, gc=False):
+    """The recording begins here, and what follows is replayed from nothing."""
 
     t_s: float
+    """What happened before that is the past, which it begins with."""
     lost: int
     """Messages that were dropped right before, because the disk did not keep up."""
-    state: str
 
 
 class RecordEntry(msgspec.Struct, frozen=True, gc=False):
@@ -142,6 +142,7 @@ def _imu(imu: ImuRecord) -> dict[str, Any]:
 _NUMBER: Final = {"type": "number"}
 _INTEGER: Final = {"type": "integer"}
 _TEXT: Final = {"type": "string"}
+_BASE64: Final = {"type": "string", "contentEncoding": "base64"}
 _TRIAD: Final = {"type": "array", "items": _NUMBER, "minItems": 3, "maxItems": 3}
 _TEXTS: Final = {"type": "array", "items": _TEXT}
 _TRIADS: Final = (
@@ -166,7 +167,7 @@ def _object(required: str, **properties: Any) -> dict[str, Any]:
 
 
 SCHEMAS: Final[dict[str, dict[str, Any]]] = {
-    "companion.RawBytes": _object("t_s", t_s=_NUMBER, data={"type": "string", "contentEncoding": "base64"}),
+    "companion.RawBytes": _object("t_s", t_s=_NUMBER, data=_BASE64),
     "companion.Imu": _object(
         "t_s gyro_rad_s accel_m_s2",
         t_s=_NUMBER,
@@ -183,8 +184,8 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
     "companion.Compass": _object(
         "t_s heading_deg", t_s=_NUMBER, heading_deg=_NUMBER, pitch_deg=_NUMBER, roll_deg=_NUMBER
     ),
-    "companion.Journal": _object("t_s event", t_s=_NUMBER, event=_TEXT, detail=_TEXT),
-    "companion.State": _object("t_s lost state", t_s=_NUMBER, lost=_INTEGER, state=_TEXT),
+    "companion.Journal": _object("t_s event", t_s=_NUMBER, event=_TEXT, detail=_BASE64),
+    "companion.Start": _object("t_s lost", t_s=_NUMBER, lost=_INTEGER),
     "companion.Record": _object(
         "t_s state reason warnings started_at duration_s imus record",
         t_s=_NUMBER,
@@ -240,7 +241,7 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
 def schema_of(topic: str) -> str:
     """The name of a topic's schema."""
     known = {
-        STATE: "companion.State",
+        START: "companion.Start",
         JOURNAL: "companion.Journal",
         RECORD: "companion.Record",
         GRADIENTER: "companion.Gradienter",

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 
-from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
+from companion.autopilot.firmware.imu_calibration import whole_of
 from companion.calibration.collector.measurement import Measurement
 from companion.calibration.collector.rolling import RollingCollector, Window
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.joint import weigh
-from companion.calibration.solution.prior import Expectation
 from companion.calibration.solution.record import AlignmentUsed, Record
 from companion.calibration.solution.site import Whereabouts
 from companion.calibration.solution.solve import ImuSolution, Solution, solve_at
@@ -21,6 +20,7 @@ from companion.configured import models
 from companion.configured.models import aligned
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array
+from companion.recording.details import Offsets, Solved
 from companion.replay.again import record_again, refined_window
 from companion.replay.compare import Difference, differences
 
@@ -45,30 +45,21 @@ class Calibrations:
         """The daemon's; nothing is solved before it is known."""
         self.again: list[Replayed] = []
         self.where = Whereabouts()
-        self.offsets: dict[str, ImuCalibration | None] = {}
-        self._windows: dict[int, Window | Measurement | CalibrationRefusedError] = {}
+        self.offsets: Offsets = {}
+        self._windows: dict[int, Measurement | CalibrationRefusedError] = {}
         self._solution: Solution | None = None
-        self._solved_with: dict[str, ImuCalibration | None] = {}
+        self._solved_with: Offsets = {}
         """The offsets in force when that was measured; by now others may have been written."""
         self._no_solution = ""
         self._refused: str | None = None
         """Why the estimator refuses here what was measured then."""
         self._alignment: AlignmentUsed | None = None
 
-    def begin(
-        self,
-        windows: list[tuple[int, Window]],
-        where: Whereabouts,
-        offsets: dict[str, ImuCalibration | None],
-        solved: dict[str, Any] | None,
-    ) -> None:
-        """Go on from what was known when a part of the recording began."""
-        self._windows.update(windows)
-        self.where, self.offsets = where, offsets
+    def begin(self) -> None:
+        """Nothing is known yet of what follows."""
+        self._windows.clear()
         self._solution, self._refused = None, None
-        self._no_solution = "it was measured before this part of the recording"
-        if solved is not None:
-            self.solve(solved)
+        self._no_solution = "its measurement is not in the recording"
 
     def measured(self, number: int, found: Measurement | CalibrationRefusedError) -> None:
         """Means were taken; most of them nobody ever asks for."""
@@ -76,12 +67,12 @@ class Calibrations:
         while len(self._windows) > WINDOWS_KEPT:
             del self._windows[next(iter(self._windows))]
 
-    def solve(self, detail: dict[str, Any]) -> None:
+    def solve(self, detail: Solved) -> None:
         """Work out what was solved from means that were taken before."""
         self._solution, self._no_solution, self._refused = None, "", None
-        window = self._windows.get(detail["window"])
-        self.where, self._solved_with = detail["where"], detail["offsets"]
-        used = detail.get("alignment")
+        window = self._windows.get(-1 if detail.window is None else detail.window)
+        self.where, self._solved_with = detail.where, detail.offsets
+        used = detail.alignment
         self._alignment = (
             AlignmentUsed(measured_at="", offset_deg=(used[0], used[1]), sigma_deg=used[2]) if used else None
         )
@@ -91,11 +82,9 @@ class Calibrations:
         try:
             if isinstance(window, CalibrationRefusedError):
                 raise window
-            if isinstance(window, Measurement):
-                window = window.window()
-            solution = self._solved(refined_window(window, detail["refined"]), What[detail["what"]])
+            solution = self._solved(refined_window(window.window(), detail.refined), What[detail.what])
             whole = {found.name: self._whole(found) for found in solution.imus}
-            self._solution = weigh(solution, whole, detail.get("expectation") or Expectation()).solution
+            self._solution = weigh(solution, whole, detail.expectation).solution
         except CalibrationRefusedError as error:
             self._refused = f"refused here: {error}"
 

@@ -1,9 +1,9 @@
 """A recording through the same decoders, collector and estimator, in the recorded order and at the recorded times.
 
 Recomputed: every sample from its raw bytes, every batch, verdict of stillness and mean, pose, biases, sigmas and
-covariances. Taken from the recording: when somebody looked at the collector or reset it, which of the autopilot's
-messages counted (its offsets had to be known), place and date, the offsets in force, means found by a dither, and all
-that only the autopilot can tell: what was written and read back, and with which outcome.
+covariances. Taken from the recording: when seconds were ended and readings forgotten, which of the autopilot's
+messages counted (its offsets had to be known), place and date, the offsets in force, means found by a dither, how far
+the heading has wandered, and all that only the autopilot can tell: what was written and read back, with which outcome.
 """
 
 from __future__ import annotations
@@ -11,20 +11,19 @@ from __future__ import annotations
 import datetime
 from collections import Counter
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 
-from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.calibration.collector.rolling import RollingCollector, Window
+from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.record import Record, from_json
-from companion.calibration.solution.site import Whereabouts
 from companion.config import Config
-from companion.configured.devices import Role, collect, parts_of, serial_devices
+from companion.configured import models
+from companion.configured.devices import Role, SerialDevice, collect, parts_of, serial_devices
 from companion.errors import CalibrationRefusedError, StorageError
 from companion.protocols.decoding.base import Decoder
-from companion.recording import state, topics
+from companion.recording import details, topics
 from companion.recording.files import versions
 from companion.recording.walk import Attachment, Messages, Metadata, Recording
 from companion.replay.calibrations import Calibrations, Replayed
@@ -32,7 +31,9 @@ from companion.replay.telemetry import Telemetry
 
 __all__ = ["Replay", "Replayed", "Result"]
 
-_UNUSABLE: Final = (msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+_UNUSABLE: Final = (
+    msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError,
+)  # fmt: skip
 """What a handler says of a message that nobody could have written."""
 _raw: Final = msgspec.json.Decoder(topics.RawBytes)
 
@@ -50,18 +51,6 @@ class Result(msgspec.Struct, frozen=True):
     """What a reader should know: other versions, samples that do not decode as they did."""
 
 
-class _State(msgspec.Struct, frozen=True):
-    """What `StateEntry.state` holds."""
-
-    collector: RollingCollector
-    decoders: dict[str, Decoder]
-    mavlink: bytes
-    windows: list[tuple[int, Window]]
-    where: Whereabouts
-    offsets: dict[str, ImuCalibration | None]
-    solved: dict[str, Any] | None
-
-
 class Replay:
     """One pass over one recording.
 
@@ -74,12 +63,13 @@ class Replay:
         self._config: Config | None = None
         self._versions: dict[str, str] = {}
         self._collector: RollingCollector | None = None
+        self._devices: list[SerialDevice] = []
         self._decoders: dict[str, Decoder] = {}
         self._roles: dict[str, tuple[Role, ...]] = {}
         """Of each device, by the name that its bytes have."""
         self._autopilots: list[str] = []
         """IMUs whose samples come over MAVLink."""
-        self._telemetry = Telemetry(b"", 0.0)
+        self._telemetry = Telemetry()
         self._calibrations = Calibrations()
         self._handlers: dict[str, Callable[[bytes], None] | None] = {}
         self._notes: list[str] = []
@@ -144,7 +134,8 @@ class Replay:
         except msgspec.MsgspecError as error:
             raise StorageError(f"{self._recording.path}: its configuration is of another version: {error}") from None
         self._calibrations.config = self._config
-        self._roles = {device.name: device.roles for device in serial_devices(self._config)}
+        self._devices = serial_devices(self._config)
+        self._roles = {device.name: device.roles for device in self._devices}
         self._autopilots = [imu.name for imu in self._config.imu if imu.source == "autopilot"]
 
     # --- what comes, in its order
@@ -157,7 +148,7 @@ class Replay:
             handler = self._handlers[topic]
         except KeyError:
             handler = self._handlers[topic] = self._handler_of(topic)
-        if handler is None or (self._collector is None and topic != topics.STATE):
+        if handler is None or (self._collector is None and topic != topics.START):
             return
         try:
             handler(data)
@@ -168,7 +159,7 @@ class Replay:
 
     def _handler_of(self, topic: str) -> Callable[[bytes], None] | None:
         known: dict[str, Callable[[bytes], None]] = {
-            topics.STATE: self._take_state,
+            topics.START: self._start,
             topics.JOURNAL: self._take_event,
             topics.RECORD: self._take_record,
             topics.MAVLINK_IN: self._take_mavlink,
@@ -186,22 +177,37 @@ class Replay:
         return None
 
     def _at(self, t_s: float) -> None:
-        if self._first_s is None:
-            self._first_s = t_s
         self._now_s = t_s
 
-    def _take_state(self, data: bytes) -> None:
-        if self._config is None:
+    @property
+    def _is_past(self) -> bool:
+        """Whether this happened before the recording was begun."""
+        return self._first_s is not None and self._now_s < self._first_s
+
+    def _start(self, data: bytes) -> None:
+        config = self._config
+        if config is None:
             return
-        entry = msgspec.json.decode(data, type=topics.StateEntry)
+        entry = msgspec.json.decode(data, type=topics.StartEntry)
         self._at(entry.t_s)
+        if self._first_s is None:
+            self._first_s = entry.t_s
         if entry.lost:
             self._notes.append(f"{entry.lost} messages were lost in recording; replayed from behind the gap")
-        plain = state.from_json(entry.state)
-        known = _State(**plain)
-        self._collector, self._decoders = known.collector, known.decoders
-        self._telemetry = Telemetry(known.mavlink, entry.t_s)
-        self._calibrations.begin(known.windows, known.where, known.offsets, known.solved)
+        self._collector = RollingCollector(
+            models.settings(config),
+            (),
+            gradienter=config.gradienter is not None,
+            compass=config.compass is not None,
+            gradienter_lag=models.lag("gradienter", config.gradienter),
+            compass_lag=models.lag("compass", config.compass),
+            field_by=models.field_by(config),
+        )
+        self._decoders = {
+            device.name: device.info.decoder(device.settings.seconds_per_byte) for device in self._devices
+        }
+        self._telemetry = Telemetry()
+        self._calibrations.begin()
 
     def _take_serial(self, name: str, data: bytes) -> None:
         raw = _raw.decode(data)
@@ -225,7 +231,7 @@ class Replay:
     def _take_telemetry(self, name: str, data: bytes) -> None:
         """A sample of the autopilot that counted."""
         sample, strange = self._telemetry.sample(msgspec.json.decode(data, type=topics.ImuEntry))
-        if strange is not None:
+        if strange is not None and not self._is_past:
             self._strange[f"imu {name}: {strange}"] += 1
         if self._collector is not None:
             self._collector.add_imu(name, sample)
@@ -239,19 +245,19 @@ class Replay:
         if entry.event == "tick":
             collector.tick(entry.t_s)
             return
-        detail = state.from_json(entry.detail)
+        detail = details.decode(entry.event, entry.detail)
         match entry.event:
             case "window":
                 try:
-                    self._calibrations.measured(detail, collector.measurement(entry.t_s))
+                    measurement = collector.measurement(entry.t_s)
                 except CalibrationRefusedError as error:
-                    self._calibrations.measured(detail, error)
+                    self._calibrations.measured(detail.number, error)
+                else:
+                    self._calibrations.measured(detail.number, measurement.with_wander(detail.wander_deg))
             case "reset":
                 collector.reset(*detail)
             case "imu":
                 collector.set_imu(detail)
-            case "retarget":
-                collector.retarget(detail)
             case "expect":
                 collector.expect(gradienter=detail[0], compass=detail[1])
             case "place":

@@ -21,19 +21,13 @@ _NOT_THERE: Final = "a sample is not in the MAVLink bytes"
 
 
 class Telemetry:
-    """Decodes what came over the link, and finds in it the samples that went into the collector.
+    """Decodes what came over the link, and finds in it the samples that went into the collector."""
 
-    Args:
-        half_received: the beginning of a frame that had come when the recording began.
-        t_s: when that was.
-    """
-
-    def __init__(self, half_received: bytes, t_s: float) -> None:
+    def __init__(self) -> None:
         self._link = MavlinkLink()
         self._pending: dict[str, deque[tuple[float, Reading]]] = {}
         for each in {*sum(imu_messages.ARDUPILOT.values(), ()), *sum(imu_messages.PX4.values(), ())}:
             self._listen(each)
-        self._link.receive(half_received, t_s)
 
     def _listen(self, kind: ImuMessage) -> None:
         pending = self._pending[kind.kind.message] = deque(maxlen=PENDING)

@@ -257,7 +257,7 @@ def test_a_recording_may_begin_in_the_middle_of_a_calibration(tmp_path: Path) ->
         assert not hasattr(job, "code"), job
         for _ in range(4):
             await asyncio.sleep(5.37)
-            rig.service.recorder._new_part = True
+            rig.service.recorder._part_ends = True
         await rig.until(lambda: not rig.service.calibrating.conductor.state.busy, 60.0)
 
     paths, records = record(tmp_path, during, own_imu=True, seed=7)
@@ -266,6 +266,26 @@ def test_a_recording_may_begin_in_the_middle_of_a_calibration(tmp_path: Path) ->
     ended = [result for result in results if result.calibrations]
     assert len(ended) == 1
     same(ended[0], records)
+
+
+def test_a_recording_holds_what_a_calibration_after_a_long_stand_needs(tmp_path: Path) -> None:
+    """The daemon has been running for longer than the seconds that a recording begins with."""
+
+    async def during(rig: Rig) -> None:
+        for _ in range(2):
+            await asyncio.sleep(150.0)
+            rig.service.recorder._part_ends = True
+            await asyncio.sleep(1.7)
+            result, _ = await calibrated(rig)
+            assert result.outcome == "done", result
+
+    paths, records = record(tmp_path, during, own_imu=True, seed=8, max_s=30.0, feed_s=0.07)
+    results = [replayed(path) for path in paths]
+    again = [each for result in results for each in result.calibrations]
+    assert [str(difference) for each in again for difference in each.differences] == []
+    assert [each.record for each in again] == records
+    assert [result.notes for result in results] == [[]] * len(results)
+    assert max(result.seconds for result in results) < 200.0
 
 
 def test_moved_armed_and_twice(tmp_path: Path) -> None:
@@ -436,13 +456,13 @@ def test_a_damaged_recording_is_one_line_or_a_replay_and_never_anything_else(
         chunk_size=20_000,
     )
     whole, rng = plain.read_bytes(), random.Random(13)
-    state = whole.index(b'"state":"{')
+    state = whole.index(b'"event":"imu"')
     journal = whole.index(b'"event":"tick"')
     path = tmp_path / "damaged.mcap"
     refused: list[str] = []
     for attempt in range(30):
         data = bytearray(whole[:500_000])
-        # The state and the journal are a small part of a file and the part that is read by hand.
+        # What is in force and the journal are a small part of a file, and the part that is read by hand.
         begin, end = ((state, state + 5000), (journal - 2000, journal + 2000), (0, len(data)))[attempt % 3]
         for _ in range(1 + attempt // 4):
             data[rng.randrange(begin, end)] = rng.randrange(256)
@@ -489,7 +509,7 @@ def test_the_independent_reader_finds_every_message_as_its_schema_says(usual: tu
     assert set(count) == {
         *("/serial/own", "/serial/gradienter", "/serial/compass", "/mavlink/in", "/mavlink/out"),
         *("/imu/fc", "/imu/own", "/gradienter", "/compass"),
-        *("/companion/state", "/companion/journal", "/companion/record"),
+        *("/companion/start", "/companion/journal", "/companion/record"),
     }
     assert count["/imu/own"] > 200 * 10
     assert count["/imu/fc"] > 100 * 5
@@ -584,7 +604,7 @@ def test_a_full_disk_disturbs_nothing_is_said_once_and_ends_by_itself(
             await asyncio.sleep(4 * recorder_module.RETRY_S)
             fault = rig.service.status()["recording"]["fault"]
             assert "No space left on device" in fault
-            assert recorder._ring_queue.items == []
+            assert len(rig.service.core.collector.journal.items) < 1000
             recorder._ring = Ring(tmp_path / "recordings", 16 << 20)
             await asyncio.sleep(1.2 * recorder_module.RETRY_S)
             assert rig.service.status()["recording"]["fault"] is None
@@ -619,7 +639,7 @@ def test_a_disk_that_hangs_holds_nothing_up_and_the_hole_is_in_the_file(
                 result, during = await calibrated(rig)
                 for _ in range(30):
                     await asyncio.sleep(1.0)
-                    most = max(most, len(rig.service.recorder._ring_queue.items))
+                    most = max(most, len(rig.service.core.collector.journal.items))
             finally:
                 hangs_s = 0.0  # the daemon's end waits for the disk
             assert result.outcome == "done"
@@ -703,10 +723,11 @@ def test_another_version_is_named_and_another_format_refused(
     (note,) = replayed(usual[0]).notes
     assert f"numpy {ours['numpy']}, here 99.0" in note
     assert "pdp11: the last digits may differ" in note
-    path = tmp_path / "later.mcap"
-    path.write_bytes(usual[0].read_bytes().replace(b"format\x01\x00\x00\x001", b"format\x01\x00\x00\x002"))
-    with pytest.raises(StorageError, match="found format 2; allowed: 1"):
-        replayed(path)
+    for other in (b"1", b"3"):
+        path = tmp_path / "other.mcap"
+        path.write_bytes(usual[0].read_bytes().replace(b"format\x01\x00\x00\x002", b"format\x01\x00\x00\x00" + other))
+        with pytest.raises(StorageError, match=f"found format {other.decode()}; allowed: 2 .recorded by companion"):
+            replayed(path)
 
 
 # --- the command line

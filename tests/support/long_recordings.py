@@ -17,15 +17,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.solution.site import Whereabouts
 from companion.config import Config, parse
 from companion.configured import models
-from companion.configured.devices import serial_devices
 from companion.recording import journal, topics
-from companion.recording.files import RecordingFile, versions
-from companion.recording.journal import Beginning, Entry
-from companion.recording.state import freeze
+from companion.recording.details import Means
+from companion.recording.files import Beginning, RecordingFile, versions
+from companion.recording.journal import Entry, Journal
+from companion.recording.past import Past
 from companion.samples import CompassSample, ImuSample, TiltSample
 
 Floats = NDArray[np.float64]
@@ -139,7 +138,7 @@ def _ticks(seconds: float) -> Iterator[Entry]:
     for k in range(1, int(seconds)):
         t_s = START_S + k + 0.4
         yield topics.JOURNAL, t_s, journal._event, (t_s, "tick", None)
-        yield topics.JOURNAL, t_s, journal._event, (t_s, "window", k)
+        yield topics.JOURNAL, t_s, journal._event, (t_s, "window", Means(k, None))
 
 
 def write_recording(path: Path, *, seconds: float, rate_hz: float = 1000.0, imus: int = 1, read_s: float = 0.0) -> int:
@@ -154,37 +153,24 @@ def write_recording(path: Path, *, seconds: float, rate_hz: float = 1000.0, imus
     """
     names = [f"imu{k}" for k in range(imus)]
     settings = config(names)
-    collector = RollingCollector(
-        models.settings(settings),
-        [models.imu_input(imu, None) for imu in settings.imu],
-        gradienter=True,
-        compass=True,
-        gradienter_lag=models.lag("gradienter", settings.gradienter),
-        compass_lag=models.lag("compass", settings.compass),
-        field_by=models.field_by(settings),
-    )
-    decoders = {device.name: freeze(device.info.decoder(10.0 / device.baud)) for device in serial_devices(settings)}
-    state = {
-        "collector": freeze(collector),
-        "decoders": decoders,
-        "mavlink": b"",
-        "windows": [],
-        "where": Whereabouts(40.0, 116.0, 50.0, "config", None),
-        "offsets": {},
-        "solved": None,
-    }
+    begin_s, past = START_S - 0.01, Past(60.0, ())
+    first = Journal()
+    for imu in settings.imu:
+        first.set_in_force(begin_s, "imu", models.imu_input(imu, None))
+    first.set_in_force(begin_s, "place", Whereabouts(40.0, 116.0, 50.0, "config", None))
+    first.begin(begin_s)
     file = RecordingFile(path)
-    begin_s = START_S - 0.01
     streams = [
         *(_imu(name, seconds, rate_hz, read_s, seed) for seed, name in enumerate(names)),
         _gradienter(seconds),
         _compass(seconds),
         _ticks(seconds),
     ]
-    file.write([Beginning(begin_s, UNIX_S, versions(), msgspec.json.encode(settings), state)])
+    beginning = Beginning(begin_s, UNIX_S, versions(), msgspec.json.encode(settings), past)
+    file.write(past.messages(first.take()), beginning)
     entries = heapq.merge(*streams, key=lambda entry: entry[1])
     for _, second in itertools.groupby(entries, key=lambda entry: int(entry[1])):
-        file.write(list(second))
+        file.write(past.messages(list(second)), beginning)
     file.close()
     return imus * round(seconds * rate_hz)
 

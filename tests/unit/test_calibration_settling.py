@@ -21,7 +21,6 @@ from companion.configured.models import lag
 from companion.errors import CalibrationRefusedError
 from companion.physics.gradienter import attitude_from_readings
 from companion.protocols.registry import PROTOCOLS
-from companion.recording.state import freeze, from_json, to_json
 from companion.samples import ImuSample, TiltSample
 from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import Gradienter, VectorNavBinary
@@ -256,13 +255,3 @@ def test_the_protocols_lag_is_the_default_and_the_configuration_comes_first() ->
     compass = Compass(port="/dev/x", protocol="hmr3300", lag_s=0.288, sigma_deg=1.5)
     assert lag("compass", compass) == Lag(0.288, 1.5)
     assert lag("compass", None).lag_s == 0.0
-
-
-def test_a_recording_that_begins_in_a_tail_goes_on_with_it() -> None:
-    settling = Settling(Lag(0.43, 0.005))
-    settling.judge(0, batch(0, 1.0, 6.0, 2.0), moved=True)
-    again = from_json(to_json(freeze(settling)))
-    for slot in range(1, 8):
-        row = batch(slot, 1.0, 1.0, 1.0)
-        assert again.judge(slot, row, moved=False) == settling.judge(slot, row, moved=False)
-        assert again.left_s == settling.left_s

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import json
 import struct
 import tracemalloc
 from collections.abc import Iterator
@@ -17,10 +15,8 @@ from hypothesis import strategies as st
 
 from companion.cli import main as companion
 from companion.config import parse
-from companion.errors import StorageError
 from companion.recording import topics
 from companion.recording.files import versions
-from companion.recording.state import from_json
 from companion.recording.walk import MAGIC, Message, Recording
 
 MB = 1 << 20
@@ -173,45 +169,27 @@ def test_no_bytes_do_more_than_end_a_recording(tmp_path_factory: pytest.TempPath
     assert recording.cut_short is not None
 
 
-# --- the state in it
+# --- what is in force, in it
 
 
-def array(shape: list[int], kind: str = "<f8", data: bytes = b"") -> str:
-    return json.dumps({"$": "array", "type": kind, "shape": shape, "data": base64.b64encode(data).decode()})
+def lists(count: int) -> bytes:
+    return b"\xdd" + struct.pack(">I", count)
 
 
-def many(kind: str, of: str) -> str:
-    return f'{{"$": "{kind}", "of": {of}}}'
-
-
-BYTES = 8 * MB
-STATES = {
-    "ten million rows of nothing": many("stack", array([10**7, 0])),
-    "many stacks of nothing": f"[{', '.join([many('stack', array([10**5, 0]))] * 100)}]",
-    "an array for each byte": many("stack", array([BYTES, 1], "|i1", bytes(BYTES))),
-    "a number for each byte": many("tuple", array([BYTES], "|i1", bytes(BYTES))),
-    "columns of nothing": f'{{"$": "columns", "name": "Window", "is": {{"a": {array([10**7, 0])}}}}}',
-    "lists without end": f"[{'[], ' * 3_000_000}[]]",
-    "objects without end": f"[{'{}, ' * 3_000_000}{{}}]",
-    "depth without end": "[" * 3_000_000,
-    "a type of a million": json.dumps({"$": "scalar", "type": "f8," * 900_000, "data": ""}),
+DETAILS = {
+    "a list longer than the data": lists(2**32 - 1),
+    "ten million zeros": lists(10**7) + bytes(10**7),
+    "lists without end": lists(900_000) + b"\x90" * 900_000,
+    "depth without end": b"\x91" * 900_000,
+    "an IMU that is turned by nothing": msgspec.msgpack.encode(
+        {"name": "fc", "rotation": [[]] * 9, "profile": {"name": "x", "gyro": {}, "accel": {}}}
+    ),
 }
 
 
-@pytest.mark.parametrize("what", STATES)
-def test_a_state_that_would_fill_the_memory_is_refused(what: str) -> None:
-    tracemalloc.start()
-    try:
-        with pytest.raises(StorageError, match="of another version or damaged") as caught:
-            from_json(STATES[what])
-        assert tracemalloc.get_traced_memory()[1] < MOST
-    finally:
-        tracemalloc.stop()
-    assert len(str(caught.value)) < 200
-
-
-def test_a_state_that_would_fill_the_memory_is_one_line_of_the_replay(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("what", DETAILS)
+def test_an_event_that_would_fill_the_memory_is_one_line_of_the_replay(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str, request: pytest.FixtureRequest
 ) -> None:
     table = b"".join(
         text(each.encode()) for item in (versions() | {"t_s": "1", "unix_s": "1"}).items() for each in item
@@ -219,18 +197,22 @@ def test_a_state_that_would_fill_the_memory_is_one_line_of_the_replay(
     config = msgspec.json.encode(
         parse('[mavlink]\nurl = "udpin:0.0.0.0:1"\n[[imu]]\nname = "fc"\nsource = "autopilot"\n', "")
     )
-    entry = msgspec.json.encode(topics.StateEntry(1.0, 0, STATES["many stacks of nothing"]))
-    path = tmp_path / "state.mcap"
+    start = msgspec.json.encode(topics.StartEntry(1.0, 0))
+    entry = msgspec.json.encode(topics.JournalEntry(1.0, "imu", DETAILS[what]))
+    path = tmp_path / "event.mcap"
     path.write_bytes(
         MAGIC
         + record(12, text(topics.METADATA.encode()) + text(table))
         + record(9, bytes(16) + text(topics.CONFIG.encode()) + text(b"") + struct.pack("<Q", len(config)) + config)
-        + packed(channel(1, topics.STATE.encode()) + message(entry))
+        + packed(channel(1, topics.START.encode()) + message(start))
+        + packed(channel(1, topics.JOURNAL.encode()) + message(entry))
     )
+    request.getfixturevalue("_little_memory")
     assert companion(["replay", str(path)]) == 1
-    assert capsys.readouterr().err == (
-        "companion: the state in the recording is of another version or damaged (a stack of next to nothing)\n"
-    )
+    said = capsys.readouterr().err
+    assert said.startswith(f"companion: {path}: a message on /companion/journal cannot be used by this version (")
+    assert said.count("\n") == 1
+    assert len(said) < 400
 
 
 # --- logs of others

@@ -16,9 +16,10 @@ from companion.cli import main as companion
 from companion.config import Config, Noise, parse
 from companion.configured import models
 from companion.errors import ConfigError, StorageError
-from companion.recording import topics
-from companion.recording.files import RecordingFile, versions
-from companion.recording.journal import Beginning, Entry
+from companion.recording import details, topics
+from companion.recording.files import Beginning, RecordingFile, versions
+from companion.recording.journal import Entry
+from companion.recording.past import Past
 from companion.replay.still_log import read_logs
 from companion.samples import ImuSample
 from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, check_name
@@ -358,9 +359,8 @@ def recording(
 ) -> Path:
     """A recording of noise; at `written_s` the daemon wrote offsets, which moved the gyros by 100 deg/h."""
     config = parse(SMALLEST.format("bmi088"), "x.toml")
-    begin = Beginning(
-        t_s=t_s[0], unix_s=unix_s + t_s[0], versions=versions(), config=msgspec.json.encode(config), state=None, lost=0
-    )
+    past = Past(60.0, (imu,))
+    begin = Beginning(t_s[0], unix_s + t_s[0], versions(), msgspec.json.encode(config), past)
     rng = np.random.default_rng(1)
     entries: list[Entry] = []
     for t in t_s:
@@ -368,12 +368,12 @@ def recording(
         if written_s is not None and t >= written_s:
             gyro[1] += 100.0 * DEG_H
         if t == written_s:
-            event = topics.JournalEntry(t, "reset", '["offsets written",null]')
+            event = topics.JournalEntry(t, "reset", details.encode(("offsets written", None)))
             entries.append((topics.JOURNAL, t, msgspec.json.encode, (event,)))
         sample = ImuSample(t, tuple(gyro), tuple(accel), 25.0)
         entries.append((topics.IMU + imu, t, topics.imu_json, (sample, message)))
     file = RecordingFile(path)
-    file.write([begin, *entries])
+    file.write(past.messages(entries), begin)
     file.close()
     return path
 

@@ -14,28 +14,36 @@ from mcap.reader import make_reader
 
 from companion.errors import StorageError
 from companion.recording import journal as journal_module
+from companion.recording import past as past_module
 from companion.recording import topics
-from companion.recording.files import RESERVE_BYTES, RecordingFile, Ring, versions
-from companion.recording.journal import Beginning, Entry, Journal, Queue
+from companion.recording.files import RESERVE_BYTES, Beginning, RecordingFile, Ring, versions
+from companion.recording.journal import Journal
+from companion.recording.past import Message as Written
+from companion.recording.past import Past
 from companion.recording.walk import Message, Recording
+from companion.samples import ImuSample
 
 MB = 1 << 20
 
 
 def beginning(t_s: float = 1000.0) -> Beginning:
-    return Beginning(t_s=t_s, unix_s=1.7e9, versions=versions(), config=b"{}", state={"a": 1})
+    return Beginning(t_s=t_s, unix_s=1.7e9, versions=versions(), config=b"{}", past=Past(60.0, ()))
 
 
-def raw(count: int, size: int, seed: int = 0) -> list[Entry]:
-    """Entries that do not get smaller by compression."""
+def taken(journal: Journal) -> list[Written]:
+    return Past(60.0, ()).messages(journal.take())
+
+
+def raw(count: int, size: int, seed: int = 0) -> list[Written]:
+    """Messages that do not get smaller by compression."""
     import random
 
     rng = random.Random(seed)
     made = Journal()
-    made.queues.append(queue := Queue())
+    made.begin(1000.0)
     for k in range(count):
         made.raw("/serial/own", 1000.0 + k / 100, rng.randbytes(size))
-    return [item for item in queue.take() if not isinstance(item, Beginning)]
+    return taken(made)[1:]
 
 
 def messages(path: Path, topic: str) -> list[Message]:
@@ -52,8 +60,9 @@ def test_the_ring_keeps_within_its_size_and_the_oldest_go_first(tmp_path: Path) 
     most = 0
     seen: set[int] = set()
     for second in range(60):
-        begin = [beginning()] if second == 0 or ring.is_full else []
-        ring.write([*begin, *raw(40, 2000, second)])
+        if ring.is_full:
+            ring.close()
+        ring.write(raw(40, 2000, second), beginning())
         if second == 0:
             kept.write_bytes(b"asked for by somebody")
         now = [path for path in (tmp_path / "ring").iterdir() if path != kept]
@@ -69,7 +78,7 @@ def test_the_ring_keeps_within_its_size_and_the_oldest_go_first(tmp_path: Path) 
     left = sorted(path for path in (tmp_path / "ring").glob("0*.mcap"))
     assert len(left) >= 5
     for path in left:
-        assert messages(path, topics.STATE), "every file can be replayed by itself"
+        assert messages(path, topics.START), "every file can be replayed by itself"
         with path.open("rb") as file:
             summary = make_reader(file).get_summary()
         assert summary is not None
@@ -85,7 +94,7 @@ def test_a_ring_found_too_large_at_start_is_made_smaller(tmp_path: Path) -> None
     for number in range(1, 9):
         (tmp_path / f"{number:06d}.mcap").write_bytes(bytes(MB))
     ring = Ring(tmp_path, 4 * MB)
-    ring.write([beginning(), *raw(1, 10)])
+    ring.write(raw(1, 10), beginning())
     ring.close()
     assert numbers(tmp_path) == [6, 7, 8, 9]
 
@@ -102,10 +111,10 @@ def test_a_recording_is_its_owners_alone_whatever_the_umask(tmp_path: Path) -> N
     before = os.umask(0)
     try:
         ring = Ring(tmp_path / "ring", 8 * MB)
-        ring.write([beginning(), *raw(1, 10)])
+        ring.write(raw(1, 10), beginning())
         ring.close()
         asked_for = RecordingFile(tmp_path / "flights" / "mine.mcap")
-        asked_for.write([beginning()])
+        asked_for.write([], beginning())
         asked_for.close()
     finally:
         os.umask(before)
@@ -125,8 +134,8 @@ def full(path: Path) -> IO[bytes]:
 def test_a_full_disk_is_one_line_and_what_was_written_is_a_recording(tmp_path: Path) -> None:
     file = RecordingFile(tmp_path / "a.mcap", full)
     with pytest.raises(StorageError, match=r"a\.mcap: cannot be written: No space left on device"):
-        file.write([beginning(), *raw(100, 1000)])
-    file.write(raw(1, 10))  # nothing more happens
+        file.write(raw(100, 1000), beginning())
+    file.write(raw(1, 10), beginning())  # nothing more happens
     file.close()
 
 
@@ -138,41 +147,42 @@ def test_the_disk_is_never_filled_to_the_brim_and_the_ring_gives_way_first(tmp_p
 
     ring = Ring(tmp_path, 8 * MB, free_bytes=left)
     for second in range(8):
-        ring.write([beginning(), *raw(10, 5000, second)])
+        ring.write(raw(10, 5000, second), beginning())
+        ring.close()
     assert len(numbers(tmp_path)) == 8
+    ring.write(raw(10, 5000), beginning())
     free = RESERVE_BYTES - 1
     with pytest.raises(StorageError, match="less than 32 MB free"):
-        ring.write(raw(10, 5000, 99))
-    assert numbers(tmp_path) == [8], "old recordings make room for what matters more"
-    assert messages(tmp_path / "000008.mcap", topics.STATE)
+        ring.write(raw(10, 5000, 99), beginning())
+    assert numbers(tmp_path) == [9], "old recordings make room for what matters more"
+    assert messages(tmp_path / "000009.mcap", topics.START)
     free = 10 * RESERVE_BYTES
-    ring.write([beginning(), *raw(10, 5000)])
+    ring.write(raw(10, 5000), beginning())
     ring.close()
-    assert numbers(tmp_path) == [8, 9]
+    assert numbers(tmp_path) == [9, 10]
 
 
 def test_what_finds_no_room_is_lost_in_one_piece_and_said_in_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(journal_module, "MOST_ENTRIES", 50)
-    queue, made = Queue(), Journal()
-    made.queues.append(queue)
-    queue.begin(beginning())
+    made = Journal()
+    made.begin(1000.0)
     file = RecordingFile(tmp_path / "a.mcap")
     for k in range(20):
         made.raw("/serial/own", 1000.0 + k, bytes([k]))
-    file.write(queue.take())
+    file.write(taken(made), beginning())
     for k in range(20, 90):  # the disk hangs
         made.raw("/serial/own", 1000.0 + k, bytes([k]))
-    assert queue.take() == [], "nothing of a part with a hole in it"
-    assert queue.lost == queue.lost_in_all == 70
-    queue.begin(beginning(1090.0))
+    assert made.take() == [], "nothing of a part with a hole in it"
+    assert made.lost == made.lost_in_all == 70
+    made.begin(1090.0)
     for k in range(90, 95):
         made.raw("/serial/own", 1000.0 + k, bytes([k]))
-    file.write(queue.take())
+    file.write(taken(made), beginning())
     file.close()
-    entries = [topics_of(message) for message in messages(tmp_path / "a.mcap", topics.STATE)]
-    assert [entry.lost for entry in entries] == [0, 70]
+    entries = [topics_of(message) for message in messages(tmp_path / "a.mcap", topics.START)]
+    assert [entry.lost for entry in entries] == [0, 0, 70], "the file, the journal, the journal again"
     import msgspec
 
     found = [
@@ -182,20 +192,58 @@ def test_what_finds_no_room_is_lost_in_one_piece_and_said_in_the_file(
     assert found == [bytes([k]) for k in [*range(20), *range(90, 95)]]
 
 
-def topics_of(message: Message) -> topics.StateEntry:
+def topics_of(message: Message) -> topics.StartEntry:
     import msgspec
 
-    return msgspec.json.decode(message.data, type=topics.StateEntry)
+    return msgspec.json.decode(message.data, type=topics.StartEntry)
 
 
 def test_raw_bytes_in_waiting_are_bounded_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(journal_module, "MOST_BYTES", 1000)
-    queue, made = Queue(), Journal()
-    made.queues.append(queue)
+    made = Journal()
+    made.begin(0.0)
     for k in range(3):
         made.raw("/mavlink/in", float(k), bytes(400))
-    assert queue.lost == 3
-    assert queue.items == []
+    assert made.lost == 4  # its beginning too
+    assert made.items == []
+
+
+def test_a_file_begins_with_the_seconds_before_it_and_with_what_is_in_force(tmp_path: Path) -> None:
+    made, past = Journal(), Past(1.0, ("fc",))
+    made.set_in_force(990.0, "expect", (True, False))
+    made.begin(1000.0)
+    sample = ImuSample(1000.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), None)
+    for second in range(200):
+        now_s = 1000.0 + second
+        made.raw("/serial/own", now_s, bytes([second]))
+        made.raw(topics.MAVLINK_OUT, now_s, b"sent")
+        made.imu("own", sample, None)
+        made.imu("fc", sample, "RAW_IMU")
+        if second == 20:
+            made.set_in_force(now_s, "expect", (True, True))
+        entries = made.take()
+        past.keep(entries, past.messages(entries), now_s + 0.5)
+    found = past.beginning(1200.0)
+    assert [message[0] for message in found[:2]] == [topics.START, topics.JOURNAL]
+    assert b'"expect"' in found[1][2]
+    assert found[1][1] == 1020.0, "the latest before the first second that is kept"
+    assert {message[0] for message in found[2:]} == {"/serial/own", "/imu/fc"}
+    assert [message[1] for message in found if message[0] == "/serial/own"] == [1000.0 + k for k in range(133, 200)]
+
+
+def test_the_seconds_before_are_bounded_in_bytes_and_end_at_a_gap(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(past_module, "MOST_BYTES", 10_000)
+    past, made = Past(60.0, ()), Journal()
+    made.begin(0.0)
+    for second in range(20):
+        made.raw("/serial/own", second, os.urandom(1500))
+        entries = made.take()
+        past.keep(entries, past.messages(entries), second)
+    assert [message[1] for message in past.beginning(20.0)[1:]] == [14, 15, 16, 17, 18, 19]
+    made.begin(30.0)
+    entries = made.take()
+    past.keep(entries, past.messages(entries), 30.0)
+    assert len(past.beginning(30.0)) == 1
 
 
 @pytest.mark.parametrize("content", [b"", b"hello, world, this is no recording", bytes(100)])

@@ -22,7 +22,7 @@ def test_what_came_too_long_ago_or_not_yet_is_not_found(
     """A sample behind a hundred readings that nobody counted, of which thirty are remembered."""
     monkeypatch.setattr("companion.replay.telemetry.PENDING", 30)
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-    telemetry = Telemetry(b"", 1.0)
+    telemetry = Telemetry()
     for number in range(100):
         frame = DIALECT.MAVLink_raw_imu_message(10_000 * number, number, *range(8), 0, 0).pack(codec)
         telemetry.receive(bytes(frame), 5.0 + 0.01 * number)

@@ -66,6 +66,12 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
             field=self.field,
         )
 
+    def with_wander(self, wander_deg: float | None) -> Measurement:
+        """The same where the heading was watched for longer than its readings are known."""
+        if self.heading is None:
+            return self
+        return msgspec.structs.replace(self, heading=msgspec.structs.replace(self.heading, wander_deg=wander_deg))
+
     def _tilt(self) -> TiltWindow | None:
         return None if self.tilt is None else tilt_window(self.tilt.some())
 

@@ -61,8 +61,6 @@ class RollingCollector(Intake):
         ValueError: two IMUs of one name.
     """
 
-    _watch: HeadingWatch | None = None
-
     def __init__(
         self,
         settings: Settings,
@@ -216,10 +214,15 @@ class RollingCollector(Intake):
                 self._heading,
                 slots,
                 from_field=self._field is not None and self._field.from_field,
-                wander_deg=None if self._watch is None else self._watch.wander_deg,
+                wander_deg=self.wander_deg,
             ),
             field=self._field.window(slots) if self._field and self._heading else None,
         )
+
+    @property
+    def wander_deg(self) -> float | None:
+        """How far the heading has wandered since the aircraft last moved; None until that is known."""
+        return self._watch.wander_deg
 
     def imu_seconds(self) -> dict[str, Batch]:
         """The last whole second of each IMU that has one, still or not."""
@@ -276,7 +279,7 @@ class RollingCollector(Intake):
         for source in sources:  # the IMUs first: they say whether it moved
             good = source.judge(slot, moved=moved) and good
             moved = moved or (source.kind == "imu" and not source.verdict.still and not source.verdict.fault)
-        if self._watch is not None and self._heading is not None:
+        if self._heading is not None:
             others = [source.verdict for source in sources if source is not self._heading]
             self._watch.take(self._heading.batches.batches.get(slot), others)
         self._trace.add(slot, sources, good=good)

@@ -12,7 +12,7 @@ from typing import Final
 from companion.configured.devices import Role, SerialDevice, parts_of
 from companion.daemon.devices.sensor_health import SensorHealth
 from companion.daemon.offload import Offload
-from companion.links.serial.bytestream import ByteLink, PortSettings
+from companion.links.serial.bytestream import ByteLink
 from companion.links.serial.ports import find_holders
 from companion.links.system.budget import Budget
 from companion.links.system.together import Together
@@ -115,7 +115,7 @@ class SerialSensor:
         offload: Offload = asyncio.to_thread,
         together: Together | None = None,
     ) -> None:
-        settings = PortSettings(device.port, device.baud, device.parity)
+        settings = device.settings
         self.device = device
         self.name, self.protocol = device.name, device.info.name
         self.roles = [SensorRole(self, role) for role in device.roles]

@@ -12,11 +12,11 @@ import logging
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import msgspec
 
-from companion.calibration.collector.rolling import RollingCollector, Window
+from companion.calibration.collector.rolling import Window
 from companion.calibration.request import What, is_time_limit
 from companion.calibration.solution.prior import Expectation
 from companion.calibration.solution.site import Whereabouts
@@ -30,20 +30,20 @@ from companion.errors import StorageError
 from companion.links.mavlink.link import Direction
 from companion.links.system.request import Object
 from companion.recording import topics
-from companion.recording.files import FOLDER_MODE, RecordingFile, Ring, is_available, versions
-from companion.recording.journal import Beginning, Queue
-from companion.recording.redact import KeyFilter, without_key
-from companion.recording.state import freeze
+from companion.recording.details import Solved
+from companion.recording.files import FOLDER_MODE, Beginning, RecordingFile, Ring, is_available, versions
+from companion.recording.past import Message, Past
+from companion.recording.redact import KeyFilter
 
 logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 FLUSH_S: Final = 1.0
 """What a power cut costs."""
 RETRY_S: Final = 60.0
 DEFAULT_MB: Final = 64
 """Some 35 minutes of a 200 Hz IMU beside 100 Hz telemetry."""
-WINDOWS_TAKEN_ALONG: Final = 8
-"""Into the next file, for a calibration that is being worked out in this moment."""
 MOST_FILE_BYTES: Final = 4 << 30
 PROGRESS_S: Final = 0.5
 HANGS_S: Final = 5.0
@@ -56,7 +56,8 @@ class _OnRequest:
     """A recording that somebody asked for."""
 
     file: RecordingFile
-    queue: Queue
+    lost_before: int
+    """Messages that were lost in all when it began."""
     since_s: float
     until_s: float | None
     ended: asyncio.Future[Object]
@@ -70,9 +71,9 @@ class Recorder(Subsystem):
         self.fault: str | None = None
         """Why the ring is not written, in one line; None while all is well."""
         self._config, self._collector, self._journal = config, collector, collector.journal
-        self._link, self._offload = link, core.offload
+        self._offload = core.offload
         self._alignment, self._conductor = calibrating.alignment, calibrating.conductor
-        self._sensors = {sensor.name: sensor for sensor in devices.sensors}
+        self._past = Past(config.calibration.max_s, (imu.name for imu in config.imu if imu.source == "autopilot"))
         self._folder = config.storage.path / "recordings"
         megabytes = config.storage.recordings_mb
         self._ring: Ring | None = None
@@ -80,16 +81,18 @@ class Recorder(Subsystem):
             self._ring = Ring(self._folder, (DEFAULT_MB if megabytes is None else megabytes) << 20)
         elif megabytes:
             self.fault = HOW_TO_INSTALL
-        self._ring_queue = Queue()
         self._ring_again_s = 0.0
-        self._new_part = False
+        self._part_ends = False
+        """What is in the journal now ends its file."""
+        self._taken_s = 0.0
+        """When the journal was emptied last: what came before is the past of a file that begins now."""
+        self._config_json = msgspec.json.encode(config)
         self._on_request: _OnRequest | None = None
         self._flushing = asyncio.Lock()
-        self._solved: object = None
-        self._around = Surroundings(config, core.vehicle, devices.imus.values())
+        self._around = Surroundings(config, core.vehicle, devices.imus.values(), self._journal)
         self._no_keys = KeyFilter()
         link.tap = self._on_mavlink
-        for sensor in self._sensors.values():
+        for sensor in devices.sensors:
             sensor.tap = self._on_serial
         calibrating.solving.watch(self._on_solved)
         calibrating.conductor.watch(self._on_ended)
@@ -102,7 +105,7 @@ class Recorder(Subsystem):
                 self._no_keys.restart()
             else:
                 data = self._no_keys(data)
-        if self._journal.queues:
+        if self._journal.is_on:
             now_s = asyncio.get_running_loop().time() if t_s is None else t_s
             self._journal.raw(topics.MAVLINK_IN if direction == "in" else topics.MAVLINK_OUT, now_s, data)
 
@@ -113,27 +116,23 @@ class Recorder(Subsystem):
         self, measured: Window, refined: Window, where: Whereabouts, what: What, expectation: Expectation
     ) -> None:
         """A calibration's biases have been worked out; what from, besides the readings."""
-        self._solved = freeze(
-            {
-                "window": self._collector.number_of(measured),
-                # What a dither has found comes from other readings than those of the window.
-                "refined": refined if refined is not measured else None,
-                "where": where,
-                "what": what.name,
-                "offsets": self._around.read_offsets(),
-                "alignment": None if (used := self._alignment.used) is None else (*used.offset_deg, used.sigma_deg),
-                # What is known from before lies on disk and changes with every calibration.
-                "expectation": expectation,
-            }
+        used = self._alignment.used
+        solved = Solved(
+            window=self._collector.number_of(measured),
+            refined=refined if refined is not measured else None,
+            where=where,
+            what=what.name,
+            offsets=self._around.read_offsets(),
+            alignment=None if used is None else (*used.offset_deg, used.sigma_deg),
+            expectation=expectation,
         )
-        self._journal.event(asyncio.get_running_loop().time(), "solved", self._solved)
+        self._journal.event(asyncio.get_running_loop().time(), "solved", solved)
 
     def _on_ended(self, job: Job, _result: JobResult) -> None:
         if job.record is None or not job.record.is_worth_keeping:
             return
         self._journal.record(job.record, asyncio.get_running_loop().time())
-        self._solved = None
-        self._new_part = True
+        self._part_ends = True
 
     # --- to the disk
 
@@ -151,7 +150,7 @@ class Recorder(Subsystem):
                     self.fault = "internal error; the log has the details"
                     if self._on_request is not None:
                         await self._end(self._on_request, self.fault, state="failed")
-                    self._journal.queues.clear()
+                    self._journal.end()
                     await asyncio.Event().wait()
         finally:
             await self._flush()
@@ -164,28 +163,47 @@ class Recorder(Subsystem):
                     logger.warning("recordings: %s", error)
 
     async def _turn(self) -> None:
-        idle = self._ring is not None and self._ring_queue not in self._journal.queues
-        if idle and asyncio.get_running_loop().time() >= self._ring_again_s:
-            self._begin(self._ring_queue)
+        if self._ring is not None and not self._journal.is_on:
+            self._begin()
         await asyncio.sleep(FLUSH_S)
-        if self._journal.queues:
-            self._around.look(self._journal)
+        if self._journal.is_on:
+            self._around.look(asyncio.get_running_loop().time())
         await self._flush()
+
+    def _begin(self) -> None:
+        now_s = asyncio.get_running_loop().time()
+        self._around.look(now_s)
+        self._journal.begin(now_s)
+        self._taken_s = now_s
 
     async def _flush(self) -> None:
         async with self._flushing:
-            await self._flush_ring()
+            journal, loop = self._journal, asyncio.get_running_loop()
+            if not journal.is_on:
+                return
+            if journal.lost:
+                level = logging.WARNING if journal.lost == journal.lost_in_all else logging.DEBUG  # once is enough
+                logger.log(level, "recordings: the disk is too slow, %d messages lost; begun anew", journal.lost)
+                self._begin()
+            beginning = Beginning(
+                self._taken_s, time.time() - (loop.time() - self._taken_s), versions(), self._config_json, self._past
+            )
+            self._taken_s = loop.time()
+            entries, part_ends, self._part_ends = journal.take(), self._part_ends, False
+            messages = await self._in_thread(self._past.messages, entries)
+            await self._flush_ring(messages, beginning, part_ends=part_ends)
             if self._on_request is not None:
-                await self._flush_file(self._on_request)
+                await self._flush_file(self._on_request, messages, beginning)
+            await self._in_thread(self._past.keep, entries, messages, self._taken_s)
 
-    async def _flush_ring(self) -> None:
-        ring, queue = self._ring, self._ring_queue
-        if ring is None or queue not in self._journal.queues:
+    async def _flush_ring(self, messages: list[Message], beginning: Beginning, *, part_ends: bool) -> None:
+        ring = self._ring
+        if ring is None or asyncio.get_running_loop().time() < self._ring_again_s:
             return
-        if queue.lost:
-            self._begin_part(queue)
         try:
-            await self._in_thread(ring.write, queue.take())
+            await self._in_thread(ring.write, messages, beginning)
+            if part_ends or (ring.is_full and not self._conductor.state.busy):
+                await self._in_thread(ring.close)
         except StorageError as error:
             self._stop_ring(str(error))
         except Exception:
@@ -195,19 +213,16 @@ class Recorder(Subsystem):
             if self.fault is not None:
                 logger.info("recordings: written again")
                 self.fault = None
-            if self._new_part or (ring.is_full and not self._conductor.state.busy):
-                self._new_part = False
-                self._begin_part(queue)
 
-    async def _in_thread(self, function: Callable[..., object], *arguments: object) -> None:
+    async def _in_thread(self, function: Callable[..., T], *arguments: object) -> T:
         """Run a call that touches a file; a cancel waits for its end, since two of them must never overlap.
 
         Raises:
             StorageError: as the call.
         """
-        task: asyncio.Future[None] = asyncio.ensure_future(self._offload(function, *arguments))
+        task: asyncio.Future[T] = asyncio.ensure_future(self._offload(function, *arguments))
         try:
-            await asyncio.shield(task)
+            return await asyncio.shield(task)
         except asyncio.CancelledError:
             done, _ = await asyncio.wait([task], timeout=HANGS_S)
             if not done:
@@ -217,18 +232,14 @@ class Recorder(Subsystem):
             raise
 
     def _stop_ring(self, why: str) -> None:
-        self._journal.queues.remove(self._ring_queue)
-        self._ring_queue = Queue()
         self._ring_again_s = asyncio.get_running_loop().time() + RETRY_S
         # Said once: it may stay so for the whole day.
         logger.log(logging.WARNING if self.fault is None else logging.DEBUG, "recordings: %s", why)
         self.fault = why
 
-    async def _flush_file(self, recording: _OnRequest) -> None:
-        if recording.queue.lost:
-            self._begin_part(recording.queue)
+    async def _flush_file(self, recording: _OnRequest, messages: list[Message], beginning: Beginning) -> None:
         try:
-            await self._in_thread(recording.file.write, recording.queue.take())
+            await self._in_thread(recording.file.write, messages, beginning)
         except StorageError as error:
             await self._end(recording, str(error), state="failed")
         except Exception:
@@ -239,33 +250,6 @@ class Recorder(Subsystem):
                 await self._end(recording, "recorded as long as was asked for")
             elif recording.file.bytes_written >= MOST_FILE_BYTES:
                 await self._end(recording, f"ended at {MOST_FILE_BYTES >> 30} GB, as large as a file may be")
-
-    def _begin(self, queue: Queue) -> None:
-        queue.begin(self._beginning())
-        self._journal.queues.append(queue)
-
-    def _begin_part(self, queue: Queue) -> None:
-        if queue.lost:
-            level = logging.WARNING if queue.lost == queue.lost_in_all else logging.DEBUG  # once is enough
-            logger.log(level, "recordings: the disk is too slow, %d messages lost; begun anew", queue.lost)
-        queue.begin(self._beginning())
-
-    def _beginning(self) -> Beginning:
-        return Beginning(
-            t_s=asyncio.get_running_loop().time(),
-            unix_s=time.time(),
-            versions=versions(),
-            config=msgspec.json.encode(self._config),
-            state={
-                "collector": freeze(self._collector, RollingCollector),
-                "decoders": {name: freeze(sensor.decoder) for name, sensor in self._sensors.items()},
-                "mavlink": without_key(self._link.half_received),
-                "windows": list(self._collector.windows)[-WINDOWS_TAKEN_ALONG:],
-                "where": self._around.where,
-                "offsets": self._around.offsets,
-                "solved": self._solved,
-            },
-        )
 
     # --- on request
 
@@ -312,8 +296,9 @@ class Recorder(Subsystem):
             raise
         now_s = loop.time()
         until_s = None if seconds is None else now_s + seconds
-        recording = self._on_request = _OnRequest(file, Queue(), now_s, until_s, loop.create_future())
-        self._begin(recording.queue)
+        recording = self._on_request = _OnRequest(file, self._journal.lost_in_all, now_s, until_s, loop.create_future())
+        if not self._journal.is_on:
+            self._begin()
         logger.info("recording to %s", path)
         return recording
 
@@ -323,16 +308,16 @@ class Recorder(Subsystem):
             raise StorageError(f"already recording to {path}; end it with: companion record --stop")
 
     async def _stop(self, recording: _OnRequest, why: str) -> Object:
+        await self._flush()
         async with self._flushing:
-            if not recording.ended.done():
-                await self._flush_file(recording)
             if not recording.ended.done():
                 await self._end(recording, why)
         return recording.ended.result()
 
     async def _end(self, recording: _OnRequest, why: str, state: str = "done") -> None:
-        self._journal.queues.remove(recording.queue)
         self._on_request = None
+        if self._ring is None:
+            self._journal.end()
         size = recording.file.bytes_written
         try:
             await self._in_thread(recording.file.close)
@@ -348,7 +333,7 @@ class Recorder(Subsystem):
                 "seconds": round(seconds, 1),
                 "bytes": size,
                 "messages": recording.file.messages,
-                "lost": recording.queue.lost_in_all,
+                "lost": self._journal.lost_in_all - recording.lost_before,
             }
         )
 
@@ -362,7 +347,7 @@ class Recorder(Subsystem):
         ring, asked = self._ring, self._on_request
         return {
             "fault": self.fault,
-            "lost": self._ring_queue.lost_in_all,
+            "lost": self._journal.lost_in_all,
             "ring": None
             if ring is None
             else {"directory": str(ring.folder), "bytes": ring.bytes_in_all, "most_bytes": ring.most_bytes},
@@ -372,7 +357,7 @@ class Recorder(Subsystem):
                 "path": str(asked.file.path),
                 "seconds": round(asyncio.get_running_loop().time() - asked.since_s, 1),
                 "bytes": asked.file.bytes_written,
-                "lost": asked.queue.lost_in_all,
+                "lost": self._journal.lost_in_all - asked.lost_before,
             },
         }
 

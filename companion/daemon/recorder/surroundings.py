@@ -2,60 +2,41 @@
 
 from __future__ import annotations
 
-import asyncio
-import dataclasses
 from collections.abc import Iterable
 
-from companion.autopilot.firmware.imu_calibration import ImuCalibration, ImuParameters
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.solution.site import Whereabouts
 from companion.config import Config
 from companion.configured import models
 from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.recording.details import Offsets
 from companion.recording.journal import Journal
 
 
 class Surroundings:
     """What a replay needs to know of the world, and the raw bytes do not say in one place."""
 
-    def __init__(self, config: Config, vehicle: Vehicle, imus: Iterable[AutopilotImu]) -> None:
+    def __init__(self, config: Config, vehicle: Vehicle, imus: Iterable[AutopilotImu], journal: Journal) -> None:
+        self._journal = journal
         self._config, self._vehicle, self._imus = config, vehicle, {imu.name: imu for imu in imus}
         self._seen: dict[str, ImuCalibration | None] = dict.fromkeys(self._imus)
-        self.where = models.whereabouts(config, vehicle)
-        """Place and date."""
-        self.offsets = self.read_offsets()
-        """As they were when somebody looked last."""
+        self._where: Whereabouts | None = None
 
-    def read_offsets(self) -> dict[str, ImuCalibration | None]:
+    def read_offsets(self) -> Offsets:
         """What the autopilot takes off each of its IMUs; None where that is not known."""
-        return {name: _plain_names(imu.calibration) for name, imu in self._imus.items()}
+        return {name: imu.calibration for name, imu in self._imus.items()}
 
-    def look(self, journal: Journal) -> None:
+    def look(self, now_s: float) -> None:
         """Note what has changed."""
-        now_s = asyncio.get_running_loop().time()
-        calibrations = {name: imu.calibration for name, imu in self._imus.items()}
-        if any(calibrations[name] is not before for name, before in self._seen.items()):
-            self._seen, self.offsets = calibrations, self.read_offsets()
-            journal.event(now_s, "offsets", self.offsets)
+        offsets = self.read_offsets()
+        if any(offsets[name] is not before for name, before in self._seen.items()):
+            self._seen = offsets
+            self._journal.set_in_force(now_s, "offsets", offsets)
         where = models.whereabouts(self._config, self._vehicle)
-        if _coarse(where) != _coarse(self.where):
-            self.where = where
-            journal.event(now_s, "place", where)
-
-
-def _plain_names(calibration: ImuCalibration | None) -> ImuCalibration | None:
-    """Without what only one firmware knows of its parameters."""
-    if calibration is None:
-        return None
-    names = calibration.parameters
-    plain = ImuParameters(
-        gyro_offset=names.gyro_offset,
-        accel_offset=names.accel_offset,
-        accel_scale=names.accel_scale,
-        gyro_id=names.gyro_id,
-        accel_id=names.accel_id,
-    )
-    return dataclasses.replace(calibration, parameters=plain)
+        if self._where is None or _coarse(where) != _coarse(self._where):
+            self._where = where
+            self._journal.set_in_force(now_s, "place", where)
 
 
 def _coarse(where: Whereabouts) -> tuple[object, ...]:

@@ -1,0 +1,101 @@
+"""The seconds before now, packed in memory: a recording begins with them, so that a replay knows what the daemon knew.
+
+They cover what a calibration is made of: the longest still stretch, and what it takes to know that it is one. What is
+not needed for that (what was sent, samples that come again from their bytes) is left out.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, Final
+
+import msgspec
+
+from companion.recording import topics
+from companion.recording.journal import Entry, in_force_key
+
+LEARNED_S: Final = 65.0
+"""Beyond the longest stretch: what the gates on stillness learn from, and the tail of a movement before."""
+MOST_BYTES: Final = 8 * 1024 * 1024
+"""Packed. 125 s of an IMU at 1 kHz are 5 MB."""
+IN_FORCE: Final = frozenset({"imu", "expect", "place", "offsets"})
+BREATH: Final = 64
+"""So many messages are made before the event loop gets a chance, should it wait for the interpreter's lock."""
+BREATH_S: Final = 2e-4
+"""Not zero: who lets go of the lock for no time at all gets it back before anybody else wakes up."""
+
+Message = tuple[str, float, bytes]
+"""Topic, time, JSON."""
+
+
+def breathing(items: Iterable[Any]) -> Iterator[Any]:
+    """The items, with a rest now and then in which others may run."""
+    for number, item in enumerate(items):
+        yield item
+        if number % BREATH == BREATH - 1:
+            time.sleep(BREATH_S)
+
+
+class Past:
+    """What has been in the journal lately. Used by one thread at a time.
+
+    Args:
+        longest_stretch_s: the longest still stretch that a calibration is made of.
+        replayed_imus: IMUs whose samples a replay takes from their messages: the autopilot's.
+    """
+
+    def __init__(self, longest_stretch_s: float, replayed_imus: Iterable[str]) -> None:
+        self._keep_s = longest_stretch_s + LEARNED_S
+        self._left_out = (topics.MAVLINK_OUT, topics.RECORD, topics.GRADIENTER, topics.COMPASS)
+        self._imus = frozenset(topics.IMU + name for name in replayed_imus)
+        self._seconds: deque[tuple[float, bytes, dict[str, Message]]] = deque()
+        """When each ended, its messages, and what came into force in it."""
+        self._in_force: dict[str, Message] = {}
+        """Before the first of them."""
+        self._bytes = 0
+
+    def messages(self, entries: Sequence[Entry]) -> list[Message]:
+        """The entries as messages."""
+        return [(topic, t_s, function(*arguments)) for topic, t_s, function, arguments in breathing(entries)]
+
+    def keep(self, entries: Sequence[Entry], messages: Sequence[Message], until_s: float) -> None:
+        """Remember what happened until now; a start forgets what was before."""
+        import zstandard
+
+        changes: dict[str, Message] = {}
+        wanted: list[Message] = []
+        for (_, _, _, arguments), message in zip(entries, messages, strict=True):
+            topic = message[0]
+            if topic == topics.START:
+                self.forget()
+                changes, wanted = {}, []
+            elif topic == topics.JOURNAL and arguments[1] in IN_FORCE:
+                changes[in_force_key(arguments[1], arguments[2])] = message
+                wanted.append(message)
+            elif topic not in self._left_out and (not topic.startswith(topics.IMU) or topic in self._imus):
+                wanted.append(message)
+        packed = zstandard.compress(msgspec.msgpack.encode(wanted), 1)
+        self._seconds.append((until_s, packed, changes))
+        self._bytes += len(packed)
+        while self._seconds and (self._bytes > MOST_BYTES or self._seconds[0][0] < until_s - self._keep_s):
+            _, oldest, changed = self._seconds.popleft()
+            self._bytes -= len(oldest)
+            self._in_force.update(changed)
+
+    def forget(self) -> None:
+        """There is a gap behind it."""
+        self._seconds.clear()
+        self._in_force.clear()
+        self._bytes = 0
+
+    def beginning(self, t_s: float) -> list[Message]:
+        """What a recording begins with that begins at `t_s`."""
+        import zstandard
+
+        start: Message = (topics.START, t_s, msgspec.json.encode(topics.StartEntry(t_s, 0)))
+        found = [start, *self._in_force.values()]
+        for _, packed, _ in self._seconds:
+            found += msgspec.msgpack.decode(zstandard.decompress(packed), type=list[Message])
+        return found
