@@ -548,7 +548,7 @@ def test_recording_on_request(tmp_path: Path) -> None:
             assert ended["bytes"] > 100_000
             assert ended["lost"] == 0
             assert len(replies) > 20
-            assert rig.service.recorder.status()["file"] is None
+            assert rig.service.status()["recording"]["file"] is None
             # Until somebody stops it, and one at a time.
             running = asyncio.create_task(asked(rig))
             await asyncio.sleep(2.2)
@@ -691,7 +691,7 @@ def test_the_ring_is_on_unless_switched_off(tmp_path: Path) -> None:
         rig.config = msgspec.structs.replace(rig.config, storage=storage)
         async with rig.running():
             await asyncio.sleep(3.0)
-            assert rig.service.recorder.status()["ring"]["most_bytes"] == 64 << 20
+            assert rig.service.status()["recording"]["ring"]["most_bytes"] == 64 << 20
 
     run_virtual(main())
     assert len(ring(tmp_path)) == 1
