@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,11 +18,13 @@ from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.firmware.rivals import rivals_of
-from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.telemetry.imu_stream import ImuStream, StreamKind
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
+from companion.config import Imu
+from companion.configured import models
+from companion.daemon.core import Core
 from companion.errors import AutopilotError
-from companion.links.mavlink.link import MavlinkLink
+from companion.links.system.listeners import Listeners
 from companion.samples import ImuSample
 
 logger = logging.getLogger(__name__)
@@ -43,34 +45,17 @@ class _Announced(NamedTuple):
 
 
 class AutopilotImu:
-    """Samples of one autopilot IMU to `take`, while the offsets behind them are known.
+    """Gives the collector the samples of one autopilot IMU while the offsets behind them are known.
 
     Args:
-        name: the IMU's name in the configuration.
-        instance: 1 to 3.
-        take: gets every sample that counts.
-        void: called with a reason when everything taken so far is no longer valid.
-        kind_changed: called when the telemetry changes its message or resolution, and when the sensor's own steps
-            behind it (rad/s, m/s^2; 0 where they do not matter) turn out to be other ones.
+        core: the autopilot, and the collector.
+        imu: which of its IMUs.
+        slots: what is known about PX4's slots.
         rate_hz: asked of the autopilot.
-        memory: what is known about PX4's slots.
     """
 
-    def __init__(
-        self,
-        name: str,
-        instance: int,
-        link: MavlinkLink,
-        vehicle: Vehicle,
-        parameters: ParameterClient,
-        *,
-        take: Callable[[ImuSample], None],
-        void: Callable[[str], None],
-        kind_changed: Callable[[StreamKind | None, tuple[float, float]], None],
-        rate_hz: float,
-        memory: SlotMemory | None = None,
-    ) -> None:
-        self.name, self.instance = name, instance
+    def __init__(self, core: Core, imu: Imu, slots: SlotMemory, rate_hz: float) -> None:
+        self.name, self.instance = imu.name, imu.instance or 1
         self.calibration: ImuCalibration | None = None
         """What the autopilot subtracts, as read; None while that is not known."""
         self.problem = "not read yet"
@@ -81,15 +66,14 @@ class AutopilotImu:
         """How often the autopilot has restarted or other offsets have come into force, not by us."""
         self.upset = ""
         """The latest of these, in a few words."""
-        self.tap: Callable[[ImuSample], None] | None = None
-        """Gets every sample, whatever the offsets behind it."""
-        self.also: Callable[[ImuSample], None] | None = None
-        """Gets every sample that counts, before `take`: for what must not wait."""
-        self._vehicle, self._parameters = vehicle, parameters
-        self._memory = memory or SlotMemory()
-        self._take, self._void = take, void
-        self.on_read: Callable[[ImuCalibration | None, ImuCalibration], None] = lambda before, after: None
+        self.on_sample: Listeners[ImuSample] = Listeners()
+        """Told of every sample, whatever the offsets behind it."""
+        self.on_counting: Listeners[ImuSample] = Listeners()
+        """Told of every sample that counts, before the collector: for what must not wait."""
+        self.on_read: Listeners[ImuCalibration | None, ImuCalibration] = Listeners()
         """Told of every reading: what was read before, unless we have written since, and what is in force now."""
+        self._imu, self._slots = imu, slots
+        self._vehicle, self._parameters, self._collector = core.vehicle, core.parameters, core.collector
         self._known: ImuCalibration | None = None
         """What was read last, unless we have written since."""
         self._ours = 0
@@ -97,16 +81,17 @@ class AutopilotImu:
         self._pause_s = 0.0
         self._stale = asyncio.Event()
         self._stale.set()
-        self._kind_changed, self._grid = kind_changed, (0.0, 0.0)
+        self._grid = (0.0, 0.0)
+        """The sensor's own steps, rad/s and m/s^2; 0 where they do not matter."""
         self.stream = ImuStream(
-            link,
-            vehicle,
-            instance,
+            core.link,
+            core.vehicle,
+            self.instance,
             self._on_sample,
             rate_hz=rate_hz,
-            on_kind_change=lambda k: kind_changed(k, self._grid),
+            on_kind_change=self._kind_changed,
         )
-        self._unsubscribe = (parameters.watch(self._on_parameter), vehicle.watch(self._on_event))
+        self._unsubscribe = (core.parameters.watch(self._on_parameter), core.vehicle.watch(self._on_event))
 
     async def run(self) -> None:
         """Ask for the telemetry and follow the offsets until cancelled."""
@@ -149,7 +134,7 @@ class AutopilotImu:
         assumed, announced, self._announced = self.calibration, self._announced, None
         why = "the autopilot's offsets were read anew" if announced is None else f"{announced.name} was changed"
         try:
-            fresh = await self._read()
+            fresh = await read_calibration(self._parameters, self.instance, self._slots)
         except AutopilotError:
             if announced is not None and not self._ours:
                 self._upset(why)
@@ -160,8 +145,8 @@ class AutopilotImu:
         self.calibration, self.problem, self.failures = fresh, "", 0
         if self._grid != (grid := (fresh.gyro_grid_rad_s, fresh.accel_grid_m_s2)):
             self._grid = grid
-            self._kind_changed(self.stream.kind, grid)
-        self.on_read(known, fresh)
+            self._kind_changed(self.stream.kind)
+        self.on_read.tell(known, fresh)
         now_s = asyncio.get_running_loop().time()
         holds = assumed is not None and _same(assumed, fresh)
         if announced is not None and holds:
@@ -174,24 +159,25 @@ class AutopilotImu:
         if not holds:
             if assumed is not None:
                 self.upsets, self.upset = self.upsets + 1, why
-            self._void(why)
+            self._collector.reset(why, self.name)
         return holds
 
-    async def _read(self) -> ImuCalibration:
-        return await read_calibration(self._parameters, self.instance, self._memory)
-
     def _on_sample(self, sample: ImuSample) -> None:
-        if self.tap is not None:
-            self.tap(sample)
+        if self.on_sample:
+            self.on_sample.tell(sample)
         if self.calibration is not None:
-            if self.also is not None:
-                self.also(sample)
-            self._take(sample)
+            if self.on_counting:
+                self.on_counting.tell(sample)
+            self._collector.add_imu(self.name, sample)
+
+    def _kind_changed(self, kind: StreamKind | None) -> None:
+        message = None if kind is None else kind.message
+        self._collector.set_imu(models.imu_input(self._imu, kind, self._grid), message)
 
     def _invalidate(self, why: str) -> None:
         self.calibration = None
         self.problem = f"offsets being read again: {why}"
-        self._void(why)
+        self._collector.reset(why, self.name)
         self._stale.set()
 
     def _upset(self, why: str) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Callable
 from typing import Final
 
 from companion.links.serial.bytestream import ByteLink
+from companion.links.system.listeners import Listeners
 from companion.protocols.decoding.base import Decoder
 from companion.protocols.stream_health import SILENT, SILENT_AFTER_S, StreamHealth, Trouble
 
@@ -27,24 +27,15 @@ AGAIN_S: Final = 60.0
 
 
 class SensorHealth:
-    """What is wrong with one sensor now, and how often what has been.
-
-    Args:
-        link: its port.
-        kind: as in the configuration: imu, gradienter, compass.
-        protocol: likewise.
-        decoder: whose counts are looked at.
-        polled: it speaks only when it is asked.
-    """
+    """What is wrong with one sensor now, and how often what has been; `polled`: it speaks only when it is asked."""
 
     def __init__(self, link: ByteLink, kind: str, protocol: str, decoder: Decoder, *, polled: bool) -> None:
         self.link, self.kind, self.protocol = link, kind, protocol
         self.stream = StreamHealth(protocol, decoder)
         self.counts: Counter[str] = Counter()
         """How often each trouble has begun, and each event happened."""
-        self.stuck: Trouble | None = None
-        """That its reading stays while the aircraft does not: found out by who sees the other sensors too."""
-        self.on_implausible: Callable[[Trouble], object] = lambda trouble: None
+        self._stuck: Trouble | None = None
+        self.on_implausible: Listeners[Trouble] = Listeners()
         """Told, as often as the log, when its readings begin to look good without being so."""
         self._renew_after_s = RENEW_POLLED_AFTER_S if polled else RENEW_AFTER_S
         self._opened_s = self._grace_since_s = 0.0
@@ -73,12 +64,10 @@ class SensorHealth:
         if not self.link.connected:
             words = self.link.last_error or f"{self.link.settings.url}: not open yet"
             return Trouble(SILENT if self._renewed else ABSENT, words)
-        found = self._flood(now_s) or self.stream.trouble(now_s) or self.stuck
+        found = self._flood(now_s) or self.stream.trouble(now_s) or self._stuck
         if found is None:
             return None
-        port = self.link.settings
-        line = f"{port.url} at {port.baud} baud, parity {port.parity}" if not port.is_tcp else port.url
-        return Trouble(found.key, f"{line}: {found.words}", found.implausible)
+        return Trouble(found.key, f"{line_of(self.link)}: {found.words}", found.implausible)
 
     def words(self, now_s: float) -> str | None:
         """What is wrong with it in one line, or None while good samples come."""
@@ -95,8 +84,12 @@ class SensorHealth:
         rate = f"{self._bytes_per_s / 1e3:.0f} kB/s" if self._bytes_per_s else "too much"
         return Trouble(FLOOD, f"floods us ({rate}); the surplus is thrown away: another device, or a loop-back?")
 
-    def look(self, now_s: float) -> Trouble | None:
-        """See how it does, count and say what has changed, and ask a silent peer anew; called about twice a second."""
+    def look(self, now_s: float, stuck: Trouble | None = None) -> Trouble | None:
+        """See how it does, count and say what has changed, and ask a silent peer anew; called about twice a second.
+
+        `stuck`: its reading stays while the aircraft does not, as who sees the other sensors too has found.
+        """
+        self._stuck = stuck
         since_s, before = self._received
         if now_s - since_s >= 1.0:
             self._bytes_per_s = (self.link.bytes_received - before) / (now_s - since_s) if since_s else 0.0
@@ -136,7 +129,7 @@ class SensorHealth:
         self._said = found.key
         self.counts[found.key] += 1
         if self._tell(found, now_s) and found.implausible:
-            self.on_implausible(found)
+            self.on_implausible.tell(found)
 
     def _tell(self, what: Trouble, now_s: float) -> bool:
         """In the log; whether in the ordinary one."""
@@ -169,3 +162,9 @@ class SensorHealth:
             "speaks": self.stream.speaks,
             "port": self.link.settings.url,
         }
+
+
+def line_of(link: ByteLink) -> str:
+    """The port and how it is set, for people."""
+    port = link.settings
+    return port.url if port.is_tcp else f"{port.url} at {port.baud} baud, parity {port.parity}"

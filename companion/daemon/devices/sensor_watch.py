@@ -140,7 +140,7 @@ class SensorWatch:
         self._has_failed = False
         self._say = say
         for sensor in sensors:
-            sensor.health.on_implausible = functools.partial(self._tell, sensor)
+            sensor.health.on_implausible.add(functools.partial(self._tell, sensor))
 
     def _tell(self, sensor: SerialSensor, trouble: Trouble) -> None:
         """To the ground stations: no calibration comes to an end with it, and what was written with it may be wrong."""
@@ -163,9 +163,7 @@ class SensorWatch:
         """One look at all of them."""
         self._witness.look(self._collector.imu_seconds(), self._corrected)
         for sensor in self._sensors:
-            if "imu" not in sensor.kinds:
-                sensor.health.stuck = self._stuck(sensor)
-            found = sensor.health.look(now_s)
+            found = sensor.health.look(now_s, None if "imu" in sensor.kinds else self._stuck(sensor))
             if found is not None and found.implausible:
                 self._collector.reset(f"{sensor.name}: {found.words}", sensor.name if sensor.kinds == {"imu"} else None)
 

@@ -10,11 +10,12 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from companion.configured.devices import Role, SerialDevice, parts_of
-from companion.daemon.devices.sensor_health import SensorHealth
+from companion.daemon.devices.sensor_health import SensorHealth, line_of
 from companion.daemon.offload import Offload
 from companion.links.serial.bytestream import ByteLink
 from companion.links.serial.ports import find_holders
 from companion.links.system.budget import Budget
+from companion.links.system.listeners import Listeners
 from companion.links.system.together import Together
 from companion.protocols.registry import Kind
 from companion.protocols.roles import Part
@@ -29,9 +30,9 @@ TICK_S: Final = 0.02
 COARSE_S: Final = 0.25
 """Between two looks otherwise."""
 LIVELY_S: Final = 1.0
-"""So long after something was said a conversation counts as going on."""
+"""How long after something was said a conversation counts as going on."""
 LOOK_AGAIN_S: Final = 60.0
-"""So long a look at who else has the port open holds."""
+"""How long a port-holder check stays valid."""
 HELD_AGAIN_S: Final = 5.0
 MOST_WORDS: Final = 20
 """Different things said to one device that are told in the log."""
@@ -134,10 +135,10 @@ class SerialSensor:
         self.health = SensorHealth(
             self.link, device.roles[0].kind, self.protocol, self.decoder, polled=self.dialogue is not None
         )
-        self.tap: Callable[[str, bytes | None, float], object] | None = None
-        """Called with (name, bytes, time) before they are decoded; without bytes: some are missing."""
-        self.on_samples: Callable[[Sequence[Sample], float], object] | None = None
-        """Called with all samples of a read, and its time, before anybody else gets them: for what must not wait."""
+        self.on_bytes: Listeners[str, bytes | None, float] = Listeners()
+        """Told (name, bytes, time) before they are decoded; without bytes: some are missing."""
+        self.on_samples: Listeners[Sequence[Sample], float] = Listeners()
+        """Told all samples of a read, and its time, before anybody else gets them: for what must not wait."""
         self._take, self._offload = take, offload
         self._by_role = dict(zip(device.roles, self.roles, strict=True))
         self.other_north: str | None = None
@@ -165,9 +166,7 @@ class SerialSensor:
         self._together.take()
         if connected:
             now_s = asyncio.get_running_loop().time()
-            if self.tap is not None:
-                self.tap(self.name, None, now_s)
-            self.decoder.interrupted()
+            self._interrupted(now_s)
             self.health.opened()
             self._openings += 1
             self._alone, self._look_at_s = False, -math.inf
@@ -177,8 +176,10 @@ class SerialSensor:
     def _on_gap(self) -> None:
         """Bytes are missing from here on."""
         self._together.take()
-        if self.tap is not None:
-            self.tap(self.name, None, asyncio.get_running_loop().time())
+        self._interrupted(asyncio.get_running_loop().time())
+
+    def _interrupted(self, now_s: float) -> None:
+        self.on_bytes.tell(self.name, None, now_s)
         self.decoder.interrupted()
 
     def _arrived(self, data: bytes, t_s: float) -> None:
@@ -197,11 +198,11 @@ class SerialSensor:
 
     def receive(self, data: bytes, t_s: float) -> None:
         """Take bytes that were read at `t_s`."""
-        if self.tap is not None:
-            self.tap(self.name, data, t_s)
+        if self.on_bytes:
+            self.on_bytes.tell(self.name, data, t_s)
         samples = self.decoder.receive(data, t_s)
-        if samples and self.on_samples is not None:
-            self.on_samples(samples, t_s)
+        if samples and self.on_samples:
+            self.on_samples.tell(samples, t_s)
         if (breaks := self.decoder.times.clock.breaks) != self._breaks:
             self._breaks = breaks
             logger.warning("%s: the device restarted, or its clock jumped; measuring afresh", self.link.name)
@@ -266,8 +267,7 @@ class SerialSensor:
     @property
     def line(self) -> str:
         """The port and how it is set, for people."""
-        port = self.link.settings
-        return port.url if port.is_tcp else f"{port.url} at {port.baud} baud, parity {port.parity}"
+        return line_of(self.link)
 
     @property
     def problem(self) -> str | None:

@@ -8,8 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 
 from companion.autopilot.firmware.imu_calibration import accel_taken_off
 from companion.autopilot.firmware.px4_slots import SlotMemory
-from companion.autopilot.telemetry.imu_stream import StreamKind
-from companion.config import Imu
 from companion.configured import models
 from companion.configured.devices import Role, collect, serial_devices
 from companion.daemon.core import Core, Subsystem, Task
@@ -21,7 +19,7 @@ from companion.daemon.devices.signing import LinkSigning
 from companion.daemon.offload import keep_ticking
 from companion.links.system.request import Object
 from companion.protocols.roles import Part
-from companion.samples import ImuSample, Sample
+from companion.samples import Sample
 
 
 class Devices(Subsystem):
@@ -35,8 +33,9 @@ class Devices(Subsystem):
     def __init__(self, core: Core, imu_rate_hz: float | None = None) -> None:
         self._core = core
         self.slots = SlotMemory()
-        self._imu_rate_hz = models.imu_rate_hz(core.config) if imu_rate_hz is None else imu_rate_hz
-        self.imus = {imu.name: self._autopilot_imu(imu) for imu in core.config.imu if imu.source == "autopilot"}
+        rate_hz = models.imu_rate_hz(core.config) if imu_rate_hz is None else imu_rate_hz
+        imus = [imu for imu in core.config.imu if imu.source == "autopilot"]
+        self.imus = {imu.name: AutopilotImu(core, imu, self.slots, rate_hz) for imu in imus}
         """The autopilot's IMUs, by name."""
         self.sensors = [
             SerialSensor(device, self._take, core.offload, core.link.together) for device in serial_devices(core.config)
@@ -91,31 +90,6 @@ class Devices(Subsystem):
             *(((sensor.name, sensor.run) for sensor in self.sensors) if ports else ()),
             *([("sensor-watch", self.watch.run)] if ports else []),
         ]
-
-    def _autopilot_imu(self, imu: Imu) -> AutopilotImu:
-        core = self._core
-
-        def kind_changed(kind: StreamKind | None, grid: tuple[float, float]) -> None:
-            core.collector.set_imu(models.imu_input(imu, kind, grid), None if kind is None else kind.message)
-
-        def take(sample: ImuSample) -> None:
-            core.collector.add_imu(imu.name, sample)
-
-        def void(why: str) -> None:
-            core.collector.reset(why, imu.name)
-
-        return AutopilotImu(
-            imu.name,
-            imu.instance or 1,
-            core.link,
-            core.vehicle,
-            core.parameters,
-            take=take,
-            void=void,
-            kind_changed=kind_changed,
-            rate_hz=self._imu_rate_hz,
-            memory=self.slots,
-        )
 
     def _take(self, role: Role, part: Part) -> None:
         reading = collect(self._core.collector, role, part)

@@ -82,12 +82,12 @@ class AttitudeService:
         self._autopilot_imu = devices.imus.get(self.carrier.imu.name)
         if self._autopilot_imu is not None:
             take = self._guarded(self._on_autopilot_samples)
-            self._autopilot_imu.also = lambda sample: take((sample,), sample.t_s)
+            self._autopilot_imu.on_counting.add(lambda sample: take((sample,), sample.t_s))
         for sensor in devices.sensors:
             if any(role.name == self.carrier.imu.name for role in sensor.roles):
-                sensor.on_samples = self._guarded(self._on_imu)
+                sensor.on_samples.add(self._guarded(self._on_imu))
             elif "compass" in sensor.kinds:
-                sensor.on_samples = self._guarded(lambda samples, _read_s: self.carrier.take_compass(samples))
+                sensor.on_samples.add(self._guarded(lambda samples, _read_s: self.carrier.take_compass(samples)))
 
     # --- what arrives
 

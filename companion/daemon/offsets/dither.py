@@ -7,10 +7,9 @@ back after whatever ends the dither too early: a cancel, arming, a reboot, a los
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import dataclasses
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import msgspec
@@ -207,7 +206,8 @@ class Ditherer:
             if sample.t_s >= settled_s and len(source.batches) < SECONDS:
                 source.add(sample.t_s, sample.gyro_rad_s + sample.accel_m_s2, None, sample.t_device_s)
 
-        with _tapped(work.imu, take):
+        stop = work.imu.on_sample.add(take)
+        try:
             while len(source.batches) < SECONDS and loop.time() < deadline_s:
                 await job.pause(POLL_S)
                 self._check(job, work)
@@ -215,6 +215,8 @@ class Ditherer:
                     raise AutopilotError("no heartbeat while the offsets dithered")
                 source.close_before(loop.time() - 0.5)
                 moved = moved or self._moving(work.name)
+        finally:
+            stop()
         batches: Sequence[Batch] = list(source.batches.values())[:SECONDS]
         return Step(_shift_of(work.calibration, values) / work.steps_si, batches), moved
 
@@ -260,15 +262,6 @@ def _shift_of(calibration: ImuCalibration, values: Mapping[str, float]) -> Array
     gyro = np.asarray(calibration.gyro_offset_rad_s) - [values[name] for name in names.gyro_offset]
     accel = np.asarray(calibration.accel_offset_m_s2) - [values[name] for name in names.accel_offset]
     return np.concatenate([rotation @ gyro, rotation @ (np.asarray(calibration.accel_scale) * accel)])
-
-
-@contextlib.contextmanager
-def _tapped(imu: AutopilotImu, take: Callable[[ImuSample], None]) -> Iterator[None]:
-    imu.tap = take
-    try:
-        yield
-    finally:
-        imu.tap = None
 
 
 def _with(window: ImuWindow, found: Dithered) -> ImuWindow:

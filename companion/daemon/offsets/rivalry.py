@@ -41,7 +41,7 @@ class Rivalry:
         self._was_armed = False
         self._unsubscribe = vehicle.watch(self._on_event)
         for name, imu in imus.items():
-            imu.on_read = functools.partial(self._on_read, name)
+            imu.on_read.add(functools.partial(self._on_read, name))
 
     @property
     def rivals(self) -> tuple[Rival, ...]:

@@ -93,7 +93,7 @@ class Recorder(Subsystem):
         self._no_keys = KeyFilter()
         link.tap = self._on_mavlink
         for sensor in devices.sensors:
-            sensor.tap = self._on_serial
+            sensor.on_bytes.add(self._on_serial)
         calibrating.solving.watch(self._on_solved)
         calibrating.conductor.watch(self._on_ended)
 
