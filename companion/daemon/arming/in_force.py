@@ -1,8 +1,7 @@
 """What calibration is in force in each IMU, since when, and what speaks against it.
 
-Three things are watched: the calibrations that end, the offsets that the autopilot says it has, and what the rolling
-window says of the present output. Offsets that change while nobody here writes were changed by somebody else, or by
-a boot that measured the gyros itself (INS_GYR_CAL = 1, autopilots 1.5).
+Three things are watched: the calibrations that end, the offsets that the autopilot says it has (`offset_watch`), and
+what the rolling window says of the present output.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from typing import Final
 
 import msgspec
 
-from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
 from companion.calibration.solution.doubt import Doubt
@@ -35,32 +33,27 @@ from companion.component.service import JobResult
 from companion.config import Config, Imu
 from companion.configured import models
 from companion.daemon import offload as estimating
+from companion.daemon.arming.offset_watch import OffsetWatch
 from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.held_back import HeldBack, Key
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
-from companion.daemon.job import ALIGNMENT, Job
+from companion.daemon.job import Job
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import vector
 from companion.samples import Triad, Vector
 
 logger = logging.getLogger(__name__)
 
+_GYRO: Final[Triad] = "gyro"
+_ACCEL: Final[Triad] = "accel"
 _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 # Causes that a measurement settles. What the pilot undid and what somebody else chose is theirs until asked for, and
 # what a boot replaced is pushed again.
 _SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED})
 SETTLED_EVERY_S: Final = 5
 """So often the output is looked at while nothing speaks against what is in force; else every second."""
-
-
-class _Known(msgspec.Struct, frozen=True):
-    """The offsets that the autopilot had when they were looked at last."""
-
-    gyro: Vector
-    accel: Vector
-    boots: int
 
 
 class InForce:
@@ -89,7 +82,7 @@ class InForce:
             "accel": settings.target_accel_sigma_m_s2,
         }
         self._sources = {imu.name: imu for imu in _judged(config)}
-        triads: tuple[Triad, ...] = ("gyro", "accel") if config.gradienter is not None else ("gyro",)
+        triads = (_GYRO, _ACCEL) if config.gradienter is not None else (_GYRO,)
         self._held: dict[Key, Held | Why] = {(name, triad): Why.NEVER for name in self._sources for triad in triads}
         self._left_out: set[Key] = set()
         """What no calibration can settle, and is not judged."""
@@ -100,14 +93,7 @@ class InForce:
         self._temperatures: dict[str, float] = {}
         self._measured_s = self._looked_s = -1.0
         self._worth_since_s: float | None = None
-        self._known: dict[str, _Known] = {}
-        self._before: dict[str, _Known] = {}
-        self._failed = False
-        self._written: dict[str, dict[str, float]] = {}
-        """By IMU: what a calibration has just left there, until that is looked at."""
-        self._asked_restart = False
-        self.foreign: str | None = None
-        """What somebody else has changed since the last request, in few words."""
+        self._offsets = OffsetWatch(core.vehicle, imus, self._lose)
         self.calibration: Record | None = None
         """The last finished calibration of this run, while at least one of its values is in force."""
         self.undone = False
@@ -115,6 +101,11 @@ class InForce:
         alignment.watch(self._realigned)
 
     # --- what is known
+
+    @property
+    def foreign(self) -> str | None:
+        """What somebody else has changed since the last request, in few words."""
+        return self._offsets.foreign
 
     @property
     def what(self) -> What:
@@ -182,7 +173,7 @@ class InForce:
 
     def record_of(self, name: str) -> ImuRecord | None:
         """What the last calibration found in one IMU; None when nothing did, or something has replaced it."""
-        keys: list[Key] = [(name, "gyro"), (name, "accel")]
+        keys = [(name, _GYRO), (name, _ACCEL)]
         if self.calibration is None or any(
             isinstance(self._held.get(key), Why) or key in self._held_back for key in keys
         ):
@@ -204,26 +195,21 @@ class InForce:
 
     def _on_ended(self, job: Job, result: JobResult) -> None:
         """A calibration or an undo has come to its end: what the autopilot has now is of our doing."""
-        self._let_go()
-        self._written = {}
+        self._forget()
+        self._offsets.on_ended(job, result)
         done = result.outcome == "done"
-        self._failed = not done
         if job.kind == "undo":
             if done:
                 self.undone, self.calibration = True, None
                 self._held_back.let_go()
                 self._held = dict.fromkeys(self._held, Why.UNDONE)
             return
-        if not job.automatic and job.kind != ALIGNMENT:
-            self.foreign = None
         if done and job.record is not None:
             self.undone = False
             self.calibration = job.record
-            self._asked_restart = job.reboot
             for imu in job.record.imus:
                 if imu.name in self._sources:
                     self._take(imu, asyncio.get_running_loop().time(), job.held_back)
-                    self._written[imu.name] = {name: one.after for name, one in imu.written.items()}
 
     def _realigned(self) -> None:
         """The gradienter has another zero from now on: accelerometers calibrated with the old one must be seen anew."""
@@ -236,14 +222,14 @@ class InForce:
     def _take(self, imu: ImuRecord, now_s: float, held_back: Mapping[Key, Doubt]) -> None:
         """Hold what a calibration has found in one IMU, save what it has not written for doubt."""
         corrected = imu.name in self._imus
-        for triad, sigma, bias in (
-            ("gyro", imu.gyro_sigma_use_rad_s, imu.gyro_bias_rad_s),
-            ("accel", imu.accel_sigma_use_m_s2, imu.accel_bias_m_s2),
-        ):
-            key: Key = (imu.name, "gyro" if triad == "gyro" else "accel")
+        halves: tuple[tuple[Triad, str, Vector | None, Vector | None, Vector | None], ...] = (
+            ("gyro", "GYR", imu.gyro_sigma_use_rad_s, imu.gyro_bias_rad_s, imu.residual_gyro_rad_s),
+            ("accel", "ACC", imu.accel_sigma_use_m_s2, imu.accel_bias_m_s2, imu.residual_accel_m_s2),
+        )
+        for triad, mark, sigma, bias, residual in halves:
+            key = (imu.name, triad)
             if key not in self._held or sigma is None or bias is None:
                 continue
-            mark = "GYR" if triad == "gyro" else "ACC"
             outcomes = {one.outcome for name, one in imu.written.items() if mark in name}
             found = Held(
                 calibrated_s=now_s,
@@ -260,70 +246,24 @@ class InForce:
                 self._held[key] = found
                 self._held_back.let_go(name=imu.name, triad=triad)
                 continue
-            residual = imu.residual_gyro_rad_s if triad == "gyro" else imu.residual_accel_m_s2
             seen = msgspec.structs.replace(found, expected=residual if corrected and residual is not None else bias)
             self._held_back.hold(key, doubt, seen)
 
     def poll(self, *, writing: bool) -> None:
-        """Compare the autopilot's offsets with those that were there before.
-
-        Args:
-            writing: whether we may be changing them ourselves just now.
-        """
+        """See whether anybody has changed the autopilot's offsets, unless we may be changing them just now."""
         if writing:
-            self._let_go()
-            return
-        for name, imu in self._imus.items():
-            calibration = imu.calibration
-            if calibration is None:
-                continue
-            now = _Known(calibration.gyro_offset_rad_s, calibration.accel_offset_m_s2, self._vehicle.boots)
-            known = self._known.get(name)
-            self._known[name] = now
-            if known is None:
-                self._look_after_job(name, self._before.pop(name, now), now, calibration)
-            elif known.boots != now.boots:
-                replaced = (known.gyro, known.accel) != (now.gyro, now.accel)
-                self._lose(name, Why.REPLACED if replaced else Why.REBOOTED)
-            elif known != now:
-                self._changed_by_others(name)
-
-    def _look_after_job(self, name: str, before: _Known, now: _Known, calibration: ImuCalibration) -> None:
-        """What a job has left is compared with what there is: between the two the EKF may have settled for minutes."""
-        written = self._written.pop(name, {})
-        restarted = before.boots != now.boots and not self._asked_restart
-        if self._failed and (before.gyro, before.accel) != (now.gyro, now.accel):
-            # What was ours has been put back by now; what a restart has not replaced is somebody else's.
-            if before.boots == now.boots:
-                self._changed_by_others(name)
-            else:
-                self._lose(name, Why.FAILED)
-        elif written and calibration.contradicts(written):
-            if restarted:
-                self._lose(name, Why.REPLACED)
-            else:
-                self._changed_by_others(name)
-        elif restarted:
-            self._lose(name, Why.REBOOTED)
-
-    def _changed_by_others(self, name: str) -> None:
-        self.foreign = f"{name} was changed"
-        logger.warning("imu %s: somebody else changed its offsets; they are left alone", name)
-        self._lose(name, Why.CHANGED)
-
-    def _let_go(self) -> None:
-        """What the autopilot has from now on is our own doing, until it is looked at again."""
-        self._before, self._known = dict(self._known) or self._before, {}
-        self._forget()
+            self._offsets.let_go()
+            self._forget()
+        else:
+            self._offsets.poll()
 
     def _lose(self, name: str, why: Why) -> None:
         if why is not Why.REBOOTED:  # which has kept them
             self._held_back.let_go(name=name)
-        for triad in ("gyro", "accel"):
-            key: Key = (name, "gyro" if triad == "gyro" else "accel")
-            held = self._held.get(key)
+        for key in [key for key in self._held if key[0] == name]:
+            held = self._held[key]
             # What was never there, or was taken back on purpose, is not lost again by a restart.
-            if held is not None and (isinstance(held, Held) or why in (Why.CHANGED, Why.FAILED)):
+            if isinstance(held, Held) or why in (Why.CHANGED, Why.FAILED):
                 if isinstance(held, Held) and why is Why.REBOOTED:
                     self._shelved[key] = held
                 self._held[key] = why
@@ -351,7 +291,7 @@ class InForce:
         if window.end_s == self._measured_s:
             return False
         self._measured_s = window.end_s
-        known = dict(self._known)
+        known = self._offsets.known()
         try:
             solution: Solution = await self._offload(
                 solve_at,
@@ -364,7 +304,7 @@ class InForce:
         except CalibrationRefusedError:
             self._forget()
             return True
-        if known == self._known:  # else the offsets have changed while it was worked out
+        if known == self._offsets.known():  # else the offsets have changed while it was worked out
             self._note(solution, window.end_s, window.end_s - window.start_s)
         return True
 
@@ -373,11 +313,10 @@ class InForce:
         for imu in solution.imus:
             if imu.temperature_degc is not None:
                 self._temperatures[imu.name] = imu.temperature_degc
-            for triad, residual, sigma in (
-                ("gyro", imu.gyro_rad_s, imu.gyro_sigma_use_rad_s),
-                ("accel", imu.accel_m_s2, imu.accel_sigma_use_m_s2),
+            for key, residual, sigma in (
+                ((imu.name, _GYRO), imu.gyro_rad_s, imu.gyro_sigma_use_rad_s),
+                ((imu.name, _ACCEL), imu.accel_m_s2, imu.accel_sigma_use_m_s2),
             ):
-                key: Key = (imu.name, "gyro" if triad == "gyro" else "accel")
                 if key in solution.unknown:
                     self._leave_out(key)
                     continue

@@ -1,0 +1,112 @@
+"""Who has changed the autopilot's offsets: what it says that it has is compared with what was there before.
+
+Offsets that change while nobody here writes were changed by somebody else, or by a boot that measured the gyros itself
+(INS_GYR_CAL = 1, autopilots 1.5).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+
+import msgspec
+
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.vehicle.vehicle import Vehicle
+from companion.calibration.solution.validity import Why
+from companion.component.service import JobResult
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.job import ALIGNMENT, Job
+from companion.samples import Vector
+
+logger = logging.getLogger(__name__)
+
+
+class _Known(msgspec.Struct, frozen=True):
+    """The offsets that the autopilot had when they were looked at last."""
+
+    gyro: Vector
+    accel: Vector
+    boots: int
+
+
+class OffsetWatch:
+    """Compares; `poll` often.
+
+    Args:
+        vehicle: whether it restarted.
+        imus: the autopilot's IMUs by name.
+        lost: told which IMU's offsets are ours no longer, and why.
+    """
+
+    def __init__(self, vehicle: Vehicle, imus: Mapping[str, AutopilotImu], lost: Callable[[str, Why], object]) -> None:
+        self._vehicle, self._imus, self._lost = vehicle, imus, lost
+        self._known: dict[str, _Known] = {}
+        self._before: dict[str, _Known] = {}
+        """What was known before a job, until what that has left is looked at."""
+        self._failed = self._asked_restart = False
+        self._written: dict[str, dict[str, float]] = {}
+        """By IMU: what a calibration has just left there, until that is looked at."""
+        self.foreign: str | None = None
+        """What somebody else has changed since the last request, in few words."""
+
+    def known(self) -> dict[str, _Known]:
+        """What is in the autopilot, to be compared with later."""
+        return dict(self._known)
+
+    def let_go(self) -> None:
+        """What the autopilot has from now on is our own doing, until it is looked at again."""
+        self._before, self._known = dict(self._known) or self._before, {}
+
+    def on_ended(self, job: Job, result: JobResult) -> None:
+        """A calibration, an alignment or an undo has come to its end."""
+        self.let_go()
+        self._written, self._failed = {}, result.outcome != "done"
+        if job.kind == "undo":
+            return
+        if not job.automatic and job.kind != ALIGNMENT:
+            self.foreign = None
+        if not self._failed and job.record is not None:
+            self._asked_restart = job.reboot
+            for imu in job.record.imus:
+                self._written[imu.name] = {name: one.after for name, one in imu.written.items()}
+
+    def poll(self) -> None:
+        """Compare the autopilot's offsets with those that were there before."""
+        for name, imu in self._imus.items():
+            calibration = imu.calibration
+            if calibration is None:
+                continue
+            now = _Known(calibration.gyro_offset_rad_s, calibration.accel_offset_m_s2, self._vehicle.boots)
+            known = self._known.get(name)
+            self._known[name] = now
+            if known is None:
+                self._look_after_job(name, self._before.pop(name, now), now, calibration)
+            elif known.boots != now.boots:
+                replaced = (known.gyro, known.accel) != (now.gyro, now.accel)
+                self._lost(name, Why.REPLACED if replaced else Why.REBOOTED)
+            elif known != now:
+                self._changed_by_others(name)
+
+    def _look_after_job(self, name: str, before: _Known, now: _Known, calibration: ImuCalibration) -> None:
+        """What a job has left is compared with what there is: between the two the EKF may have settled for minutes."""
+        written = self._written.pop(name, {})
+        restarted = before.boots != now.boots and not self._asked_restart
+        if self._failed and (before.gyro, before.accel) != (now.gyro, now.accel):
+            # What was ours has been put back by now; what a restart has not replaced is somebody else's.
+            if before.boots == now.boots:
+                self._changed_by_others(name)
+            else:
+                self._lost(name, Why.FAILED)
+        elif written and calibration.contradicts(written):
+            if restarted:
+                self._lost(name, Why.REPLACED)
+            else:
+                self._changed_by_others(name)
+        elif restarted:
+            self._lost(name, Why.REBOOTED)
+
+    def _changed_by_others(self, name: str) -> None:
+        self.foreign = f"{name} was changed"
+        logger.warning("imu %s: somebody else changed its offsets; they are left alone", name)
+        self._lost(name, Why.CHANGED)
