@@ -75,6 +75,17 @@ class ArmAnswer(msgspec.Struct, frozen=True):
 
     verdict: Literal["accept", "wait", "refuse"]
     words: str
+    hold_still_s: int | None = None
+    """How long to hold still, where nothing else is needed."""
+    meanwhile: str = ""
+    """What goes on while it is held still."""
+
+    @classmethod
+    def hold_still(cls, seconds: float, meanwhile: str = "") -> ArmAnswer:
+        """That it may arm when it has stood still for so long."""
+        whole_s = max(1, round(seconds))
+        words = f"hold still {whole_s} s"
+        return cls("wait", f"{words}: {meanwhile}" if meanwhile else words, whole_s, meanwhile)
 
 
 class ArmGate(Protocol):

@@ -51,6 +51,8 @@ class Job:
         """By IMU and triad, what is measured but not written, and why: only of what nobody asked for."""
         self.words = ""
         """What is going on now, for people."""
+        self.hold_still_s: int | None = None
+        """How long the aircraft has to stand still before anything else goes on."""
         self._percent = 0
         self._until_s = 0.0
         self._cancelled_by: str | None = None
@@ -66,10 +68,10 @@ class Job:
         """0 to 100, never falling."""
         return self._percent
 
-    def progress(self, percent: float, words: str) -> None:
-        """Say how far it is and what is going on."""
+    def progress(self, percent: float, words: str, hold_still_s: int | None = None) -> None:
+        """Say how far it is and what is going on; and how long to hold still, where that is all."""
         self._percent = max(self._percent, min(99, int(percent)))
-        self.words = words
+        self.words, self.hold_still_s = words, hold_still_s
 
     def lasts(self, seconds: float) -> None:
         """Say how long what is going on now will take."""

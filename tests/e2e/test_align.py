@@ -276,7 +276,7 @@ def test_who_may_start_one_and_how_it_ends(tmp_path: Path) -> None:
             job = started(conductor.start_alignment(Plan("zero"), "test", 900.0))
             refused = conductor.start_calibration(What.BOTH, "test")
             assert isinstance(refused, Refusal)
-            assert "a gradienter alignment is running (1 of 3" in refused.reason or "waiting" in refused.reason
+            assert "a gradienter alignment is running (" in refused.reason
             await made.until(lambda: "waiting for it to move" in job.words, 60.0)
             assert conductor.cancel("the test")
             assert (await job.finished).outcome == "cancelled"

@@ -13,6 +13,7 @@ from companion.autopilot.firmware.firmwares import settle_s
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.machine import State
+from companion.component.service import ArmAnswer
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.offsets.effect import LOOK_S
 
@@ -59,19 +60,19 @@ class Forecast:
         job = self._conductor.running
         return 0.0 if job is None else job.left_s
 
-    def words(self, now_s: float) -> str:
+    def answer(self, now_s: float) -> ArmAnswer:
         """What is going on and for how long yet, for somebody who may not arm because of it."""
         state = self._conductor.state
         if state is State.UNDOING:
-            return "old offsets are being put back: wait"
+            return ArmAnswer("wait", "old offsets are being put back: wait")
         if state is State.RESTARTING:
-            return "autopilot is being restarted: wait"
+            return ArmAnswer("wait", "autopilot is being restarted: wait")
         if state is State.SETTLING:
-            return f"EKF settling: wait, {self._left_s(state, self._job_s, now_s):.0f} s at most"
+            left_s = self._left_s(state, self._job_s, now_s)
+            return ArmAnswer("wait", f"EKF settling: wait, {left_s:.0f} s at most")
         if state not in _VERB:
-            return "writing new offsets: wait"
-        left_s = self._left_s(state, self._estimate_s(state, now_s), now_s)
-        return f"hold still {left_s:.0f} s: {_VERB[state]}"
+            return ArmAnswer("wait", "writing new offsets: wait")
+        return ArmAnswer.hold_still(self._left_s(state, self._estimate_s(state, now_s), now_s), _VERB[state])
 
     def _estimate_s(self, state: State, now_s: float) -> float:
         after_s = EKF_S.get(self._vehicle.firmware or "", 0.0)

@@ -132,24 +132,24 @@ class Readiness:
             return ArmAnswer("refuse", "writing is off (CMP_PUSH): no gate")
         glance = self._collector.glance(now_s)
         if self._conductor.state.is_writing:
-            return ArmAnswer("wait", self._forecast.words(now_s))
+            return self._forecast.answer(now_s)
         if glance.obstacle is not None and not glance.moving:
             return ArmAnswer("refuse", glance.obstacle.words)
         if (reading := self.in_force.reading()) is not None:
             return ArmAnswer("wait", f"reading {reading}")
         findings = self.in_force.findings(now_s)
         if all(finding.why is Why.REBOOTED for finding in findings) and findings and not self.in_force.measured:
-            left_s = max(1.0, self._conductor.settings.min_still_s + 1.0 - glance.still_s)
-            return ArmAnswer("wait", f"hold still {left_s:.0f} s: checking after restart")
+            left_s = self._conductor.settings.min_still_s + 1.0 - glance.still_s
+            return ArmAnswer.hold_still(left_s, "checking after restart")
         if findings:
             why_not = self._automatic.why_not()
             if why_not is None:
-                return ArmAnswer("wait", f"hold still {self.until_calibrated_s(now_s):.0f} s")
+                return ArmAnswer.hold_still(self.until_calibrated_s(now_s))
             return ArmAnswer("refuse", f"{findings[0].words}: {why_not}")
         if (owed := self._conclusion.owed) is not None:
             return ArmAnswer("refuse", owed)
         if glance.moving or glance.steady_s < STEADY_S:
-            return ArmAnswer("wait", f"hold still {max(1.0, STEADY_S - glance.steady_s):.0f} s")
+            return ArmAnswer.hold_still(STEADY_S - glance.steady_s)
         return ArmAnswer("accept", self.in_words(now_s))
 
     def until_calibrated_s(self, now_s: float) -> float:

@@ -140,7 +140,7 @@ class Aligner:
         moved, why = not taken, ""
         while True:
             now_s = loop.time()
-            status, waiting_for = await self._measuring.look(job, ARMED)
+            status, waiting_for, hold_still_s = await self._measuring.look(job, ARMED)
             self._check_offsets(taken)
             moving = self._collector.glance(now_s).moving
             if moving:
@@ -151,8 +151,7 @@ class Aligner:
                 words = f"{why or f'{number - 1} done. Now {wish}'}; waiting for it to move"
             elif waiting_for is not None:
                 # Once it stands again, what to do is said by itself.
-                stands = status.obstacle is not None and status.obstacle.hold_still_s is not None
-                words = waiting_for if stands else f"{why or wish}; {waiting_for}"
+                words = waiting_for if hold_still_s is not None else f"{why or wish}; {waiting_for}"
             else:
                 words = f"measuring, {max(still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
             self._measuring.show(measuring=share > 0.0)

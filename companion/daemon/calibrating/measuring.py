@@ -37,6 +37,8 @@ class Stand(NamedTuple):
     status: Status
     waiting_for: str | None
     """What is in the way of measuring."""
+    hold_still_s: int | None
+    """For how long to hold still, where nothing else is."""
 
 
 class Measuring:
@@ -68,8 +70,10 @@ class Measuring:
         job.check_time()
         await estimating.catch_up(self._core.collector, self._core.offload)
         status = self._core.collector.status(asyncio.get_running_loop().time())
-        doubt = models.place_doubt(self._core.config, self._core.vehicle)
-        return Stand(status, not_ready(self._core.vehicle, self._imus) or doubt or status.waiting_for)
+        other = not_ready(self._core.vehicle, self._imus) or models.place_doubt(self._core.config, self._core.vehicle)
+        if other is not None or status.obstacle is None:
+            return Stand(status, other, None)
+        return Stand(status, status.obstacle.words, status.obstacle.hold_still_s)
 
     def show(self, *, measuring: bool) -> None:
         """Let the state table follow."""
@@ -93,11 +97,13 @@ class Measuring:
         stop = collector.seconds.add(job.look_again)
         try:
             while True:
-                status, waiting_for = await self.look(job, "armed during the measurement; nothing was written")
+                status, waiting_for, hold_still_s = await self.look(
+                    job, "armed during the measurement; nothing was written"
+                )
                 self._check_imus(failures)
                 self.show(measuring=waiting_for is None)
                 words = waiting_for or f"still for {status.still_s:.0f} s, measuring"
-                job.progress(MEASURED_PERCENT * status.progress, words)
+                job.progress(MEASURED_PERCENT * status.progress, words, hold_still_s)
                 if waiting_for is None and status.enough:
                     self._machine.on(Event.ENOUGH)
                     job.progress(MEASURED_PERCENT, "working out the biases")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import re
 from typing import TYPE_CHECKING, Final, Literal
 
 import msgspec
@@ -33,7 +32,6 @@ _WRITING: Final[dict[State, str]] = {
     State.VERIFYING: "CHECKING",
     State.RESTARTING: "RESTARTING AUTOPILOT",
 }
-_HOLD_STILL: Final = re.compile(r"hold still (\d+) s(?: more)?(?:: )?")
 
 
 class Headline(msgspec.Struct, frozen=True):
@@ -113,8 +111,8 @@ class Headlines:
             return Headline(f"MEASURING {percent} %", words, "busy")
         if self._vehicle.arm_state is ArmState.UNKNOWN:
             return self._no_autopilot()
-        if (held := _hold_still(words)) is not None:
-            return held
+        if job.hold_still_s is not None:
+            return _hold_still(job.hold_still_s)
         if self._collector.glance(now_s).moving:
             return Headline("HOLD STILL", words, "wait")
         return Headline("WAITING", words, "wait")
@@ -124,8 +122,8 @@ class Headlines:
         answer = self._readiness.answer()
         if answer.verdict == "accept":
             return Headline("READY", answer.words, "good")
-        if (held := _hold_still(answer.words)) is not None:
-            return held
+        if answer.hold_still_s is not None:
+            return _hold_still(answer.hold_still_s, answer.meanwhile)
         if answer.verdict == "wait":
             return Headline("WAIT", answer.words, "wait")
         return self._failed() or Headline("NOT READY", answer.words, "bad")
@@ -144,7 +142,7 @@ class Headlines:
             return Headline("NOT CALIBRATED", self._devices.watch.worst() or glance.obstacle.words, "bad")
         if glance.obstacle is not None:
             if (hold_s := glance.obstacle.hold_still_s) is not None:
-                return Headline(f"HOLD STILL {hold_s} s", "measuring begins then", "wait")
+                return _hold_still(hold_s)
             return Headline("HOLD STILL", glance.obstacle.words, "wait")
         left_s = self._readiness.until_calibrated_s(now_s)
         return Headline(f"HOLD STILL {left_s:.0f} s", f"{words}: it calibrates by itself", "wait")
@@ -155,9 +153,5 @@ class Headlines:
         return Headline("FAILED", self._conductor.reason, "bad")
 
 
-def _hold_still(words: str) -> Headline | None:
-    """Of "hold still 6 s more" and the like, with the seconds in the big word; None for other words."""
-    match = _HOLD_STILL.match(words)
-    if match is None:
-        return None
-    return Headline(f"HOLD STILL {match[1]} s", words[match.end() :] or "measuring begins then", "wait")
+def _hold_still(seconds: int, meanwhile: str = "") -> Headline:
+    return Headline(f"HOLD STILL {seconds} s", meanwhile or "measuring begins then", "wait")
