@@ -11,14 +11,15 @@ flood of requests costs neither memory nor bandwidth, and still gets every param
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 import re
-import struct
 from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.autopilot.parameters.float32 import float32
 from companion.component.permission import Permission
 from companion.component.statustext import Say, Severity, Weight
 from companion.errors import CompanionError
@@ -31,30 +32,15 @@ _NAME = re.compile(r"CMP_[A-Z0-9_]{1,12}")
 _REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
 
 
-def _float32(value: float) -> float:
-    """The value as the wire carries it; infinite where float32 cannot hold it."""
-    try:
-        rounded: float = struct.unpack("<f", struct.pack("<f", value))[0]
-    except OverflowError:
-        return math.copysign(math.inf, value)
-    return rounded
-
-
+@dataclasses.dataclass(slots=True, kw_only=True)
 class _Parameter:
-    __slots__ = ("index", "maximum", "minimum", "name", "on_set", "read_only", "value")
-
-    def __init__(
-        self,
-        name: str,
-        index: int,
-        value: float,
-        limits: tuple[float, float],
-        on_set: Callable[[float], None] | None,
-        *,
-        read_only: bool,
-    ) -> None:
-        self.name, self.index, self.value, self.on_set, self.read_only = name, index, value, on_set, read_only
-        self.minimum, self.maximum = limits
+    name: str
+    index: int
+    value: float
+    minimum: float
+    maximum: float
+    on_set: Callable[[float], None] | None
+    read_only: bool
 
     def allows(self, value: float) -> bool:
         """Whether the value is a number within the limits (all are float32; NaN compares false)."""
@@ -113,9 +99,13 @@ class OwnParameters:
             raise RuntimeError(f"{name}: parameters cannot be added once the component runs")
         if not _NAME.fullmatch(name) or name in self._by_name:
             raise ValueError(f"{name!r} is not a free name of the form CMP_..., at most 16 characters")
-        limits = (_float32(minimum), _float32(maximum))
-        parameter = _Parameter(name, len(self._all), _float32(value), limits, on_set, read_only=read_only)
-        if not (math.isfinite(limits[0]) and math.isfinite(limits[1]) and parameter.allows(parameter.value)):
+        parameter = _Parameter(
+            name=name, index=len(self._all), value=float32(value), minimum=float32(minimum), maximum=float32(maximum),
+            on_set=on_set, read_only=read_only,
+        )  # fmt: skip
+        if not (
+            math.isfinite(parameter.minimum) and math.isfinite(parameter.maximum) and parameter.allows(parameter.value)
+        ):
             raise ValueError(f"{name}: {value:g} is not within finite limits {minimum:g} .. {maximum:g}")
         self._all.append(parameter)
         self._by_name[name] = parameter
@@ -132,7 +122,7 @@ class OwnParameters:
             ValueError: not a number, or out of the limits.
         """
         parameter = self._by_name[name]
-        value = _float32(value)
+        value = float32(value)
         if not parameter.allows(value):
             raise ValueError(f"{name}: {value:g} is not within {parameter.minimum:g} .. {parameter.maximum:g}")
         if value != parameter.value:
@@ -210,7 +200,7 @@ class OwnParameters:
 
     def _apply(self, parameter: _Parameter, message: mavlink.MAVLink_param_set_message) -> str:
         """Take over the new value; returns why not, or nothing."""
-        value = _float32(message.param_value)
+        value = float32(message.param_value)
         if parameter.read_only:
             return "it is read only"
         if message.param_type != _REAL32:

@@ -206,7 +206,7 @@ def test_two_companions_of_one_name_are_told_apart_in_words(tmp_path: Path) -> N
             async with alone(tmp_path / "a", one.section()) as first:
                 await until_connected(first)
                 async with alone(tmp_path / "b", one.section()):
-                    assert "'companion-7'" in await until_problem(first, "is another client called")
+                    assert "'companion-7'" in await until_problem(first, "another client called")
 
     asyncio.run(main())
 

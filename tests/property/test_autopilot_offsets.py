@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from companion.autopilot.firmware.ardupilot import parameters_of
 from companion.autopilot.firmware.imu_calibration import (
     ImuCalibration,
+    accel_offset_after,
     changes_for,
-    offsets_after,
+    gyro_offset_after,
     output_step,
     vector_changes,
     whole_bias,
@@ -22,6 +23,12 @@ from companion.samples import Vector
 from tests.support.scripted_autopilot import f32
 
 G = 9.80665
+
+
+def offsets_after(
+    calibration: ImuCalibration, gyro: tuple[float, float, float], accel: tuple[float, float, float]
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    return gyro_offset_after(calibration, gyro), accel_offset_after(calibration, accel)
 
 
 def from_euler_deg(roll: float, pitch: float, yaw: float) -> Matrix:

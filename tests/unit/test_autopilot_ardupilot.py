@@ -14,7 +14,7 @@ from companion.autopilot.firmware.imu_calibration import (
     ImuCalibration,
     accel_offset_after,
     changes_for,
-    offsets_after,
+    gyro_offset_after,
     output_step,
     whole_bias,
 )
@@ -44,6 +44,12 @@ IMU1 = {
 }
 
 
+def offsets_after(
+    calibration: ImuCalibration, gyro: tuple[float, float, float], accel: tuple[float, float, float]
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    return gyro_offset_after(calibration, gyro), accel_offset_after(calibration, accel)
+
+
 def read(parameters: dict[str, float], instance: int = 1, autopilot: ScriptedAutopilot | None = None) -> ImuCalibration:
     async def main() -> ImuCalibration:
         link = MavlinkLink()
@@ -68,7 +74,7 @@ def test_names_of_the_instances_of_which_the_first_is_irregular() -> None:
     assert one.accel_offset[1] == "INS_ACCOFFS_Y"
     assert one.accel_scale[2] == "INS_ACCSCAL_Z"
     assert (one.gyro_id, one.accel_id, one.use) == ("INS_GYR_ID", "INS_ACC_ID", "INS_USE")
-    assert (one.gyro_caltemp, one.accel_caltemp) == ("INS_GYR1_CALTEMP", "INS_ACC1_CALTEMP")
+    assert one.gyro_caltemp == "INS_GYR1_CALTEMP"
     assert two.gyro_offset[0] == "INS_GYR2OFFS_X"
     assert two.accel_offset[0] == "INS_ACC2OFFS_X"
     assert two.accel_scale[0] == "INS_ACC2SCAL_X"
@@ -80,7 +86,7 @@ def test_names_of_the_instances_of_which_the_first_is_irregular() -> None:
     assert four.gyro_offset == ("INS4_GYROFFS_X", "INS4_GYROFFS_Y", "INS4_GYROFFS_Z")
     assert (four.gyro_id, four.gyro_caltemp, four.use) == ("INS4_GYR_ID", "INS4_GYR_CALTEMP", "INS4_USE")
     for names in (one, two, three, four):
-        for name in (*names.gyro_offset, *names.accel_scale, names.accel_caltemp, names.tcal_enable):
+        for name in (*names.gyro_offset, *names.accel_scale, names.tcal_enable):
             assert len(name) <= 16
     with pytest.raises(AutopilotError, match="IMU 6"):
         parameters_of(6)

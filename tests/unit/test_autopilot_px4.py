@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from companion.autopilot.firmware.firmwares import needs_reboot, read_calibration, warnings_about
+from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
+from companion.autopilot.firmware.px4 import needs_reboot, warnings_about
 from companion.autopilot.firmware.px4_slots import NO_IMU, Slot, SlotMemory
 from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.parameters.client import ParameterClient

@@ -15,7 +15,6 @@ import pytest
 import trustme
 
 from companion.config.sections import Mqtt
-from companion.links.mqtt import client as mqtt
 from companion.links.mqtt import filter as mqtt_filter
 from companion.links.mqtt.client import Incoming, MqttLink
 from companion.links.mqtt.filter import BrokerFaultError, MqttFilter, NoGreetingError
@@ -233,7 +232,6 @@ def test_the_worst_broker_is_named_and_costs_next_to_nothing(
     broker: HostileBroker, words: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(mqtt_filter, "FLOOD_S", 1.0)
-    monkeypatch.setattr(mqtt, "MANY", 1)
     said, allocated = until_words(broker, words)
     assert allocated < MOST_ALLOCATED_BYTES
     assert said.startswith(f"127.0.0.1:{broker.port}: the broker ")

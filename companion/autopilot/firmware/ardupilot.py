@@ -28,8 +28,6 @@ class ArduPilotParameters(ImuParameters):
 
     gyro_caltemp: str
     """Temperature of the gyro's calibration, deg C; never written."""
-    accel_caltemp: str
-    """Temperature of the accelerometer's calibration, deg C; never written."""
     tcal_enable: str
     """Temperature calibration: 0 off, 1 on, 2 learning."""
     use: str
@@ -52,7 +50,6 @@ def parameters_of(instance: int) -> ArduPilotParameters:
             gyro_id=f"INS{instance}_GYR_ID",
             accel_id=f"INS{instance}_ACC_ID",
             gyro_caltemp=f"INS{instance}_GYR_CALTEMP",
-            accel_caltemp=f"INS{instance}_ACC_CALTEMP",
             tcal_enable=f"INS{instance}_TCAL_ENABLE",
             use=f"INS{instance}_USE",
         )
@@ -66,7 +63,6 @@ def parameters_of(instance: int) -> ArduPilotParameters:
         gyro_id=f"INS_GYR{n}_ID",
         accel_id=f"INS_ACC{n}_ID",
         gyro_caltemp=f"INS_GYR{instance}_CALTEMP",
-        accel_caltemp=f"INS_ACC{instance}_CALTEMP",
         tcal_enable=f"INS_TCAL{instance}_ENABLE",
         use=f"INS_USE{n}",
     )

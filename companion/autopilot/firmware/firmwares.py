@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
 from companion.autopilot.firmware import ardupilot, px4
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.firmware.px4_slots import SlotMemory
-from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.errors import AutopilotError
@@ -42,21 +40,6 @@ async def read_calibration(
     raise AutopilotError("this autopilot is neither ArduPilot nor PX4; it is not supported")
 
 
-def needs_reboot(changes: Sequence[Change]) -> bool:
-    """Whether the autopilot's attitude stays wrong after these changes until it is restarted."""
-    return px4.needs_reboot(changes)
-
-
-def stale_tilt_deg(changes: Sequence[Change]) -> float:
-    """How far the autopilot's attitude may be off after these changes until it is restarted."""
-    return px4.stale_tilt_deg(changes)
-
-
 def settle_s(firmware: Firmware | None) -> float:
     """How long after a write the telemetry may still show the old offsets."""
     return _SETTLE_S.get(firmware or "other", 2.0)
-
-
-def warnings_about(calibration: ImuCalibration, changes: Sequence[Change]) -> tuple[str, ...]:
-    """What a firmware makes of these changes later, for people."""
-    return px4.warnings_about(calibration, changes) if calibration.far_step is not None else ()

@@ -126,24 +126,8 @@ class ImuCalibration:
         return any(name in known and not same_float32(known[name], value) for name, value in values.items())
 
 
-def offsets_after(
-    calibration: ImuCalibration, gyro_residual_rad_s: Vector, accel_residual_m_s2: Vector
-) -> tuple[Vector, Vector]:
-    """The gyro (rad/s) and accelerometer (m/s^2) offsets that take the residuals out of the output.
-
-    Args:
-        calibration: in force while the residuals were measured.
-        gyro_residual_rad_s: mean output minus truth, vehicle FRD.
-        accel_residual_m_s2: likewise.
-
-    Raises:
-        CalibrationRefusedError: not plausible, see the limits at the top.
-    """
-    return gyro_offset_after(calibration, gyro_residual_rad_s), accel_offset_after(calibration, accel_residual_m_s2)
-
-
 def gyro_offset_after(calibration: ImuCalibration, residual_rad_s: Vector) -> Vector:
-    """gyro_offset + R^-1 residual, rounded to float32; see `offsets_after`."""
+    """The offset that takes a residual (mean output minus truth, FRD) out: gyro_offset + R^-1 residual, as float32."""
     _require_plausible("gyro residual", residual_rad_s, MAX_GYRO_RESIDUAL_RAD_S, DEG, "deg/s", calibration.instance)
     step = calibration.orientation.T @ np.asarray(residual_rad_s)
     after = _vector(np.asarray(calibration.gyro_offset_rad_s) + step)
@@ -152,7 +136,7 @@ def gyro_offset_after(calibration: ImuCalibration, residual_rad_s: Vector) -> Ve
 
 
 def accel_offset_after(calibration: ImuCalibration, residual_m_s2: Vector) -> Vector:
-    """accel_offset + diag(1/accel_scale) R^-1 residual, rounded to float32; see `offsets_after`."""
+    """The same: accel_offset + diag(1/accel_scale) R^-1 residual."""
     _require_plausible(
         "accelerometer residual", residual_m_s2, MAX_ACCEL_RESIDUAL_M_S2, 1.0, "m/s^2", calibration.instance
     )
@@ -170,7 +154,7 @@ def changes_for(
     """What to write, accelerometers first (autopilots 9.3: the better order); None: that half stays as it is.
 
     Raises:
-        CalibrationRefusedError: as `offsets_after`.
+        CalibrationRefusedError: a value that is not plausible, see the limits at the top.
     """
     names = calibration.parameters
     changes: list[Change] = []

@@ -149,16 +149,15 @@ def stale_tilt_deg(changes: Sequence[Change]) -> float:
 
 def warnings_about(calibration: ImuCalibration, changes: Sequence[Change]) -> tuple[str, ...]:
     """What PX4 makes of these changes later, for people."""
-    found: list[str] = []
+    if calibration.far_step is None:  # not PX4
+        return ()
     after = {change.parameter: change.after for change in changes}
     names = calibration.parameters.accel_offset
     x, y, z = (after.get(n, old) for n, old in zip(names, calibration.accel_offset_m_s2, strict=True))
-    if too_small_to_apply_at_boot((x, y, z)):
-        found.append(
-            f"{names[0]}, Y and Z are {math.hypot(x, y, z) / MG:.2f} mg in all: below 1 mg (0.01 m/s^2) PX4 starts"
-            " without them; calibrate again after a restart"
-        )
-    return tuple(found)
+    if not too_small_to_apply_at_boot((x, y, z)):
+        return ()
+    size = f"{names[0]}, Y and Z are {math.hypot(x, y, z) / MG:.2f} mg in all"
+    return (f"{size}: below 1 mg (0.01 m/s^2) PX4 starts without them; calibrate again after a restart",)
 
 
 async def _read_rotation(parameters: ParameterClient, gyro: Slot, accel: Slot) -> Matrix:

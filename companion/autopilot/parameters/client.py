@@ -19,7 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.parameters.encoding import REAL32, decode, encode, is_integer
 from companion.autopilot.parameters.float32 import float32, same_float32
 from companion.autopilot.parameters.inbox import Inbox, Rebooted, Refusal
-from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
+from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.errors import (
     AutopilotRebootedError,
     NotDisarmedError,
@@ -85,16 +85,11 @@ class ParameterClient:
             ParameterRefusedError: PARAM_ERROR, such as that it does not exist.
             AutopilotRebootedError: the autopilot restarted meanwhile.
         """
-        tries = 0
-        with self._exchange(name) as inbox:
-            for tries in self._required_tries():
-                answer = await self._ask(inbox, name, -1)
-                if answer is not None:
-                    self._learn_loss(tries)
-                if isinstance(answer, float):
-                    return answer
-                if isinstance(answer, Refusal):
-                    raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.words}")
+        answer, tries = await self._ask_repeatedly(name, self._required_tries())
+        if isinstance(answer, float):
+            return answer
+        if answer is not None:
+            raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.words}")
         raise ParameterTimeoutError(
             f"{self.vehicle.name} does not answer for {name} ({tries} requests, {self._timeout_s:g} s each)"
             f"{self.vehicle.why_silent}"
@@ -116,25 +111,21 @@ class ParameterClient:
         if name in self._absent:
             return None
         boots = self.vehicle.boots
-        with self._exchange(name) as inbox:
-            for tries in range(1, (_TRIES_MORE if self._repeated > _LOSSY else _TRIES) + 1):
-                answer = await self._ask(inbox, name, -1)
-                if answer is not None:
-                    self._learn_loss(tries)
-                if isinstance(answer, float):
-                    return answer
-                if isinstance(answer, Refusal):
-                    if answer.code == _DOES_NOT_EXIST:
-                        self._absent.add(name)
-                        return None
-                    raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.words}")
+        most = _TRIES_MORE if self._repeated > _LOSSY else _TRIES
+        answer, tries = await self._ask_repeatedly(name, range(1, most + 1))
+        if isinstance(answer, float):
+            return answer
+        if answer is not None:
+            if answer.code == _DOES_NOT_EXIST:
+                self._absent.add(name)
+                return None
+            raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.words}")
         if not self.vehicle.alive or not await self._answers_at_all():
             raise ParameterTimeoutError(
                 f"{self.vehicle.name} answers neither for {name} nor for anything else{self.vehicle.why_silent}"
             )
         # It answers again or for others only: a silence that ends in this moment must not be taken for an absence.
-        with self._exchange(name) as inbox:
-            answer = await self._ask(inbox, name, -1)
+        answer, _ = await self._ask_repeatedly(name, [1])
         if isinstance(answer, float):
             return answer
         if name in self._types:
@@ -236,9 +227,7 @@ class ParameterClient:
             unsubscribe()
 
     def _require_disarmed(self, name: str) -> None:
-        state = self.vehicle.arm_state
-        if state is not ArmState.DISARMED:
-            why = "the aircraft is armed" if state is ArmState.ARMED else "it is unknown whether the aircraft is armed"
+        if (why := self.vehicle.arm_state.why_not_written) is not None:
             raise NotDisarmedError(f"{name} is not written: {why}")
 
     @contextlib.contextmanager
@@ -281,6 +270,16 @@ class ParameterClient:
         if isinstance(answer, float):
             self._answering = inbox.name if index < 0 else self._answering
         return answer
+
+    async def _ask_repeatedly(self, name: str, tries: Iterable[int]) -> tuple[float | Refusal | None, int]:
+        """The first answer, and how many requests there were."""
+        count = 0
+        with self._exchange(name) as inbox:
+            for count in tries:
+                if (answer := await self._ask(inbox, name, -1)) is not None:
+                    self._learn_loss(count)
+                    return answer, count
+        return None, count
 
     async def _answers_at_all(self) -> bool:
         """Whether a parameter that must exist is answered for: the last one that was, else the first of the list."""

@@ -14,6 +14,7 @@ import logging
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Final
 
+from msgspec import structs
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.parameters.change import (
@@ -75,6 +76,13 @@ class _Item:
     outcome: Outcome = "failed"
     left: bool = False
 
+    def seen(self) -> WrittenParameter:
+        """What the record says of it."""
+        change = self.change
+        return WrittenParameter(
+            before=change.before, after=change.after, read_back=self.read_back, outcome=self.outcome
+        )
+
 
 class _Failure(Exception):  # noqa: N818 - never leaves this module
     def __init__(self, kind: FailureKind, reason: str) -> None:
@@ -83,12 +91,7 @@ class _Failure(Exception):  # noqa: N818 - never leaves this module
 
 
 class ParameterWriter:
-    """Writes sets of parameters to one autopilot, one set at a time.
-
-    Args:
-        parameters: single parameters.
-        vehicle: whether it is armed, whether it restarted.
-    """
+    """Writes sets of parameters to one autopilot, one set at a time."""
 
     def __init__(self, parameters: ParameterClient, vehicle: Vehicle) -> None:
         self.written: dict[str, WrittenParameter] = {}
@@ -178,13 +181,8 @@ class ParameterWriter:
             # Nobody looks at the telemetry after this, and who is told that it is done may arm.
             await let_pass(self._vehicle, moment(self._vehicle), TAKEN_S)
         self.written = {
-            change.parameter: WrittenParameter(
-                before=change.before,
-                after=change.after,
-                read_back=done[change.parameter].read_back,
-                outcome="rolled_back",
-            )
-            for change in changes
+            c.parameter: structs.replace(done[c.parameter], before=c.before, after=c.after, outcome="rolled_back")
+            for c in changes
         }
         return self.written
 
@@ -196,9 +194,7 @@ class ParameterWriter:
             raise ValueError("a parameter is named twice")
         items = [_Item(change) for change in changes]
         self._publish(items)
-        state = self._vehicle.arm_state
-        if state is not ArmState.DISARMED:
-            why = "the aircraft is armed" if state is ArmState.ARMED else "it is unknown whether the aircraft is armed"
+        if (why := self._vehicle.arm_state.why_not_written) is not None:
             raise NothingWrittenError(f"nothing is written: {why}")
         if self._vehicle.system_status == mavlink.MAV_STATE_CALIBRATING:
             raise NothingWrittenError(f"nothing is written: {self._vehicle.name} is calibrating its own sensors")
@@ -389,12 +385,7 @@ class ParameterWriter:
         return "changed by someone else" if foreign else "answered another value"
 
     def _publish(self, items: list[_Item]) -> dict[str, WrittenParameter]:
-        self.written = {
-            item.change.parameter: WrittenParameter(
-                before=item.change.before, after=item.change.after, read_back=item.read_back, outcome=item.outcome
-            )
-            for item in items
-        }
+        self.written = {item.change.parameter: item.seen() for item in items}
         self.left_changed = tuple(item.change.parameter for item in items if item.left)
         return self.written
 

@@ -29,6 +29,13 @@ class ArmState(enum.Enum):
     ARMED = "armed"
     UNKNOWN = "unknown"
 
+    @property
+    def why_not_written(self) -> str | None:
+        """Why nothing may be written, for people; None: it may."""
+        if self is ArmState.DISARMED:
+            return None
+        return "the aircraft is armed" if self is ArmState.ARMED else "it is unknown whether the aircraft is armed"
+
 
 class ArmingWatch:
     """Takes the heartbeats of one vehicle and says what may be believed of them."""

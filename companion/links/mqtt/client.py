@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from companion.config import Mqtt
 from companion.links.mqtt.credentials import is_open_to_all, read_password, tls_context
-from companion.links.mqtt.filter import LEAVE_DEADLINE_S, MAX_PACKET_BYTES, BrokerFaultError, MqttFilter
+from companion.links.mqtt.filter import LEAVE_DEADLINE_S, MAX_PACKET_BYTES, MqttFilter
 from companion.links.mqtt.outbox import Outbox
-from companion.links.mqtt.words import causes, explain, is_of_protocol
-from companion.links.system.backoff import Backoff
+from companion.links.mqtt.words import explain, is_of_protocol
+from companion.links.system.backoff import Backoff, Reconnection
 
 if TYPE_CHECKING:
     import aiomqtt
@@ -40,8 +40,6 @@ FIRST_WAIT_S: Final = 0.5
 LONGEST_WAIT_S: Final = 30.0
 WORTH_S: Final = 10.0
 """A connection that lasted so long was worth one: the next attempts begin with short waits again."""
-MANY: Final = 3
-"""So many connections in a row that were not worth one are more than bad luck."""
 MQTT_3_1_1: Final = 4
 MQTT_5: Final = 5
 """The numbers of the two protocols on the wire."""
@@ -83,27 +81,27 @@ class MqttLink:
     ) -> None:
         self.settings, self.client_id = settings, client_id
         self.outbox = Outbox()
-        self.last_error: str | None = None
-        """Why there is, or last was, no connection; one line for people."""
         self.connections = 0
         """How often the broker was reached."""
         self._will, self._subscriptions, self._on_message = will, tuple(subscriptions), on_message
         self._offload = offload
-        self._backoff = Backoff(FIRST_WAIT_S, LONGEST_WAIT_S)
+        self._reconnection = Reconnection("mqtt", Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), worth_s=WORTH_S)
         self._protocol: int = MQTT_5
         self._connected_s: float | None = None
         self._since = datetime.datetime.now(tz=datetime.UTC)
-        self._retry_s: float | None = None
         self._refused: list[str] = []
-        self._warned: str | None = None
         self._warned_open = False
-        self._short = 0
         self._echoed = will is None
 
     @property
     def connected(self) -> bool:
         """Whether the broker has accepted us."""
         return self._connected_s is not None
+
+    @property
+    def last_error(self) -> str | None:
+        """Why there is, or last was, no connection; one line for people."""
+        return self._reconnection.last_error or None
 
     @property
     def where(self) -> str:
@@ -114,7 +112,8 @@ class MqttLink:
         """For `companion status` and `check`."""
         now_s = asyncio.get_running_loop().time()
         since_s = None if self._connected_s is None else now_s - self._connected_s
-        retry_s = None if self._retry_s is None else max(0.0, self._retry_s - now_s)
+        next_s = self._reconnection.retry_s
+        retry_s = None if next_s is None else max(0.0, next_s - now_s)
         refused_now = [*self._refused]
         if since_s is not None and since_s > ANSWER_DEADLINE_S and not self._echoed:
             # Few brokers tell a client that they let it neither speak nor hear.
@@ -144,40 +143,30 @@ class MqttLink:
         loop = asyncio.get_running_loop()
         problem = await self._offload(_load_library)
         if problem is not None:
-            self._down(problem)
+            self._reconnection.down(problem)
             await loop.create_future()
-        while True:
-            began_s, protocol, before = loop.time(), self._protocol, self.connections
+        await self._reconnection.keep(self._once)
+
+    async def _once(self) -> str:
+        """One connection, to its end, in the newest protocol that the broker speaks; why it has ended."""
+        before, reason = self.connections, f"{self.where}: the connection has ended"
+        for protocol in (MQTT_5, MQTT_3_1_1) if self._protocol == MQTT_5 else (MQTT_3_1_1,):
+            self._protocol = protocol
+            ended: BaseException | None = None
             try:
                 await self._serve()
             except* Exception as group:  # noqa: BLE001 - whatever it is, it costs the connection and nothing else
-                self._lost(group, began_s, reached=self.connections > before)
-            if (protocol, self._protocol) == (MQTT_5, MQTT_3_1_1):
-                continue
-            if loop.time() - began_s >= WORTH_S:
-                self._backoff.reset()
-            delay_s = self._backoff.next_s()
-            self._retry_s = loop.time() + delay_s
-            await asyncio.sleep(delay_s)
-            self._retry_s = None
-
-    def _lost(self, error: BaseException, began_s: float, *, reached: bool) -> None:
-        """Say why there is no connection, unless the older protocol has to be tried first."""
-        logger.debug("mqtt", exc_info=error)
-        if is_of_protocol(error) and not reached:
+                ended = group
+            if ended is None:
+                return reason
+            logger.debug("mqtt", exc_info=ended)
+            reached = self.connections > before
+            reason = f"{self.where}: {explain(ended, self.settings, self.client_id, reached=reached)}"
             # A broker that is too old for MQTT 5 says so, or says nothing, or closes the connection.
-            self._protocol = MQTT_3_1_1 if self._protocol == MQTT_5 else MQTT_5
-            if self._protocol == MQTT_3_1_1:
-                return
-        why = explain(error, self.settings, self.client_id, reached=reached)
-        # Who was thrown out by another client did nothing wrong before.
-        is_fault = isinstance(causes(error)[0], BrokerFaultError)
-        is_short = reached and not is_fault and asyncio.get_running_loop().time() - began_s < WORTH_S
-        self._short = self._short + 1 if is_short else 0
-        if self._short >= MANY:
-            # Two clients of one name throw each other out for ever, and few brokers say so.
-            why += f"; again and again: is another client called {self.client_id!r}, too?"
-        self._down(f"{self.where}: {why}")
+            if reached or not is_of_protocol(ended):
+                return reason
+        self._protocol = MQTT_5
+        return reason
 
     async def flush(self, within_s: float) -> None:
         """Wait until everything was sent, if there is a connection, and for so long at most."""
@@ -294,13 +283,7 @@ class MqttLink:
         self.connections += 1
         self.outbox.opened()
         protocol = {MQTT_5: "MQTT 5", MQTT_3_1_1: "MQTT 3.1.1"}[self._protocol]
-        logger.info("mqtt: %s to %s (%s)", "connected again" if self._warned else "connected", self.where, protocol)
-        self._warned = None
-
-    def _down(self, reason: str) -> None:
-        self.last_error = reason
-        logger.log(logging.DEBUG if self._warned == reason else logging.WARNING, "mqtt: %s", reason)
-        self._warned = reason
+        self._reconnection.up(f"connected to {self.where} ({protocol})")
 
 
 async def _both(sending: Coroutine[Any, Any, None], receiving: Coroutine[Any, Any, None]) -> None:

@@ -91,7 +91,9 @@ def _of_code(code: int, error: BaseException, settings: Mqtt, client_id: str) ->
         UNSUPPORTED_PROTOCOL: "the broker speaks neither MQTT 5 nor 3.1.1",
         _CLIENT_ID: f"the broker refuses the client id {client_id!r} (mqtt.client_id)",
         _SHUTTING_DOWN: "the broker shuts down",
-        **dict.fromkeys(_LOST, "the connection is gone (broker stopped? network?)"),
+        **dict.fromkeys(
+            _LOST, f"the connection is gone (broker stopped? network? another client called {client_id!r}?)"
+        ),
         **dict.fromkeys(_SILENT, "nothing heard from the broker any more"),
         **dict.fromkeys(_UNAVAILABLE, "the broker is not available now"),
     }
