@@ -59,10 +59,8 @@ def bias_covariance(
     gravity_m_s2: float,
     gravity_sigma_m_s2: float,
     earth_rate_body: Uncertain,
-    gyro_variance: Array,
-    accel_variance: Array,
 ) -> Matrix:
-    """The 6x6 covariance of (gyro bias, accelerometer bias); method section 2.1.
+    """The 6x6 covariance of (gyro bias, accelerometer bias) without the sensors' own variances; method section 2.1.
 
     An attitude error eps makes db_a = eps x f and db_g = eps x w; the cross term is kept, since one tilt error
     makes both. What remains unknown of the Earth's rate (latitude, or a heading never measured) comes in with
@@ -74,13 +72,11 @@ def bias_covariance(
         gravity_m_s2: its magnitude; `gravity_sigma_m_s2` its one-sigma error.
         gravity_sigma_m_s2: see there.
         earth_rate_body: the Earth's rate in body axes, rad/s.
-        gyro_variance: of the mean rate as an estimate of the next minutes, shape (3,), (rad/s)^2.
-        accel_variance: likewise of the specific force, shape (3,), (m/s^2)^2.
     """
     by_rate = -skew(earth_rate_body.mean)  # eps x w = -[w x] eps
     by_force = -skew(gravity_m_s2 * up)
     jacobian = np.vstack([by_rate, by_force])
     covariance = jacobian @ attitude_covariance_rad2 @ jacobian.T
-    covariance[:3, :3] += earth_rate_body.covariance + np.diag(gyro_variance)
-    covariance[3:, 3:] += np.outer(up, up) * gravity_sigma_m_s2**2 + np.diag(accel_variance)
+    covariance[:3, :3] += earth_rate_body.covariance
+    covariance[3:, 3:] += np.outer(up, up) * gravity_sigma_m_s2**2
     return covariance

@@ -19,7 +19,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -82,6 +82,30 @@ def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed
     solution = dataclasses.replace(
         solution, imus=tuple(_with_effect(imu, expected.get(imu.name), shared) for imu in solution.imus)
     )
+    found = _doubts(solution, whole, expected, shared)
+    known = [one for triad in _TRIADS for one in _known(solution, whole, expected, triad, today=False)]
+    doubted = {(doubt.triad, name) for doubt in found for name in doubt.names}
+    # A tilt, a gravity or a turn that nobody expected is in all of them, whether or not each shows it.
+    shaken = {doubt.triad for doubt in found if doubt.of_all}
+
+    def may_weigh(one: _Known) -> bool:
+        is_doubted = one.triad in shaken or (one.triad, solution.imus[one.imu].name) in doubted
+        return one.expected.weighs and not is_doubted and _agrees(_witness(solution, shared, one))
+
+    used = list(filter(may_weigh, known))
+    weighed = _estimate(solution, shared, used, zero_is_known=expectation.zero_is_known) if used else solution
+    imus = []
+    for k, imu in enumerate(weighed.imus):
+        prior = _prior([one for one in known if one.imu == k], used, solution, shared, whole)
+        own = [doubt.words for doubt in found if not doubt.of_all and imu.name in doubt.names]
+        imus.append(dataclasses.replace(imu, prior=prior, warnings=(*imu.warnings, *own)))
+    common = [doubt.words for doubt in found if doubt.of_all]
+    weighed = dataclasses.replace(weighed, imus=tuple(imus), warnings=(*solution.warnings, *common))
+    return Weighed(weighed, tuple(found))
+
+
+def _doubts(solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu], shared: Shared) -> list[Doubt]:
+    """What contradicts what was known."""
     found: list[Doubt] = []
     for triad in _TRIADS:
         # What was measured in this power-up says most; where it is content, nothing older has to be asked.
@@ -92,32 +116,7 @@ def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed
             if said or (today and len(known) == len(solution.imus)):
                 found += said
                 break
-    doubted = {(doubt.triad, name) for doubt in found for name in doubt.names}
-    known = [one for triad in _TRIADS for one in _known(solution, whole, expected, triad, today=False)]
-    # A tilt, a gravity or a turn that nobody expected is in all of them, whether or not each shows it.
-    shaken = {doubt.triad for doubt in found if doubt.of_all}
-    used = [
-        one
-        for one in known
-        if one.expected.weighs
-        and one.triad not in shaken
-        and (one.triad, solution.imus[one.imu].name) not in doubted
-        and _agrees(_witness(solution, shared, one))
-    ]
-    weighed = _estimate(solution, shared, used, zero_is_known=expectation.zero_is_known) if used else solution
-    imus = tuple(
-        dataclasses.replace(
-            imu,
-            prior=_prior(k, imu.name, solution, shared, known, used, whole),
-            warnings=(
-                *imu.warnings,
-                *(doubt.words for doubt in found if not doubt.of_all and imu.name in doubt.names),
-            ),
-        )
-        for k, imu in enumerate(weighed.imus)
-    )
-    common = [doubt.words for doubt in found if doubt.of_all]
-    return Weighed(dataclasses.replace(weighed, imus=imus, warnings=(*solution.warnings, *common)), tuple(found))
+    return found
 
 
 def points(
@@ -136,8 +135,22 @@ def points(
         return {}
     doubted = {(doubt.triad, name) for doubt in found for name in doubt.names}
     by_zero = _by_zero(shared)
-    gyro_shared = np.diag(shared.covariance)[:3]
-    accel_shared = np.maximum(np.diag(shared.covariance)[3:] - np.diag(by_zero @ by_zero.T), 0.0)
+    common = np.diag(shared.covariance).copy()
+    common[3:] = np.maximum(common[3:] - np.diag(by_zero @ by_zero.T), 0.0)
+
+    def measured(imu: ImuSolution, triad: Triad) -> Measured | None:
+        bias = whole[imu.name][_TRIADS.index(triad)]
+        if bias is None:
+            return None
+        part = _part(triad)
+        return Measured(
+            bias=vector(bias),
+            sigma_stat=vector(imu.gyro_sigma_stat_rad_s if triad == "gyro" else imu.accel_sigma_stat_m_s2),
+            sigma_use=vector(np.sqrt(_own_variance(imu, shared)[part])),
+            sigma_shared=vector(np.sqrt(common[part])),
+            suspect=(triad, imu.name) in doubted,
+        )
+
     return {
         imu.name: Point(
             started_at=started_at,
@@ -147,36 +160,17 @@ def points(
             up=vector(shared.up),
             zero=zero if whole[imu.name][1] is not None else None,
             zero_sigma_rad=shared.zero_sigma_rad,
-            gyro=_measured(
-                whole[imu.name][0],
-                imu.gyro_sigma_stat_rad_s,
-                _own_variance(imu, shared)[:3],
-                gyro_shared,
-                suspect=("gyro", imu.name) in doubted,
-            ),
-            accel=_measured(
-                whole[imu.name][1],
-                imu.accel_sigma_stat_m_s2,
-                _own_variance(imu, shared)[3:],
-                accel_shared,
-                suspect=("accel", imu.name) in doubted,
-            ),
+            gyro=measured(imu, "gyro"),
+            accel=measured(imu, "accel"),
         )
         for imu in solution.imus
         if imu.name in whole
     }
 
 
-def _measured(bias: Array | None, stat: Array, use: Array, shared: Array, *, suspect: bool) -> Measured | None:
-    if bias is None:
-        return None
-    return Measured(
-        bias=vector(bias),
-        sigma_stat=vector(stat),
-        sigma_use=vector(np.sqrt(use)),
-        sigma_shared=vector(np.sqrt(shared)),
-        suspect=suspect,
-    )
+def _part(triad: Triad) -> slice:
+    """Its rows of six."""
+    return slice(0, 3) if triad == "gyro" else slice(3, 6)
 
 
 def _with_effect(imu: ImuSolution, expected: ExpectedImu | None, shared: Shared) -> ImuSolution:
@@ -216,16 +210,20 @@ def _own_variance(imu: ImuSolution, shared: Shared) -> Array:
 
 def _by_zero(shared: Shared) -> Matrix:
     """Accelerometer bias by the gradienter's zero, in sigmas of that, (3, 2)."""
-    return np.zeros((3, 2)) if shared.by_reading is None else shared.by_reading * shared.zero_sigma_rad
+    return _by_reading(shared) * shared.zero_sigma_rad
 
 
 def _other_zero(shared: Shared, expected: Expected) -> Matrix:
     """What is expected by the error of earlier zeros, (3, 2)."""
-    return np.zeros((3, 2)) if shared.by_reading is None else shared.by_reading * expected.other_zero_rad
+    return _by_reading(shared) * expected.other_zero_rad
+
+
+def _by_reading(shared: Shared) -> Matrix:
+    return np.zeros((3, 2)) if shared.by_reading is None else shared.by_reading
 
 
 def _witness(solution: Solution, shared: Shared, known: _Known) -> Witness:
-    part = slice(0, 3) if known.triad == "gyro" else slice(3, 6)
+    part = _part(known.triad)
     imu, expected = solution.imus[known.imu], known.expected
     common = shared.covariance[part, part]
     if known.triad == "accel":
@@ -265,9 +263,7 @@ def _estimate(solution: Solution, shared: Shared, used: Sequence[_Known], *, zer
     innovation = -np.concatenate([one.difference for one in used])
     s_d = _whole_covariance(solution)
     zero = _by_zero(shared)
-    noise = np.zeros((3, 2))
-    if shared.by_reading is not None:
-        noise = shared.by_reading * np.array(shared.reading_sigma_rad)
+    noise = _by_reading(shared) * np.array(shared.reading_sigma_rad)
     # Every accelerometer's share of the zero's error: in d it is whole, in p as far as that was measured with it.
     zero_in_d = np.zeros((6 * count, 2))
     noise_in_d = np.zeros((6 * count, 2))
@@ -326,43 +322,26 @@ def _shifted(imu: ImuSolution, shift: Array, covariance: Matrix, stat: Array) ->
 
 
 def _prior(
-    imu: int,
-    name: str,
-    solution: Solution,
-    shared: Shared,
-    known: Sequence[_Known],
-    used: Sequence[_Known],
-    whole: Whole,
+    known: Sequence[_Known], used: Sequence[_Known], solution: Solution, shared: Shared, whole: Whole
 ) -> Prior | None:
-    """What the record says of it."""
-    gyro: GyroPrior | None = None
-    accel: AccelPrior | None = None
+    """What the record says of what was known of one IMU."""
+    found: dict[Triad, GyroPrior | AccelPrior] = {}
     for one in known:
-        if one.imu != imu:
-            continue
         witness, expected = _witness(solution, shared, one), one.expected
-        sigma = vector(np.sqrt(np.array(expected.variance)))
-        shift = vector(witness.difference / witness.sigma)
-        measured = whole[name][_TRIADS.index(one.triad)]
+        measured = whole[witness.name][_TRIADS.index(one.triad)]
         assert measured is not None  # of nothing else something is known
-        if one.triad == "gyro":
-            gyro = GyroPrior(
-                used=one in used,
-                power_ups=expected.power_ups,
-                temperature_model=expected.by_temperature,
-                expected_rad_s=expected.value,
-                sigma_rad_s=sigma,
-                measured_rad_s=vector(measured),
-                shift_sigma=shift,
-            )
-        else:
-            accel = AccelPrior(
-                used=one in used,
-                power_ups=expected.power_ups,
-                temperature_model=expected.by_temperature,
-                expected_m_s2=expected.value,
-                sigma_m_s2=sigma,
-                measured_m_s2=vector(measured),
-                shift_sigma=shift,
-            )
-    return None if gyro is None and accel is None else Prior(gyro=gyro, accel=accel)
+        unit = "rad_s" if one.triad == "gyro" else "m_s2"
+        figures: dict[str, Any] = {
+            f"expected_{unit}": expected.value,
+            f"sigma_{unit}": vector(np.sqrt(np.array(expected.variance))),
+            f"measured_{unit}": vector(measured),
+            "shift_sigma": vector(witness.difference / witness.sigma),
+        }
+        kind = GyroPrior if one.triad == "gyro" else AccelPrior
+        found[one.triad] = kind(
+            used=one in used,
+            power_ups=expected.power_ups,
+            temperature_model=expected.by_temperature,
+            **figures,
+        )
+    return Prior(**{triad: found.get(triad) for triad in _TRIADS}) if found else None  # type: ignore[arg-type]

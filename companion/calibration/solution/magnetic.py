@@ -91,39 +91,30 @@ def assess(
     """
     heading = vehicle_heading_rad(compass, window.heading_deg, up)
     found = _Field(None, None, None) if field is None else _look(field, compass, local, up, up_covariance)
-    gradient, tilt_deg, vertical = np.zeros(3), 0.0, False
+    gradient, vertical = np.zeros(3), False
     if window.from_field and field is not None:
         try:
             gradient = heading_by_up(compass.vehicle_from_sensor @ np.array(field.field), up)
         except ValueError:
             vertical = True
-        if up_covariance is not None:
-            tilt_deg = math.sqrt(gradient @ up_covariance @ gradient) / DEG
     difference = None
     if not window.from_field and found.heading_rad is not None:
         difference = wrap_deg((heading - found.heading_rad) / DEG)
-    declination_sigma_deg = 0.0
-    if compass.magnetic:
-        heading += local.declination_deg * DEG
-        declination_sigma_deg = local.declination_sigma_deg
+    declination_sigma_deg = local.declination_sigma_deg if compass.magnetic else 0.0
     wander_deg = window.wander_deg or 0.0
     bound_deg = None
     if found.bound_deg is not None:
+        tilt_deg = 0.0 if up_covariance is None else math.sqrt(gradient @ up_covariance @ gradient) / DEG
         chance_deg = _NINETY_FIVE * math.hypot(tilt_deg, window.sigma_deg, declination_sigma_deg)
         bound_deg = min(math.hypot(max(found.bound_deg, abs(difference or 0.0)), wander_deg, chance_deg), 180.0)
     sigma_deg = math.hypot(max(compass.sigma_at(up), wander_deg), window.sigma_deg, declination_sigma_deg)
-    useless = vertical or (bound_deg or 0.0) > USELESS_DEG or (compass.magnetic and _use(local.field) == "none")
+    # Where there is a field to be told from the Earth's, or a north that the compass could show.
+    use = local.field.compass_use if compass.magnetic and local.field is not None else "good"
+    useless = vertical or (bound_deg or 0.0) > USELESS_DEG or use == "none"
     if useless:
         bound_deg = 180.0
-    warnings = ["compass field is vertical: no heading"] if vertical else []
-    warnings += _warnings(found, local, bound_deg, useless=useless, magnetic=compass.magnetic)
-    warnings += _unsteady(window, difference)
-    if field is not None and field.unit == "counts":
-        warnings.append("compass field in counts: only its direction is checked (counts_per_gauss is not set)")
-    if field is not None and up_covariance is None:
-        warnings.append("compass field without a gradienter: heading error bound unknown")
     return Heading(
-        heading_rad=heading,
+        heading_rad=heading + (local.declination_deg * DEG if compass.magnetic else 0.0),
         # A heading is never surer than what is known of its error.
         sigma_rad=max(sigma_deg, bound_deg or 0.0) * DEG,
         heading_by_up=gradient,
@@ -138,7 +129,13 @@ def assess(
             device_minus_field_deg=_rounded(difference, 2),
             wander_deg=_rounded(window.wander_deg, 2),
         ),
-        warnings=tuple(warnings),
+        warnings=(
+            *(["compass field is vertical: no heading"] if vertical else []),
+            *_near_pole(use),
+            *_disturbed(found, local.field, bound_deg, useless=useless, use=use),
+            *_unsteady(window, difference),
+            *_unchecked(field, up_covariance),
+        ),
     )
 
 
@@ -179,39 +176,54 @@ def _look(
     return _Field(strength, inclination, own, deflection_bound_deg(unseen, across))
 
 
-def _warnings(found: _Field, local: LocalEarth, bound_deg: float | None, *, useless: bool, magnetic: bool) -> list[str]:
-    warnings = []
-    if magnetic and _use(local.field) == "none":
-        warnings.append("too near the magnetic pole for a compass: heading unknown, gyro sigma widened")
-    elif magnetic and _use(local.field) == "poor":
-        warnings.append("near the magnetic pole: the compass heading is weak")
-    if local.field is None:
-        return warnings
-    off = None if found.strength_gauss is None else found.strength_gauss / local.field.strength_gauss - 1.0
-    if off is not None and abs(off) > UNIT_GATE:
-        warnings.append(
-            f"compass field is {found.strength_gauss:.3g} gauss, the Earth's {local.field.strength_gauss:.3g}: wrong"
-            " counts_per_gauss, or a magnet"
-        )
-    parts = []
-    if off is not None and abs(off) > STRENGTH_GATE:
-        parts.append(f"{abs(off) * 100.0:.0f} % {'above' if off > 0.0 else 'below'} the Earth's")
+def _near_pole(use: str) -> list[str]:
+    if use == "none":
+        return ["too near the magnetic pole for a compass: heading unknown, gyro sigma widened"]
+    return ["near the magnetic pole: the compass heading is weak"] if use == "poor" else []
+
+
+def _disturbed(
+    found: _Field, earths: MagneticField | None, bound_deg: float | None, *, useless: bool, use: str
+) -> list[str]:
+    """In what the field is not the Earth's, and what that makes of the heading."""
+    if earths is None:
+        return []
+    warnings, parts = [], []
+    if found.strength_gauss is not None:
+        off = found.strength_gauss / earths.strength_gauss - 1.0
+        if abs(off) > UNIT_GATE:
+            warnings.append(
+                f"compass field is {found.strength_gauss:.3g} gauss, the Earth's {earths.strength_gauss:.3g}: wrong"
+                " counts_per_gauss, or a magnet"
+            )
+        if abs(off) > STRENGTH_GATE:
+            parts.append(f"{abs(off) * 100.0:.0f} % {'above' if off > 0.0 else 'below'} the Earth's")
     if found.inclination_rad is not None:
-        dip = found.inclination_rad / DEG - local.field.inclination_deg
+        dip = found.inclination_rad / DEG - earths.inclination_deg
         if abs(dip) > INCLINATION_GATE_DEG:
             # Towards the nadir in the north and towards the zenith in the south is steeper.
-            steeper = dip * math.copysign(1.0, local.field.inclination_deg) > 0.0
+            steeper = dip * math.copysign(1.0, earths.inclination_deg) > 0.0
             parts.append(f"{abs(dip):.1f} deg {'steeper' if steeper else 'flatter'} than the Earth's")
-    if parts and useless:
-        warnings.append(f"compass field {' and '.join(parts)}: heading useless; move away from iron")
-    elif parts and bound_deg is not None:
-        warnings.append(
-            f"compass field {' and '.join(parts)}: heading may be off by {bound_deg:.0f} deg; move away from iron"
-        )
-    elif parts:
-        warnings.append(f"compass field {' and '.join(parts)}: move away from iron")
-    elif useless and bound_deg is not None and _use(local.field) != "none":
-        warnings.append("compass field too flat or too steep to show a heading: heading unknown, gyro sigma widened")
+    if not parts:
+        if useless and use != "none":
+            warnings.append(
+                "compass field too flat or too steep to show a heading: heading unknown, gyro sigma widened"
+            )
+        return warnings
+    consequence = ""
+    if useless:
+        consequence = "heading useless; "
+    elif bound_deg is not None:
+        consequence = f"heading may be off by {bound_deg:.0f} deg; "
+    return [*warnings, f"compass field {' and '.join(parts)}: {consequence}move away from iron"]
+
+
+def _unchecked(field: FieldWindow | None, up_covariance: Matrix | None) -> list[str]:
+    warnings = []
+    if field is not None and field.unit == "counts":
+        warnings.append("compass field in counts: only its direction is checked (counts_per_gauss is not set)")
+    if field is not None and up_covariance is None:
+        warnings.append("compass field without a gradienter: heading error bound unknown")
     return warnings
 
 
@@ -227,10 +239,6 @@ def _unsteady(window: HeadingWindow, difference: float | None) -> list[str]:
             " heading may be off as much"
         )
     return warnings
-
-
-def _use(field: MagneticField | None) -> str:
-    return "good" if field is None else field.compass_use
 
 
 def _rounded(value: float | None, digits: int) -> float | None:

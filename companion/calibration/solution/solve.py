@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Final
 
 import numpy as np
@@ -20,7 +20,13 @@ from companion.calibration.collector.rolling import ImuWindow, TiltWindow, Windo
 from companion.calibration.means.pose_models import CompassModel, GradienterModel, up_in_vehicle, vehicle_heading_rad
 from companion.calibration.request import What
 from companion.calibration.solution import magnetic
-from companion.calibration.solution.bias import accelerometer_bias, attitude_error_jacobian, bias_covariance, gyro_bias
+from companion.calibration.solution.bias import (
+    Uncertain,
+    accelerometer_bias,
+    attitude_error_jacobian,
+    bias_covariance,
+    gyro_bias,
+)
 from companion.calibration.solution.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site
 from companion.calibration.solution.site import IN_CONFIGURATION, LocalEarth, Remedies, Whereabouts, local_earth
 from companion.errors import CalibrationRefusedError
@@ -105,6 +111,10 @@ class Truth:
         gamma, theta = roll_pitch_from_up(self.up)
         return body_from_ned(gamma, theta, self.heading_rad or 0.0)
 
+    def earth_rate(self, local: LocalEarth) -> Uncertain:
+        """The Earth's rate in the vehicle's axes."""
+        return local.rate_in_body(self.body_from_ned, heading_known=self.heading_rad is not None)
+
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Shared:
@@ -153,36 +163,34 @@ def solve(
             a gradienter.
     """
     warnings = list(local.warnings)
-    tilted = window.tilt if gradienter is not None else None
-    accelerometers = what.accelerometers and tilted is not None
-    if what.accelerometers and tilted is None:
+    gradienter = gradienter if window.tilt is not None else None
+    compass = compass if window.heading is not None else None
+    if what.accelerometers and gradienter is None:
         if what is What.ACCELEROMETERS:
             raise CalibrationRefusedError(
                 "accelerometers need a gradienter: without one the tilt is unknown; configure [gradienter] or"
                 " calibrate the gyros only"
             )
         warnings.append("no gradienter: gyros only, accelerometers not calibrated")
-    if compass is None or window.heading is None:
+    if compass is None:
         warnings.append(
             f"{local.remedies.no_heading}: the horizontal part of the Earth's rate is unknown, gyro sigma widened"
         )
-    truth = truth_of(window, gradienter if tilted is not None else None, compass, local, warnings)
-    imus = tuple(_estimate(imu, truth, local, gyros=what.gyros, accelerometers=accelerometers) for imu in window.imus)
+    truth = truth_of(window, gradienter, compass, local, warnings)
+    shared = _shared(truth, local, 0.0 if gradienter is None else gradienter.sigma_deg * DEG)
+    wanted: dict[Triad, bool] = {"gyro": what.gyros, "accel": what.accelerometers and gradienter is not None}
+    asked = [triad for triad, is_wanted in wanted.items() if is_wanted]
+    imus = tuple(_estimate(imu, truth, local, shared, asked) for imu in window.imus)
     if all(imu.gyro_rad_s is None and imu.accel_m_s2 is None for imu in imus):
-        refusals = [
-            words for imu in window.imus for words in _hidden(imu, gyros=what.gyros, accelerometers=accelerometers)
-        ]
+        refusals = [words for imu in window.imus for words in _hidden(imu, asked)]
         if refusals:
             raise CalibrationRefusedError("; ".join(refusals))
-    unknown: list[tuple[str, Triad]] = [(imu.name, "gyro") for imu in window.imus if what.gyros and imu.refused("gyro")]
-    unknown += [(imu.name, "accel") for imu in window.imus if accelerometers and imu.refused("accel")]
-    shared = _shared(truth, local, gradienter.sigma_deg * DEG if gradienter is not None and tilted is not None else 0.0)
     return Solution(
         pose=_pose(truth),
         site=local.site,
         imus=imus,
         warnings=tuple(warnings),
-        unknown=tuple(unknown),
+        unknown=tuple((imu.name, triad) for triad in asked for imu in window.imus if imu.refused(triad)),
         magnetic=truth.magnetic,
         shared=shared,
         cross=dict.fromkeys(itertools.combinations((imu.name for imu in imus), 2), shared.covariance),
@@ -225,8 +233,7 @@ def truth_of(
     else:
         mean = np.mean([imu.accel_m_s2 for imu in window.imus], axis=0)
         up = mean / np.linalg.norm(mean)
-        across = np.eye(3) - np.outer(up, up)
-        up_covariance = across * (LEVEL_BY_ACCELEROMETER_SIGMA_DEG * DEG) ** 2
+        up_covariance = (np.eye(3) - np.outer(up, up)) * (LEVEL_BY_ACCELEROMETER_SIGMA_DEG * DEG) ** 2
     if math.hypot(up[1], up[2]) < 0.1:
         raise CalibrationRefusedError("the aircraft stands on its nose or tail (pitch beyond 84 deg): lay it down")
     jacobian = attitude_error_jacobian(up)
@@ -311,9 +318,7 @@ def _shared(truth: Truth, local: LocalEarth, zero_sigma_rad: float) -> Shared:
             up=truth.up,
             gravity_m_s2=local.gravity_m_s2,
             gravity_sigma_m_s2=local.gravity_sigma_m_s2,
-            earth_rate_body=local.rate_in_body(truth.body_from_ned, heading_known=truth.heading_rad is not None),
-            gyro_variance=np.zeros(3),
-            accel_variance=np.zeros(3),
+            earth_rate_body=truth.earth_rate(local),
         ),
         by_reading=None if by_up is None else -local.gravity_m_s2 * by_up,
         reading_sigma_rad=truth.reading_sigma_rad,
@@ -321,34 +326,27 @@ def _shared(truth: Truth, local: LocalEarth, zero_sigma_rad: float) -> Shared:
     )
 
 
-def _estimate(imu: ImuWindow, truth: Truth, local: LocalEarth, *, gyros: bool, accelerometers: bool) -> ImuSolution:
-    rate = local.rate_in_body(truth.body_from_ned, heading_known=truth.heading_rad is not None)
-    covariance = bias_covariance(
-        attitude_covariance_rad2=truth.attitude_covariance_rad2,
-        up=truth.up,
-        gravity_m_s2=local.gravity_m_s2,
-        gravity_sigma_m_s2=local.gravity_sigma_m_s2,
-        earth_rate_body=rate,
-        gyro_variance=np.square(imu.gyro_sigma_use_rad_s),
-        accel_variance=np.square(imu.accel_sigma_use_m_s2),
-    )
+def _estimate(imu: ImuWindow, truth: Truth, local: LocalEarth, shared: Shared, asked: Collection[Triad]) -> ImuSolution:
+    gyro = accel = None
+    if "gyro" in asked and imu.refused("gyro") is None:
+        gyro = gyro_bias(np.array(imu.gyro_rad_s), truth.earth_rate(local).mean)
+    if "accel" in asked and imu.refused("accel") is None:
+        accel = accelerometer_bias(np.array(imu.accel_m_s2), truth.up, local.gravity_m_s2)
+    own = np.square([*imu.gyro_sigma_use_rad_s, *imu.accel_sigma_use_m_s2])
     return ImuSolution(
         name=imu.name,
         samples=imu.samples,
         temperature_degc=imu.temperature_degc,
-        gyro_rad_s=gyro_bias(np.array(imu.gyro_rad_s), rate.mean) if gyros and imu.refused("gyro") is None else None,
-        accel_m_s2=accelerometer_bias(np.array(imu.accel_m_s2), truth.up, local.gravity_m_s2)
-        if accelerometers and imu.refused("accel") is None
-        else None,
+        gyro_rad_s=gyro,
+        accel_m_s2=accel,
         gyro_sigma_stat_rad_s=np.array(imu.gyro_sigma_stat_rad_s),
         accel_sigma_stat_m_s2=np.array(imu.accel_sigma_stat_m_s2),
-        covariance=covariance,
-        warnings=(*imu.warnings, *_hidden(imu, gyros=gyros, accelerometers=accelerometers)),
+        covariance=shared.covariance + np.diag(own),
+        warnings=(*imu.warnings, *_hidden(imu, asked)),
         dithered=imu.dithered,
     )
 
 
-def _hidden(imu: ImuWindow, *, gyros: bool, accelerometers: bool) -> list[str]:
+def _hidden(imu: ImuWindow, asked: Collection[Triad]) -> list[str]:
     """What this IMU's readings do not tell, or not well, of what is asked for."""
-    asked = {"gyro": gyros, "accel": accelerometers}
-    return [hidden.words for part, hidden in imu.hidden.items() if asked[part]]
+    return [hidden.words for triad, hidden in imu.hidden.items() if triad in asked]
