@@ -9,25 +9,15 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
 import logging
 import sys
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final, NoReturn
 
 from companion import __version__, config
 from companion.cli import logs
-from companion.config.profiles import SavedProfiles
+from companion.cli.terminal import FAILED, NO_DAEMON, USAGE, Command, Parser, count, print_json, print_lines, seconds
 from companion.errors import CompanionError, ConfigError, DaemonUnreachableError, NobodyHeardError
-from companion.printable import printable
-
-DONE: Final = 0
-FAILED: Final = 1
-USAGE: Final = 2
-NO_DAEMON: Final = 3
-
-Command = Callable[[argparse.Namespace], Awaitable[int]]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -59,71 +49,10 @@ async def _dispatch(options: argparse.Namespace) -> int:
     return await command(options)
 
 
-def print_lines(*lines: object, error: bool = False, end: str = "\n") -> None:
-    """Print lines for people, or JSON: the one door to the terminal, by which nothing goes that it would obey.
-
-    Args:
-        lines: each is one, whatever is in it.
-        error: to stderr.
-        end: of each.
-    """
-    stream = sys.stderr if error else sys.stdout
-    for line in lines:
-        stream.write(printable(str(line)) + end)
-    stream.flush()
-
-
 def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
     print_lines(f"companion: {reason}", error=True)
     if getattr(options, "json", False):
         print_json({"state": state, "reason": reason})
-
-
-def load_config(options: argparse.Namespace, *, profiles: bool = False, forgiving: bool = False) -> config.Config:
-    """The configuration that -c names, or the default one.
-
-    Args:
-        options: of the command line.
-        profiles: read the saved noise profiles that it names too; who only asks the daemon may not be allowed to, and
-            leaves them be.
-        forgiving: one of them that is damaged is no reason to refuse the configuration.
-    """
-
-    def saved(directory: Path) -> SavedProfiles | None:
-        from companion.storage.profiles import ProfileStore
-
-        return ProfileStore(directory, forgiving=forgiving) if profiles else None
-
-    return config.load(config_path(options), saved)
-
-
-def storage_path(options: argparse.Namespace) -> Path:
-    """The storage directory of the configuration; where none is named and the default one is not there, the usual one.
-
-    Raises:
-        ConfigError: the configuration that -c names cannot be read.
-    """
-    try:
-        return load_config(options).storage.path
-    except ConfigError:
-        if hasattr(options, "config"):
-            raise
-        return config.Storage().path
-
-
-def config_path(options: argparse.Namespace) -> Path:
-    """The file that -c names, or the default one."""
-    path: Path = getattr(options, "config", config.DEFAULT_PATH)
-    return path
-
-
-class Parser(argparse.ArgumentParser):
-    """Says a usage error in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        """Say a usage error in one line."""
-        print_lines(f"{self.prog}: {message} (see {self.prog} --help)", error=True)
-        self.exit(USAGE)
 
 
 def _parser() -> Parser:
@@ -184,38 +113,11 @@ def _parser() -> Parser:
     )
     setup.add_command(add)
     history = add("history", client.history, "list past calibrations")
-    history.add_argument("-n", "--limit", type=_count, default=20, metavar="N", help="the latest N (default 20)")
-    report.add_command(add, _count)
+    history.add_argument("-n", "--limit", type=count, default=20, metavar="N", help="the latest N (default 20)")
+    report.add_command(add)
     add("monitor", monitor.monitor, "watch the daemon until Ctrl-C")
     add("web-token", local.web_token, "where the page is, and the token that its buttons need")
     recordings.add_commands(add)
     profile.add_command(add)
     ground.add_commands(commands, common)
     return parser
-
-
-def seconds(text: str) -> float:
-    """An argument that is a time.
-
-    Raises:
-        argparse.ArgumentTypeError: it is none.
-    """
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a time in seconds above 0")
-    return value
-
-
-def _count(text: str) -> int:
-    value = int(text) if text.isdecimal() else 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
-    return value
-
-
-def print_json(value: Any) -> None:
-    """Print the one JSON object of a command."""
-    print_lines(json.dumps(value))

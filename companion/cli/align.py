@@ -5,18 +5,16 @@ from __future__ import annotations
 import argparse
 import asyncio
 import math
-from collections.abc import Awaitable, Callable
 from typing import Any
 
-from companion.cli import DONE, FAILED, load_config, print_json, print_lines, seconds
+from companion.cli.client import finish
+from companion.cli.terminal import AddCommand, load_config, print_lines, seconds
 from companion.daemon.faces.control import ask
 
 Object = dict[str, Any]
 
 
-def add_command(
-    add: Callable[[str, Callable[[argparse.Namespace], Awaitable[int]], str], argparse.ArgumentParser],
-) -> None:
+def add_command(add: AddCommand) -> None:
     """Add it to the parser of the command line."""
     parser = add("align", align, "measure the gradienter's zero (turn by 180 degrees), or how it sits (tilts)")
     what = parser.add_mutually_exclusive_group(required=True)
@@ -66,18 +64,14 @@ async def _cancel(path: Any) -> Object:
 
 
 def _finish(options: argparse.Namespace, action: str, reply: Object) -> int:
-    if reply["kind"] == "error":
-        answer: Object = {"state": "refused", "reason": reply["reason"]}
-        print_lines(f"companion: {reply['reason']}", error=True)
-    else:
-        answer = {key: value for key, value in reply.items() if key != "kind"}
-    good = answer["state"] in ("done", "in force") or (action == "show" and answer["state"] != "refused")
-    if getattr(options, "json", False):
-        print_json(answer)
-    elif reply["kind"] != "error":
-        print_lines(f"{answer['state'].upper()}: {answer['reason']}" if answer["reason"] else answer["state"].upper())
-        print_lines(*(alignment_lines(answer["alignment"]) if answer.get("alignment") else ()))
-    return DONE if good else FAILED
+    answer = {key: value for key, value in reply.items() if key != "kind"}
+    lines: list[str] = []
+    if reply["kind"] != "error":
+        state = answer["state"].upper()
+        lines = [f"{state}: {answer['reason']}" if answer["reason"] else state]
+        lines += alignment_lines(answer["alignment"]) if answer.get("alignment") else []
+    good = answer.get("state") in ("done", "in force") or (action == "show" and answer.get("state") != "refused")
+    return finish(options, reply, answer, lines, good=good)
 
 
 def alignment_lines(record: Object) -> list[str]:

@@ -5,24 +5,25 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from companion.cli import DONE, FAILED, load_config, print_json, print_lines, show
+from companion.cli import show
+from companion.cli.terminal import DONE, FAILED, load_config, print_json, print_lines
 from companion.daemon.faces.control import ask
 
 Object = dict[str, Any]
 
 
-async def _request(options: argparse.Namespace, request: Object) -> Object:
+async def request(options: argparse.Namespace, wanted: Object) -> Object:
     """Send a request, show its progress on stderr, return its last reply."""
     reply: Object = {}
     shown = ""
-    async for reply in ask(load_config(options).control.path, request):
+    async for reply in ask(load_config(options).control.path, wanted):
         if reply["kind"] == "progress" and reply["text"] != shown:
             shown = reply["text"]
             print_lines(f"[{reply['percent']:3d} %] {reply['state']}: {shown}", error=True)
     return reply
 
 
-def _finish(options: argparse.Namespace, reply: Object, answer: Object, lines: list[str], *, good: bool) -> int:
+def finish(options: argparse.Namespace, reply: Object, answer: Object, lines: list[str], *, good: bool) -> int:
     """Print an answer, as JSON or as lines for people, and give the exit code."""
     if reply["kind"] == "error":
         answer, lines, good = {"state": "refused", "reason": reply["reason"]}, [], False
@@ -36,48 +37,48 @@ def _finish(options: argparse.Namespace, reply: Object, answer: Object, lines: l
 
 async def status(options: argparse.Namespace) -> int:
     """`companion status`."""
-    reply = await _request(options, {"command": "status"})
+    reply = await request(options, {"command": "status"})
     answer = reply.get("status", {})
-    return _finish(options, reply, answer, show.status_lines(answer) if answer else [], good=True)
+    return finish(options, reply, answer, show.status_lines(answer) if answer else [], good=True)
 
 
 async def calibrate(options: argparse.Namespace) -> int:
     """`companion calibrate`."""
     what = "gyros" if options.gyros else "accelerometers" if options.accelerometers else "both"
-    request = {
+    wanted = {
         "command": "calibrate",
         "what": what,
         "wait": options.wait,
         "timeout_s": options.timeout,
         "reboot": options.reboot,
     }
-    reply = await _request(options, request)
+    reply = await request(options, wanted)
     if "record" in reply:
         record = reply["record"]
-        return _finish(options, reply, record, show.record_lines(record), good=record["state"] == "done")
+        return finish(options, reply, record, show.record_lines(record), good=record["state"] == "done")
     answer = {key: reply.get(key) for key in ("state", "reason")}
-    return _finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=True)
+    return finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=True)
 
 
 async def cancel(options: argparse.Namespace) -> int:
     """`companion cancel`."""
-    reply = await _request(options, {"command": "cancel"})
+    reply = await request(options, {"command": "cancel"})
     answer = {key: reply.get(key) for key in ("state", "reason")}
-    return _finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=True)
+    return finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=True)
 
 
 async def undo(options: argparse.Namespace) -> int:
     """`companion undo`."""
-    reply = await _request(options, {"command": "undo", "force": options.force})
+    reply = await request(options, {"command": "undo", "force": options.force})
     answer = {key: reply.get(key) for key in ("state", "reason", "written")}
-    return _finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=answer["state"] == "done")
+    return finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=answer["state"] == "done")
 
 
 async def history(options: argparse.Namespace) -> int:
     """`companion history`."""
-    reply = await _request(options, {"command": "history", "limit": options.limit})
+    reply = await request(options, {"command": "history", "limit": options.limit})
     records = reply.get("records", [])
     armings = reply.get("armings", [])
     numbers = reply.get("numbers", [])
     answer = {"numbers": numbers, "records": records, "armings": armings}
-    return _finish(options, reply, answer, show.history_lines(numbers, records, armings), good=True)
+    return finish(options, reply, answer, show.history_lines(numbers, records, armings), good=True)

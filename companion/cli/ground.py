@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from companion.cli import DONE, FAILED, Parser, print_json, print_lines, seconds
+from companion.cli.terminal import DONE, FAILED, Parser, print_json, print_lines, seconds
 from companion.errors import ConfigError, LinkError, NobodyHeardError
 
 if TYPE_CHECKING:

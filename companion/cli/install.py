@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from companion.cli import DONE, FAILED, Command, print_json, print_lines
+from companion.cli.terminal import DONE, FAILED, AddCommand, print_json, print_lines
 
 if TYPE_CHECKING:
     from companion.installation.install import Step, Target
 
 
-def add_commands(add: Callable[[str, Command, str], argparse.ArgumentParser]) -> None:
+def add_commands(add: AddCommand) -> None:
     """Add `install-service`, `uninstall-service` and `udev-rule`; `add` makes a parser of name, command and help."""
     for name, command, words in (
         ("install-service", install, "start the companion at every boot: unit, udev rules, configuration"),

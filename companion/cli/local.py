@@ -10,7 +10,8 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from companion.cli import DONE, FAILED, config_path, load_config, logs, print_json, print_lines, show
+from companion.cli import logs, show
+from companion.cli.terminal import DONE, FAILED, config_path, load_config, print_json, print_lines
 from companion.errors import CompanionError, LinkError
 
 if TYPE_CHECKING:

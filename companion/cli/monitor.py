@@ -17,7 +17,8 @@ import textwrap
 import time
 from typing import Any, Final, Protocol
 
-from companion.cli import DONE, load_config, print_json, print_lines, show
+from companion.cli import show
+from companion.cli.terminal import DONE, load_config, print_json, print_lines
 from companion.daemon.faces.control import ask
 from companion.errors import DaemonUnreachableError
 from companion.printable import printable

@@ -11,13 +11,20 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
-from companion.cli import DONE, FAILED, Command, load_config, print_json, print_lines, seconds, storage_path
+from companion.cli.terminal import (
+    DONE,
+    FAILED,
+    AddCommand,
+    load_config,
+    print_json,
+    print_lines,
+    seconds,
+    storage_path,
+)
 from companion.errors import CalibrationRefusedError, ConfigError, StorageError
 from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from companion.calibration.noise.allan import AllanModel, NoiseProfile
     from companion.calibration.profiling.coverage import Kept
     from companion.calibration.profiling.profile_fit import AxisFinding, Finding
@@ -54,7 +61,7 @@ class Result(NamedTuple):
         ]
 
 
-def add_command(add: Callable[[str, Command, str], argparse.ArgumentParser]) -> None:
+def add_command(add: AddCommand) -> None:
     """Add `profile`; `add` makes a parser of name, command and help."""
     sub = add("profile", profile, "learn an IMU's noise from recordings of it at rest (docs/profiles.md)")
     sub.add_argument("files", nargs="+", type=Path, metavar="FILE", help="recordings (.mcap) or CSV logs")

@@ -6,13 +6,15 @@ import argparse
 import asyncio
 import sys
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from companion.cli import DONE, FAILED, load_config, print_json, print_lines, seconds, show, storage_path
+from companion.cli import show
+from companion.cli.client import finish
+from companion.cli.terminal import DONE, FAILED, AddCommand, load_config, print_json, print_lines, seconds, storage_path
 from companion.daemon.faces.control import ask
 from companion.errors import ConfigError
 
@@ -25,9 +27,7 @@ MOST_LINES = 20
 """Of differences, for people; --json has them all."""
 
 
-def add_commands(
-    add: Callable[[str, Callable[[argparse.Namespace], Awaitable[int]], str], argparse.ArgumentParser],
-) -> None:
+def add_commands(add: AddCommand) -> None:
     """Add both to the parser of the command line."""
     recorder = add("record", record, "record everything to a file until Ctrl-C (the last half hour is kept anyway)")
     recorder.add_argument("file", nargs="?", type=Path, metavar="FILE", help="default: one beside the daemon's own")
@@ -92,18 +92,13 @@ async def _end(options: argparse.Namespace, reply: Object) -> int:
     if not reply:
         async for answer in ask(load_config(options).control.path, {"command": "record", "stop": True}):
             reply = answer
-    if reply["kind"] == "error":
-        reply = {"state": "refused", "reason": reply["reason"]}
-        print_lines(f"companion: {reply['reason']}", error=True)
     answer = {key: item for key, item in reply.items() if key != "kind"}
-    if getattr(options, "json", False):
-        print_json(answer)
-    elif "file" in answer:
+    lines: list[str] = []
+    if "file" in answer:
         lost = f", {answer['lost']} messages lost" if answer["lost"] else ""
-        print_lines(
-            f"{answer['file']}: {answer['seconds']:.0f} s, {answer['bytes'] / 1e6:.1f} MB{lost}; {answer['reason']}"
-        )
-    return DONE if answer["state"] == "done" else FAILED
+        size = f"{answer['seconds']:.0f} s, {answer['bytes'] / 1e6:.1f} MB"
+        lines = [f"{answer['file']}: {size}{lost}; {answer['reason']}"]
+    return finish(options, reply, answer, lines, good=answer.get("state") == "done")
 
 
 async def replay(options: argparse.Namespace) -> int:

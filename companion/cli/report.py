@@ -5,19 +5,18 @@ from __future__ import annotations
 import argparse
 import datetime
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from companion.cli import DONE, FAILED, USAGE, Command, load_config, print_json, print_lines
+from companion.cli.terminal import DONE, FAILED, USAGE, AddCommand, count, load_config, print_json, print_lines
 from companion.errors import CompanionError, ConfigError, StorageError
 
 if TYPE_CHECKING:
     from companion.calibration.noise.allan import NoiseProfile
 
 
-def add_command(add: Callable[[str, Command, str], argparse.ArgumentParser], count: Callable[[str], int]) -> None:
-    """Add `report`; `add` makes a parser of name, command and help, `count` reads a number above 0."""
+def add_command(add: AddCommand) -> None:
+    """Add `report`."""
     sub = add("report", report, "make a page (one HTML file) of a calibration, or of all: needs no daemon, no network")
     sub.add_argument(
         "record", nargs="?", metavar="RECORD", help="its number, or the beginning of its time (default: the latest)"

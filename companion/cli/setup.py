@@ -4,31 +4,28 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import Any
+from typing import Any, Final
 
-from companion.cli import DONE, FAILED, load_config, print_json, print_lines
-from companion.daemon.faces.control import ask
+from companion.cli.client import finish, request
+from companion.cli.terminal import AddCommand, print_lines
 
 Object = dict[str, Any]
 
-
-async def _request(options: argparse.Namespace, request: Object) -> Object:
-    question = {"command": "autopilot-setup", **request}
-    return [reply async for reply in ask(load_config(options).control.path, question)][-1]
+QUESTION: Final = {"command": "autopilot-setup"}
 
 
 async def setup(options: argparse.Namespace) -> int:
     """`companion autopilot-setup`."""
     if options.apply:
-        shown = await _request(options, {"action": "show"})
+        shown = await request(options, {**QUESTION, "action": "show"})
         for risk in shown.get("risks", []):
             print_lines(f"risk: {risk}", error=True)
         if shown["kind"] != "error" and shown["state"] != "applied" and not _agreed(options):
-            return _finish(options, {"kind": "error", "reason": "not applied: say --yes, or answer on a terminal"})
-        return _finish(options, await _request(options, {"action": "apply"}))
+            return _said(options, {"kind": "error", "reason": "not applied: say --yes, or answer on a terminal"})
+        return _said(options, await request(options, {**QUESTION, "action": "apply"}))
     if options.undo:
-        return _finish(options, await _request(options, {"action": "undo", "force": options.force}))
-    return _finish(options, await _request(options, {"action": "show"}))
+        return _said(options, await request(options, {**QUESTION, "action": "undo", "force": options.force}))
+    return _said(options, await request(options, {**QUESTION, "action": "show"}))
 
 
 def _agreed(options: argparse.Namespace) -> bool:
@@ -41,17 +38,10 @@ def _agreed(options: argparse.Namespace) -> bool:
     return sys.stdin.readline().strip().lower() == "yes"
 
 
-def _finish(options: argparse.Namespace, reply: Object) -> int:
-    if reply["kind"] == "error":
-        answer: Object = {"state": "refused", "reason": reply["reason"]}
-        print_lines(f"companion: {reply['reason']}", error=True)
-    else:
-        answer = {key: value for key, value in reply.items() if key != "kind"}
-    if getattr(options, "json", False):
-        print_json(answer)
-    elif reply["kind"] != "error":
-        print_lines(*setup_lines(answer))
-    return FAILED if reply["kind"] == "error" else DONE
+def _said(options: argparse.Namespace, reply: Object) -> int:
+    answer = {key: value for key, value in reply.items() if key != "kind"}
+    good = reply["kind"] != "error"
+    return finish(options, reply, answer, setup_lines(answer) if good else [], good=good)
 
 
 def setup_lines(answer: Object) -> list[str]:
@@ -71,7 +61,7 @@ def _number(value: float | None) -> str:
     return "none" if value is None else f"{value:g}"
 
 
-def add_command(add: Any) -> None:
+def add_command(add: AddCommand) -> None:
     """The subcommand and its options."""
     command = add("autopilot-setup", setup, "the autopilot's parameters for our heading: show, apply, take back")
     what = command.add_mutually_exclusive_group()

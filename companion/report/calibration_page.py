@@ -29,7 +29,6 @@ from companion.report.page import (
     drift,
     moment,
     page,
-    with_advice,
     with_sigma,
     written_count,
 )
@@ -95,7 +94,7 @@ def _headline(material: Material) -> Markup:
         tag("p", f"{moment(record.started_at)}, {vehicle}, took {record.duration_s:.0f} s"),
         tag("p", tag("span", record.state.upper(), class_=f"state {record.state}")),
         tag("p", _in_short(record), class_="lead"),
-        tag("p", record.reason) if record.state == "done" else with_advice(record.reason, "alarm"),
+        tag("p", record.reason) if record.state == "done" else card("alarm", tag("p", record.reason)),
         card("alarm", f"Undone {moment(undone)}: the values from before are in force again.") if undone else None,
     )
 
@@ -120,8 +119,9 @@ def _warnings(record: Record) -> Markup | None:
     more = len(found) - MAX_WARNINGS
     return join(
         tag("h2", "Warnings"),
-        *(with_advice(words, "caution") for words in found[:MAX_WARNINGS]),
+        *(card("caution", tag("p", words)) for words in found[:MAX_WARNINGS]),
         card("caution", f"{more} more warnings are not shown.") if more > 0 else None,
+        tag("p", "What to do about each: docs/messages.md."),
     )
 
 

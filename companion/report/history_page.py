@@ -24,7 +24,6 @@ from companion.report.page import (
     drift,
     moment,
     page,
-    with_advice,
     written_count,
 )
 
@@ -112,7 +111,7 @@ def _failures(records: Sequence[tuple[int, Record]]) -> Markup:
         numbers = ", ".join(str(number) for number, _ in same[:10]) + (", …" if len(same) > 10 else "")
         parts.append(tag("h3", f"{state}: {times}{moment(same[0][1].started_at)}"))
         parts.append(tag("p", f"number {numbers}", class_="soft"))
-        parts.append(with_advice(same[0][1].reason, "alarm" if state == "failed" else ""))
+        parts.append(card("alarm" if state == "failed" else "", tag("p", same[0][1].reason)))
     if len(groups) > MAX_FAILURES:
         parts.append(tag("p", f"{len(groups) - MAX_FAILURES} other kinds stand in the table below."))
     return tag("section", *parts)

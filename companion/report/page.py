@@ -12,7 +12,6 @@ from companion.calibration.noise.allan import NoiseProfile
 from companion.calibration.solution.record import Arming, Record
 from companion.physics.units import DEG_H, MG
 from companion.report import svg
-from companion.report.advice import advice
 from companion.report.analysis import Point, clock_is_sound, slope
 from companion.report.markup import Child, Markup, join, number, tag
 from companion.samples import Triad
@@ -48,7 +47,6 @@ h3{font-size:1.05rem;margin:1.2em 0 .3em}p{margin:.4em 0}ul{margin:.3em 0;paddin
 .lead{font-size:1.1rem;font-weight:600}
 .card{background:var(--card);border-left:5px solid var(--rule);padding:.5em .8em;margin:.6em 0}
 .card.alarm{border-color:var(--bad)}.card.caution{border-color:var(--warn)}.card.fine{border-color:var(--good)}
-.todo{font-weight:600}
 .pairs h3{margin-top:.7em}.setting{table-layout:fixed}.setting .name td{border:0;text-align:left;padding-top:.6em}
 .setting .values td{padding-top:0;text-align:left}
 .no{white-space:nowrap;overflow-wrap:normal;width:3.5em}
@@ -116,12 +114,6 @@ def card(kind: str, *children: Child) -> Markup:
 def moment(iso: str) -> str:
     """A time as people read it."""
     return f"{iso[:10]} {iso[11:16]} UTC" if len(iso) >= 16 else iso
-
-
-def with_advice(words: str, kind: str) -> Markup:
-    """A warning or reason, and what to do about it."""
-    what = advice(words)
-    return card(kind, tag("p", words), tag("p", f"What to do: {what}", class_="todo") if what else None)
 
 
 def damaged(problems: Sequence[str]) -> Markup | None:

@@ -19,6 +19,7 @@ import pytest
 
 from companion import cli
 from companion.cli import client, local
+from companion.cli.terminal import DONE
 from companion.daemon.process import check
 from companion.links.serial.bytestream import ByteLink
 from tests.support.documents import DOCUMENTS, session
@@ -75,7 +76,7 @@ def test_the_session_happens_as_shown(
                 code = await cli._dispatch(cli._parser().parse_args(words[1:]))
                 output = capsys.readouterr()
                 said = output.err + output.out
-                assert code == cli.DONE, f"{command}: {said}"
+                assert code == DONE, f"{command}: {said}"
                 assert shown(expected, said), f"{command}: {expected} is not in\n{said}"
                 happened.append(f"$ {command}\n{said}")
                 await asyncio.sleep(NEXT_COMMAND_S)

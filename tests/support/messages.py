@@ -45,7 +45,7 @@ ELSEWHERE = {
     "companion/daemon/faces/headline.py": "the big word of page and monitor: docs/page.md has each",
     "companion/cli/monitor.py": "the frame of the monitor: docs/page.md",
     "companion/ground": "printed on the ground laptop, each with what to do: docs/ground_stations.md",
-    "companion/report": "labels of pages, and advice that stands beside what it is about",
+    "companion/report": "labels of pages",
     "companion/web": "answers to browsers that ask for the wrong thing; what people see is the page",
 }
 """Rooms whose words need no row of their own, and why."""

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from companion.cli import USAGE, main
+from companion.cli import main
+from companion.cli.terminal import USAGE
 from companion.config import load, parse
 from companion.errors import ConfigError
 
