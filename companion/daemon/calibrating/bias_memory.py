@@ -39,19 +39,13 @@ logger = logging.getLogger(__name__)
 _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 _TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 _IN_WORDS: Final = {
-    "source": "source",
-    "profile": "profile",
-    "protocol": "protocol",
-    "mounting": "mounting",
-    "instance": "instance",
     "system": "vehicle",
-    "firmware": "firmware",
     "gyro": "gyro (device id)",
     "accel": "accelerometer (device id)",
-    "orientation": "orientation",
     "scale": "accelerometer scale",
     "tcal": "temperature calibration",
 }
+"""Of what is not said as it is called."""
 
 
 class _Reference(msgspec.Struct):

@@ -125,15 +125,7 @@ class Conductor:
         automatic: bool = False,
         reboot: bool = False,
     ) -> Job | Refusal:
-        """Start a calibration, or say why not; one that runs by itself and does all of this becomes the requester's.
-
-        Args:
-            what: which biases.
-            requester: who asks.
-            timeout_s: how long measuring may take.
-            automatic: nobody has asked.
-            reboot: restart the autopilot when the result is stored.
-        """
+        """Start a calibration, or say why not; one that runs by itself and does all of this becomes the requester's."""
         deadline_s = None if timeout_s is None else asyncio.get_running_loop().time() + timeout_s
         running = self._by_itself()
         whole = running is not None and not running.cancelled and not running.held_back
@@ -241,7 +233,7 @@ class Conductor:
             self._machine.on(Event.FAULT if result.outcome == "failed" else Event.CANCEL)
         self.reason = result.reason
         severity = {"done": Severity.NOTICE, "failed": Severity.ERROR, "cancelled": Severity.NOTICE}[result.outcome]
-        told = result.reason.startswith(result.outcome)
+        told = result.outcome == "cancelled"  # and by whom
         words = f"{job.kind.capitalize()} {result.reason if told else f'{result.outcome}: {result.reason}'}"
         logger.log(logging.ERROR if result.outcome == "failed" else logging.INFO, "%s", words)
         if not (job.automatic and result.outcome == "failed" and self._vehicle.arm_state is ArmState.ARMED):

@@ -77,7 +77,7 @@ class HeldBack:
             held: what is in force there.
             present: what the output shows now.
             end_s: now.
-            most_s: after so long it is tried again.
+            most_s: how long until it is tried again.
         """
         on_hold = self._kept.get(key)
         if on_hold is None:

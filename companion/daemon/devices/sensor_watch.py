@@ -118,14 +118,7 @@ class MotionWitness:
 
 
 class SensorWatch:
-    """Looks at every sensor twice a second; `run` it beside them.
-
-    Args:
-        sensors: ours.
-        collector: what must not be measured with readings that look good and are not.
-        corrected: as `MotionWitness.look`.
-        say: tells people at the ground stations.
-    """
+    """Looks at every sensor twice a second; `run` it beside them."""
 
     def __init__(
         self,

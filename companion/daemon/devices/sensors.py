@@ -100,14 +100,7 @@ class SensorRole:
 
 
 class SerialSensor:
-    """One serial device: read once, decoded once, for all its roles.
-
-    Args:
-        device: which, and how its line is set.
-        take: gets what each role takes of each sample.
-        offload: runs a blocking call elsewhere.
-        together: waits for the reads of an IMU that is read at intervals.
-    """
+    """One serial device: read once, decoded once, for all its roles; `take` gets what each takes of each sample."""
 
     def __init__(
         self,

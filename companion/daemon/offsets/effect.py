@@ -30,7 +30,7 @@ from companion.daemon.core import Core
 from companion.daemon.offsets.plan import Plan, Target
 from companion.daemon.offsets.px4_writes import FarMean, Px4Writes, step_from_far
 from companion.errors import CalibrationRefusedError
-from companion.physics.frames import Array
+from companion.physics.frames import Array, vector
 from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
 
@@ -162,20 +162,22 @@ class OnTheWay:
     accel_step: Vector
 
 
-class _Triad(NamedTuple):
-    """Gyros or accelerometers of one window."""
+class _Half(NamedTuple):
+    """The gyros or the accelerometers of one IMU, as they were written."""
 
-    mean: Vector
-    sigma_stat: Vector
-    sigma_use: Vector
+    sensor: Sensor
+    parameters: tuple[str, str, str]
+    unit: str
+    residual: Array
+    step: Vector
+    resolution: float
+    drift: float
 
-
-def _gyros(window: ImuWindow) -> _Triad:
-    return _Triad(window.gyro_rad_s, window.gyro_sigma_stat_rad_s, window.gyro_sigma_use_rad_s)
-
-
-def _accelerometers(window: ImuWindow) -> _Triad:
-    return _Triad(window.accel_m_s2, window.accel_sigma_stat_m_s2, window.accel_sigma_use_m_s2)
+    def of(self, window: ImuWindow) -> tuple[Vector, Vector, Vector]:
+        """Mean, sigma_stat and sigma_use."""
+        if self.sensor == "gyro":
+            return window.gyro_rad_s, window.gyro_sigma_stat_rad_s, window.gyro_sigma_use_rad_s
+        return window.accel_m_s2, window.accel_sigma_stat_m_s2, window.accel_sigma_use_m_s2
 
 
 def judge_vectors(
@@ -194,56 +196,46 @@ def judge_vectors(
     gyro_step, accel_step = output_step(calibration, changes)
     names, noise = calibration.parameters, noise_profile(profile)
     spans_s = (sides.before.duration_s, sides.after.duration_s)
-    ordinary = (math.inf, math.inf) if profile is not None else ORDINARY_FLICKER
+    gyro_flicker, accel_flicker = (math.inf, math.inf) if profile is not None else ORDINARY_FLICKER
+    gyro_lsb, accel_lsb = (kind.gyro_step_rad_s, kind.accel_step_m_s2) if kind else (0.0, 0.0)
+    halves = []
+    if (residual := sides.accel_residual) is not None:
+        drift = _drift_sigma(noise.accel, accel_flicker, spans_s)
+        halves.append(_Half("accel", names.accel_offset, "m/s^2", residual, accel_step, accel_lsb, drift))
+    if (residual := sides.gyro_residual) is not None:
+        drift = _drift_sigma(noise.gyro, gyro_flicker, spans_s)
+        halves.append(_Half("gyro", names.gyro_offset, "rad/s", residual, gyro_step, gyro_lsb, drift))
+    return [_judge_half(half, sides, calibration, on_the_way) for half in halves]
 
-    def observe(triad: Callable[[ImuWindow], _Triad], residual: Array, drift: float, rest: _Rest) -> Verdict:
-        before, after = triad(sides.before), triad(sides.after)
-        observation = Observation(
-            parameters=rest.parameters,
-            unit=rest.unit,
-            before=before.mean,
-            before_sigma=before.sigma_stat,
-            after=after.mean,
-            after_sigma=_hypot(_no_calmer(after.sigma_stat, before.sigma_stat, spans_s), drift),
-            expected_step=rest.step,
-            truth=_minus(before.mean, residual),
-            tolerance=TOLERANCE_SIGMAS * max(before.sigma_use),
-            orientation=calibration.orientation,
+
+def _judge_half(half: _Half, sides: Sides, calibration: ImuCalibration, on_the_way: OnTheWay | None) -> Verdict:
+    (before, before_sigma, use), (after, after_sigma, _) = half.of(sides.before), half.of(sides.after)
+    spans_s = (sides.before.duration_s, sides.after.duration_s)
+    observation = Observation(
+        parameters=half.parameters,
+        unit=half.unit,
+        before=before,
+        before_sigma=before_sigma,
+        after=after,
+        after_sigma=vector(np.hypot(_no_calmer(after_sigma, before_sigma, spans_s), half.drift)),
+        expected_step=half.step,
+        truth=vector(np.subtract(before, half.residual)),
+        tolerance=TOLERANCE_SIGMAS * max(use),
+        orientation=calibration.orientation,
+    )
+    verdict = judge(observation)
+    far = on_the_way.far.get(half.sensor) if on_the_way is not None else None
+    if not verdict.ok or on_the_way is None or far is None:
+        return verdict
+    return judge(
+        dataclasses.replace(
+            observation,
+            before=vector(far.mean),
+            before_sigma=vector(far.sigma),
+            expected_step=on_the_way.gyro_step if half.sensor == "gyro" else on_the_way.accel_step,
+            resolution=half.resolution,
         )
-        verdict = judge(observation)
-        far = on_the_way.far.get(rest.sensor) if on_the_way is not None else None
-        if not verdict.ok or on_the_way is None or far is None:
-            return verdict
-        return judge(
-            dataclasses.replace(
-                observation,
-                before=_vector(far.mean),
-                before_sigma=_vector(far.sigma),
-                expected_step=on_the_way.gyro_step if rest.sensor == "gyro" else on_the_way.accel_step,
-                resolution=rest.resolution,
-            )
-        )
-
-    result = []
-    if sides.accel_residual is not None:
-        rest = _Rest("accel", names.accel_offset, "m/s^2", accel_step, kind.accel_step_m_s2 if kind else 0.0)
-        drift = _drift_sigma(noise.accel, ordinary[1], spans_s)
-        result.append(observe(_accelerometers, sides.accel_residual, drift, rest))
-    if sides.gyro_residual is not None:
-        rest = _Rest("gyro", names.gyro_offset, "rad/s", gyro_step, kind.gyro_step_rad_s if kind else 0.0)
-        drift = _drift_sigma(noise.gyro, ordinary[0], spans_s)
-        result.append(observe(_gyros, sides.gyro_residual, drift, rest))
-    return result
-
-
-class _Rest(NamedTuple):
-    """What else an observation needs."""
-
-    sensor: Sensor
-    parameters: tuple[str, str, str]
-    unit: str
-    step: Vector
-    resolution: float
+    )
 
 
 def in_short(verdict: Verdict) -> str:
@@ -268,11 +260,6 @@ def _drift_sigma(model: AllanModel, most_flicker: float, spans_s: tuple[float, f
     return float(np.sqrt(floor_variance(min(model.flicker, most_flicker), model.walk, *spans_s)))
 
 
-def _hypot(sigmas: Vector, drift: float) -> Vector:
-    x, y, z = (float(np.hypot(sigma, drift)) for sigma in sigmas)
-    return x, y, z
-
-
 def _no_calmer(after: Vector, before: Vector, spans_s: tuple[float, float]) -> Vector:
     """The sigmas of the later mean, but none below what the noise before the write makes of so many seconds.
 
@@ -283,14 +270,4 @@ def _no_calmer(after: Vector, before: Vector, spans_s: tuple[float, float]) -> V
     longer = float(np.sqrt(spans_s[0] / spans_s[1])) if spans_s[1] > 0.0 else 1.0
     triad = float(np.sqrt(np.mean(np.square(before)))) if spans_s[0] < MIN_BATCHES else 0.0
     x, y, z = (max(sigma, longer * usual, longer * triad) for sigma, usual in zip(after, before, strict=True))
-    return x, y, z
-
-
-def _vector(values: Array) -> Vector:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
-
-
-def _minus(mean: Vector, residual: Array) -> Vector:
-    x, y, z = (float(a - b) for a, b in zip(mean, residual, strict=True))
     return x, y, z

@@ -101,12 +101,6 @@ class FirmwareCalibration:
 
         In a transaction of these changes, which grows with what the firmware may change besides.
 
-        Args:
-            changes: all that is wanted.
-            gyros: the gyros' part of it.
-            before: from `prepare`.
-            go_on: told what is going on.
-
         Raises:
             NothingWrittenError: as `ParameterWriter.apply`.
             WriteFailedError: as `ParameterWriter.apply`.
@@ -146,11 +140,6 @@ class FirmwareCalibration:
         self, gyros: Sequence[Change], outcome: Outcome | None, go_on: Callable[[str], None]
     ) -> str | None:
         """After new gyro offsets: wait until the EKF agrees with them.
-
-        Args:
-            gyros: what was written.
-            outcome: of the firmware's calibration, None where there was none.
-            go_on: told how far it is; what it raises ends the waiting.
 
         Returns:
             What a pilot should know when it has not settled; None when it has, or when nothing is to settle.

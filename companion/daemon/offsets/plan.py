@@ -23,9 +23,8 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.offsets.rivalry import Rivalry
 from companion.errors import AutopilotError
-from companion.physics.frames import Array
+from companion.physics.frames import Array, vector
 from companion.physics.units import MG
-from companion.samples import Vector
 
 COARSE_ACCEL_MG: Final = 5.0
 """What the autopilots' own calibrations reach on a level table; a new offset known worse than that is worth a word."""
@@ -101,11 +100,6 @@ class Planner:
     async def plan(self, solution: Solution, draft: Draft, *, push: bool) -> Plan:
         """Work out which parameter gets which value; fills the draft's whole biases and warnings.
 
-        Args:
-            solution: what was found.
-            draft: gets the whole biases and what a pilot should know; what it holds back is not planned.
-            push: whether anything is to be written at all.
-
         Raises:
             AutopilotError: a parameter cannot be read, or the autopilot cannot be calibrated as it is.
             CalibrationRefusedError: what was found is no bias.
@@ -125,7 +119,9 @@ class Planner:
                 continue
             for warning in self._rivalry.left_of(calibration):
                 draft.warn(found.name, warning)
-            changes = changes_for(calibration, _vector(gyro), _vector(accel))
+            changes = changes_for(
+                calibration, None if gyro is None else vector(gyro), None if accel is None else vector(accel)
+            )
             if push:
                 coarse_mg = float(found.accel_sigma_use_m_s2.max()) / MG if accel is not None else 0.0
                 if coarse_mg > COARSE_ACCEL_MG:
@@ -184,10 +180,3 @@ def _residual_of_consumer(calibration: ImuCalibration, found: ImuSolution) -> tu
         board = rotation.T @ found.accel_m_s2
         accel = rotation @ (scale * (board - np.asarray(calibration.accel_offset_m_s2)))
     return gyro, accel
-
-
-def _vector(values: Array | None) -> Vector | None:
-    if values is None:
-        return None
-    x, y, z = (float(value) for value in values)
-    return x, y, z

@@ -70,11 +70,6 @@ class Pusher:
 
         The block verifies what was written: `verify` alone lets it stay.
 
-        Args:
-            plan: what to write.
-            draft: filled with what was.
-            go_on: told what takes longer.
-
         Yields:
             The plan, and what the firmware has changed besides.
 

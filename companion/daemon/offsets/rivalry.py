@@ -24,14 +24,7 @@ JUST_NOW_S: Final = 20.0
 
 
 class Rivalry:
-    """Watches over the autopilot's IMUs.
-
-    Args:
-        vehicle: the autopilot.
-        imus: by name.
-        say: words for the ground stations.
-        stop_rivals: whether they are to be switched off with the next write.
-    """
+    """Watches over the autopilot's IMUs; `stop_rivals`: they are to be switched off with the next write."""
 
     def __init__(self, vehicle: Vehicle, imus: Mapping[str, AutopilotImu], say: Say, *, stop_rivals: bool) -> None:
         self._vehicle, self._imus, self._say = vehicle, imus, say
