@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
+from companion.protocols.compasses.hmr3300 import Hmr3300Decoder, Hmr3300Dialogue
 from companion.protocols.compasses.nmea import Hmr3000Dialogue, NmeaDecoder
 from companion.protocols.decoding.base import Decoder
 from companion.protocols.decoding.dialogue import AGAIN_S, ANSWER_S, PATIENCE, SILENT_S, Dialogue
@@ -14,7 +15,7 @@ from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDeco
 from companion.protocols.inclinometers.jewell import JewellDecoder, JewellDialogue
 from sim.aircraft import Pose, VirtualAircraft
 from sim.compasses import NmeaCompass
-from sim.devices import Gradienter, SerialDevice
+from sim.devices import HMR3300, Gradienter, SerialDevice
 from sim.gradienters import BeiInclinometer, Jewell
 
 AIRCRAFT = VirtualAircraft(Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0))
@@ -63,6 +64,7 @@ TALKING: list[Callable[[], Conversation]] = [
     lambda: Conversation(Gradienter(AIRCRAFT), InclinometerXyDecoder(), InclinometerXyDialogue()),
     lambda: Conversation(BeiInclinometer(AIRCRAFT), InclinometerXyDecoder(), InclinometerXyDialogue()),
     lambda: Conversation(NmeaCompass(AIRCRAFT), NmeaDecoder(), Hmr3000Dialogue()),
+    lambda: Conversation(HMR3300(AIRCRAFT), Hmr3300Decoder(), Hmr3300Dialogue()),
     lambda: Conversation(NmeaCompass(AIRCRAFT, sentences=("HDT",), rate_hz=1.0), NmeaDecoder(), Hmr3000Dialogue()),
     lambda: Conversation(Jewell(AIRCRAFT, rate_hz=1.0), JewellDecoder(), JewellDialogue()),
 ]
@@ -79,61 +81,63 @@ def test_nothing_is_said_to_a_device_that_speaks_by_itself(make: Callable[[], Co
 
 def test_nothing_is_said_to_a_device_of_which_only_rubbish_comes() -> None:
     """A wrong baud rate: it speaks, and is not to be told anything at that rate."""
-    for dialogue in (InclinometerXyDialogue(), Hmr3000Dialogue(), JewellDialogue()):
+    for dialogue in (InclinometerXyDialogue(), Hmr3300Dialogue(), Hmr3000Dialogue(), JewellDialogue()):
         dialogue.opened(0.0)
         for step in range(2000):
             dialogue.heard(b"\xf0\x1c\x80", 0, step * 0.05)
             assert dialogue.due(step * 0.05) == b""
 
 
-def test_a_stopped_meas_is_started_after_it_has_shown_that_it_is_stopped() -> None:
-    device = Gradienter(AIRCRAFT)
+@pytest.mark.parametrize("make", [Gradienter, BeiInclinometer])
+def test_a_stopped_gradienter_is_polled_and_left_alone_when_it_streams_again(make: type[Gradienter]) -> None:
+    device = make(AIRCRAFT)
     line = Conversation(device, InclinometerXyDecoder(), InclinometerXyDialogue())
-    device.command(b"s", 0.0)
-    line.run(6.0)
-    assert line.words == [b"*", b"R", b"S"]
+    device.command(b"s" if make is Gradienter else b"f", 0.0)
+    line.run(12.0)
+    assert set(line.words) == {b"R"}
     assert line.said[0][0] >= SILENT_S
-    assert device.streaming
-    assert line.samples > 15
-    assert line.dialogue.words == "it was stopped: stream started with S"
-    device.command(b"s", line.now_s)  # by another hand
-    line.run(6.0)
-    assert line.words == [b"*", b"R", b"S"] * 2
-
-
-def test_a_polled_bei_is_started_with_its_own_letter_and_stores_nothing() -> None:
-    device = BeiInclinometer(AIRCRAFT, polled=True)
-    line = Conversation(device, InclinometerXyDecoder(), InclinometerXyDialogue())
-    line.hear(device.power_on(0.0))
-    line.run(6.0)
-    assert line.words == [b"*", b"F"]
-    assert line.samples > 15
-    assert device.stored == 0
-
-
-def test_a_bei_in_its_setup_level_is_not_told_anything() -> None:
-    """There "F" would be written to its EEPROM."""
-    device = BeiInclinometer(AIRCRAFT)
-    device.command(b"fprog", 0.0)
-    assert device.setup
-    line = Conversation(device, InclinometerXyDecoder(), InclinometerXyDialogue())
-    line.run(300.0)
-    assert set(line.words) == {b"*"}
-    assert len(line.said) <= 6
-    assert device.stored == 0
-    assert line.dialogue.words == "it is in its setup level: switch it off and on"
-
-
-def test_a_gradienter_that_streams_again_after_the_question_is_left_alone() -> None:
-    """Its answer to R would be followed by more readings: it was not stopped after all."""
-    device = Gradienter(AIRCRAFT)
-    line = Conversation(device, InclinometerXyDecoder(), InclinometerXyDialogue())
-    device.command(b"s", 0.0)
-    while not line.said:
-        line.run(STEP_S)
-    device.command(b"S", line.now_s)
+    assert not device.streaming
+    assert line.samples == pytest.approx(10.0 / InclinometerXyDialogue.PERIOD_S, rel=0.25)
+    assert line.dialogue.words == "asked 5 times a second with R"
+    device.command(b"S" if make is Gradienter else b"F", line.now_s)  # by another hand
+    line.run(2.0)
+    asked = len(line.said)
     line.run(20.0)
-    assert line.words == [b"*"]
+    assert len(line.said) == asked
+
+
+def test_nothing_is_stored_in_a_bei_in_its_setup_level() -> None:
+    """There "F" would be written to its EEPROM."""
+    device = BeiInclinometer(AIRCRAFT, polled=True)
+    device.command(b"fprog", 0.0)
+    stored = device.stored
+    line = Conversation(device, InclinometerXyDecoder(), InclinometerXyDialogue())
+    line.run(60.0)
+    assert device.setup
+    assert device.stored == stored
+
+
+def test_a_stopped_hmr3300_is_polled() -> None:
+    device = HMR3300(AIRCRAFT)
+    device.power_on(0.0)
+    device.streaming = False
+    line = Conversation(device, Hmr3300Decoder(), Hmr3300Dialogue())
+    line.run(12.0)
+    assert set(line.words) == {b"*Q\r\n"}
+    assert line.samples == pytest.approx(10.0 / Hmr3300Dialogue.PERIOD_S, rel=0.35)
+    assert not device.streaming
+
+
+def test_an_hmr3300_behind_a_bad_contact_is_never_stopped() -> None:
+    """It streams all the time, only nothing of it arrives: `*S` would stop it."""
+    device = HMR3300(AIRCRAFT)
+    device.power_on(0.0)
+    dialogue = Hmr3300Dialogue()
+    dialogue.opened(0.0)
+    said = b"".join(dialogue.due(0.02 * n) for n in range(3000))
+    assert device.command(said, 60.0) == b""
+    assert device.streaming
+    assert 10 <= said.count(b"*Q") <= 20
 
 
 def test_an_hmr3000_without_sentences_is_polled() -> None:
@@ -169,7 +173,7 @@ def test_a_silent_jewell_is_polled_in_whichever_format_and_stores_nothing(output
     assert device.stored == 0
 
 
-@pytest.mark.parametrize("dialogue", [Hmr3000Dialogue, JewellDialogue])
+@pytest.mark.parametrize("dialogue", [Hmr3000Dialogue, JewellDialogue, InclinometerXyDialogue])
 def test_nobody_there_is_asked_ever_more_seldom(dialogue: type[Dialogue]) -> None:
     line = Conversation(None, NmeaDecoder(), dialogue())
     line.run(120.0)
@@ -182,10 +186,3 @@ def test_nobody_there_is_asked_ever_more_seldom(dialogue: type[Dialogue]) -> Non
     asked = len(line.said)
     line.run(SILENT_S - 0.1)
     assert len(line.said) == asked
-
-
-def test_a_gradienter_that_is_not_there_is_asked_seldom() -> None:
-    line = Conversation(None, InclinometerXyDecoder(), InclinometerXyDialogue())
-    line.run(120.0)
-    assert set(line.words) == {b"*", b"R"}
-    assert 20 <= len(line.said) <= 50

@@ -12,11 +12,11 @@ is believed only if it follows a whole line end: the rest "3.4, 18.6, -0.5" of a
 from __future__ import annotations
 
 import re
-from typing import ClassVar, Final
+from typing import ClassVar
 
 from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import LineDecoder, RejectedError
-from companion.protocols.decoding.dialogue import AGAIN_S, ANSWER_S, SILENT_S, Dialogue
+from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, MagSample, Sample
 
 _DEGREES = re.compile(rb"[+-]?\d{1,3}\.\d{1,3}")
@@ -95,53 +95,12 @@ class Hmr3300Decoder(LineDecoder):
         return CompassSample(t_s, heading_deg)
 
 
-ALONE_S: Final = 0.4
-"""How long after the answer no other line may come: three periods of the stream (8 lines a second, HMR3200: 15)."""
-_ONE_LINE: Final = re.compile(rb"[-+0-9][-+0-9., ]{0,38}\r\n")
-_MOST: Final = 80
-"""Bytes of an answer that are kept: two lines and more are no answer."""
+class Hmr3300Dialogue(PollDialogue):
+    """`*Q` asks for one line, and is obeyed only while the stream is stopped.
 
-
-class Hmr3300Dialogue(Dialogue):
-    """Starts a stopped stream; says nothing to a device that streams.
-
-    `*S` toggles the stream and so is never sent blind: it would stop a device that streams behind a bad contact.
-    `*Q` asks for one line and is obeyed only while the stream is stopped (Honeywell's HMR3200/HMR3300 data sheet).
-    So a device that has been silent is asked for one line; that line, alone, proves that it is there and stopped,
-    and only then does `*S` follow.
+    `*S` would start the stream, but toggles it: a device that streams behind a bad contact would be stopped.
     """
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._ask_at_s = 0.0
-        self._asked_s: float | None = None
-        self._heard_s: float | None = None
-        self._answer = b""
-        """What came since the question."""
-
-    def opened(self, t_s: float) -> None:  # noqa: D102 - as in the base class
-        self._ask_at_s, self._asked_s = t_s + SILENT_S, None
-
-    def heard(self, data: bytes, samples: int, t_s: float) -> None:  # noqa: D102
-        if self._asked_s is None:
-            # Whatever it says, even what cannot be read: it is no device that keeps silent.
-            self._ask_at_s = t_s + SILENT_S
-        else:
-            self._answer, self._heard_s = (self._answer + data)[:_MOST], t_s
-
-    def due(self, t_s: float) -> bytes:  # noqa: D102
-        if self._asked_s is None:
-            if t_s < self._ask_at_s:
-                return b""
-            self._asked_s, self._heard_s, self._answer = t_s, None, b""
-            self.words = "silent: asked for one line with *Q"
-            return b"*Q\r\n"
-        if t_s < (self._asked_s + ANSWER_S if self._heard_s is None else self._heard_s + ALONE_S):
-            return b""
-        self._asked_s = None
-        if _ONE_LINE.fullmatch(self._answer):
-            self._ask_at_s = t_s + SILENT_S
-            self.words = "it was stopped: stream started with *S"
-            return b"*S\r\n"
-        self._ask_at_s = t_s + AGAIN_S
-        return b""
+    QUESTION = b"*Q\r\n"
+    PERIOD_S = 0.125
+    NAME = "*Q"
