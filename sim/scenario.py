@@ -10,7 +10,7 @@ from typing import Literal
 from pygeomag.geomag import GeoMag
 
 from sim.aircraft import Pose, Site, VirtualAircraft
-from sim.autopilot import ArduPilotDouble
+from sim.ardupilot.double import ArduPilotDouble
 from sim.devices import HMR3300, Gradienter, Law, SerialDevice
 from sim.families import fit, law_of, make
 from sim.firmware.double import AutopilotDouble

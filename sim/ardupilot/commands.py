@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.ardupilot.board import Board
 from sim.ardupilot.calibrations import ACCEL_PAUSE_S, ACCEL_TIME_S, AVERAGED_S, GYRO_GIVES_UP_S, GYRO_TIME_S
 from sim.ardupilot.messages import BUILDERS, STREAM_GROUPS
 from sim.ardupilot.versions import Version, since
 from sim.firmware.channel import Channel
 from sim.firmware.command import Command
-
-if TYPE_CHECKING:
-    from sim.autopilot import ArduPilotDouble
 
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = (
     mavlink.MAV_RESULT_ACCEPTED,
@@ -33,7 +30,7 @@ _FORCE_ARM: dict[float, Version] = {2989.0: "4.3", 21196.0: "4.6"}
 class CommandServer:
     """Carries out commands; a handler returns the result, or None when the acknowledgement comes later."""
 
-    def __init__(self, double: ArduPilotDouble) -> None:
+    def __init__(self, double: Board) -> None:
         self._double = double
         self._handlers: dict[int, Callable[[Command], int | None]] = {
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_message_interval,

@@ -10,14 +10,11 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.ardupilot.board import Board
 from sim.firmware.channel import Message
-
-if TYPE_CHECKING:
-    from sim.autopilot import ArduPilotDouble
 
 EXTNAV = 6
 LEAST_SPACING_MS = 20
@@ -34,7 +31,7 @@ FUSED_S = 2.0
 class ExternalNav:
     """The chain from message to heading; `restart` at each boot."""
 
-    def __init__(self, double: ArduPilotDouble) -> None:
+    def __init__(self, double: Board) -> None:
         self._double = double
         self.rejected: Counter[str] = Counter()
         """By reason."""

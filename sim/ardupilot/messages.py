@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.ardupilot.board import Board
 from sim.ardupilot.versions import NEWEST
 from sim.earth import STANDARD_GRAVITY_M_S2
 from sim.firmware.messages import (
@@ -20,14 +20,11 @@ from sim.firmware.messages import (
 )
 from sim.firmware.numbers import truncated_16
 
-if TYPE_CHECKING:
-    from sim.autopilot import ArduPilotDouble
-
 Message = mavlink.MAVLink_message
-Builder = Callable[["ArduPilotDouble", float], Message]
+Builder = Callable[["Board", float], Message]
 
 
-def heartbeat(double: ArduPilotDouble, loop_s: float) -> Message:
+def heartbeat(double: Board, loop_s: float) -> Message:
     """HEARTBEAT; a calibration does not show in it, neither on Copter nor on Plane."""
     base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
     if double.armed:
@@ -37,7 +34,7 @@ def heartbeat(double: ArduPilotDouble, loop_s: float) -> Message:
     return mavlink.MAVLink_heartbeat_message(kind, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, base, 0, state, 3)
 
 
-def highres_imu(double: ArduPilotDouble, loop_s: float) -> Message:
+def highres_imu(double: Board, loop_s: float) -> Message:
     """HIGHRES_IMU: floats of the first IMU; the temperature is the barometer's, the magnetic unit is wrong by 10^6."""
     t_s = double.aircraft.time_at(loop_s)
     gx, gy, gz, ax, ay, az = double.imu_output(0, loop_s).tolist()
@@ -49,7 +46,7 @@ def highres_imu(double: ArduPilotDouble, loop_s: float) -> Message:
     )  # fmt: skip
 
 
-def _integers(double: ArduPilotDouble, index: int, loop_s: float) -> tuple[int, ...]:
+def _integers(double: Board, index: int, loop_s: float) -> tuple[int, ...]:
     """xacc..zgyro of RAW and SCALED messages (mG, mrad/s), magnetic field in milligauss, temperature in 0.01 degC."""
     t_s = double.aircraft.time_at(loop_s)
     mx, my, mz = (truncated_16(float(value)) for value in magnetic_body(double, t_s))
@@ -62,7 +59,7 @@ def _integers(double: ArduPilotDouble, index: int, loop_s: float) -> tuple[int, 
     return (*milli_g, *milli_rad, mx, my, mz, temperature)
 
 
-def raw_imu(double: ArduPilotDouble, loop_s: float) -> Message:
+def raw_imu(double: Board, loop_s: float) -> Message:
     """RAW_IMU: not raw at all, the same as SCALED_IMU."""
     ax, ay, az, gx, gy, gz, mx, my, mz, temperature = _integers(double, 0, loop_s)
     return mavlink.MAVLink_raw_imu_message(
@@ -70,36 +67,36 @@ def raw_imu(double: ArduPilotDouble, loop_s: float) -> Message:
     )
 
 
-def scaled_imu(double: ArduPilotDouble, loop_s: float) -> Message:
+def scaled_imu(double: Board, loop_s: float) -> Message:
     """SCALED_IMU, first IMU."""
     return mavlink.MAVLink_scaled_imu_message(double.boot_ms(loop_s), *_integers(double, 0, loop_s))
 
 
-def scaled_imu2(double: ArduPilotDouble, loop_s: float) -> Message:
+def scaled_imu2(double: Board, loop_s: float) -> Message:
     """SCALED_IMU2, second IMU."""
     return mavlink.MAVLink_scaled_imu2_message(double.boot_ms(loop_s), *_integers(double, 1, loop_s))
 
 
-def scaled_imu3(double: ArduPilotDouble, loop_s: float) -> Message:
+def scaled_imu3(double: Board, loop_s: float) -> Message:
     """SCALED_IMU3, third IMU, all zero if there is none."""
     return mavlink.MAVLink_scaled_imu3_message(double.boot_ms(loop_s), *_integers(double, 2, loop_s))
 
 
-def attitude(double: ArduPilotDouble, loop_s: float) -> Message:
+def attitude(double: Board, loop_s: float) -> Message:
     """ATTITUDE: the estimator's, in the vehicle frame, that is with AHRS_TRIM taken off."""
     roll, pitch, yaw = double.estimated_angles_rad(loop_s)
     rates = double.imu_output(0, loop_s)[:3] + double.estimator.omega_i
     return mavlink.MAVLink_attitude_message(double.boot_ms(loop_s), roll, pitch, yaw, *map(float, rates))
 
 
-def ahrs(double: ArduPilotDouble, loop_s: float) -> Message:
+def ahrs(double: Board, loop_s: float) -> Message:
     """AHRS: omegaI is minus the estimator's gyro bias."""
     double.update_estimator(loop_s)
     x, y, z = map(float, double.estimator.omega_i)
     return mavlink.MAVLink_ahrs_message(x, y, z, 0.0, 0.0, 0.001, 0.002)
 
 
-def ekf_status_report(double: ArduPilotDouble, loop_s: float) -> Message:
+def ekf_status_report(double: Board, loop_s: float) -> Message:
     """EKF_STATUS_REPORT: without a heading EKF3 does not use GNSS, and holds its position instead."""
     flags = mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_VERT | mavlink.EKF_POS_VERT_ABS
     external = double.external_nav
@@ -111,14 +108,14 @@ def ekf_status_report(double: ArduPilotDouble, loop_s: float) -> Message:
     return mavlink.MAVLink_ekf_status_report_message(flags, 0.05, 0.05, 0.05, 0.02, 0.0, 0.0)
 
 
-def vfr_hud(double: ArduPilotDouble, loop_s: float) -> Message:
+def vfr_hud(double: Board, loop_s: float) -> Message:
     """VFR_HUD: on a copter without an airspeed sensor the field has the speed over ground."""
     _, _, yaw = double.estimated_angles_rad(loop_s)
     heading = round(np.degrees(yaw)) % 360
     return mavlink.MAVLink_vfr_hud_message(double.airspeed_m_s, 0.0, heading, 0, double.aircraft.site.height_m, 0.0)
 
 
-def autopilot_version(double: ArduPilotDouble, loop_s: float) -> Message:
+def autopilot_version(double: Board, loop_s: float) -> Message:
     """AUTOPILOT_VERSION: PARAM_FLOAT, and neither C_CAST nor BYTEWISE."""
     capabilities = (
         mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.ardupilot.board import Board
 from sim.ardupilot.versions import since
 from sim.firmware.channel import Channel
 from sim.firmware.faults import names_match
-from sim.firmware.writes import Write, after_write
-
-if TYPE_CHECKING:
-    from sim.autopilot import ArduPilotDouble
+from sim.firmware.writes import Write
 
 NO_INDEX = 65535
 LIST_PERIOD_S = 0.00176
@@ -25,7 +22,7 @@ DOES_NOT_EXIST, OUT_OF_RANGE, PERMISSION_DENIED = 1, 2, 3
 class ParameterServer:
     """Answers PARAM_SET, PARAM_REQUEST_READ and PARAM_REQUEST_LIST for the double."""
 
-    def __init__(self, double: ArduPilotDouble) -> None:
+    def __init__(self, double: Board) -> None:
         self._double = double
         self.writes: list[Write] = []
 
@@ -50,7 +47,7 @@ class ParameterServer:
             return
         double.update_estimator(loop_s)
         double.parameters.set(name, value, takes_effect=not faults.echo_without_effect)
-        if not after_write(double):
+        if not double.after_write():
             wrong = names_match(faults.wrong_echo, name)
             for member in double.parameters.family(name):
                 self.announce(member, wrong=wrong and member == name)

@@ -205,6 +205,27 @@ class AutopilotDouble(abc.ABC):
         if self._failed is not None:
             asyncio.get_running_loop().call_soon(self._tick)
 
+    def after_write(self) -> bool:
+        """Count down the faults that wait for a write; True if this one rebooted the autopilot."""
+        faults = self.faults
+        if faults.foreign_write_after is not None:
+            count, name, value = faults.foreign_write_after
+            faults.foreign_write_after = (count - 1, name, value) if count > 1 else None
+            if count <= 1:
+                self.soon(0.01, lambda: self.write_as_another_station(name, value))
+        if faults.arm_after_writes is not None:
+            faults.arm_after_writes -= 1
+            if faults.arm_after_writes <= 0:
+                faults.arm_after_writes = None
+                self.arm()
+        if faults.reboot_after_writes is not None:
+            faults.reboot_after_writes -= 1
+            if faults.reboot_after_writes <= 0:
+                faults.reboot_after_writes = None
+                self.reboot()
+                return True
+        return False
+
     # The inside.
 
     def _begin(self, loop_s: float) -> None:

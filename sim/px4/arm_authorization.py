@@ -7,14 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.px4.board import Board
 from sim.px4.port import PX4Port
-
-if TYPE_CHECKING:
-    from sim.px4.double import PX4Double
 
 REQUEST = mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST
 RETRY_S, RETRIES = 0.5, 3
@@ -42,7 +40,7 @@ class Request:
 class ArmAuthorization:
     """The state that the checks before arming ask."""
 
-    def __init__(self, double: PX4Double) -> None:
+    def __init__(self, double: Board) -> None:
         self._double = double
         self.requests = 0
         """Requests sent since the start, repetitions not counted."""

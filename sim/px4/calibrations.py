@@ -11,17 +11,14 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.earth import STANDARD_GRAVITY_M_S2, Array, angles_of, body_from_ned
+from sim.px4.board import Board
 from sim.px4.calibration import SensorCalibration
 from sim.px4.vehicle_imu import VehicleImu
-
-if TYPE_CHECKING:
-    from sim.px4.double import PX4Double
 
 GYRO_TIME_S = 1.07
 GYRO_TRIES = 20
@@ -38,7 +35,7 @@ _INFO, _CRITICAL = mavlink.MAV_SEVERITY_INFO, mavlink.MAV_SEVERITY_CRITICAL
 class Calibrations:
     """The commander's worker: one job at a time."""
 
-    def __init__(self, double: PX4Double) -> None:
+    def __init__(self, double: Board) -> None:
         self._double = double
         self.busy = False
 

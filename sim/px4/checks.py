@@ -6,15 +6,12 @@ Facts: PX4 `HealthAndArmingChecks` (2026-08), autopilots 4.4, 5.2, 9.2, and a ru
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.px4.board import Board
 from sim.px4.calibration import Kind, find_slot
-
-if TYPE_CHECKING:
-    from sim.px4.double import PX4Double
 
 WATCH_S = 0.5
 REPORT_EVERY_S = 2.0
@@ -28,7 +25,7 @@ _BIAS_ALARM = 0.75
 class Checks:
     """What stands against arming."""
 
-    def __init__(self, double: PX4Double) -> None:
+    def __init__(self, double: Board) -> None:
         self._double = double
         self._reported: list[str] = []
         self._reported_s = -math.inf

@@ -8,17 +8,17 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.firmware.command import Command
-from sim.px4.checks import NOT_AUTHORIZED
+from sim.px4.arm_authorization import ArmAuthorization
+from sim.px4.board import Board
+from sim.px4.calibrations import Calibrations
+from sim.px4.checks import NOT_AUTHORIZED, Checks
+from sim.px4.external_vision import ExternalVision
 from sim.px4.messages import BUILDERS
 from sim.px4.port import HEARTBEAT, PX4Port
-
-if TYPE_CHECKING:
-    from sim.px4.double import PX4Double
 
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED = (
     mavlink.MAV_RESULT_ACCEPTED,
@@ -46,8 +46,16 @@ _UNANSWERED = {
 class Commander:
     """Carries out commands; a handler returns the result, or None when the acknowledgement comes later or never."""
 
-    def __init__(self, double: PX4Double) -> None:
-        self._double = double
+    def __init__(
+        self,
+        double: Board,
+        checks: Checks,
+        calibrations: Calibrations,
+        vision: ExternalVision,
+        authorization: ArmAuthorization,
+    ) -> None:
+        self._double, self._checks, self._calibrations = double, checks, calibrations
+        self._vision, self._authorization = vision, authorization
         self._at_the_port: dict[int, Callable[[Command], int | None]] = {
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_message_interval,
             mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_message_interval,
@@ -166,15 +174,15 @@ class Commander:
 
     def _check(self, done: Callable[[list[str]], None]) -> None:
         """All checks of an arm request: the failures, with the authorisation as the last."""
-        failures = self._double.checks.failures(self._double.now_s())
-        authorization = self._double.authorization
+        failures = self._checks.failures(self._double.now_s())
+        authorization = self._authorization
         if authorization.required:
             authorization.check(lambda given: done(failures if given else [*failures, NOT_AUTHORIZED]))
         else:
             done(failures)
 
     def _first_check_done(self, command: Command, failures: list[str]) -> None:
-        if failures and self._double.checks.report(failures, self._double.now_s()):
+        if failures and self._checks.report(failures, self._double.now_s()):
             # To put failures into words all checks run once more, and with them the question for authorisation.
             self._check(lambda again: self._arming_done(command, armed=not again))
         else:
@@ -196,7 +204,7 @@ class Commander:
                 self._carry_out(waiting)
 
     def _run_prearm_checks(self, command: Command) -> int:
-        for failure in self._double.checks.failures(command.loop_s):
+        for failure in self._checks.failures(command.loop_s):
             self._double.say(mavlink.MAV_SEVERITY_CRITICAL, f"Preflight Fail: {failure}")
         return ACCEPTED
 
@@ -204,11 +212,11 @@ class Commander:
         yaw_deg = command.params[2]
         if not math.isfinite(yaw_deg):
             return UNSUPPORTED
-        self._double.vision.heading_by_command(yaw_deg, command.loop_s)
+        self._vision.heading_by_command(yaw_deg, command.loop_s)
         return ACCEPTED
 
     def _calibrate(self, command: Command) -> int:
-        double, worker = self._double, self._double.calibrations
+        double, worker = self._double, self._calibrations
         if double.armed or worker.busy:
             return TEMPORARILY_REJECTED
         gyros, accelerometers = command.params[0], command.params[4]
@@ -232,7 +240,7 @@ class Commander:
 
     def _storage(self, command: Command) -> int | None:
         double, store, action = self._double, self._double.parameters, command.params[0]
-        if double.armed or double.calibrations.busy:
+        if double.armed or self._calibrations.busy:
             return TEMPORARILY_REJECTED
         if action == 0.0:
             store.load()

@@ -9,14 +9,11 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from typing import TYPE_CHECKING
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.firmware.channel import Message
-
-if TYPE_CHECKING:
-    from sim.px4.double import PX4Double
+from sim.px4.board import Board
 
 YAW_BIT = 8
 """Of EKF2_EV_CTRL."""
@@ -39,7 +36,7 @@ COMPASS_FADES_S = 10.0
 class ExternalVision:
     """The chain from message to heading; `restart` at each boot."""
 
-    def __init__(self, double: PX4Double) -> None:
+    def __init__(self, double: Board) -> None:
         self._double = double
         self.rejected: Counter[str] = Counter()
         """By reason."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -17,12 +16,10 @@ from sim.firmware.messages import (
     system_time,
 )
 from sim.firmware.numbers import truncated_16
-
-if TYPE_CHECKING:
-    from sim.px4.double import PX4Double
+from sim.px4.board import Board
 
 Message = mavlink.MAVLink_message
-Builder = Callable[["PX4Double", float], Message | None]
+Builder = Callable[["Board", float], Message | None]
 _SCALED_IMU = (
     mavlink.MAVLink_scaled_imu_message,
     mavlink.MAVLink_scaled_imu2_message,
@@ -31,7 +28,7 @@ _SCALED_IMU = (
 _HOLD_MODE = 4 << 16 | 3 << 24
 
 
-def heartbeat(double: PX4Double, loop_s: float) -> Message:
+def heartbeat(double: Board, loop_s: float) -> Message:
     """HEARTBEAT: UNINIT while a pre-flight check fails."""
     base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
     base |= mavlink.MAV_MODE_FLAG_AUTO_ENABLED | mavlink.MAV_MODE_FLAG_GUIDED_ENABLED
@@ -47,7 +44,7 @@ def heartbeat(double: PX4Double, loop_s: float) -> Message:
     return mavlink.MAVLink_heartbeat_message(kind, mavlink.MAV_AUTOPILOT_PX4, base, _HOLD_MODE, state, 3)
 
 
-def highres_imu(double: PX4Double, loop_s: float) -> Message:
+def highres_imu(double: Board, loop_s: float) -> Message:
     """HIGHRES_IMU: the first IMU less what the estimator takes for its bias; the temperature is the air's."""
     t_s = double.aircraft.time_at(loop_s)
     sample_s, output = double.imu_output(0, loop_s)
@@ -62,7 +59,7 @@ def highres_imu(double: PX4Double, loop_s: float) -> Message:
     )  # fmt: skip
 
 
-def scaled_imu(double: PX4Double, loop_s: float, index: int) -> Message | None:
+def scaled_imu(double: Board, loop_s: float, index: int) -> Message | None:
     """SCALED_IMU, 2, 3: corrected, no estimator, truncated to mG and mrad/s; None without that IMU."""
     if index >= len(double.imus):
         return None
@@ -82,19 +79,19 @@ def scaled_imu(double: PX4Double, loop_s: float, index: int) -> Message | None:
     return kind[index](boot_ms, *fields)
 
 
-def attitude(double: PX4Double, loop_s: float) -> Message:
+def attitude(double: Board, loop_s: float) -> Message:
     """ATTITUDE: the estimator's."""
     roll, pitch, yaw = double.estimated_angles_rad(loop_s)
     rates = double.imu_output(0, loop_s).output[:3] - double.vehicle_imus[0].estimator.gyro_bias_rad_s
     return mavlink.MAVLink_attitude_message(double.boot_ms(loop_s), roll, pitch, yaw, *map(float, rates))
 
 
-def timesync(double: PX4Double, loop_s: float) -> Message:
+def timesync(double: Board, loop_s: float) -> Message:
     """TIMESYNC: a request of its own."""
     return mavlink.MAVLink_timesync_message(0, double.boot_us(loop_s) * 1000)
 
 
-def home_position(double: PX4Double, loop_s: float) -> Message | None:
+def home_position(double: Board, loop_s: float) -> Message | None:
     """HOME_POSITION: set when there is a position."""
     if not double.has_position:
         return None
@@ -105,14 +102,14 @@ def home_position(double: PX4Double, loop_s: float) -> Message | None:
     )  # fmt: skip
 
 
-def extended_sys_state(double: PX4Double, loop_s: float) -> Message:
+def extended_sys_state(double: Board, loop_s: float) -> Message:
     """EXTENDED_SYS_STATE: it never leaves the ground."""
     return mavlink.MAVLink_extended_sys_state_message(
         mavlink.MAV_VTOL_STATE_UNDEFINED, mavlink.MAV_LANDED_STATE_ON_GROUND
     )
 
 
-def estimator_status(double: PX4Double, loop_s: float) -> Message:
+def estimator_status(double: Board, loop_s: float) -> Message:
     """ESTIMATOR_STATUS: what it uses for its heading is not in it."""
     flags = mavlink.ESTIMATOR_ATTITUDE | mavlink.ESTIMATOR_VELOCITY_VERT | mavlink.ESTIMATOR_POS_VERT_ABS
     if double.has_position:
@@ -122,7 +119,7 @@ def estimator_status(double: PX4Double, loop_s: float) -> Message:
     )
 
 
-def autopilot_version(double: PX4Double, loop_s: float) -> Message:
+def autopilot_version(double: Board, loop_s: float) -> Message:
     """AUTOPILOT_VERSION: PARAM_FLOAT and PARAM_ENCODE_BYTEWISE."""
     capabilities = (
         mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
@@ -157,28 +154,4 @@ BUILDERS: dict[int, Builder] = {
     mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: extended_sys_state,
     mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version,
     mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: estimator_status,
-}
-
-# Streams that run by themselves, in Hz: the modes "onboard" (TELEM2, the companion) and "normal" (TELEM1). GPS_RAW_INT
-# goes out as often as the receiver speaks.
-ONBOARD_RATES: dict[int, float] = {
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
-    mavlink.MAVLINK_MSG_ID_TIMESYNC: 10.0,
-    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 50.0,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE: 100.0,
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 50.0,
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 10.0,
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS: 5.0,
-    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
-    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
-    mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
-}
-NORMAL_RATES: dict[int, float] = {
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE: 15.0,
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 5.0,
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS: 1.0,
-    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 1.0,
-    mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
 }

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.firmware.faults import names_match
-from sim.firmware.writes import Write, after_write
+from sim.firmware.writes import Write
+from sim.px4.board import Board
 from sim.px4.parameters import INT32, REAL32, bytes_as_float, float_as_int
 from sim.px4.port import PX4Port
-
-if TYPE_CHECKING:
-    from sim.px4.double import PX4Double
 
 DOES_NOT_EXIST, READ_ONLY, TYPE_UNSUPPORTED, TYPE_MISMATCH = 1, 5, 6, 7
 ECHO_S = (0.0002, 0.001)
@@ -30,7 +27,7 @@ MEANINGLESS_INDEX = 14736
 class ParameterServer:
     """Answers PARAM_SET, PARAM_REQUEST_READ and PARAM_REQUEST_LIST for the double."""
 
-    def __init__(self, double: PX4Double) -> None:
+    def __init__(self, double: Board) -> None:
         self._double = double
         self.writes: list[Write] = []
         self._telling: set[int] = set()
@@ -62,7 +59,7 @@ class ParameterServer:
         else:
             if store.set(name, value):
                 double.parameters_changed(consumers=not double.faults.echo_without_effect)
-            if not after_write(double):
+            if not double.after_write():
                 self._send_soon(port, name, wrong=names_match(double.faults.wrong_echo, name))
 
     def read(self, port: PX4Port, message: mavlink.MAVLink_param_request_read_message) -> None:

@@ -30,6 +30,31 @@ class PacedStream(Stream):
     last_s: float = 0.0
 
 
+# Streams that run by themselves, in Hz: the modes "onboard" (TELEM2, the companion) and "normal" (TELEM1). GPS_RAW_INT
+# goes out as often as the receiver speaks.
+ONBOARD_RATES: dict[int, float] = {
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
+    mavlink.MAVLINK_MSG_ID_TIMESYNC: 10.0,
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 50.0,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: 100.0,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 50.0,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 10.0,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: 5.0,
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
+    mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
+}
+NORMAL_RATES: dict[int, float] = {
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: 15.0,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 5.0,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: 1.0,
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 1.0,
+    mavlink.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
+}
+
+
 class PX4Port(Channel):
     """One MAVLink instance.
 

@@ -8,16 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sim.earth import STANDARD_GRAVITY_M_S2, Array
+from sim.px4.board import Board
 from sim.px4.calibration import SensorCalibration
 from sim.px4.vehicle_imu import VehicleImu
-
-if TYPE_CHECKING:
-    from sim.px4.double import PX4Double
 
 POLL_S = 0.5
 SAMPLE_S = 0.02
@@ -35,7 +32,7 @@ ACCEL_WORTH_M_S2, GYRO_WORTH_RAD_S = 0.05, 0.01
 class BackgroundGyroCalibration:
     """IMU_GYRO_CAL_EN: started at boot, or not; while disarmed and still it replaces offsets that are far wrong."""
 
-    def __init__(self, double: PX4Double) -> None:
+    def __init__(self, double: Board) -> None:
         self._double = double
         self.running = False
         self.commits = 0
@@ -138,7 +135,7 @@ class LearnedOffsets:
     The same happens on the ground to a sensor that has no slot: it is given one.
     """
 
-    def __init__(self, double: PX4Double) -> None:
+    def __init__(self, double: Board) -> None:
         self._double = double
         self.commits = 0
         """How often it wrote."""

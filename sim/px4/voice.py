@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.px4.board import Board
 from sim.px4.port import PX4Port
-
-if TYPE_CHECKING:
-    from sim.px4.double import PX4Double
 
 TEXT_PERIOD_S = 0.05
 STALE_S = 5.0
@@ -19,7 +15,7 @@ _CHUNK = 50
 class Voice:
     """Says texts on all ports; where nobody listens they wait, and are dropped when they are 5 s old."""
 
-    def __init__(self, double: PX4Double) -> None:
+    def __init__(self, double: Board) -> None:
         self._double = double
 
     def say(self, severity: int, text: str) -> None:

@@ -19,7 +19,7 @@ from companion.daemon.job import Job
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
 from sim.aircraft import Pose
-from sim.autopilot import offset_names
+from sim.ardupilot.double import offset_names
 from sim.devices import HMR3300, Gradienter
 from sim.hands import Hands
 from sim.imu_model import MG

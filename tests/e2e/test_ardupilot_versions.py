@@ -13,7 +13,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.calibration.request import What
-from sim.autopilot import offset_names
+from sim.ardupilot.double import offset_names
 from sim.imu_model import DEG_H, MG
 from tests.e2e.test_calibration import calibrated, started
 from tests.support.rig import Rig

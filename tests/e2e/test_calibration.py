@@ -15,7 +15,7 @@ from companion.calibration.request import What
 from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
-from sim.autopilot import offset_names
+from sim.ardupilot.double import offset_names
 from sim.imu_model import DEG_H, MG
 from tests.support.component import ACCEPTED, CALIBRATE, UNDO
 from tests.support.rig import Rig

@@ -17,7 +17,7 @@ from companion.component.service import JobResult
 from companion.config.sections import Imu, Push
 from companion.daemon.job import Job
 from companion.storage.changes import ChangeLog
-from sim.autopilot import ArduPilotDouble, offset_names
+from sim.ardupilot.double import ArduPilotDouble, offset_names
 from sim.imu_model import DEG_H, MG, AxisNoise, ImuModel, ImuSpec
 from sim.motions import Handling
 from sim.px4.double import PX4Double

@@ -25,7 +25,7 @@ from companion.daemon.job import Job
 from companion.daemon.process.service import Service
 from companion.protocols.registry import PROTOCOLS
 from sim.aircraft import Pose, VirtualAircraft
-from sim.autopilot import ArduPilotDouble
+from sim.ardupilot.double import ArduPilotDouble
 from sim.devices import SerialDevice
 from sim.families import COMPASSES, GRADIENTERS, IMUS, fit, law_of
 from sim.imu_model import DEG_H, MG, Bias, ImuModel

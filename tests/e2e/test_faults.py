@@ -16,7 +16,7 @@ from companion.calibration.request import What
 from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
-from sim.autopilot import ArduPilotDouble, offset_names
+from sim.ardupilot.double import ArduPilotDouble, offset_names
 from sim.imu_model import DEG_H, MG
 from sim.motions import Handling, SlowTurn
 from tests.e2e.test_calibration import FC_PARAMETERS, calibrated, started

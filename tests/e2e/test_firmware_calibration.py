@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.calibration.machine import State
 from companion.calibration.request import What
 from companion.component.service import JobResult, Refusal
-from sim.autopilot import offset_names
+from sim.ardupilot.double import offset_names
 from sim.imu_model import DEG_H
 from tests.e2e.test_calibration import FC_PARAMETERS, calibrated, started
 from tests.support.component import CALIBRATE, UNDO

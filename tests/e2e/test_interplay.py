@@ -16,7 +16,7 @@ from companion.calibration.machine import State
 from companion.calibration.request import What
 from companion.calibration.solution.validity import Why
 from companion.component.service import Refusal
-from sim.autopilot import offset_names
+from sim.ardupilot.double import offset_names
 from sim.imu_model import DEG_H
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual

@@ -12,7 +12,7 @@ from companion.calibration.request import What
 from companion.calibration.solution.record import Record
 from companion.component.service import JobResult
 from companion.daemon.job import Job
-from sim.autopilot import offset_names
+from sim.ardupilot.double import offset_names
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 

@@ -14,7 +14,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import Pose, VirtualAircraft
-from sim.autopilot import ArduPilotDouble
+from sim.ardupilot.double import ArduPilotDouble
 from sim.firmware.double import AutopilotDouble
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.px4.double import PX4Double

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim.aircraft import Pose, Site, VirtualAircraft
-from sim.autopilot import ArduPilotDouble
+from sim.ardupilot.double import ArduPilotDouble
 from sim.devices import HMR3300, Gradienter, ImuLine, SerialDevice, VectorNavBinary
 from sim.earth import EARTH_RATE_RAD_S, angles_of, body_from_ned
 from sim.imu_model import ImuModel

@@ -17,7 +17,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
-from sim.autopilot import ArduPilotDouble
+from sim.ardupilot.double import ArduPilotDouble
 from sim.earth import STANDARD_GRAVITY_M_S2, Array
 from sim.imu_model import Bias
 from sim.motions import Motion

@@ -16,7 +16,7 @@ from companion.daemon.offload import Offload
 from companion.daemon.process.service import Service
 from companion.links.mavlink.link import MavlinkLink
 from sim.aircraft import Pose, Site, VirtualAircraft
-from sim.autopilot import ArduPilotDouble
+from sim.ardupilot.double import ArduPilotDouble
 from sim.devices import HMR3300, Gradienter, Law, SerialDevice, VectorNavBinary
 from sim.firmware.double import AutopilotDouble
 from sim.flight import MovingAircraft, Route

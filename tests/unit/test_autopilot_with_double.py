@@ -22,7 +22,7 @@ from companion.errors import AutopilotRebootedError
 from companion.links.mavlink.link import MavlinkLink
 from companion.samples import ImuSample, Vector
 from sim.aircraft import Pose, VirtualAircraft
-from sim.autopilot import ArduPilotDouble
+from sim.ardupilot.double import ArduPilotDouble
 from sim.imu_model import DEG_H, MG, ImuModel
 from tests.support.virtual_time import run_virtual
 from tests.support.wire import Wire

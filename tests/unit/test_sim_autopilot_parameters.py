@@ -12,7 +12,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import Pose, VirtualAircraft
-from sim.autopilot import ArduPilotDouble, offset_names
+from sim.ardupilot.double import ArduPilotDouble, offset_names
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.motions import Handling
 from sim.station import Station

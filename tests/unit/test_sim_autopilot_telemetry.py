@@ -12,7 +12,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import Pose, Site, VirtualAircraft
-from sim.autopilot import ArduPilotDouble
+from sim.ardupilot.double import ArduPilotDouble
 from sim.earth import STANDARD_GRAVITY_M_S2, mounting_matrix
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.motions import SlowTurn, Vibration

@@ -12,7 +12,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import Pose, VirtualAircraft
-from sim.autopilot import ArduPilotDouble
+from sim.ardupilot.double import ArduPilotDouble
 from sim.imu_model import ImuModel
 from sim.px4.double import PX4Double
 from tests.support.component import Ground

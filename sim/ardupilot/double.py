@@ -6,39 +6,32 @@ reference of this project, sections 1, 2, 3, 5.4, 7.5, 9.1 and 9.3.1); the class
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Literal
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
-from sim.ardupilot.calibrations import Calibrations
-from sim.ardupilot.channel import ArduPilotChannel
+from sim.ardupilot.board import Board
 from sim.ardupilot.commands import CommandServer
-from sim.ardupilot.estimator import CoarseEstimator
 from sim.ardupilot.external_nav import ExternalNav
-from sim.ardupilot.inertial import InertialPath
 from sim.ardupilot.messages import BUILDERS
 from sim.ardupilot.parameter_server import ParameterServer
-from sim.ardupilot.parameters import ParameterStore, default_parameters, device_id, offset_names
+from sim.ardupilot.parameters import device_id, offset_names
 from sim.ardupilot.routing import Router
-from sim.ardupilot.versions import NEWEST, Version, since
-from sim.earth import Array
 from sim.firmware.channel import Channel, Message
 from sim.firmware.command import command_of
-from sim.firmware.double import HEARTBEAT, AutopilotDouble
+from sim.firmware.double import HEARTBEAT
 from sim.firmware.faults import Faults
 from sim.firmware.numbers import float32
 from sim.firmware.writes import Write
-from sim.imu_model import Bias, ImuModel
+from sim.imu_model import ImuModel
 
 __all__ = ["ArduPilotDouble", "Faults", "Write", "float32", "offset_names"]
 
-LOOP_RATE_HZ = {"copter": 400.0, "plane": 50.0}
 
-
-class ArduPilotDouble(AutopilotDouble):
+class ArduPilotDouble(Board):
     """An autopilot with up to three IMUs on a virtual aircraft.
 
     It is an `End` (attach, receive) on which the companion is plugged in; `ground` is a second one for a ground
@@ -48,51 +41,15 @@ class ArduPilotDouble(AutopilotDouble):
     missions, logs, SETUP_SIGNING (`require_signatures` stands for it), 6-position calibration, the 10 s that
     consistency checks must pass before arming.
 
-    Args:
-        aircraft: the truth.
-        imus: one to three models; the first is IMU 1. Their `mounting_deg` is how the board is really turned, which
-            AHRS_ORIENTATION (default none) is meant to undo.
-        version: "4.3" to "4.8"; `sim.ardupilot.versions` says how they differ.
-        vehicle: "copter" (loop 400 Hz) or "plane" (50 Hz: nothing above 40 Hz).
-        parameters: values that differ from the defaults, such as {"INS_GYR_CAL": 0}; set before the first boot.
-        up_s: how long it has been running when the simulation begins.
-        auxiliary: whether the board has parameters of IMU 4 and 5, and a gyro behind 4 that no message shows.
-        has_position: whether it has a GNSS fix, and so a position and a date.
-        clock_ppm: how much faster its clock runs.
+    Arguments are those of `Board`.
     """
 
-    def __init__(
-        self,
-        aircraft: VirtualAircraft,
-        imus: Sequence[ImuModel],
-        *,
-        system_id: int = 1,
-        version: Version = NEWEST,
-        vehicle: Literal["copter", "plane"] = "copter",
-        parameters: Mapping[str, float] | None = None,
-        up_s: float = 30.0,
-        auxiliary: bool = False,
-        has_position: bool = True,
-        clock_ppm: float = 0.0,
-        seed: int = 0,
-    ) -> None:
-        if not 1 <= len(imus) <= 3:
-            raise ValueError(f"imus: found {len(imus)}; allowed: 1 to 3")
-        channels = (ArduPilotChannel(system_id, self._handle), ArduPilotChannel(system_id, self._handle))
-        super().__init__(aircraft, imus, channels, up_s=up_s, has_position=has_position, clock_ppm=clock_ppm, seed=seed)
-        self.system_id, self.version, self.vehicle = system_id, version, vehicle
-        self._auxiliary = auxiliary
-        self.parameters = self._new_store(parameters or {})
-        self.estimator = CoarseEstimator()
-        self.external_nav = ExternalNav(self)
-        self.airspeed_m_s = 0.0
-        """What its VFR_HUD says."""
-        self._router = Router(system_id, self.channels)
-        self._paths = [InertialPath(model, number + 1, self.parameters, seed=seed) for number, model in enumerate(imus)]
-        self.calibrations = Calibrations(self._paths, self.parameters, self.random)
+    def __init__(self, aircraft: VirtualAircraft, imus: Sequence[ImuModel], **more: Any) -> None:
+        super().__init__(aircraft, imus, **more)
+        self.external_nav: ExternalNav = ExternalNav(self)
+        self._router = Router(self.system_id, self.channels)
         self._parameter_server = ParameterServer(self)
         self._commands = CommandServer(self)
-        self._frozen: dict[int, Array] = {}
         self._boot_gyros(0.0)
 
     # What tests and people do to it.
@@ -129,12 +86,6 @@ class ArduPilotDouble(AutopilotDouble):
             self.armed = False
             self.say(mavlink.MAV_SEVERITY_INFO, "Disarming motors")
 
-    def residual(self, instance: int, loop_s: float) -> Bias:
-        """What is left in the output of IMU `instance` (1..3) after offsets and scales: output minus truth, FRD."""
-        t_s = self.aircraft.time_at(loop_s)
-        output, truth = self._paths[instance - 1].corrected(t_s, armed=self.armed), self.aircraft.truth_at(t_s)
-        return Bias(output[:3] - truth.rate_rad_s, output[3:] - truth.force_m_s2)
-
     def hears(self, component_id: int) -> bool:
         """Whether that component of our system was heard since the last boot; else its messages end here."""
         return self._router.knows(component_id)
@@ -164,29 +115,6 @@ class ArduPilotDouble(AutopilotDouble):
 
     # What its parts use.
 
-    @property
-    def has_highres_imu(self) -> bool:
-        """4.6 and later, on boards with more than 1 MB of flash."""
-        return since(self.version, "4.6") and not self.faults.int_only
-
-    @property
-    def fastest_interval_ms(self) -> int:
-        """Whole milliseconds of 1.25 loop periods."""
-        return int(1.25 * 1000.0 / LOOP_RATE_HZ[self.vehicle])
-
-    def imu_output(self, index: int, loop_s: float) -> Array:
-        """Filtered rates and specific forces (6) of IMU index 0..2 in vehicle FRD."""
-        if self.faults.frozen_imu and index in self._frozen:
-            return self._frozen[index]
-        output = self._paths[index].output(self.aircraft.time_at(loop_s), armed=self.armed)
-        self._frozen[index] = output
-        return output
-
-    def update_estimator(self, loop_s: float) -> None:
-        """Bring the estimator to this time; to be called before anything changes the output."""
-        error = self.residual(1, loop_s)
-        self.estimator.update(self.aircraft.time_at(loop_s), error.gyro_rad_s, error.accel_m_s2)
-
     def estimated_angles_rad(self, loop_s: float) -> tuple[float, float, float]:
         """Roll, pitch, yaw of ATTITUDE: truth, the estimator's tilt error, less AHRS_TRIM; yaw in (-pi, pi]."""
         self.update_estimator(loop_s)
@@ -196,52 +124,12 @@ class ArduPilotDouble(AutopilotDouble):
         yaw = (yaw + self.estimator.yaw_error_rad + np.pi) % (2.0 * np.pi) - np.pi
         return roll + roll_error - trim["AHRS_TRIM_X"], pitch + pitch_error - trim["AHRS_TRIM_Y"], float(yaw)
 
-    def answer_delay_s(self) -> float:
-        """Time to a PARAM_VALUE: 2 to 6 ms, on Plane 17 to 23 ms."""
-        low, high = (0.002, 0.006) if self.vehicle == "copter" else (0.017, 0.023)
-        return float(self.random.uniform(low, high))
-
-    def read_delay_s(self) -> float:
-        """Time to the answer to a read, which waits for the next turn of a slow thread: 5 to 95 ms."""
-        return float(self.random.uniform(0.005, 0.095))
-
-    def coin(self) -> bool:
-        """Heads or tails."""
-        return bool(self.random.integers(2))
-
     def announce(self, names: Iterable[str]) -> None:
         """PARAM_VALUE on every port for what the autopilot itself has changed and saved."""
         for name in names:
             self._parameter_server.announce(name)
 
-    def say(self, severity: int, text: str) -> None:
-        """STATUSTEXT on every port, cut at 50 characters a chunk."""
-        data = text.encode()
-        chunks = [data[start : start + 50] for start in range(0, len(data), 50)]
-        text_id = int(self.random.integers(1, 65536)) if len(chunks) > 1 else 0
-        for channel in self.channels:
-            for number, chunk in enumerate(chunks):
-                self.answer(channel, mavlink.MAVLink_statustext_message(severity, chunk, text_id, number))
-
-    def erase_parameters(self) -> None:
-        """PREFLIGHT_STORAGE 2 or 4: everything is gone, at the next boot the defaults are there."""
-        for name, (value, _) in self._table().items():
-            self.parameters.set(name, value, takes_effect=False)
-
     # The inside.
-
-    def _table(self) -> dict[str, tuple[float, int]]:
-        return default_parameters(self.version, len(self.imus), auxiliary=self._auxiliary)
-
-    def _new_store(self, overrides: Mapping[str, float]) -> ParameterStore:
-        table = self._table()
-        own = "MAV_SYSID" if since(self.version, "4.7") else "SYSID_THISMAV"
-        table[own] = (float(self.system_id), table[own][1])
-        table["SCHED_LOOP_RATE"] = (LOOP_RATE_HZ[self.vehicle], table["SCHED_LOOP_RATE"][1])
-        store = ParameterStore(table)
-        for name, value in overrides.items():
-            store.set(name, value)
-        return store
 
     def build(self, message_id: int, loop_s: float) -> Message:
         """A message of `BUILDERS`."""
