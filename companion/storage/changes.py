@@ -15,7 +15,7 @@ from typing import Final
 
 import msgspec
 
-from companion.autopilot.firmware.written import CALIBRATION, Ranges
+from companion.autopilot.firmware.written import CALIBRATION
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.storage.atomic import remove_durably, write_atomically
@@ -70,16 +70,11 @@ ChangeFile = StateFile[ChangeSet]
 
 
 class ChangeLog:
-    """The change files of one storage folder.
+    """The change files of one storage folder."""
 
-    Args:
-        directory: where.
-        ranges: all that these changes may be, by firmware.
-    """
-
-    def __init__(self, directory: Path, ranges: Mapping[Firmware, Ranges] = CALIBRATION) -> None:
-        self._directory, self._ranges = directory, ranges
-        self._allowed = {name: one for each in ranges.values() for name, one in each.items()}
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self._allowed = {name: one for each in CALIBRATION.values() for name, one in each.items()}
         self._probe = directory / "probe"
         self.journal: ChangeFile = StateFile(directory / "journal.json", ChangeSet, self._check)
 
@@ -95,7 +90,7 @@ class ChangeLog:
 
     def strange_to(self, firmware: Firmware | None, changes: ChangeSet) -> list[str]:
         """The parameters that we never write on this firmware."""
-        known = self._ranges.get(firmware or "other", {})
+        known = CALIBRATION.get(firmware or "other", {})
         return [name for name in changes.names if name not in known]
 
     def check_writable(self) -> None:

@@ -1,16 +1,13 @@
-"""`companion autopilot-setup`: the doubles' parameters, bit for bit, and what they then make of the stream."""
+"""`companion autopilot-setup`: what it says of the doubles' parameters, and what they then make of the stream."""
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 from typing import Any, Literal
 
 import pytest
 
-from companion.autopilot.vehicle.vehicle import ArmState
 from companion.cli.setup import setup_lines
-from companion.errors import CompanionError
 from tests.e2e.test_attitude_push import flight
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
@@ -26,91 +23,33 @@ AFTER: dict[Firmware, dict[str, float]] = {
 }
 
 
-async def ask(rig: Rig, action: str, **more: Any) -> dict[str, Any]:
-    request = {"command": "autopilot-setup", "action": action, **more}
-    (reply,) = [reply async for reply in rig.service.faces.answers.answer(request)]
+async def ask(rig: Rig) -> dict[str, Any]:
+    (reply,) = [reply async for reply in rig.service.faces.answers.answer({"command": "autopilot-setup"})]
     return reply
 
 
-def values(rig: Rig, firmware: Firmware) -> dict[str, float]:
-    return {name: rig.autopilot.parameter(name) for name in BEFORE[firmware]}
+async def follow(rig: Rig) -> None:
+    """As somebody with a ground station does."""
+    for row in (await ask(rig))["parameters"]:
+        rig.autopilot.write_as_another_station(row["parameter"], row["wanted"])
 
 
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-def test_show_apply_undo(tmp_path: Path, firmware: Firmware) -> None:
+def test_what_is_to_be_set_is_said_and_nothing_is_written(tmp_path: Path, firmware: Firmware) -> None:
     async def main() -> None:
         async with flight(
             tmp_path, firmware=firmware, calibrated=False, used=False, parameters=BEFORE[firmware]
         ) as flying:
             rig = flying.rig
-            before = values(rig, firmware)
-            shown = await ask(rig, "show")
+            shown = await ask(rig)
             assert shown["state"] == "not applied"
             assert {row["parameter"]: row["wanted"] for row in shown["parameters"]} == pytest.approx(AFTER[firmware])
+            assert all(f"{name} {value:g}" in shown["reason"] for name, value in AFTER[firmware].items())
             assert shown["risks"]
             assert setup_lines(shown)
-            assert values(rig, firmware) == before
-            applied = await ask(rig, "apply")
-            assert applied["state"] == "applied"
-            assert {one["outcome"] for one in applied["written"].values()} == {"stored"}
-            assert values(rig, firmware) == pytest.approx(AFTER[firmware])
-            assert (await ask(rig, "show"))["state"] == "applied"
-            assert "nothing was written" in (await ask(rig, "apply"))["reason"]
-            # A calibration's undo is another's: it must not take this with it.
-            await flying.calibrate()
-            undone = await ask(rig, "undo")
-            assert undone["state"] == "undone"
-            assert values(rig, firmware) == before
-            with pytest.raises(CompanionError, match="nothing to undo"):
-                await ask(rig, "undo")
-            assert rig.service.offsets.ledger.undoable  # the calibration's
-
-    run_virtual(main())
-
-
-def test_only_disarmed_and_only_with_a_stream_to_come(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with flight(tmp_path, calibrated=False, used=False) as flying:
-            flying.rig.autopilot.arm()
-            await asyncio.sleep(1.5)
-            with pytest.raises(CompanionError, match="armed"):
-                await ask(flying.rig, "apply")
-            assert not [write for write in flying.rig.double.writes if "EK3" in write.name or "VISO" in write.name]
-            flying.rig.autopilot.disarm()
-            await flying.rig.until(lambda: flying.rig.service.core.vehicle.arm_state is ArmState.DISARMED, 10.0)
-            # Nothing was written, so nothing is looked after first.
-            assert (await ask(flying.rig, "apply"))["state"] == "applied"
-            assert not [text for text in flying.rig.ground.texts() if "Interrupted write" in text]
-        rig = Rig(tmp_path / "off")
-        async with rig.running():
-            await rig.ready()
-            with pytest.raises(CompanionError, match=r'push\.attitude is "off"'):
-                await ask(rig, "apply")
-
-    run_virtual(main())
-
-
-@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
-def test_a_daemon_that_dies_in_the_middle_leaves_the_old_values(tmp_path: Path, firmware: Firmware) -> None:
-    """The second write never gets through; the next daemon puts the first back by itself."""
-
-    async def main() -> None:
-        first = flight(tmp_path, firmware=firmware, calibrated=False, used=False, parameters=BEFORE[firmware])
-        async with first as flying:
-            rig = flying.rig
-            before = values(rig, firmware)
-            asking = asyncio.ensure_future(ask(rig, "apply"))
-            name = next(iter(BEFORE[firmware]))
-            await rig.until(lambda: rig.autopilot.parameter(name) != before[name], 10.0)
-            kept = (tmp_path / "setup/journal.json").read_bytes()
-            asking.cancel()
-            await asyncio.gather(asking, return_exceptions=True)
-            halfway = values(rig, firmware) | {name: AFTER[firmware][name]}
-        (tmp_path / "setup/journal.json").write_bytes(kept)  # as the power cut found it
-        second = flight(tmp_path, firmware=firmware, calibrated=False, used=False, parameters=halfway)
-        async with second as flying:
-            await flying.rig.until(lambda: values(flying.rig, firmware) == before, 30.0)
-            await flying.rig.until(lambda: not (tmp_path / "setup/journal.json").exists(), 5.0)
+            assert {name: rig.autopilot.parameter(name) for name in BEFORE[firmware]} == pytest.approx(BEFORE[firmware])
+            await follow(rig)
+            assert (await ask(rig))["state"] == "applied"
 
     run_virtual(main())
 
@@ -121,7 +60,7 @@ def test_the_set_up_and_the_stream_together(tmp_path: Path) -> None:
     async def main() -> None:
         async with flight(tmp_path, calibrated=False, used=False) as flying:
             rig = flying.rig
-            await ask(rig, "apply")
+            await follow(rig)
             rig.double.reboot()
             await rig.until(lambda: rig.service.core.vehicle.boots == 1, 20.0)
             assert rig.double.external_nav.selected

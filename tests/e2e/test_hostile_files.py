@@ -36,7 +36,7 @@ CONTENTS: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("what", CONTENTS)
-@pytest.mark.parametrize("name", ["journal.json", "undo-1.json", "setup/journal.json"])
+@pytest.mark.parametrize("name", ["journal.json", "undo-1.json"])
 def test_it_starts_says_so_and_writes_nothing(
     tmp_path: Path, name: str, what: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -58,7 +58,6 @@ def test_it_starts_says_so_and_writes_nothing(
             assert said.startswith(f"{path}: cannot be {'read' if what == 'a FIFO' else 'used'}: ")
             assert rig.service.offsets.recovery.fault is None
             assert not rig.service.offsets.recovery.pending
-            assert not rig.service.heading.setup.recovery.pending
             if name == "undo-1.json":
                 answer = rig.service.calibrating.conductor.start_undo("test")
                 assert isinstance(answer, Refusal)

@@ -15,7 +15,6 @@ from typing import Any
 import msgspec
 import pytest
 
-from companion.autopilot.firmware.written import HEADING_SETUP
 from companion.calibration.solution.record import Arming
 from companion.errors import StorageError
 from companion.storage import signing_time
@@ -68,7 +67,6 @@ HOSTILE: dict[str, Callable[[Path], Any]] = {
 FILES: dict[str, Callable[[Path], Any]] = {
     "journal.json": lambda folder: ChangeLog(folder).journal.take(),
     "undo-1.json": lambda folder: ChangeLog(folder).undos()[0].take(),
-    "setup/journal.json": lambda folder: ChangeLog(folder / "setup", HEADING_SETUP).journal.take(),
     "alignment.json": lambda folder: AlignmentStore(folder).take(),
     "biases.json": lambda folder: BiasStore(folder).read() or None,
     "armings.json": lambda folder: BoundedList(folder / "armings.json", Arming, 200).read() or None,
@@ -353,17 +351,5 @@ def test_everything_that_a_calibration_writes_may_be_kept(tmp_path: Path) -> Non
     changes = ChangeSet(255, (*offsets, *family))
     ChangeLog(tmp_path).journal.write(changes)
     assert ChangeLog(tmp_path).journal.read() == changes
-    setup = ChangeSet(
-        1,
-        (
-            Changed("VISO_TYPE", 0.0, 1.0),
-            Changed("EK3_SRC1_YAW", 1.0, 6.0),
-            Changed("EKF2_EV_CTRL", 15.0, 15.0),
-            Changed("EKF2_EV_NOISE_MD", 1.0, 0.0),
-            Changed("EKF2_EVA_NOISE", 0.1, 0.05),
-            Changed("EKF2_EV_DELAY", 175.5, 0.0),
-        ),
-    )
-    ChangeLog(tmp_path / "setup", HEADING_SETUP).journal.write(setup)
     with pytest.raises(StorageError, match="VISO_TYPE"):
-        ChangeLog(tmp_path).journal.write(setup)
+        ChangeLog(tmp_path).journal.write(ChangeSet(1, (Changed("VISO_TYPE", 0.0, 1.0),)))

@@ -78,7 +78,7 @@ def replies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Object]:
                 {"command": "cancel"},
                 {"command": "status"},
                 {"command": "align", "action": "show"},
-                {"command": "autopilot-setup", "action": "show"},
+                {"command": "autopilot-setup"},
             ):
                 async for reply in rig.service.faces.answers.answer(request):
                     found[f"{request['command']}{' under way' if reply['kind'] == 'progress' else ''}"] = reply
@@ -124,7 +124,7 @@ COMMANDS = [
     ["undo"],
     ["history"],
     ["align", "--show"],
-    ["autopilot-setup", "--show"],
+    ["autopilot-setup"],
 ]
 
 

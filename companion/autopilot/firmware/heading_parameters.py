@@ -28,9 +28,6 @@ class Wanted:
     """The value's bits are to be set, others stay as they are."""
     optional: bool = False
     """Some releases do without it."""
-    most: float = 255.0
-    """No value beyond this is written, nor put back; and none below zero."""
-    whole: bool = True
 
     def after(self, before: float) -> float:
         """What it is to become."""
@@ -44,8 +41,8 @@ _ARDUPILOT: Final = (
 _PX4: Final = (
     Wanted("EKF2_EV_CTRL", float(EV_YAW), "EKF2 takes its heading from external vision", bits=True),
     Wanted("EKF2_EV_NOISE_MD", 0.0, "with the sigma that we send"),
-    Wanted("EKF2_EVA_NOISE", 0.05, "as long as that is above 3 deg", most=10.0, whole=False),
-    Wanted("EKF2_EV_DELAY", 0.0, "our stamps are those of the samples", optional=True, most=1000.0, whole=False),
+    Wanted("EKF2_EVA_NOISE", 0.05, "as long as that is above 3 deg"),
+    Wanted("EKF2_EV_DELAY", 0.0, "our stamps are those of the samples", optional=True),
 )
 WANTED: Final[dict[Firmware, tuple[Wanted, ...]]] = {"ardupilot": _ARDUPILOT, "px4": _PX4}
 

@@ -9,7 +9,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Final
 
-from companion.autopilot.firmware import ardupilot, heading_parameters, px4
+from companion.autopilot.firmware import ardupilot, px4
 from companion.autopilot.firmware.imu_calibration import (
     MAX_ACCEL_OFFSET_M_S2,
     MAX_ACCEL_RESIDUAL_M_S2,
@@ -78,9 +78,3 @@ CALIBRATION: Final[Mapping[Firmware, Ranges]] = {
     "px4": {**_px4(), **dict.fromkeys(rivals_of("px4"), _SWITCH)},
 }
 """By a calibration and its undo."""
-
-HEADING_SETUP: Final[Mapping[Firmware, Ranges]] = {
-    firmware: {one.parameter: Range(0.0, one.most, whole=one.whole) for one in wanted}
-    for firmware, wanted in heading_parameters.WANTED.items()
-}
-"""By `companion autopilot-setup` and its undo."""

@@ -9,9 +9,8 @@ from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.heading.autopilot_setup import AutopilotSetup
+from companion.daemon.heading.autopilot_setup import autopilot_setup
 from companion.daemon.heading.pose_now import PoseNow
-from companion.daemon.offsets.subsystem import Offsets
 from companion.links.system.request import Object
 
 if TYPE_CHECKING:
@@ -21,34 +20,31 @@ if TYPE_CHECKING:
 class Heading(Subsystem):
     """The pose that people see, and the attitude that is pushed."""
 
-    def __init__(
-        self, core: Core, devices: Devices, offsets: Offsets, calibrating: Calibrating, arming: Arming
-    ) -> None:
+    def __init__(self, core: Core, devices: Devices, calibrating: Calibrating, arming: Arming) -> None:
+        self._core = core
         self.attitude = _attitude(core, devices, calibrating, arming)
         """None unless a heading is pushed."""
         self.pose = PoseNow(core, calibrating.alignment, None if self.attitude is None else self.attitude.pose)
         devices.watch_pose(self.pose.take)
-        self.setup = AutopilotSetup(core, offsets.writer, calibrating.conductor)
 
     def commands(self) -> Mapping[str, Handler]:  # noqa: D102 - as in the base class
         return {"autopilot-setup": self._answer_setup}
 
-    async def _answer_setup(self, request: Object, _face: str) -> AsyncIterator[Object]:
-        yield await self.setup.answer(request)
+    async def _answer_setup(self, _request: Object, _face: str) -> AsyncIterator[Object]:
+        yield await autopilot_setup(self._core)
 
     def status(self) -> Object:  # noqa: D102
         attitude = self.attitude
         return {
             "pose": self.pose.now(),
             "readings": self.pose.readings(),
-            "warnings": [*self.setup.ledger.unusable, *(attitude.warnings if attitude is not None else ())],
+            "warnings": [] if attitude is None else attitude.warnings,
             "attitude": None if attitude is None else attitude.view(),
             "devices": [] if attitude is None else [attitude.status()],
         }
 
     def tasks(self) -> Sequence[Task]:  # noqa: D102
-        attitude: list[Task] = [] if self.attitude is None else [("attitude", self.attitude.run)]
-        return [("setup", self.setup.run), *attitude]
+        return [] if self.attitude is None else [("attitude", self.attitude.run)]
 
 
 def _attitude(core: Core, devices: Devices, calibrating: Calibrating, arming: Arming) -> AttitudeService | None:

@@ -38,13 +38,9 @@ class Recovery:
         ledger: Ledger,
         say: Say,
         changing: Callable[[], contextlib.AbstractContextManager[None]],
-        *,
-        command: str = "companion undo",
     ) -> None:
         self._vehicle, self._parameters, self._writer = vehicle, parameters, writer
         self._ledger, self._say, self._changing = ledger, say, changing
-        self._command = command
-        """By which people ask for an undo."""
         self._listeners: Listeners[str] = Listeners()
 
     def watch(self, on_recovered: Callable[[str], None]) -> None:
@@ -134,7 +130,7 @@ class Recovery:
         if foreign and not force:
             raise AutopilotError(
                 f"changed by somebody else or by a boot since, so nothing was put back: {'; '.join(foreign)}."
-                f" {self._command} --force puts the others back"
+                f" companion undo --force puts the others back"
             )
         if foreign:
             logger.warning("changed by somebody else since, left alone: %s", "; ".join(foreign))

@@ -75,6 +75,8 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
         findings.append(Finding("mqtt", good=mqtt["good"], words=mqtt["summary"]))
     # Whose noise figures an IMU's sigmas are made of.
     findings += [Finding(f"profile {imu.name}", good=True, words=profile_in_words(imu.profile)) for imu in config.imu]
+    if config.push.attitude != "off" and is_running:
+        findings.append(await _heading(config))
     if config.calibration.at_arm == "gate":
         findings.append(_gate(config, status["arming"]["setup"]))
     for kind in ("gradienter", "compass"):
@@ -104,6 +106,12 @@ def _gate(config: Config, setup: Object) -> Finding:
         return Finding("arming", good=False, words="not known whether the autopilot asks before it arms: try again")
     problem = setup["problem"]
     return Finding("arming", good=problem is None, words=problem or "the autopilot asks before it arms")
+
+
+async def _heading(config: Config) -> Finding:
+    """Whether the autopilot takes in our heading."""
+    replies = [reply async for reply in ask(config.control.path, {"command": "autopilot-setup"})]
+    return Finding("heading", good=replies[-1].get("state") == "applied", words=replies[-1]["reason"])
 
 
 async def _listen(config: Config, seconds: float) -> Object:

@@ -52,7 +52,7 @@ class Service:
         self.offsets = Offsets(core, self.devices)
         self.calibrating = Calibrating(core, self.devices, self.offsets)
         self.arming = Arming(core, self.devices, self.offsets, self.calibrating)
-        self.heading = Heading(core, self.devices, self.offsets, self.calibrating, self.arming)
+        self.heading = Heading(core, self.devices, self.calibrating, self.arming)
         self.recorder = Recorder(core, self.devices, self.calibrating)
         self.faces = Faces(core, self.devices, self.offsets, self.calibrating, self.arming, self.heading, self.recorder)
 
