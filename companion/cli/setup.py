@@ -5,26 +5,18 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from companion.cli import DONE, FAILED, load_config, print_json, print_lines
-from companion.daemon.faces.control import ask
+from companion.cli.client import finish, request
+from companion.cli.terminal import AddCommand
 
 Object = dict[str, Any]
 
 
 async def setup(options: argparse.Namespace) -> int:
     """`companion autopilot-setup`."""
-    path = load_config(options).control.path
-    reply = [reply async for reply in ask(path, {"command": "autopilot-setup"})][-1]
-    if reply["kind"] == "error":
-        answer: Object = {"state": "refused", "reason": reply["reason"]}
-        print_lines(f"companion: {reply['reason']}", error=True)
-    else:
-        answer = {key: value for key, value in reply.items() if key != "kind"}
-    if getattr(options, "json", False):
-        print_json(answer)
-    elif reply["kind"] != "error":
-        print_lines(*setup_lines(answer))
-    return FAILED if reply["kind"] == "error" else DONE
+    reply = await request(options, {"command": "autopilot-setup"})
+    answer = {key: value for key, value in reply.items() if key != "kind"}
+    good = reply["kind"] != "error"
+    return finish(options, reply, answer, setup_lines(answer) if good else [], good=good)
 
 
 def setup_lines(answer: Object) -> list[str]:
@@ -41,6 +33,6 @@ def _number(value: float | None) -> str:
     return "none" if value is None else f"{value:g}"
 
 
-def add_command(add: Any) -> None:
+def add_command(add: AddCommand) -> None:
     """The subcommand."""
     add("autopilot-setup", setup, "what the autopilot needs set to take in our heading")

@@ -46,7 +46,9 @@ class Bench:
     async def set_up(self) -> None:
         """What `companion autopilot-setup` says, from a ground station."""
         shown = await self.ask("autopilot-setup")
-        await self.ground.put_all({row["parameter"]: row["wanted"] for row in shown["parameters"] if row["wanted"] is not None})
+        await self.ground.put_all(
+            {row["parameter"]: row["wanted"] for row in shown["parameters"] if row["wanted"] is not None}
+        )
         shown = await self.ask("autopilot-setup")
         assert shown["state"] == "applied", shown
 
