@@ -11,6 +11,7 @@ from typing import Any, Final, NoReturn
 
 from companion import config
 from companion.config.profiles import SavedProfiles
+from companion.config.sections import Config, Storage
 from companion.errors import ConfigError
 from companion.printable import printable
 
@@ -38,7 +39,7 @@ def print_lines(*lines: object, error: bool = False, end: str = "\n") -> None:
     stream.flush()
 
 
-def load_config(options: argparse.Namespace, *, profiles: bool = False, forgiving: bool = False) -> config.Config:
+def load_config(options: argparse.Namespace, *, profiles: bool = False, forgiving: bool = False) -> Config:
     """The configuration that -c names, or the default one.
 
     Args:
@@ -67,7 +68,7 @@ def storage_path(options: argparse.Namespace) -> Path:
     except ConfigError:
         if hasattr(options, "config"):
             raise
-        return config.Storage().path
+        return Storage().path
 
 
 def config_path(options: argparse.Namespace) -> Path:

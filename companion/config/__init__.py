@@ -14,54 +14,9 @@ import msgspec
 
 from companion.config.profiles import Saved, none_saved, with_saved_profiles
 from companion.config.rules import check_together
-from companion.config.sections import (
-    AtArm,
-    Calibration,
-    Compass,
-    CompassProtocol,
-    Config,
-    Control,
-    Gradienter,
-    GradienterProtocol,
-    Imu,
-    ImuProtocol,
-    Log,
-    Mavlink,
-    Mounting,
-    Mqtt,
-    Noise,
-    Parity,
-    Push,
-    Storage,
-    Vehicle,
-)
+from companion.config.sections import Config
 from companion.config.words import brief, explain, refuse_unknown_keys
 from companion.errors import ConfigError
-
-__all__ = [
-    "DEFAULT_PATH",
-    "AtArm",
-    "Calibration",
-    "Compass",
-    "CompassProtocol",
-    "Config",
-    "Control",
-    "Gradienter",
-    "GradienterProtocol",
-    "Imu",
-    "ImuProtocol",
-    "Log",
-    "Mavlink",
-    "Mounting",
-    "Mqtt",
-    "Noise",
-    "Parity",
-    "Push",
-    "Storage",
-    "Vehicle",
-    "load",
-    "parse",
-]
 
 DEFAULT_PATH = Path("/etc/companion/companion.toml")
 MOST_BYTES: Final = 64 * 1024

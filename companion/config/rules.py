@@ -8,9 +8,8 @@ import math
 import re
 from collections.abc import Iterator
 
-from companion.config.mavlink_rules import check_access
-from companion.config.mqtt_rules import check_mqtt
-from companion.config.sections import Compass, Config, Gradienter, Imu, Mounting
+from companion.config.sections import Compass, Config, Gradienter, Imu, Mavlink, Mounting, Mqtt
+from companion.config.senders import ALLOWED, Senders
 from companion.config.words import allowed
 from companion.errors import ConfigError
 from companion.rotations import ROTATIONS_DEG
@@ -18,6 +17,8 @@ from companion.rotations import ROTATIONS_DEG
 UPRIGHT_COSINE = 0.5
 LAST_PORT = 65535
 LEAST_RECORDINGS_MB = 8
+MAX_TOPIC_BYTES = 200
+"""Of a topic's beginning; MQTT itself allows 65535."""
 PORT_WORDS = "a device path (/dev/...) or tcp://HOST:PORT"
 
 
@@ -56,11 +57,11 @@ def check_together(config: Config, name: str) -> None:
     _check_field_heading(config, name)
     _check_ports_differ(config, name)
     _check_mavlink_url(config.mavlink.url, name)
-    check_access(config.mavlink, name)
+    _check_access(config.mavlink, name)
     if config.web is not None:
         _check_bind(config.web.bind, name)
     if config.mqtt is not None:
-        check_mqtt(config.mqtt, name)
+        _check_mqtt(config.mqtt, name)
     if (config.vehicle.latitude_deg is None) != (config.vehicle.longitude_deg is None):
         raise ConfigError(
             f"{name}: 'vehicle': found only one of latitude_deg and longitude_deg; allowed: both or neither"
@@ -228,4 +229,60 @@ def _check_upright(mounting: Mounting, here: str, name: str) -> None:
     if math.cos(math.radians(roll_deg)) * math.cos(math.radians(pitch_deg)) < UPRIGHT_COSINE:
         raise ConfigError(
             f"{name}: {here!r}: found {mounting!r}, on its side or upside down; allowed: within 60 degrees of upright"
+        )
+
+
+def _check_access(mavlink: Mavlink, name: str) -> None:
+    """Who may ask, and signing."""
+    for entry in mavlink.allow:
+        try:
+            Senders([entry])
+        except ValueError:
+            raise ConfigError(f"{name}: 'mavlink.allow': found {entry!r}; allowed: {ALLOWED}") from None
+    path = mavlink.signing_key_file
+    if mavlink.signing in ("sign", "require") and path is None:
+        raise ConfigError(
+            f"{name}: 'mavlink.signing_key_file' is missing; allowed: a text, not empty (needed by signing ="
+            f' "{mavlink.signing}")'
+        )
+    if path is not None and "/" in path and not path.startswith("/"):
+        raise ConfigError(
+            f"{name}: 'mavlink.signing_key_file': found {path!r}; allowed: a path that begins with /, or the bare name"
+            " of a systemd credential"
+        )
+
+
+def _check_mqtt(mqtt: Mqtt, name: str) -> None:
+    if mqtt.base_topic is not None:
+        _check_topic(mqtt.base_topic, "mqtt.base_topic", name)
+    if mqtt.password_file is not None and mqtt.username is None:
+        raise ConfigError(f"{name}: 'mqtt.username' is missing; allowed: a text, not empty (needed by password_file)")
+    if mqtt.password_file is not None and "/" in mqtt.password_file and not mqtt.password_file.startswith("/"):
+        raise ConfigError(
+            f"{name}: 'mqtt.password_file': found {mqtt.password_file!r}; allowed: a path that begins with /, or the"
+            " bare name of a systemd credential"
+        )
+    for key in ("ca_file", "cert_file", "key_file"):
+        path = getattr(mqtt, key)
+        if path is not None and not mqtt.tls:
+            raise ConfigError(f"{name}: 'mqtt.{key}': found {path!r}; allowed: only with tls = true")
+        if path is not None and not path.startswith("/"):
+            raise ConfigError(f"{name}: 'mqtt.{key}': found {path!r}; allowed: a path that begins with /")
+    for key, other in (("cert_file", "key_file"), ("key_file", "cert_file")):
+        if getattr(mqtt, key) is not None and getattr(mqtt, other) is None:
+            raise ConfigError(f"{name}: 'mqtt.{other}' is missing; allowed: a path (needed by {key})")
+
+
+def _check_topic(topic: str, here: str, name: str) -> None:
+    good = (
+        len(topic.encode()) <= MAX_TOPIC_BYTES
+        and not any(character in topic for character in "+# ")
+        and not topic.startswith(("/", "$"))
+        and not topic.endswith("/")
+        and "//" not in topic
+    )
+    if not good:
+        raise ConfigError(
+            f"{name}: {here!r}: found {topic!r}; allowed: words with / between them, such as"
+            f' "field/heron", without + # or blanks, at most {MAX_TOPIC_BYTES} bytes'
         )

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import Literal
 
 from companion.calibration.collector.rolling import RollingCollector
-from companion.config import Compass, Config, Gradienter, Imu
+from companion.config.sections import Compass, Config, Gradienter, Imu
 from companion.links.serial.bytestream import PortSettings
 from companion.protocols.registry import PROTOCOLS, Kind, ProtocolInfo
 from companion.protocols.roles import Part, part_for

@@ -14,8 +14,7 @@ from companion.calibration.solution.record import AlignmentUsed
 from companion.calibration.solution.site import Whereabouts
 from companion.calibration.solution.solve import CompassModel, GradienterModel
 from companion.calibration.stillness.settling import AT_ONCE, Lag
-from companion.config import Compass, Config, Gradienter, Imu, Noise
-from companion.config.sections import GradienterProtocol
+from companion.config.sections import Compass, Config, Gradienter, GradienterProtocol, Imu, Noise
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H, MG
 from companion.protocols.registry import PROTOCOLS

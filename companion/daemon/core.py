@@ -10,7 +10,7 @@ from typing import Any
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.component.statustext import Severity, StatusText, Weight
-from companion.config import Config
+from companion.config.sections import Config
 from companion.configured import models
 from companion.daemon.offload import Offload
 from companion.links.mavlink.link import MavlinkLink

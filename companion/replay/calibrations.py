@@ -15,7 +15,7 @@ from companion.calibration.solution.joint import weigh
 from companion.calibration.solution.record import AlignmentUsed, Record
 from companion.calibration.solution.site import Whereabouts
 from companion.calibration.solution.solve import ImuSolution, Solution, solve_at
-from companion.config import Config
+from companion.config.sections import Config
 from companion.configured import models
 from companion.configured.models import aligned
 from companion.errors import CalibrationRefusedError

@@ -23,7 +23,7 @@ from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.record import Record
 from companion.calibration.solution.site import Remedies, Whereabouts
 from companion.calibration.solution.solve import CompassModel, GradienterModel, solve_at
-from companion.config import Mounting, Noise
+from companion.config.sections import Mounting, Noise
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import rotation_matrix
 from companion.samples import ImuSample

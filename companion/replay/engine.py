@@ -18,7 +18,7 @@ import msgspec
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.record import Record, from_json
-from companion.config import Config
+from companion.config.sections import Config
 from companion.configured import models
 from companion.configured.devices import Role, SerialDevice, collect, parts_of, serial_devices
 from companion.errors import CalibrationRefusedError, StorageError

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.telemetry import imu_messages
-from companion.config import Config, Noise
+from companion.config.sections import Config, Noise
 from companion.errors import StorageError
 from companion.physics.frames import Floats
 from companion.recording import topics

@@ -14,8 +14,8 @@ import msgspec
 
 from companion import formats
 from companion.calibration.noise.allan import PROFILES, AllanModel, NoiseProfile
-from companion.config import Noise
 from companion.config.profiles import CATALOGUE
+from companion.config.sections import Noise
 from companion.errors import ConfigError, StorageError
 from companion.storage.atomic import write_atomically
 from companion.storage.state import UNREADABLE, read_regular, sealed, unsealed

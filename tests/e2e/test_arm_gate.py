@@ -12,7 +12,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.calibration.machine import State
-from companion.config import AtArm
+from companion.config.sections import AtArm
 from sim.motions import Handling
 from tests.support.component import Ground
 from tests.support.rig import Rig

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.calibration.solution.site import Whereabouts
-from companion.config import Config, parse
+from companion.config import parse
+from companion.config.sections import Config
 from companion.configured import models
 from companion.recording import journal, topics
 from companion.recording.details import Means

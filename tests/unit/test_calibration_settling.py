@@ -15,8 +15,8 @@ from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.seconds.batches import Batch
 from companion.calibration.stillness.settling import AT_ONCE, UNKNOWN_DEG, Lag, Settling
-from companion.config import Compass
-from companion.config import Gradienter as Section
+from companion.config.sections import Compass
+from companion.config.sections import Gradienter as Section
 from companion.configured.models import lag
 from companion.errors import CalibrationRefusedError
 from companion.physics.gradienter import attitude_from_readings

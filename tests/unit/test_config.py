@@ -8,8 +8,8 @@ from typing import get_args
 import pytest
 
 from companion.calibration.noise.allan import PROFILES
-from companion.config import Config, load, parse
-from companion.config.sections import Profile
+from companion.config import load, parse
+from companion.config.sections import Config, Profile
 from companion.errors import ConfigError
 
 GOOD = """

@@ -16,7 +16,8 @@ from companion.autopilot.firmware.heading_parameters import changes_for
 from companion.autopilot.telemetry.attitude_messages import attitude_messages, vision_position_estimate
 from companion.calibration.solution.record import ImuRecord, Outcome, WrittenParameter
 from companion.calibration.solution.site import Whereabouts, local_earth
-from companion.config import Imu, parse
+from companion.config import parse
+from companion.config.sections import Imu
 from companion.configured import models
 from companion.daemon.heading.difference import turn_between
 from companion.daemon.heading.sender import Sender, is_sane

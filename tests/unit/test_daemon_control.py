@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.config import Control
+from companion.config.sections import Control
 from companion.daemon.faces import control
 from companion.daemon.faces.control import ControlServer, ask
 from companion.errors import CalibrationRefusedError, DaemonUnreachableError, LinkError

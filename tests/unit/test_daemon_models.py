@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from companion.config import Config, parse
+from companion.config import parse
+from companion.config.sections import Config
 from companion.configured import models
 
 AUTOPILOT = '[mavlink]\nurl = "tcp:h:1"\n[[imu]]\nname = "fc"\nsource = "autopilot"\n'

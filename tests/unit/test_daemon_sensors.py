@@ -17,7 +17,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.config import Config, parse
+from companion.config import parse
+from companion.config.sections import Config
 from companion.configured.devices import Role, SerialDevice, serial_devices
 from companion.daemon.devices import sensors
 from companion.daemon.devices.sensors import SerialSensor

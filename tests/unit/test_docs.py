@@ -19,7 +19,8 @@ import msgspec
 import pytest
 
 from companion import cli
-from companion.config import Config, parse
+from companion.config import parse
+from companion.config.sections import Config
 from tests.support.documents import DOCUMENTS, README, ROOT, Block, blocks, commands_in, headings, prose
 
 MINIMAL = {"mavlink": '[mavlink]\nurl = "tcp:h:1"\n', "imu": '[[imu]]\nname = "a"\nsource = "autopilot"\n'}

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from companion.config import Config, parse
+from companion.config import parse
+from companion.config.sections import Config
 from companion.daemon.devices.doctor import sensor_findings, system_findings, where_it_may_be
 from companion.links.serial.faults import PortFault, port_faults, same_ports
 from companion.links.serial.ports import lasting_name, latency_timer_ms

@@ -10,7 +10,7 @@ import trustme
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 
-from companion.config import Mqtt
+from companion.config.sections import Mqtt
 from companion.errors import LinkError
 from companion.links.mqtt.credentials import is_open_to_all, read_password, tls_context
 from companion.links.mqtt.words import explain

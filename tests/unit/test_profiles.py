@@ -13,7 +13,8 @@ import pytest
 
 from companion.calibration.noise.allan import PROFILES, AllanModel, noise_profile
 from companion.cli import main as companion
-from companion.config import Config, Noise, parse
+from companion.config import parse
+from companion.config.sections import Config, Noise
 from companion.configured import models
 from companion.errors import ConfigError, StorageError
 from companion.recording import details, topics

@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import pytest
 
-from companion import config
+from companion.config import sections
 from companion.protocols.registry import PROTOCOLS, Kind
 from companion.samples import AttitudeSample, CompassSample, ImuSample, MagSample, Sample, TiltSample
 from tests.support.decoders import make_decoder
@@ -194,8 +194,8 @@ def test_an_invalid_frame_does_not_harm_its_neighbours(device: str) -> None:
 
 
 def test_the_names_are_those_of_the_configuration() -> None:
-    assert set(PROTOCOLS["imu"]) == set(get_args(config.ImuProtocol))
-    assert set(PROTOCOLS["gradienter"]) == set(get_args(config.GradienterProtocol))
-    assert set(PROTOCOLS["compass"]) == set(get_args(config.CompassProtocol))
+    assert set(PROTOCOLS["imu"]) == set(get_args(sections.ImuProtocol))
+    assert set(PROTOCOLS["gradienter"]) == set(get_args(sections.GradienterProtocol))
+    assert set(PROTOCOLS["compass"]) == set(get_args(sections.CompassProtocol))
     assert all(info.name == name for names in PROTOCOLS.values() for name, info in names.items())
-    assert all(info.parity in get_args(config.Parity) for names in PROTOCOLS.values() for info in names.values())
+    assert all(info.parity in get_args(sections.Parity) for names in PROTOCOLS.values() for info in names.values())

@@ -10,7 +10,8 @@ from typing import Any, Literal
 import msgspec
 import pytest
 
-from companion.config import Config, Imu, parse
+from companion.config import parse
+from companion.config.sections import Config, Imu
 from companion.installation import files
 
 SAMPLE = files.content(files.CONFIGURATION).decode()

@@ -30,7 +30,7 @@ from companion.calibration.solution.validity import (
     worth_writing,
 )
 from companion.component.service import JobResult
-from companion.config import Config, Imu
+from companion.config.sections import Config, Imu
 from companion.configured import models
 from companion.daemon import offload as estimating
 from companion.daemon.arming.offset_watch import OffsetWatch

@@ -14,7 +14,7 @@ from typing import Final, Literal
 from companion.calibration.machine import State
 from companion.calibration.solution.validity import Why
 from companion.component.service import ArmAnswer
-from companion.config import AtArm
+from companion.config.sections import AtArm
 from companion.daemon.arming.automatic import Automatic
 from companion.daemon.arming.forecast import Forecast
 from companion.daemon.arming.in_force import InForce

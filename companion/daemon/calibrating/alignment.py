@@ -8,7 +8,7 @@ from collections.abc import Callable
 from companion.calibration.alignment.align_record import AlignmentRecord, GradienterSettings
 from companion.calibration.solution.record import AlignmentUsed
 from companion.calibration.solution.solve import GradienterModel
-from companion.config import Config
+from companion.config.sections import Config
 from companion.configured import models
 from companion.daemon.offload import Offload
 from companion.links.system.listeners import Listeners

@@ -24,7 +24,7 @@ from companion.calibration.solution.joint import Whole, points
 from companion.calibration.solution.pose_effect import pose_effect
 from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, expect, expect_today
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
-from companion.config import Noise
+from companion.config.sections import Noise
 from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu

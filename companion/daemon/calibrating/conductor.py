@@ -22,7 +22,7 @@ from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
-from companion.config import AtArm
+from companion.config.sections import AtArm
 from companion.daemon.calibrating.align_steps import Plan
 from companion.daemon.calibrating.aligner import Aligner
 from companion.daemon.calibrating.course import Course

@@ -20,7 +20,7 @@ from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.autopilot.firmware.rivals import rivals_of
 from companion.autopilot.telemetry.imu_stream import ImuStream, StreamKind
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
-from companion.config import Imu
+from companion.config.sections import Imu
 from companion.configured import models
 from companion.daemon.core import Core
 from companion.errors import AutopilotError

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from companion.config import Config
+from companion.config.sections import Config
 from companion.configured.devices import serial_devices
 from companion.errors import LinkError
 from companion.links.serial.faults import PortFault, port_faults, same_ports, unnamed

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.component.statustext import Say, Severity, Weight
-from companion.config import Config
+from companion.config.sections import Config
 from companion.daemon.offload import Offload
 from companion.errors import LinkError, StorageError
 from companion.links.mavlink.keys import read_key

@@ -7,7 +7,7 @@ from typing import Final, get_args
 from companion.calibration.solution.record import ImuRecord
 from companion.component.own_parameters import OwnParameters
 from companion.component.service import JobResult
-from companion.config import AtArm, Config
+from companion.config.sections import AtArm, Config
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.job import Job
 from companion.errors import ConfigError

@@ -23,7 +23,7 @@ from companion.calibration.collector.rolling import Window
 from companion.calibration.solution.record import ImuRecord
 from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.calibration.solution.solve import CompassModel, GradienterModel, truth_of, vehicle_heading_rad
-from companion.config import Imu
+from companion.config.sections import Imu
 from companion.configured import models
 from companion.daemon import offload as estimating
 from companion.daemon.arming.in_force import InForce

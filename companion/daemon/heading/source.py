@@ -11,7 +11,7 @@ from companion.attitude.estimator import AttitudeSettings
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.solution.record import ImuRecord
 from companion.calibration.solution.site import LocalEarth
-from companion.config import Config, Imu
+from companion.config.sections import Config, Imu
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import MG
 from companion.samples import ImuSample, Vector

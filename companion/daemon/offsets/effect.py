@@ -24,7 +24,7 @@ from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.collector.rolling import MIN_BATCHES, ImuWindow, Window
 from companion.calibration.noise.allan import AllanModel, floor_variance, noise_profile
-from companion.config import Noise
+from companion.config.sections import Noise
 from companion.daemon import offload as estimating
 from companion.daemon.core import Core
 from companion.daemon.offsets.plan import Plan, Target

@@ -9,7 +9,7 @@ import dataclasses
 import os
 from pathlib import Path
 
-from companion.config import Config
+from companion.config.sections import Config
 from companion.configured.models import cannot_work, doubtful, profile_in_words
 from companion.daemon.devices.doctor import Diagnosis, sensor_findings, system_findings, where_it_may_be
 from companion.daemon.devices.sensor_health import ABSENT

@@ -14,7 +14,8 @@ from typing import Any, Final
 import msgspec
 
 from companion.component.own_parameters import OwnParameters
-from companion.config import Config, load
+from companion.config import load
+from companion.config.sections import Config
 from companion.config.senders import Senders
 from companion.config.words import shown
 from companion.daemon.faces.flight_line import AT_ARM

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from companion.config import Config
+from companion.config.sections import Config
 from companion.daemon.process import footprint
 from companion.daemon.process.reload import Reloader
 from companion.daemon.process.service import Service

@@ -6,7 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 
-from companion.config import Config
+from companion.config.sections import Config
 from companion.configured import models
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.solution.site import Whereabouts
-from companion.config import Config
+from companion.config.sections import Config
 from companion.configured import models
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.recording.details import Offsets

@@ -17,7 +17,7 @@ import logging
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from companion.config import Mqtt
+from companion.config.sections import Mqtt
 from companion.links.mqtt.credentials import is_open_to_all, read_password, tls_context
 from companion.links.mqtt.filter import LEAVE_DEADLINE_S, MAX_PACKET_BYTES, MqttFilter
 from companion.links.mqtt.outbox import Outbox

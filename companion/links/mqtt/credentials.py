@@ -7,7 +7,7 @@ import stat
 from pathlib import Path
 from typing import Final
 
-from companion.config import Mqtt
+from companion.config.sections import Mqtt
 from companion.errors import LinkError
 
 MAX_PASSWORD_BYTES: Final = 4096

@@ -7,7 +7,7 @@ import socket
 import ssl
 from typing import Final
 
-from companion.config import Mqtt
+from companion.config.sections import Mqtt
 from companion.errors import LinkError
 from companion.links.mqtt.filter import NoGreetingError
 

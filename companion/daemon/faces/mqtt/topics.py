@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from companion.config import Mqtt
+from companion.config.sections import Mqtt
 
 ONLINE = b"online"
 OFFLINE = b"offline"
