@@ -44,8 +44,6 @@ _ASCII = str.maketrans(
 class Severity(enum.IntEnum):
     """MAV_SEVERITY. QGroundControl speaks NOTICE and worse aloud, and opens a window for ERROR and worse."""
 
-    EMERGENCY = 0
-    ALERT = 1
     CRITICAL = 2
     ERROR = 3
     WARNING = 4
@@ -104,8 +102,6 @@ class StatusText:
         """Set when there is something new to send: whoever calls `step` waits for it."""
         self.dropped = 0
         """Texts that a full queue pushed out, or that waited for a link until they were stale."""
-        self.suppressed = 0
-        """Repeats that were not said again."""
         self._link = link
         self._waiting: dict[Weight, deque[_Text]] = {weight: deque() for weight in reversed(Weight)}
         self._said_s: OrderedDict[tuple[Severity, str], float] = OrderedDict()
@@ -184,10 +180,7 @@ class StatusText:
 
     def _is_repeat(self, severity: Severity, text: str, now_s: float) -> bool:
         said_s = self._said_s.get((severity, text))
-        if said_s is None or now_s - said_s >= REPEAT_S:
-            return False
-        self.suppressed += 1
-        return True
+        return said_s is not None and now_s - said_s < REPEAT_S
 
     def _remember(self, severity: Severity, text: str, now_s: float) -> None:
         self._said_s[(severity, text)] = now_s

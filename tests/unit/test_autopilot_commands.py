@@ -89,7 +89,7 @@ def test_the_queue_is_bounded_and_an_unknown_target_or_an_end_is_answered_at_onc
         commands = Commands(link, lambda: (1, 1))
         answers = [commands.send(SET_INTERVAL, i) for i in range(MAX_WAITING + 2)]
         assert answers[-1].done()
-        assert commands.dropped == 1
+        assert commands.results["dropped"] == 1
         commands.close()
         assert all(answer.result() is None for answer in answers)
         nobody = Commands(link, lambda: None)

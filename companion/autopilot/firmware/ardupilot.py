@@ -35,11 +35,7 @@ class ArduPilotParameters(ImuParameters):
 
 
 def parameters_of(instance: int) -> ArduPilotParameters:
-    """The names of one IMU's parameters, `instance` counting from 1.
-
-    Raises:
-        AutopilotError: no such instance.
-    """
+    """The names of one IMU's parameters, `instance` counting from 1."""
     if instance not in INSTANCES:
         raise AutopilotError(f"IMU {instance} is not known; allowed are {', '.join(map(str, INSTANCES))}")
     if instance > 3:

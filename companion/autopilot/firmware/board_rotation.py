@@ -21,12 +21,7 @@ _CUSTOM_NAMES: Final = {
 
 
 async def read_board_rotation(parameters: ParameterClient) -> Matrix:
-    """The 3x3 matrix from the board's axes to the vehicle's FRD.
-
-    Raises:
-        AutopilotError: an orientation that is not known, or a custom one that is not in force; or as
-            `ParameterClient.read`.
-    """
+    """The 3x3 matrix from the board's axes to the vehicle's FRD."""
     value = await parameters.read("AHRS_ORIENTATION")
     number = round(value) if math.isfinite(value) else -1
     if 0 <= number < len(ROTATION_NAMES):

@@ -70,11 +70,7 @@ class GyroCalibration:
 
 
 async def read_gyro_parameters(parameters: ParameterClient) -> GyroParameters:
-    """Read afresh everything that the firmware's gyro calibration writes.
-
-    Raises:
-        AutopilotError: no answer, or it restarted meanwhile.
-    """
+    """Read afresh everything that the firmware's gyro calibration writes."""
     vehicle = parameters.vehicle
     boots = vehicle.boots
     instances = {number: parameters_of(number) for number in INSTANCES}
@@ -143,10 +139,6 @@ async def wait_until_over(parameters: ParameterClient, before: Mapping[str, floa
     """After an interruption: wait until a calibration that may have been started has surely ended, or never ran.
 
     Offsets of before, or zero, tell nothing while it may run: it stores what it has found at its end.
-
-    Args:
-        parameters: of the autopilot.
-        before: gyro parameters from before it, by name.
 
     Raises:
         AutopilotError: the autopilot does not answer.

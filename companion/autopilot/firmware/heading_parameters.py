@@ -60,11 +60,7 @@ RISKS: Final[dict[Firmware, tuple[str, ...]]] = {
 
 
 def wanted_for(firmware: Firmware | None) -> tuple[Wanted, ...]:
-    """The set of a firmware.
-
-    Raises:
-        AutopilotError: no autopilot yet, or a firmware that is not known.
-    """
+    """The set of a firmware."""
     if firmware is None:
         raise AutopilotError("no autopilot has been heard yet")
     found = WANTED.get(firmware)

@@ -71,11 +71,7 @@ def parameters_of(gyro_slot: int, accel_slot: int) -> ImuParameters:
 
 
 async def read_slots(parameters: ParameterClient, sensor: Sensor) -> tuple[Slot, ...]:
-    """All slots that hold a device id, in order.
-
-    Raises:
-        AutopilotError: as `ParameterClient.read_optional`.
-    """
+    """All slots that hold a device id, in order."""
     found: list[Slot] = []
     for number in range(SLOTS):
         device_id = await read_integer(parameters, f"{PREFIX[sensor]}{number}_ID")

@@ -77,9 +77,6 @@ class SlotMemory:
             instance: 1 to 3.
             slots: all that hold a device id, in order.
             like: the device id of the IMU's other half; of a chip that is both, it is the same.
-
-        Raises:
-            AutopilotError: there is none.
         """
         prefix, word = PREFIX[sensor], WORDS[sensor]
         self._enabled[sensor] = sum(slot.enabled for slot in slots)

@@ -48,13 +48,7 @@ _AT_ONCE: Final = 6
 
 
 class ParameterClient:
-    """The parameters of one autopilot.
-
-    Args:
-        link: the connection.
-        vehicle: whose parameters they are, and whether it is armed.
-        timeout_s: how long one message's answer is awaited.
-    """
+    """The parameters of one autopilot."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, *, timeout_s: float = 1.0) -> None:
         self.vehicle = vehicle
@@ -138,15 +132,7 @@ class ParameterClient:
         return None
 
     async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]:
-        """Read several by name, a few requests at a time.
-
-        Args:
-            names: which.
-            optional: names that do not exist are left out, instead of an error.
-
-        Raises:
-            ParameterTimeoutError, ParameterRefusedError, AutopilotRebootedError: as `read` and `read_optional`.
-        """
+        """Read several by name, a few requests at a time; where `optional`, what does not exist is left out."""
         wanted = list(names)
         read = self.read_optional if optional else self.read
         found: dict[str, float] = {}

@@ -10,29 +10,17 @@ from companion.samples import Vector
 
 
 async def read_offsets(parameters: ParameterClient, names: tuple[str, str, str]) -> Vector:
-    """Three offsets; any finite ones will do, for they are only added to.
-
-    Raises:
-        AutopilotError: one is not a number; or as `ParameterClient.read`.
-    """
+    """Three offsets; any finite ones will do, for they are only added to."""
     return await _read_vector(parameters, names, -math.inf, math.inf)
 
 
 async def read_scales(parameters: ParameterClient, names: tuple[str, str, str]) -> Vector:
-    """Three scales, which will be divided by.
-
-    Raises:
-        AutopilotError: one is far from 1; or as `ParameterClient.read`.
-    """
+    """Three scales, which will be divided by."""
     return await _read_vector(parameters, names, 0.5, 2.0)
 
 
 async def read_integer(parameters: ParameterClient, name: str) -> int | None:
-    """A whole number, or None where the firmware has no such parameter.
-
-    Raises:
-        AutopilotError: not a number; or as `ParameterClient.read_optional`.
-    """
+    """A whole number, or None where the firmware has no such parameter."""
     value = await parameters.read_optional(name)
     if value is None:
         return None

@@ -81,7 +81,6 @@ class Verdict:
         fraction: of the expected step that was made, over all axes; None when nothing was to be moved.
         fraction_sigma: its standard deviation.
         residual: mean after the write minus truth, vehicle FRD.
-        within: per vehicle axis, whether the residual is within the tolerance and 4 sigma.
         problems: a line for each thing that is not right.
         warnings: a line for each thing that could not be judged.
     """
@@ -90,7 +89,6 @@ class Verdict:
     fraction: float | None
     fraction_sigma: float | None
     residual: Vector
-    within: tuple[bool, bool, bool]
     problems: tuple[str, ...]
     warnings: tuple[str, ...]
 
@@ -141,7 +139,6 @@ def judge(seen: Observation) -> Verdict:
         fraction=fraction,
         fraction_sigma=fraction_sigma,
         residual=(float(residual[0]), float(residual[1]), float(residual[2])),
-        within=(within[0], within[1], within[2]),
         problems=tuple(problems),
         warnings=tuple(hidden) if together != "seen" else (),
     )

@@ -39,17 +39,11 @@ class _Request:
 
 
 class Commands:
-    """COMMAND_LONG to one autopilot.
-
-    Args:
-        link: the connection.
-        target: the (system, component) to command, or None while it is not known yet.
-    """
+    """COMMAND_LONG to one autopilot: to what `target` gives, None while it is not known."""
 
     def __init__(self, link: MavlinkLink, target: Callable[[], tuple[int, int] | None]) -> None:
-        self.dropped = 0
         self.results: Counter[str] = Counter()
-        """Answers by result's name, plus "no answer"."""
+        """Answers by result's name, plus "no answer" and "dropped" (never sent)."""
         self._link = link
         self._target = target
         self._queues: dict[int, deque[_Request]] = {}
@@ -68,7 +62,7 @@ class Commands:
         queue = self._queues.setdefault(command, deque())
         request = _Request(parameters, timeout_s, answer)
         if len(queue) >= MAX_WAITING:
-            self.dropped += 1
+            self.results["dropped"] += 1
             request.settle(None)
         else:
             queue.append(request)

@@ -58,11 +58,7 @@ def version_text(packed: int) -> str:
 
 
 class Latch:
-    """Decides which autopilot is taken.
-
-    Args:
-        system_id: the only one that may be, or None for the first real one that is heard.
-    """
+    """Decides which autopilot is taken."""
 
     def __init__(self, system_id: int | None) -> None:
         self._system_id = system_id

@@ -53,7 +53,9 @@ class Reach:
     def answered(self) -> bool:
         """Whether the autopilot has answered anything, so that it hears us."""
         results = self._vehicle.commands.results
-        return self._parameters.answering or any(count for word, count in results.items() if word != "no answer")
+        return self._parameters.answering or any(
+            count for word, count in results.items() if word not in ("no answer", "dropped")
+        )
 
     def words(self) -> tuple[bool, str]:
         """For `companion check`: whether all is well, and the facts with the fix."""

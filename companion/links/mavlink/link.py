@@ -48,7 +48,6 @@ class MavlinkLink:
         self.sent = 0
         self.dropped = 0
         """Messages that could not be sent: no transport was attached, or its buffer was full."""
-        self.last_received_s: float | None = None
         self.tap: Callable[[Direction, bytes | None, float | None], object] | None = None
         """Called with (direction, bytes, time of arrival); without bytes: some are missing here."""
         self.signing: Signing | None = None
@@ -234,7 +233,6 @@ class MavlinkLink:
 
     def _dispatch(self, name: str, message: Message | None, t_s: float) -> None:
         self.received[name] += 1
-        self.last_received_s = t_s
         if message is None:
             return
         for handler in tuple(self._handlers.get(name, ())):

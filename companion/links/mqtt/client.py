@@ -337,11 +337,7 @@ def _inbox(take: Callable[[aiomqtt.Message], None]) -> type[asyncio.Queue[aiomqt
 
 
 async def _enter(client: aiomqtt.Client, broker: MqttFilter) -> None:
-    """Wait until the broker has accepted or refused us.
-
-    Raises:
-        aiomqtt.MqttError: it refuses.
-    """
+    """Wait until the broker has accepted or refused us."""
     entering = asyncio.get_running_loop().create_task(client.__aenter__(), name="mqtt connect")
     try:
         await asyncio.shield(entering)

@@ -58,14 +58,7 @@ class NoGreetingError(LinkError):
 
 
 class MqttFilter:
-    """A connection to a broker, and at `address` a local socket for the library; `async with` it.
-
-    Args:
-        host: the broker's.
-        port: the broker's.
-        context: for TLS, or None.
-        protocol: the version of MQTT by its number; from 5 on packets have properties.
-    """
+    """A connection to a broker, and at `address` a local socket for the library; `async with` it."""
 
     def __init__(self, host: str, port: int, context: ssl.SSLContext | None, protocol: int) -> None:
         self._host, self._port, self._context, self._protocol = host, port, context, protocol

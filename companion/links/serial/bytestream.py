@@ -310,7 +310,6 @@ class ByteLink:
                 if not data:
                     break  # the reader will find it, and what it means
                 self.bytes_received += len(data)
-                self.budget.discarded += len(data)
                 self.last_byte_s = loop.time()
         except OSError:
             pass  # empty, or gone: the reader will find it

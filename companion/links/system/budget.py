@@ -11,20 +11,13 @@ BURST_BYTES: Final = 65536.0
 
 
 class Budget:
-    """A bucket that fills with so many bytes a second, and from which every read takes.
-
-    Args:
-        bytes_per_s: how fast it fills.
-        burst_bytes: how much it holds.
-    """
+    """A bucket that fills with so many bytes a second, and from which every read takes."""
 
     def __init__(self, bytes_per_s: float = BYTES_PER_S, burst_bytes: float = BURST_BYTES) -> None:
         self._bytes_per_s, self._burst_bytes = bytes_per_s, burst_bytes
         self._left, self._t_s = burst_bytes, 0.0
         self.exceeded_s: float | None = None
         """When it was last empty; None: never."""
-        self.discarded = 0
-        """Bytes that were thrown away for it."""
 
     def left(self, now_s: float) -> float:
         """How many may be taken."""

@@ -21,10 +21,6 @@ def words_of(error: OSError) -> str:
 async def connect_tcp(url: str, address: tuple[str, int]) -> int:
     """Connect to the first address of a host that answers; return the socket's descriptor.
 
-    Args:
-        url: for people.
-        address: host and port.
-
     Raises:
         LinkError: one line that names the address and the cause.
     """
