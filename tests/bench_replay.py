@@ -21,7 +21,7 @@ from typing import Any, Final
 import numpy as np
 from mcap.reader import make_reader
 
-from companion.recording.walk import Messages, Recording
+from companion.recording.walk import Message, Recording
 from companion.replay.csv_columns import read
 from companion.replay.csv_log import PoseGiven, estimate
 from companion.replay.engine import Replay
@@ -52,7 +52,7 @@ def _by_the_library(path: Path) -> int:
 
 
 def _walked(path: Path) -> int:
-    return sum(len(item.data) for item in Recording(path).runs() if isinstance(item, Messages))
+    return sum(isinstance(item, Message) for item in Recording(path))
 
 
 def _replayed(path: Path) -> None:
@@ -113,9 +113,7 @@ def main(samples: int = MILLION // 10) -> None:
         run_virtual(_live(folder / "live"))
         path = folder / "live" / "recordings" / "000001.mcap"
         count = sum(
-            len(item.data)
-            for item in Recording(path).runs(lambda topic: topic.startswith("/imu/"))
-            if isinstance(item, Messages)
+            isinstance(item, Message) for item in Recording(path).items(lambda topic: topic.startswith("/imu/"))
         )
         took_s = best_s(partial(_replayed, path))
         _line("200 Hz serial and the autopilot's 100 Hz, samples of both", count, took_s)

@@ -1,56 +1,38 @@
 """Reads a recording from its beginning as far as it goes: a file may end anywhere, and the power may have been cut.
 
-The library's readers want the end of the file, or stop with an exception at the first cut; and a replay is to be a
-hundred times faster than what it replays. The records are those of the MCAP specification, version 0.
+Records are those of the MCAP specification, version 0, and all but messages are read by the `mcap` library. Its own
+reader of whole streams makes an object of every message, wanted or not, which alone costs more than a whole replay
+does; and it believes every length that a file says.
 """
 
 from __future__ import annotations
 
-import contextlib
+import io
 import mmap
 import struct
 import zlib
-from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
+import msgspec
 
 from companion.errors import StorageError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 _CHANNEL, _MESSAGE, _CHUNK, _ATTACHMENT, _METADATA, _DATA_END = 0x04, 0x05, 0x06, 0x09, 0x0C, 0x0F
 _HEAD: Final = struct.Struct("<BQ")
-_MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
-_CHUNK_HEAD: Final = struct.Struct("<QQQI")
-_WHOLE_HEAD: Final = _HEAD.size + _MESSAGE_HEAD.size
-_LOG_TIME: Final = _HEAD.size + 6
-"""Where in a message it stands: behind the numbers of its channel and its own."""
-_LENGTH: Final = struct.Struct("<I")
-_LONG: Final = struct.Struct("<Q")
+_WHOLE_HEAD: Final = struct.Struct("<BQHIQQ")
+"""Of a message: its record's, and its own."""
 MOST_BYTES: Final = 16 * 1024 * 1024
-"""Of a record in the file, and of a chunk unpacked; ours have a state of some MB at most."""
+"""Of a record in the file, and of a chunk unpacked; ours have less than one."""
 MOST_TIMES: Final = 100
 """All chunks together unpack to so many times the file at most, and one chunk's worth; ours to four times."""
 MOST_TOPICS: Final = 1024
-
-AT_ONCE: Final = 8
-"""Records that are given together to the thread that unpacks them: to hand one over costs half of unpacking it."""
-AT_ONCE_BYTES: Final = 2 * 1024 * 1024
-"""The last of them may be beyond that, unpacked; a chunk is a second or less."""
-GROUPS_AHEAD: Final = 2
-"""Unpacked before they are asked for."""
-
-_Record = tuple[int, int, int]
-"""Its kind, where its content begins, where it ends."""
+_NEEDS_MORE: Final = "a recording needs more than is installed: pip install 'companion[recording]'"
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
+class Message(msgspec.Struct, frozen=True, gc=False):
     """One message on a topic; `data` is JSON."""
 
     topic: str
@@ -58,30 +40,21 @@ class Message:
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class Messages:
-    """Messages that follow each other, as far as somebody wants them; (n,) of each."""
-
-    numbers: NDArray[np.int64]
-    """Of the topic of each: its place in `Recording.topics`."""
-    log_times_ns: NDArray[np.uint64]
-    data: list[bytes]
-
-
-@dataclass(frozen=True, slots=True)
-class Metadata:
+class Metadata(msgspec.Struct, frozen=True):
     """A named table of texts."""
 
     name: str
     table: dict[str, str]
 
 
-@dataclass(frozen=True, slots=True)
-class Attachment:
+class Attachment(msgspec.Struct, frozen=True):
     """A named file."""
 
     name: str
     data: bytes
+
+
+Item = Message | Metadata | Attachment
 
 
 class _DamagedError(Exception):
@@ -102,11 +75,9 @@ class Recording:
         self.path = path
         self.cut_short: str | None = None
         """After reading: why it ended before its end, in words; None when it is whole."""
-        self.topics: list[str] = []
-        """That were met so far."""
-        self._places: dict[str, int] = {}
-        self._number_of = np.full(1 << 16, -1)
-        """The number of a channel's topic; negative where it is not known or not wanted."""
+        self._topics: set[str] = set()
+        self._topic_of: dict[int, str] = {}
+        """By channel, of those that are wanted."""
         try:
             with path.open("rb") as file:
                 head = file.read(len(MAGIC))
@@ -118,101 +89,83 @@ class Recording:
         except (OSError, ValueError) as error:
             raise StorageError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
-    def __iter__(self) -> Iterator[Message | Metadata | Attachment]:
+    def __iter__(self) -> Iterator[Item]:
         """Everything in the order of writing, until the end or a cut."""
-        for item in self.runs():
-            if isinstance(item, Messages):
-                topics = [self.topics[number] for number in item.numbers.tolist()]
-                yield from map(Message, topics, item.log_times_ns.tolist(), item.data)
-            else:
-                yield item
+        return self.items(lambda topic: True)
 
-    def runs(self, wanted: Callable[[str], bool] | None = None) -> Iterator[Messages | Metadata | Attachment]:
-        """The same, many messages at once.
+    def items(self, wanted: Callable[[str], bool]) -> Iterator[Item]:
+        """The same, without the messages on topics that are not wanted.
 
         Args:
-            wanted: says of a topic, once, whether its messages are; None: all are.
+            wanted: is asked of every topic when it is met.
         """
-        self._wanted = wanted or (lambda topic: True)
         try:
-            yield from self._file(memoryview(self._data))
-        except (_DamagedError, struct.error, UnicodeDecodeError) as error:
-            self.cut_short = str(error)
+            from mcap.exceptions import EndOfFile
+        except ImportError:
+            raise StorageError(_NEEDS_MORE) from None
+        try:
+            yield from self._file(wanted)
+        except (_DamagedError, EndOfFile, struct.error, OverflowError, UnicodeDecodeError) as error:
+            self.cut_short = str(error) or "damaged: a record ends too early"
 
-    def _file(self, data: memoryview) -> Iterator[Messages | Metadata | Attachment]:
-        """What is in a file; a thread unpacks the next chunks meanwhile, which needs no interpreter."""
-        records, damage = _outermost(data), None
-        room = MOST_BYTES + MOST_TIMES * len(data)
-        waiting: deque[tuple[list[_Record], Future[list[bytes | Exception | None]]]] = deque()
-        with ThreadPoolExecutor(max_workers=1) as thread:
-            while True:
-                while damage is None and len(waiting) < GROUPS_AHEAD:
-                    group, damage = _group(data, records)
-                    waiting.append((group, thread.submit(_unpack, data, group)))
-                if not waiting:
-                    break
-                group, unpacking = waiting.popleft()
-                for (kind, at, end), chunk in zip(group, unpacking.result(), strict=False):
-                    if isinstance(chunk, Exception):
-                        raise chunk
-                    if chunk is not None:
-                        room -= len(chunk)
-                        if room < 0:
-                            raise _DamagedError(f"damaged: unpacks to more than {MOST_TIMES} times its size")
-                        yield from self._chunk(chunk)
-                    elif kind == _MESSAGE:
-                        yield self._messages(bytes(data[at - _HEAD.size : end]), np.zeros(1, dtype=np.int64))
-                    else:
-                        yield from self._other(kind, data[at:end])
-        if isinstance(damage, _DamagedError):
-            raise damage
-
-    def _chunk(self, data: bytes) -> Iterator[Messages | Metadata | Attachment]:
-        """What is in a chunk."""
-        at, size = 0, len(data)
+    def _file(self, wanted: Callable[[str], bool]) -> Iterator[Item]:
+        """What is in the file."""
+        data, size = self._data, len(self._data)
+        at, room = len(MAGIC), MOST_BYTES + MOST_TIMES * size
+        if size < at:
+            raise _DamagedError(f"cut in its first {at} bytes")
         while at < size:
-            kind, at, end = _record(data, at)
-            if kind == _MESSAGE:
-                starts = _chain(data, at - _HEAD.size)
-                yield self._messages(data, starts)
-                _, _, end = _record(data, int(starts[-1]))
-            elif kind == _DATA_END:
+            kind, begin, at = _record(data, at)
+            if kind == _DATA_END and data[size - len(MAGIC) :] == MAGIC:
                 return
+            if at - begin > MOST_BYTES:
+                raise _too_large(begin, at - begin)
+            if kind == _CHUNK:
+                chunk = _unpacked(data[begin:at], begin)
+                room -= len(chunk)
+                if room < 0:
+                    raise _DamagedError(f"damaged: unpacks to more than {MOST_TIMES} times its size")
+                yield from self._records(chunk, wanted)
             else:
-                yield from self._other(kind, data[at:end])
-            at = end
+                yield from self._records(data[begin - _HEAD.size : at], wanted)
+        raise _DamagedError(f"cut at byte {size}")
 
-    def _other(self, kind: int, data: Any) -> Iterator[Metadata | Attachment]:
-        """What a record that is neither message nor chunk has in it."""
-        if kind == _CHANNEL:
-            number = int.from_bytes(data[:2], "little")
-            topic = _text(data, 4)[0]
-            place = self._places.setdefault(topic, len(self.topics))
-            if place == len(self.topics):
-                if place == MOST_TOPICS:
-                    raise _DamagedError(f"damaged: more than {MOST_TOPICS} topics")
-                self.topics.append(topic)
-            self._number_of[number] = place if self._wanted(topic) else -1
-        elif kind == _METADATA:
-            yield _metadata(data)
-        elif kind == _ATTACHMENT:
-            yield _attachment(data)
+    def _records(self, data: bytes, wanted: Callable[[str], bool]) -> Iterator[Item]:
+        """What is in some records."""
+        at, size, topic_of = 0, len(data), self._topic_of
+        while at < size:
+            if data[at] == _MESSAGE and size - at >= _WHOLE_HEAD.size:
+                # A million of these: no call, and no object of those that nobody wants.
+                _, length, channel, _, log_time_ns, _ = _WHOLE_HEAD.unpack_from(data, at)
+                begin, at = at + _WHOLE_HEAD.size, at + _HEAD.size + length
+                if not begin <= at <= size:
+                    raise _DamagedError("damaged: a message does not end where it should")
+                if channel in topic_of:
+                    yield Message(topic_of[channel], log_time_ns, data[begin:at])
+                continue
+            kind, begin, at = _record(data, at)
+            if kind == _MESSAGE:
+                raise _DamagedError("damaged: a message does not end where it should")
+            if kind == _CHANNEL:
+                self._channel(data[begin:at], wanted)
+            elif kind == _METADATA:
+                yield _metadata(data[begin:at])
+            elif kind == _ATTACHMENT:
+                yield _attachment(data[begin:at])
 
-    def _messages(self, data: bytes, starts: NDArray[np.int64]) -> Messages:
-        """Those of the messages that begin there whose topics are known and wanted."""
-        numbers = self._number_of[_anywhere(data, "<u2")[starts + _HEAD.size]]
-        chosen = numbers >= 0
-        starts = starts[chosen]
-        begins = (starts + _WHOLE_HEAD).tolist()
-        ends = (starts + _HEAD.size + _anywhere(data, "<u8")[starts + 1].astype(np.int64)).tolist()
-        return Messages(
-            numbers[chosen],
-            _anywhere(data, "<u8")[starts + _LOG_TIME],
-            [data[begin:end] for begin, end in zip(begins, ends, strict=True)],
-        )
+    def _channel(self, data: bytes, wanted: Callable[[str], bool]) -> None:
+        from mcap.records import Channel
+
+        channel = Channel.read(_stream(data))
+        self._topics.add(channel.topic)
+        if len(self._topics) > MOST_TOPICS:
+            raise _DamagedError(f"damaged: more than {MOST_TOPICS} topics")
+        self._topic_of.pop(channel.id, None)
+        if wanted(channel.topic):
+            self._topic_of[channel.id] = channel.topic
 
 
-def _record(data: Any, at: int) -> _Record:
+def _record(data: Any, at: int) -> tuple[int, int, int]:
     """The record that begins at `at`: its kind, where its content begins, where it ends."""
     size = len(data)
     if size - at < _HEAD.size:
@@ -221,153 +174,61 @@ def _record(data: Any, at: int) -> _Record:
     at += _HEAD.size
     if kind == 0 or at + length > size:
         raise _DamagedError(f"cut at byte {size}" if kind else f"nothing but zeros from byte {at} on")
-    if kind == _MESSAGE and length < _MESSAGE_HEAD.size:
-        raise _DamagedError("damaged: a message is shorter than its head")
     return kind, at, at + length
-
-
-def _outermost(data: Any) -> Iterator[_Record]:
-    """The records of a file, as `_record` gives them, until the end of its data."""
-    at, size = len(MAGIC), len(data)
-    if size < at:
-        raise _DamagedError(f"cut in its first {at} bytes")
-    while at < size:
-        kind, begin, at = _record(data, at)
-        if kind == _DATA_END:
-            return
-        if at - begin > MOST_BYTES:
-            raise _too_large(begin, at - begin)
-        yield kind, begin, at
-    raise _DamagedError(f"cut at byte {size}")
 
 
 def _too_large(at: int, size: int) -> _DamagedError:
     return _DamagedError(f"damaged at byte {at}: found {size} bytes in one piece; allowed: {MOST_BYTES}")
 
 
-def _group(data: Any, records: Iterator[_Record]) -> tuple[list[_Record], Exception | None]:
-    """The next records, and what came instead of one more: the end, or a cut."""
-    group: list[_Record] = []
-    size = 0
-    while len(group) < AT_ONCE and size < AT_ONCE_BYTES:
-        try:
-            kind, at, end = next(records)
-        except (StopIteration, _DamagedError) as error:
-            return group, error
-        group.append((kind, at, end))
-        if kind == _CHUNK and end - at >= _CHUNK_HEAD.size:
-            size += _CHUNK_HEAD.unpack_from(data, at)[2]
-    return group, None
+def _stream(data: bytes) -> Any:
+    from mcap.data_stream import ReadDataStream
+
+    return ReadDataStream(io.BytesIO(data))
 
 
-def _unpack(data: Any, group: list[_Record]) -> list[bytes | Exception | None]:
-    """What is in the chunks among these records, as far as they are sound; in its place what is wrong with one."""
-    found: list[bytes | Exception | None] = []
-    decompress = _decompressor()
-    for kind, at, end in group:
-        try:
-            found.append(_chunk(data[at:end], at, decompress) if kind == _CHUNK else None)
-        except (_DamagedError, StorageError, struct.error, UnicodeDecodeError) as error:
-            return [*found, error]
-    return found
+def _metadata(data: bytes) -> Metadata:
+    from mcap.records import Metadata as Read
+
+    found = Read.read(_stream(data))
+    return Metadata(found.name, found.metadata)
 
 
-def _decompressor() -> Callable[[Any, int], bytes] | None:
-    """Unpacks to so many bytes at most, or raises `_DamagedError`; None where the library is not installed."""
+def _attachment(data: bytes) -> Attachment:
+    from mcap.records import Attachment as Read
+
+    found = Read.read(_stream(data))
+    return Attachment(found.name, found.data)
+
+
+def _unpacked(data: bytes, at: int) -> bytes:
+    """The records in a chunk, checked."""
+    from mcap.records import Chunk
+
+    chunk = Chunk.read(_stream(data))
+    size, packed = chunk.uncompressed_size, chunk.data
+    if size > MOST_BYTES:
+        raise _too_large(at, size)
+    if chunk.compression == "zstd":
+        packed = _decompressed(packed, size, at)
+    elif chunk.compression:
+        raise _DamagedError(f"compressed by {chunk.compression}, which is not read here")
+    if len(packed) != size or (chunk.uncompressed_crc and zlib.crc32(packed) != chunk.uncompressed_crc):
+        raise _DamagedError(f"damaged at byte {at}")
+    return packed
+
+
+def _decompressed(packed: bytes, size: int, at: int) -> bytes:
+    """So many bytes at most: what a frame says of itself is not believed."""
     try:
         import zstandard
     except ImportError:
-        return None
-    unpack = zstandard.ZstdDecompressor(max_window_size=MOST_BYTES).decompress
-
-    def decompress(packed: Any, size: int) -> bytes:
-        try:
-            # What a frame says of itself is made room for, whatever the limit is.
-            if zstandard.frame_content_size(packed) > size:
-                raise _DamagedError
-            return unpack(packed, max_output_size=size)
-        except zstandard.ZstdError as error:
-            raise _DamagedError from error
-
-    return decompress
-
-
-def _anywhere(data: Any, kind: str) -> NDArray[Any]:
-    """The numbers that begin at each byte."""
-    size = np.dtype(kind).itemsize
-    return np.ndarray((max(len(data) - size + 1, 0),), kind, data, strides=(1,))
-
-
-def _chain(data: bytes, at: int) -> NDArray[np.int64]:
-    """Where the messages begin that follow each other in a chunk, from a whole one on at `at`.
-
-    Each says where the next one is; but what looks like the beginning of one nearly always is, and can be looked for
-    everywhere at once.
-    """
-    looks = np.frombuffer(data, np.uint8)[at : len(data) - _WHOLE_HEAD + 1] == _MESSAGE
-    # So many messages would not fit in: of what is all beginnings, nothing is gained by looking everywhere.
-    if np.count_nonzero(looks) <= len(data) // _WHOLE_HEAD:
-        found: NDArray[np.int64] = at + np.flatnonzero(looks)
-        heads = _anywhere(data, "<u8")[found + 1]
-        likely = (heads >= _MESSAGE_HEAD.size) & (heads < MOST_BYTES)
-        found, ends = found[likely], found[likely] + _HEAD.size + heads[likely].astype(np.int64)
-        if bool((ends[:-1] == found[1:]).all()) and ends[-1] <= len(data):
-            return found
-    return np.fromiter(_one_by_one(data, at), dtype=np.int64)
-
-
-def _one_by_one(data: Any, at: int) -> Iterator[int]:
-    """The same by going from each to the next."""
-    with contextlib.suppress(_DamagedError):
-        while _record(data, at)[0] == _MESSAGE:
-            yield at
-            at = _record(data, at)[2]
-
-
-def _chunk(data: Any, at: int, decompress: Callable[[Any, int], bytes] | None) -> bytes:
-    """The records in a chunk, unpacked and checked."""
-    _, _, size, crc = _CHUNK_HEAD.unpack_from(data, 0)
-    compression, start = _text(data, _CHUNK_HEAD.size)
-    (length,) = _LONG.unpack_from(data, start)
-    packed = data[start + 8 : start + 8 + length]
-    if size > MOST_BYTES:
-        raise _too_large(at, size)
-    if compression == "zstd":
-        if decompress is None:
-            raise StorageError("a recording needs more than is installed: pip install 'companion[recording]'")
-        try:
-            packed = decompress(packed, size)
-        except _DamagedError:
-            raise _DamagedError(f"damaged at byte {at}") from None
-    elif compression:
-        raise _DamagedError(f"compressed by {compression}, which is not read here")
-    if len(packed) != size or (crc and zlib.crc32(packed) != crc):
-        raise _DamagedError(f"damaged at byte {at}")
-    return bytes(packed)
-
-
-def _text(data: Any, at: int) -> tuple[str, int]:
-    """A text with its length before it, and where it ends."""
-    (length,) = _LENGTH.unpack_from(data, at)
-    end = at + 4 + length
-    if end > len(data):
-        raise _DamagedError("damaged: a text ends beyond its record")
-    return str(bytes(data[at + 4 : end]), "utf-8"), end
-
-
-def _metadata(data: Any) -> Metadata:
-    name, at = _text(data, 0)
-    (length,) = _LENGTH.unpack_from(data, at)
-    at += 4
-    end, table = at + length, {}
-    while at < end:
-        key, at = _text(data, at)
-        table[key], at = _text(data, at)
-    return Metadata(name, table)
-
-
-def _attachment(data: Any) -> Attachment:
-    name, at = _text(data, 16)
-    _, at = _text(data, at)
-    (length,) = _LONG.unpack_from(data, at)
-    return Attachment(name, bytes(data[at + 8 : at + 8 + length]))
+        raise StorageError(_NEEDS_MORE) from None
+    try:
+        # What a frame says is made room for, whatever the limit is.
+        if zstandard.frame_content_size(packed) > size:
+            raise _DamagedError(f"damaged at byte {at}")
+        unpack = zstandard.ZstdDecompressor(max_window_size=MOST_BYTES)
+        return bytes(unpack.decompress(packed, max_output_size=size))
+    except zstandard.ZstdError:
+        raise _DamagedError(f"damaged at byte {at}") from None

@@ -9,6 +9,7 @@ the heading has wandered, and all that only the autopilot can tell: what was wri
 from __future__ import annotations
 
 import datetime
+import functools
 from collections import Counter
 from collections.abc import Callable
 from typing import Final
@@ -25,7 +26,7 @@ from companion.errors import CalibrationRefusedError, StorageError
 from companion.protocols.decoding.base import Decoder
 from companion.recording import details, topics
 from companion.recording.files import versions
-from companion.recording.walk import Attachment, Messages, Metadata, Recording
+from companion.recording.walk import Attachment, Message, Metadata, Recording
 from companion.replay.calibrations import Calibrations, Replayed
 from companion.replay.telemetry import Telemetry
 
@@ -83,10 +84,9 @@ class Replay:
         Raises:
             StorageError: one line: it is not one of ours, or it was made by a version whose state is not known here.
         """
-        for item in self._recording.runs(self._is_wanted):
-            if isinstance(item, Messages):
-                for number, data in zip(item.numbers.tolist(), item.data, strict=True):
-                    self._message(self._recording.topics[number], data)
+        for item in self._recording.items(self._is_wanted):
+            if isinstance(item, Message):
+                self._message(item.topic, item.data)
             elif isinstance(item, Metadata) and item.name == topics.METADATA:
                 self._versions = item.table
                 if (found := item.table.get("format")) != topics.FORMAT_VERSION:
@@ -168,11 +168,11 @@ class Replay:
             return known[topic]
         if topic.startswith(topics.SERIAL):
             name = topic.removeprefix(topics.SERIAL)
-            return lambda data: self._take_serial(name, data)
+            return functools.partial(self._take_serial, name)
         if topic.startswith(topics.IMU) and self._config is not None:
             name = topic.removeprefix(topics.IMU)
             if name in self._autopilots:
-                return lambda data: self._take_telemetry(name, data)
+                return functools.partial(self._take_telemetry, name)
         # Samples of serial devices come from their bytes.
         return None
 

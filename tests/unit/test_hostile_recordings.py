@@ -21,7 +21,7 @@ from companion.recording.walk import MAGIC, Message, Recording
 
 MB = 1 << 20
 MOST = 128 * MB
-"""Three groups of chunks, unpacked, and what is made of one."""
+"""Some chunks, unpacked, and what is made of one."""
 
 
 def record(kind: int, content: bytes) -> bytes:
@@ -203,7 +203,9 @@ def test_an_event_that_would_fill_the_memory_is_one_line_of_the_replay(
     path.write_bytes(
         MAGIC
         + record(12, text(topics.METADATA.encode()) + text(table))
-        + record(9, bytes(16) + text(topics.CONFIG.encode()) + text(b"") + struct.pack("<Q", len(config)) + config)
+        + record(
+            9, bytes(16) + text(topics.CONFIG.encode()) + text(b"") + struct.pack("<Q", len(config)) + config + bytes(4)
+        )
         + packed(channel(1, topics.START.encode()) + message(start))
         + packed(channel(1, topics.JOURNAL.encode()) + message(entry))
     )
