@@ -215,7 +215,7 @@ def _unpacked(data: bytes, at: int) -> bytes:
         raise _DamagedError(f"compressed by {chunk.compression}, which is not read here")
     if len(packed) != size or (chunk.uncompressed_crc and zlib.crc32(packed) != chunk.uncompressed_crc):
         raise _DamagedError(f"damaged at byte {at}")
-    return packed
+    return bytes(packed)
 
 
 def _decompressed(packed: bytes, size: int, at: int) -> bytes:
