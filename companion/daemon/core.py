@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.calibration.collector.rolling import Window
 from companion.component.statustext import Severity, StatusText, Weight
 from companion.config.sections import Config
 from companion.configured import models
@@ -16,6 +17,9 @@ from companion.daemon.offload import Offload
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.request import Object
 from companion.recording.collector import RecordedCollector
+
+TICK_S: Final = 0.2
+"""How often the seconds that are over end, also of sources that say nothing."""
 
 Handler = Callable[[Object, str], AsyncIterator[Object]]
 """Answers a request that came by a face (second), with any number of replies."""
@@ -60,6 +64,31 @@ class Core:
         vehicle = Vehicle(link, system_id=config.vehicle.system_id, is_carried=is_carried)
         parameters = ParameterClient(link, vehicle)
         return cls(config, offload, link, vehicle, parameters, collector, StatusText(link), only_listening)
+
+    async def keep_ticking(self) -> None:
+        """Tell the collector the time until cancelled: the only one in the daemon who does."""
+        while True:
+            self.collector.tick(asyncio.get_running_loop().time())
+            await asyncio.sleep(TICK_S)
+
+    async def catch_up(self, *, since_s: float | None = None) -> None:
+        """Let the collector know what its window holds by now, if that is not known yet.
+
+        The estimate costs milliseconds on a desktop and tens of them on a small board; an autopilot that asks whether
+        it may arm waits with its commander stopped (autopilots 5.2).
+        """
+        work = self.collector.pending(asyncio.get_running_loop().time(), since_s=since_s)
+        if work is not None:
+            self.collector.accept(work, await self.offload(work.run))
+
+    async def window(self, *, since_s: float | None = None) -> Window:
+        """`RollingCollector.window` as of now.
+
+        Raises:
+            CalibrationRefusedError: as there.
+        """
+        await self.catch_up(since_s=since_s)
+        return self.collector.window(asyncio.get_running_loop().time(), since_s=since_s)
 
     def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
         """As `StatusText.say`: to the people at the ground stations."""

@@ -50,7 +50,7 @@ def power_up(
             before(rig)
         records = []
         async with rig.running():
-            rig.service.calibrating.memory.power_up = lambda name, unix_s: since(run)
+            rig.service.calibrating.memory.power_up = lambda name, unix_s: since(run)  # type: ignore[method-assign]
             await rig.ready()
             for _ in range(times):
                 result, record = await calibrated(rig)

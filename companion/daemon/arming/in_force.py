@@ -32,7 +32,6 @@ from companion.calibration.solution.validity import (
 from companion.component.service import JobResult
 from companion.config.sections import Config, Imu
 from companion.configured import models
-from companion.daemon import offload as estimating
 from companion.daemon.arming.offset_watch import OffsetWatch
 from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.calibrating.conductor import Conductor
@@ -69,7 +68,8 @@ class InForce:
     def __init__(
         self, core: Core, imus: Mapping[str, AutopilotImu], conductor: Conductor, alignment: AlignmentInForce
     ) -> None:
-        self._config = config = core.config
+        self._core, self._config = core, core.config
+        config = core.config
         self._vehicle, self._collector, self._offload = core.vehicle, core.collector, core.offload
         self._imus, self._alignment = imus, alignment
         wanted = config.calibration
@@ -282,7 +282,7 @@ class InForce:
             return False
         self._looked_s = second
         try:
-            window = await estimating.window(self._collector, self._offload) if self.reading() is None else None
+            window = await self._core.window() if self.reading() is None else None
         except CalibrationRefusedError:
             window = None
         if window is None:

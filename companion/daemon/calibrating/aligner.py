@@ -25,7 +25,6 @@ from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.calibration.solution.solve import GradienterModel, up_in_vehicle, vehicle_heading_rad
 from companion.component.statustext import Severity
 from companion.configured import models
-from companion.daemon import offload as estimating
 from companion.daemon.calibrating import align_steps
 from companion.daemon.calibrating.align_steps import Plan, Seen
 from companion.daemon.calibrating.alignment import AlignmentInForce
@@ -79,7 +78,7 @@ class Aligner:
         measuring: Measuring,
         alignment: AlignmentInForce,
     ) -> None:
-        self._config, self._vehicle, self._collector = core.config, core.vehicle, core.collector
+        self._core, self._config, self._vehicle, self._collector = core, core.config, core.vehicle, core.collector
         self._offload, self._say = core.offload, core.say
         self._machine, self._imus, self._measuring, self._alignment = machine, imus, measuring, alignment
         self._stand_s = max(STAND_S, core.config.calibration.min_still_s)
@@ -181,7 +180,7 @@ class Aligner:
         }
 
     async def _measure(self, model: GradienterModel, taken: list[_Taken], since_s: float) -> _Taken:
-        window = await estimating.window(self._collector, self._offload, since_s=since_s + SETTLE_S)
+        window = await self._core.window(since_s=since_s + SETTLE_S)
         if window.tilt is None:
             raise CalibrationRefusedError("no reading of the gradienter in this stand")
         try:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -75,8 +75,6 @@ class BiasMemory:
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], _Reference] = {}
         self._host = _host()
-        self.power_up: Callable[[str, float], PowerUp] = self._power_up
-        """Since when the sensor of an IMU has been powered, at a wall clock time."""
 
     def load(self) -> None:
         """Read what was kept before this start; blocking."""
@@ -215,7 +213,8 @@ class BiasMemory:
 
     # --- whose it is
 
-    def _power_up(self, name: str, unix_s: float) -> PowerUp:
+    def power_up(self, name: str, unix_s: float) -> PowerUp:
+        """Since when the sensor of an IMU has been powered, at a wall clock time."""
         boot_s = self._vehicle.boot_s if name in self._imus else None
         return PowerUp(host=self._host, since_unix_s=None if boot_s is None else round(unix_s - boot_s, 1))
 

@@ -16,7 +16,6 @@ from companion.calibration.request import What
 from companion.component.service import MEASURED_PERCENT
 from companion.component.statustext import Severity
 from companion.configured import models
-from companion.daemon import offload as estimating
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, not_ready
 from companion.daemon.job import Job
@@ -68,7 +67,7 @@ class Measuring:
         if job.armed or self._core.vehicle.arm_state is ArmState.ARMED:
             raise CalibrationRefusedError(if_armed)
         job.check_time()
-        await estimating.catch_up(self._core.collector, self._core.offload)
+        await self._core.catch_up()
         status = self._core.collector.status(asyncio.get_running_loop().time())
         other = not_ready(self._core.vehicle, self._imus) or models.place_doubt(self._core.config, self._core.vehicle)
         if other is not None or status.obstacle is None:
@@ -107,7 +106,7 @@ class Measuring:
                 if waiting_for is None and status.enough:
                     self._machine.on(Event.ENOUGH)
                     job.progress(MEASURED_PERCENT, "working out the biases")
-                    return await estimating.window(collector, self._core.offload)
+                    return await self._core.window()
                 now_s = loop.time()
                 if waiting_for not in (None, said) and not job.automatic and now_s - said_s >= SAY_WAITING_EVERY_S:
                     said, said_s = words, now_s

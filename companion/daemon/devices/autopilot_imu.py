@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -237,6 +237,15 @@ class AutopilotImu:
             "summary": problem or f"autopilot IMU {self.instance}, {kind.message if kind else 'no message'}",
             "frames": self.stream.samples,
         }
+
+
+@contextlib.contextmanager
+def changing(imus: Iterable[AutopilotImu]) -> Iterator[None]:
+    """While we write offsets of these."""
+    with contextlib.ExitStack() as stack:
+        for imu in imus:
+            stack.enter_context(imu.changing())
+        yield
 
 
 def not_ready(vehicle: Vehicle, imus: Mapping[str, AutopilotImu]) -> str | None:

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 from companion.autopilot.firmware.imu_calibration import accel_taken_off
 from companion.autopilot.firmware.px4_slots import SlotMemory
 from companion.configured import models
 from companion.configured.devices import Role, collect, serial_devices
 from companion.daemon.core import Core, Subsystem, Task
-from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.devices.reach import Reach
 from companion.daemon.devices.sensor_watch import UNTOUCHED, Corrected, SensorWatch
 from companion.daemon.devices.sensors import SensorRole, SerialSensor
 from companion.daemon.devices.signing import LinkSigning
-from companion.daemon.offload import keep_ticking
 from companion.links.system.request import Object
 from companion.protocols.roles import Part
 from companion.samples import Sample
@@ -56,13 +55,9 @@ class Devices(Subsystem):
         behind = f": {why}" if why else ""
         return f"not heard yet on {self._core.config.mavlink.url}{behind}"
 
-    @contextlib.contextmanager
-    def changing(self) -> Iterator[None]:
+    def changing(self) -> contextlib.AbstractContextManager[None]:
         """While we write offsets of any of the autopilot's IMUs ourselves."""
-        with contextlib.ExitStack() as stack:
-            for imu in self.imus.values():
-                stack.enter_context(imu.changing())
-            yield
+        return changing(self.imus.values())
 
     def load(self) -> None:  # noqa: D102 - as in the base class
         self.signing.load()
@@ -83,7 +78,7 @@ class Devices(Subsystem):
     def tasks(self, *, ports: bool = True) -> Sequence[Task]:
         """As in the base class; without ports somebody else hands their bytes to `sensors`."""
         return [
-            ("collector", lambda: keep_ticking(self._core.collector)),
+            ("collector", self._core.keep_ticking),
             ("signing", self.signing.run),
             ("reach", self.reach.run),
             *((imu.name, imu.run) for imu in self.imus.values()),

@@ -25,7 +25,6 @@ from companion.calibration.solution.site import LocalEarth, Whereabouts, local_e
 from companion.calibration.solution.solve import CompassModel, GradienterModel, truth_of, vehicle_heading_rad
 from companion.config.sections import Imu
 from companion.configured import models
-from companion.daemon import offload as estimating
 from companion.daemon.arming.in_force import InForce
 from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.core import Core
@@ -107,6 +106,7 @@ class Carrier:
         """Of a stream of truncated integers."""
         self.waiting_for = "waiting for a calibration"
         """What an alignment needs."""
+        self._core = core
         self._config, self._vehicle, self._collector = core.config, core.vehicle, core.collector
         self._in_force, self._alignment, self._offload = in_force, alignment, core.offload
         self._compass = models.compass_model(core.config.compass)
@@ -220,7 +220,7 @@ class Carrier:
 
     async def _stand(self, now_s: float) -> Stand | None:
         try:
-            window = await estimating.window(self._collector, self._offload, since_s=now_s - STOOD_S)
+            window = await self._core.window(since_s=now_s - STOOD_S)
             where = models.whereabouts(self._config, self._vehicle)
             stand: Stand = await self._offload(stand_of, window, where, self._alignment.model(), self._compass)
         except CalibrationRefusedError as error:

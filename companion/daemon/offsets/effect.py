@@ -25,7 +25,6 @@ from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.collector.rolling import MIN_BATCHES, ImuWindow, Window
 from companion.calibration.noise.allan import AllanModel, floor_variance, noise_profile
 from companion.config.sections import Noise
-from companion.daemon import offload as estimating
 from companion.daemon.core import Core
 from companion.daemon.offsets.plan import Plan, Target
 from companion.daemon.offsets.px4_writes import FarMean, Px4Writes, step_from_far
@@ -58,7 +57,7 @@ class EffectWatch:
     """Waits for a still stretch of telemetry after a write, and judges it."""
 
     def __init__(self, core: Core, px4: Px4Writes) -> None:
-        self._vehicle, self._collector, self._offload, self._px4 = core.vehicle, core.collector, core.offload, px4
+        self._core, self._vehicle, self._collector, self._px4 = core, core.vehicle, core.collector, px4
         self._profiles = {imu.name: imu.profile for imu in core.config.imu}
         self._look_s = min(LOOK_S, core.config.calibration.min_still_s)
 
@@ -93,7 +92,7 @@ class EffectWatch:
             words = self._in_the_way(looked_s)
             if not words:
                 try:
-                    after = await estimating.window(self._collector, self._offload, since_s=since_s)
+                    after = await self._core.window(since_s=since_s)
                 except CalibrationRefusedError as error:
                     words = str(error)
                 else:

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import dataclasses
 import logging
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import Final
 
 from companion.autopilot.firmware.gyro_calibration import GyroParameters
@@ -18,7 +18,7 @@ from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.collector.rolling import Window
 from companion.calibration.solution.draft import Draft
 from companion.daemon.core import Core
-from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.job import JobCancelledError
 from companion.daemon.offsets.effect import EffectWatch, in_short
 from companion.daemon.offsets.firmware_calibration import FirmwareCalibration
@@ -172,15 +172,10 @@ class Pusher:
             changed.append(str(error))
         return changed
 
-    @contextlib.contextmanager
-    def _changing(self, plan: Plan, *, everything: bool) -> Iterator[None]:
+    def _changing(self, plan: Plan, *, everything: bool) -> contextlib.AbstractContextManager[None]:
         """While offsets change: those of the plan's IMUs, or of all."""
         ours = {target.name for target in plan.targets}
-        with contextlib.ExitStack() as stack:
-            for name, imu in self._imus.items():
-                if everything or name in ours:
-                    stack.enter_context(imu.changing())
-            yield
+        return changing(imu for name, imu in self._imus.items() if everything or name in ours)
 
     async def _wait_disarmed(self) -> None:
         loop = asyncio.get_running_loop()

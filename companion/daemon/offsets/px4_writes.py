@@ -27,7 +27,7 @@ from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.telemetry import imu_messages
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.component.statustext import Say, Severity, Weight
-from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.offsets.ledger import Ledger
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.physics.frames import Array
@@ -277,9 +277,7 @@ class Px4Writes:
         targets = [(imu.in_force, _again(imu.in_force)) for imu in unsure]
         try:
             async with self._ledger.transaction(ChangeSet.of(self._vehicle.system_id, changes)):
-                with contextlib.ExitStack() as stack:
-                    for imu in unsure:
-                        stack.enter_context(imu.changing())
+                with changing(unsure):
                     async with self.standing_by(targets) as look:
                         await self._writer.apply(changes, look)
                 await self._ledger.undone()

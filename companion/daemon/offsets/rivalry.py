@@ -12,8 +12,9 @@ from typing import Final
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.firmware.rivals import Rival, stop
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
-from companion.component.statustext import Say, Severity, Weight
+from companion.autopilot.vehicle.vehicle import VehicleEvent
+from companion.component.statustext import Severity, Weight
+from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 
 logger = logging.getLogger(__name__)
@@ -24,15 +25,16 @@ JUST_NOW_S: Final = 20.0
 
 
 class Rivalry:
-    """Watches over the autopilot's IMUs; `stop_rivals`: they are to be switched off with the next write."""
+    """Watches over the autopilot's IMUs."""
 
-    def __init__(self, vehicle: Vehicle, imus: Mapping[str, AutopilotImu], say: Say, *, stop_rivals: bool) -> None:
-        self._vehicle, self._imus, self._say = vehicle, imus, say
-        self.stop_rivals = stop_rivals
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
+        self._imus, self._say = imus, core.say
+        self.stop_rivals = core.config.push.stop_rivals
+        """Whether they are to be switched off with the next write."""
         self._told: set[str] = set()
         self._disarmed_s = self._rebooted_s = -math.inf
         self._was_armed = False
-        self._unsubscribe = vehicle.watch(self._on_event)
+        self._unsubscribe = core.vehicle.watch(self._on_event)
         for name, imu in imus.items():
             imu.on_read.add(functools.partial(self._on_read, name))
 

@@ -30,7 +30,7 @@ class Offsets(Subsystem):
         config, vehicle, parameters, imus = core.config, core.vehicle, core.parameters, devices.imus
         self.ledger = Ledger(ChangeLog(config.storage.path), core.offload)
         self.writer = ParameterWriter(parameters, vehicle)
-        self.rivalry = Rivalry(vehicle, imus, core.say, stop_rivals=config.push.stop_rivals)
+        self.rivalry = Rivalry(core, imus)
         px4 = Px4Writes(core.link, vehicle, self.writer, self.ledger, devices.slots, core.say)
         self.firmware = FirmwareCalibration(vehicle, parameters, self.writer, self.ledger, EkfWatch(core.link, vehicle))
         self.effect = EffectWatch(core, px4)
