@@ -16,7 +16,7 @@ from typing import Final, Literal
 import msgspec
 import numpy as np
 
-from companion.attitude.heading import STEEP_RAD, HeadingAid, innovation_of_field, innovation_of_heading
+from companion.attitude.heading import STEEP_RAD, HeadingAid, innovation_of_heading
 from companion.attitude.leveller import Leveller
 from companion.attitude.quaternion import (
     Quaternion,
@@ -165,11 +165,6 @@ class AttitudeEstimator:
         return rotate(conjugate(self._sensor_from_vehicle), self._strapdown.bias_rad_s)
 
     @property
-    def out_of_order(self) -> int:
-        """Samples left out because they were not later than the one before."""
-        return self._strapdown.out_of_order
-
-    @property
     def compass(self) -> HeadingAid:
         """What became of the compass readings."""
         return self._heading
@@ -276,14 +271,6 @@ class AttitudeEstimator:
         if abs(pitch) > STEEP_RAD:
             return False
         return self._turn(t_s, innovation_of_heading(heading_true_rad, yaw), sigma_rad)
-
-    def add_field(self, t_s: float, field_frd: Triple, declination_rad: float, sigma_rad: float) -> bool:
-        """Take the magnetic field vector, vehicle FRD and any unit, at `t_s`; returns whether it was used."""
-        found = self.kept_at(t_s)
-        if found is None:
-            return False
-        innovation = innovation_of_field(field_frd, found[1], declination_rad)
-        return innovation is not None and self._turn(t_s, innovation, sigma_rad)
 
     def kept_at(self, t_s: float) -> tuple[float, Quaternion] | None:
         """What is remembered of the attitude then, body to NED, by the present opinion of level and north.

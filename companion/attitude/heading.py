@@ -1,15 +1,13 @@
 """The heading's slow correction by a compass: a scalar, gated, that never touches the tilt.
 
-A device's own heading leans on its own pendulum and is worth nothing while the aircraft accelerates or stands steep; a
-field vector is levelled with our own attitude and may be used always. Method section 3, "tilt-compensated heading".
+A device's own heading leans on its own pendulum and is worth nothing while the aircraft accelerates or stands steep.
+Method section 3, "tilt-compensated heading".
 """
 
 from __future__ import annotations
 
 import math
 from typing import Final
-
-from companion.attitude.quaternion import Quaternion, Triple, rotate
 
 TAU_S: Final = 9.0
 """Time constant of the correction; the first readings after an alignment without heading count more."""
@@ -25,25 +23,10 @@ def innovation_of_heading(heading_true_rad: float, yaw_rad: float) -> float:
     return math.remainder(heading_true_rad - yaw_rad, 2.0 * math.pi)
 
 
-def innovation_of_field(field: Triple, ned_from_body: Quaternion, declination_rad: float) -> float | None:
-    """The same from a field vector in body FRD, any unit; None where it has no horizontal part to speak of.
-
-    In true NED the horizontal part points to magnetic north, at the declination; what it is off by, we are. Near the
-    magnetic poles nothing is left of it: below a tenth of the whole (dip above 84 degrees) it is not used.
-    """
-    north, east, down = rotate(ned_from_body, field)
-    horizontal = math.hypot(north, east)
-    if not horizontal > 0.1 * math.hypot(horizontal, down):
-        return None
-    return math.remainder(declination_rad - math.atan2(east, north), 2.0 * math.pi)
-
-
 class HeadingAid:
     """Decides what of an innovation is believed."""
 
     def __init__(self) -> None:
-        self.refused = 0
-        self.used = 0
         self._last_s: float | None = None
         self._refused_since_s: float | None = None
 
@@ -62,13 +45,11 @@ class HeadingAid:
         """
         gate = max(GATE_LEAST_RAD, GATE_SIGMAS * math.hypot(sigma_rad, compass_sigma_rad))
         if not abs(innovation_rad) <= gate:
-            self.refused += 1
             if self._refused_since_s is None:
                 self._refused_since_s = t_s
             return 0.0
         since_s = 0.0 if self._last_s is None else max(0.0, t_s - self._last_s)
         self._last_s, self._refused_since_s = t_s, None
-        self.used += 1
         # What is known badly is told by the first reading at once; after that the time constant rules.
         trust = sigma_rad**2 / (sigma_rad**2 + compass_sigma_rad**2) if sigma_rad > compass_sigma_rad else 0.0
         return max(trust, min(1.0, since_s / TAU_S))

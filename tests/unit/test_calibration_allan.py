@@ -17,10 +17,10 @@ from companion.calibration.noise.allan import (
     noise_profile,
     phi,
     student_ratio,
-    use_variance,
 )
 from companion.errors import ConfigError
 from companion.physics.units import DEG_H, MG
+from tests.support.allan import use_variance
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.calibration.collector.stop import is_enough
-from companion.calibration.means.integers import integer_means
 from companion.calibration.means.windows import ImuEstimate, ImuInput, imu_estimates, integer_steps
 from companion.calibration.noise.allan import NoiseProfile
 from companion.calibration.seconds.batches import MAX_LEVELS, Batch, BatchSource
@@ -225,15 +224,6 @@ def test_the_seconds_of_an_integer_stream_keep_their_counts_and_those_of_floats_
         assert batch.counts.table.sum(axis=0).tolist() == [batch.n] * 6
     assert integer_steps(imu()) is None
     assert integer_steps(imu(gyro_step_rad_s=MRAD)) is None
-
-
-def test_a_known_sigma_settles_what_two_values_leave_open() -> None:
-    rng = np.random.default_rng(11)
-    lsb = np.array([0.6, -0.7, 0.75, *GRAVITY_LSB[3:]])
-    batches = batches_of(white(rng, lsb, 0.25, 60))
-    found = integer_means(batches, STEPS, np.full(6, 0.25))
-    assert found.identified[:3].all()
-    assert found.values.mean(axis=0)[:3] == pytest.approx(lsb[:3], abs=0.05)
 
 
 GRID_LSB = np.repeat([math.radians(2000.0 / 32768.0) / MRAD, 1000.0 / 2048.0], 3)

@@ -160,14 +160,6 @@ def test_a_slow_steady_turn_is_seen_by_the_level_of_the_last_stretch() -> None:
     assert later[-1]
 
 
-def test_a_slow_steady_turn_is_seen_by_a_prior() -> None:
-    imu = Imu()
-    turn = np.array([0.0, 0.0, 2.0 * DEG, 0.0, 0.0, 0.0])
-    assert imu.second(turn).still  # nothing to compare with: invisible to the centred form
-    imu.gate = ImuGate("fc", noise_profile(None), gyro_prior_rad_s=np.zeros(3))
-    assert imu.second(turn).words.startswith("gyro fc turns or is biased by 2.0")
-
-
 def test_a_warm_up_ramp_is_still_and_a_step_is_not() -> None:
     imu = Imu()
     ramp = 3.0 * DEG / 3600.0

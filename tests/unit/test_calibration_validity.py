@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.calibration.noise.allan import PROFILES, AllanModel, use_variance
+from companion.calibration.noise.allan import PROFILES, AllanModel
 from companion.calibration.solution.validity import (
     DRIFT_SIGMAS,
     Held,
@@ -21,6 +21,7 @@ from companion.calibration.solution.validity import (
     worth_writing,
 )
 from companion.physics.units import DEG_H
+from tests.support.allan import use_variance
 
 GYRO = PROFILES["icm42688p"].gyro
 LIMITS = Limits(max_age_s=1800.0, max_temperature_change_k=3.0)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-import numpy as np
-
 from companion.calibration.collector.sources import Source, compass_source, gradienter_source, imu_source
 from companion.calibration.means.field_heading import FieldHeading
 from companion.calibration.means.pose_models import CompassModel, GradienterModel
@@ -98,8 +96,7 @@ class Intake(ABC):
     def set_imu(self, imu: ImuInput) -> None:
         """Add an IMU, or say that its stream is another kind now: all that was learned of it is forgotten."""
         self._inputs[imu.name] = imu
-        prior = None if imu.gyro_prior_rad_s is None else np.asarray(imu.gyro_prior_rad_s)
-        gate = ImuGate(imu.name, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2), prior)
+        gate = ImuGate(imu.name, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2))
         known = self._imus.get(imu.name)
         if known is None:
             known = self._imus[imu.name] = imu_source(imu.name, gate, self._keep)

@@ -51,8 +51,6 @@ class IntegerMeans(msgspec.Struct, frozen=True):
     """(m, c) mean of every second."""
     second_sigma: Floats
     """(c,) of one second's mean, from the Fisher information."""
-    variance: Floats
-    """(c,) of the mean over all seconds, from the Fisher information; zero where not identified."""
     hidden: Floats
     """(c,) sigma that no averaging takes away: half a step where not identified, what the shape of the noise may hide
     where identified."""
@@ -123,15 +121,12 @@ def integer_columns(
     return result
 
 
-def integer_means(
-    batches: Sequence[Batch], steps: Floats, sigma: Floats | None = None, edges: Floats | None = None
-) -> IntegerMeans:
+def integer_means(batches: Sequence[Batch], steps: Floats, edges: Floats | None = None) -> IntegerMeans:
     """Work out one stream.
 
     Args:
         batches: its good seconds, at least one, with their counts (a second without any is taken at its plain mean).
         steps: (c,) of the stream.
-        sigma: (c,) of the noise of one reading, LSB, where it is known from elsewhere (NaN where it is not).
         edges: (c,) rms displacement of the integers' edges that is known, LSB.
     """
     sizes = np.array([batch.n for batch in batches], dtype=np.float64)
@@ -141,9 +136,9 @@ def integer_means(
     width = _widths(pooled, start)
     bounds, grouped = _grouped(tables, start, width)
     weight = np.ones_like(plain)
-    found, values, scale = _linearised(bounds, grouped, sizes, weight, sigma, None)
+    found, values, scale = _linearised(bounds, grouped, sizes, weight, None, None)
     own = found.identified
-    sigma = _with_borrowed(found, grouped.sum(axis=0), sigma)
+    sigma = _borrowed(found, grouped.sum(axis=0))
     slope = np.zeros(len(steps))
     if sigma is not None and not own.all():
         found, values, scale = _linearised(bounds, grouped, sizes, weight, sigma, None)
@@ -166,7 +161,6 @@ def integer_means(
     return IntegerMeans(
         values=np.where(known, values, means),
         second_sigma=np.where(known, second, 0.0),
-        variance=np.where(known, found.variance, 0.0),
         hidden=np.where(known, np.sqrt(shape + np.square(slope)), unknown),
         identified=own,
         useless=np.asarray(~known & has_zero),
@@ -174,9 +168,9 @@ def integer_means(
     )
 
 
-def _with_borrowed(found: Fit, counts: Floats, sigma: Floats | None) -> Floats | None:
-    """The given sigmas, and for axes that show two integers only that of the other axes of their triad."""
-    result = np.full(len(found.mean), np.nan) if sigma is None else sigma.copy()
+def _borrowed(found: Fit, counts: Floats) -> Floats | None:
+    """For axes that show two integers only, the sigma of the other axes of their triad; NaN for the others."""
+    result = np.full(len(found.mean), np.nan)
     enough = counts.sum(axis=0) - counts.max(axis=0) >= MIN_BEYOND_TWO
     for start in range(0, len(result), 3):
         triad = slice(start, start + 3)

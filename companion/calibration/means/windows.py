@@ -62,8 +62,6 @@ class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
     gyro_grid_rad_s: float = 0.0
     """Steps of its own that the sensor's readings had before they became integers of the stream; 0: much finer."""
     accel_grid_m_s2: float = 0.0
-    gyro_prior_rad_s: Vector | None = None
-    """Bias known from before, in the sensor's axes and of this very stream; gates a steady turn at start."""
 
 
 def integer_steps(imu: ImuInput) -> Floats | None:

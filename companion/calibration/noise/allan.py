@@ -113,17 +113,6 @@ def floor_variance(flicker: Floats | float, walk: Floats | float, mean_s: Floats
     )
 
 
-def use_variance(model: AllanModel, mean_s: float, horizon_s: float) -> float:
-    """V(T, H): variance of (mean over the past T seconds) - (mean of the bias over the next H seconds).
-
-    Args:
-        model: the noise of the axis.
-        mean_s: T > 0.
-        horizon_s: H > 0.
-    """
-    return model.white**2 / mean_s + float(floor_variance(model.flicker, model.walk, mean_s, horizon_s))
-
-
 def slope_variance(flicker: Floats, walk: Floats, mean_s: float) -> Floats:
     """Variance of a straight line's slope over `mean_s` seconds that flicker and random walk make where there is none.
 

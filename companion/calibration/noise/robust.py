@@ -101,8 +101,6 @@ class Line(msgspec.Struct, frozen=True):
     """(c,) per second."""
     t_statistic: Floats
     """(c,) slope over its standard error."""
-    residual: Floats
-    """(m, c) values minus line."""
     end_leverage: Floats
     """(c,) variance of `end` over the variance of one value: about 4/m, against 1/m for a mean."""
 
@@ -152,6 +150,5 @@ def huber_line(
         end=np.asarray(level + slope * at_end),
         slope=np.asarray(slope),
         t_statistic=np.asarray(slope / error),
-        residual=np.asarray(residual),
         end_leverage=np.asarray(1.0 / total + np.square(at_end - centre) / spread),
     )

@@ -69,10 +69,7 @@ REST_HELD_S: Final = 30
 would lock the gate until a restart."""
 
 GYRO_BIAS_RAD_S: Final = 10.0 * DEG
-"""With no prior at all: beyond any turn-on bias that a modern part specifies (typically 0.5 to 3 deg/s)."""
-
-GYRO_PRIOR_RAD_S: Final = 1.0 * DEG
-"""Against a prior given from outside: the worst common temperature coefficient (0.015 deg/s/K) times 65 K."""
+"""Beyond any turn-on bias that a modern part specifies (typically 0.5 to 3 deg/s)."""
 
 GRAVITY_M_S2: Final = 9.81
 GRAVITY_GATE_M_S2: Final = 1.5
@@ -155,20 +152,12 @@ class ImuGate:
         name: as the pilot knows it.
         profile: its noise.
         steps: quantisation of gyro and accelerometer, 0 for floats.
-        gyro_prior_rad_s: (3,) bias known from before, in the sensor's axes, where there is one.
     """
 
-    def __init__(
-        self,
-        name: str,
-        profile: NoiseProfile,
-        steps: tuple[float, float] = (0.0, 0.0),
-        gyro_prior_rad_s: Floats | None = None,
-    ) -> None:
+    def __init__(self, name: str, profile: NoiseProfile, steps: tuple[float, float] = (0.0, 0.0)) -> None:
         self._name = name
         self._white = np.repeat([profile.gyro.white, profile.accel.white], 3)
         self._steps = np.repeat(np.asarray(steps, dtype=np.float64), 3)
-        self._prior = gyro_prior_rad_s
         self._learned: deque[Floats] = deque(maxlen=_LEARN_FROM)
         self._ordered: list[list[float]] | None = None
         """The same, channel by channel in ascending order; None: to be made when it is needed."""
@@ -289,12 +278,9 @@ class ImuGate:
         size = math.sqrt(sum(each * each for each in force))
         if not abs(size - GRAVITY_M_S2) <= GRAVITY_GATE_M_S2:
             return _fault(f"accel {name} reads {size:.1f} m/s^2, not gravity")
-        level, allowed = (
-            ([0.0] * 3, GYRO_BIAS_RAD_S) if self._prior is None else (self._prior.tolist(), GYRO_PRIOR_RAD_S)
-        )
-        found = farthest(rate, level)
-        if found > allowed:
-            return _words(f"gyro {name} turns or is biased by", found / DEG, allowed / DEG, "deg/s")
+        found = max(map(abs, rate))
+        if found > GYRO_BIAS_RAD_S:
+            return _words(f"gyro {name} turns or is biased by", found / DEG, GYRO_BIAS_RAD_S / DEG, "deg/s")
         # A few samples say little about their own scatter; what was learned says more.
         noise = batch.variance.tolist()
         if self._noise is not None:

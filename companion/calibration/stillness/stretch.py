@@ -17,9 +17,6 @@ MAX_REJECTED_RUN: Final = 3
 class Stretch:
     """Counts good and rejected seconds, and knows where the still stretch begins."""
 
-    _steady: int | None = None
-    """Good seconds since the last bad one; None: they are to be counted, as in a state that did not hold it."""
-
     def __init__(self, min_good: int, max_slots: int) -> None:
         self._min_good = min_good
         self.flags: deque[bool] = deque(maxlen=max_slots)
@@ -36,7 +33,7 @@ class Stretch:
 
     def add(self, slot: int, *, good: bool) -> bool:
         """Take the next second; False when the stretch broke with it."""
-        self._steady = self._counted() + 1 if good else 0
+        self._steady = self._steady + 1 if good else 0
         if good:
             if self.start is None:
                 self.start = slot
@@ -57,12 +54,7 @@ class Stretch:
     @property
     def steady(self) -> int:
         """Good seconds in a row until now."""
-        return min(self._counted(), len(self.flags))
-
-    def _counted(self) -> int:
-        if self._steady is None:
-            self._steady = next((k for k, good in enumerate(reversed(self.flags)) if not good), len(self.flags))
-        return self._steady
+        return min(self._steady, len(self.flags))
 
     @property
     def good_now(self) -> bool:
