@@ -27,7 +27,6 @@ REPEAT_S: Final = 0.05
 one does in SITL's lockstep, and then asks no more; and links lose packets. A second answer changes nothing for it."""
 ATTEMPT_S: Final = 1.5
 """A request so long after the first of an attempt, and no retransmission, begins a new one."""
-MISDIRECTED_EVERY_S: Final = 60.0
 
 
 class ArmAuthoriser:
@@ -41,7 +40,7 @@ class ArmAuthoriser:
         say: Say,
     ) -> None:
         self._link, self._vehicle, self._gate, self._say = link, vehicle, gate, say
-        self._attempt_s = self._misdirected_s = -math.inf
+        self._attempt_s = -math.inf
         self._repeat: asyncio.TimerHandle | None = None
         self.answered = 0
         self._unsubscribe = link.subscribe(mavlink.MAVLink_command_long_message, self._on_message)
@@ -59,10 +58,10 @@ class ArmAuthoriser:
         sender = (message.get_srcSystem(), message.get_srcComponent())
         if system_id is None or sender != (system_id, mavlink.MAV_COMP_ID_AUTOPILOT1):
             return
-        if message.target_component not in (0, self._link.component_id) or self._gate.at_arm == "off":
-            return
-        if message.target_system != self._link.system_id:
-            self._misdirected(message.target_system, now_s)
+        target = (message.target_system, message.target_component)
+        if target not in ((self._link.system_id, 0), (self._link.system_id, self._link.component_id)):
+            return  # PX4 asks on every link; whom it asks is checked with its parameters
+        if self._gate.at_arm == "off":
             return
         answer, gate = self._gate.answer(), self._gate.at_arm == "gate"
         result = mavlink.MAV_RESULT_ACCEPTED
@@ -90,10 +89,3 @@ class ArmAuthoriser:
             return False
         self._attempt_s = now_s
         return True
-
-    def _misdirected(self, target: int, now_s: float) -> None:
-        """PX4 asks the system that COM_ARM_AUTH_ID names, on every link: we hear when that is not us."""
-        if now_s - self._misdirected_s >= MISDIRECTED_EVERY_S:
-            self._misdirected_s = now_s
-            own = self._link.system_id
-            self._say(Severity.WARNING, f"Arming asks system {target}: set COM_ARM_AUTH_ID to {own}", Weight.REFUSAL)

@@ -48,11 +48,6 @@ class GyroParameters:
     tcal: tuple[str, ...]
     """INS_TCALn_ENABLE and the like that are not 0: there the calibration changes what an offset means."""
 
-    def offset(self, instance: int) -> tuple[float, float, float]:
-        """X, Y, Z of one instance; rad/s."""
-        x, y, z = (self.values[name] for name in parameters_of(instance).gyro_offset)
-        return x, y, z
-
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class GyroCalibration:

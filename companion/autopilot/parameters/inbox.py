@@ -34,11 +34,6 @@ class Inbox:
         self._arrived.append(item)
         self._bell.set()
 
-    def clear(self) -> None:
-        """Forget what has arrived so far."""
-        self._arrived.clear()
-        self._bell.clear()
-
     async def get(self, deadline_s: float) -> float | Refusal | Rebooted | None:
         """The next item, or None at the deadline (loop's clock)."""
         while not self._arrived:

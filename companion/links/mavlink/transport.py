@@ -12,7 +12,7 @@ import errno
 import functools
 import logging
 import re
-from typing import Any, Protocol, cast
+from typing import Any
 
 from companion.errors import LinkError
 from companion.links.mavlink.link import MavlinkLink, Sender
@@ -107,14 +107,6 @@ async def _run_udp(
     await reconnection.keep(once)
 
 
-class _DatagramOut(Protocol):
-    """What every event loop's datagram transport can, though asyncio's own type does not say so."""
-
-    def sendto(self, data: bytes, addr: tuple[Any, ...] | None = None) -> None: ...
-
-    def get_write_buffer_size(self) -> int: ...
-
-
 class _Udp(asyncio.DatagramProtocol):
     """What both kinds of UDP share: receiving, a bounded way out, and an end."""
 
@@ -124,7 +116,8 @@ class _Udp(asyncio.DatagramProtocol):
         self.now_s = loop.time
         self.closed: asyncio.Future[None] = loop.create_future()
         self._failed: asyncio.Future[str] = loop.create_future()
-        self._transport: _DatagramOut | None = None
+        self._transport: Any = None
+        """uvloop's is no asyncio.DatagramTransport by type."""
 
     async def run(self) -> str:
         """Serve until the socket fails; returns why."""
@@ -138,7 +131,7 @@ class _Udp(asyncio.DatagramProtocol):
         """What is due once a second."""
 
     def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
-        self._transport = cast("_DatagramOut", transport)
+        self._transport = transport
         if hasattr(transport, "max_size"):
             transport.max_size = MOST_DATAGRAM_BYTES
 
