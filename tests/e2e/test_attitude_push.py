@@ -318,31 +318,14 @@ def test_a_new_alignment_that_turns_the_heading_is_a_reset(tmp_path: Path) -> No
     run_virtual(main())
 
 
-def test_px4_is_told_the_heading_once_and_converges_on_our_clock(tmp_path: Path) -> None:
+def test_px4_converges_on_our_clock(tmp_path: Path) -> None:
     async def main() -> None:
         async with flight(tmp_path, firmware="px4") as flying:
-            commands = mavlink.MAVLink_command_long_message
-            told = [one for one in flying.witness.of(commands) if one.command == 620]
             await flying.sleep(60.0)
-            told = [one for one in flying.witness.of(commands) if one.command == 620]
-            assert len(told) == 1
-            assert told[0].param3 == pytest.approx(40.0, abs=2.0)
-            assert flying.attitude.external.outcome == "heading given to PX4"
             vision = flying.rig.px4.vision
             assert vision.converged
             assert vision.active
             assert 0.0 < vision.late_s < 0.02
-
-    run_virtual(main())
-
-
-def test_an_older_px4_does_not_know_the_command(tmp_path: Path) -> None:
-    async def main() -> None:
-        async with flight(tmp_path, firmware="px4", version="1.16") as flying:
-            await flying.sleep(5.0)
-            assert flying.attitude.external.outcome is not None
-            assert "does not take a heading by command" in flying.attitude.external.outcome
-            assert flying.rig.px4.vision.active
 
     run_virtual(main())
 

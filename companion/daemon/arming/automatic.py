@@ -60,14 +60,7 @@ class AutomaticWrite(msgspec.Struct, frozen=True):
 
 
 class Automatic:
-    """Starts calibrations by itself; `run` decides when.
-
-    Args:
-        core: what all share; the writes are counted in its storage.
-        imus: the autopilot's IMUs by name.
-        conductor: runs them, as for everybody else.
-        in_force: what is in force, and whether better is to be had.
-    """
+    """Starts calibrations by itself; `run` decides when."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], conductor: Conductor, in_force: InForce) -> None:
         self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor

@@ -33,13 +33,7 @@ _VERB: Final = {
 
 
 class Forecast:
-    """Of the write that the conductor does.
-
-    Args:
-        vehicle: whose firmware decides how long it takes.
-        collector: how long it has been still.
-        conductor: what it is doing.
-    """
+    """Of the write that the conductor does."""
 
     def __init__(self, vehicle: Vehicle, collector: RollingCollector, conductor: Conductor) -> None:
         self._vehicle, self._collector, self._conductor = vehicle, collector, conductor

@@ -56,14 +56,7 @@ SETTLED_EVERY_S: Final = 5
 
 
 class InForce:
-    """The calibration in force; `poll` often, `measure` whenever there may be a new window.
-
-    Args:
-        core: what all share.
-        imus: the autopilot's IMUs by name.
-        conductor: what becomes of calibrations.
-        alignment: of the gradienter.
-    """
+    """The calibration in force; `poll` often, `measure` whenever there may be a new window."""
 
     def __init__(
         self, core: Core, imus: Mapping[str, AutopilotImu], conductor: Conductor, alignment: AlignmentInForce

@@ -49,15 +49,7 @@ _WAITS: Final = {
 
 
 class Readiness:
-    """The arm gate's answer, and what goes with it: `run` keeps it fresh.
-
-    Args:
-        core: what all share.
-        conclusion: whether the autopilot must be restarted although its offsets are right.
-        conductor: what runs, and what is set for arming.
-        in_force: what is in force, and what speaks against it.
-        automatic: whether a calibration will start by itself.
-    """
+    """The arm gate's answer, and what goes with it: `run` keeps it fresh."""
 
     def __init__(
         self, core: Core, conclusion: Conclusion, conductor: Conductor, in_force: InForce, automatic: Automatic

@@ -13,11 +13,6 @@ def shown_calibration(in_force: InForce, last: Record | None, now_s: float) -> d
 
     `calibrated_ago_s` and `confirmed_ago_s` are null where that is not known to be in force: a wall clock that was
     wrong in the field tells no age.
-
-    Args:
-        in_force: what is in force.
-        last: the last record, whatever became of it.
-        now_s: loop time.
     """
     record = in_force.calibration
     known = record is not None

@@ -14,12 +14,7 @@ MONITOR_EVERY_S: Final = 0.5
 
 
 class Answers:
-    """The one door for people's requests, whatever face they come by.
-
-    Args:
-        subsystems: what the daemon consists of.
-        pose: whose declination is looked up when somebody looks.
-    """
+    """The one door for people's requests, whatever face they come by."""
 
     def __init__(self, subsystems: Sequence[Subsystem], pose: PoseNow) -> None:
         self._subsystems, self._pose = subsystems, pose

@@ -20,7 +20,6 @@ from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.heading.carrier import SLOWEST_AIRSPEED_M_S, Carrier
 from companion.daemon.heading.difference import Difference
-from companion.daemon.heading.external_estimate import ExternalEstimate
 from companion.daemon.heading.health import Health
 from companion.daemon.heading.sender import Sender, is_sane
 from companion.daemon.heading.source import carrying_imu, without_truncation
@@ -43,14 +42,7 @@ SAID_AGAIN_S: Final = 30.0
 
 
 class AttitudeService:
-    """Carries, pushes and watches the attitude; `run` it.
-
-    Args:
-        core: what all share; with `push.attitude` "yaw" or "full".
-        devices: which hand over what they read at once.
-        in_force: what the last calibration found.
-        alignment: of the gradienter.
-    """
+    """Carries, pushes and watches the attitude; `run` it."""
 
     def __init__(self, core: Core, devices: Devices, in_force: InForce, alignment: AlignmentInForce) -> None:
         config, link, vehicle = core.config, core.link, core.vehicle
@@ -62,7 +54,6 @@ class AttitudeService:
         self.health = Health(self.carrier, self.difference, vehicle)
         self.sender = Sender(link, models.attitude_rate_hz(config), full=config.push.attitude == "full")
         self.timesync = TimesyncResponder(link, vehicle)
-        self.external = ExternalEstimate(vehicle, self.difference)
         self._wanted = StandingRequests(vehicle.commands)
         self._wanted.add(mavlink.MAVLink_attitude_message, ATTITUDE_RATE_HZ)
         self._unsubscribe = [
@@ -74,10 +65,8 @@ class AttitudeService:
         self._airspeed_s = -math.inf
         self._looked_s = -math.inf
         self._was_pushing = False
-        self._told = 0
         self._said: tuple[str, float] = ("", -math.inf)
         self._warned: str | None = None
-        self._telling: asyncio.Task[None] | None = None
         self._running = False
         self._autopilot_imu = devices.imus.get(self.carrier.imu.name)
         if self._autopilot_imu is not None:
@@ -175,8 +164,6 @@ class AttitudeService:
             self.health.stop("the companion ends")
             for unsubscribe in (*self._unsubscribe, self.difference.close, self.timesync.close, self.carrier.close):
                 unsubscribe()
-            if self._telling is not None:
-                self._telling.cancel()
 
     async def _turn(self, now_s: float) -> None:
         if now_s - self._airspeed_s > AIRSPEED_OLD_S:
@@ -192,7 +179,6 @@ class AttitudeService:
             await self.carrier.look(now_s)
         self.sender.count(now_s)
         self._tell(now_s)
-        self._tell_px4()
 
     def _tell(self, now_s: float) -> None:
         if self.health.pushing != self._was_pushing:
@@ -212,16 +198,6 @@ class AttitudeService:
         if self._said[0] != words or now_s - self._said[1] >= SAID_AGAIN_S:
             self._said = (words, now_s)
             self._say(severity, words, Weight.NEWS)
-
-    def _tell_px4(self) -> None:
-        """The heading by command, once at each alignment."""
-        attitude = self.carrier.now()
-        if self._told == self.carrier.alignments or attitude is None or not self.health.pushing:
-            return
-        self._told = self.carrier.alignments
-        if self._telling is not None:
-            self._telling.cancel()
-        self._telling = asyncio.get_running_loop().create_task(self.external.tell(attitude), name="attitude estimate")
 
     # --- what is known
 
@@ -268,7 +244,6 @@ class AttitudeService:
             "alignments": self.carrier.alignments,
             "reset_counter": self.carrier.reset_counter % 256,
             "timesync_answers": self.timesync.answered,
-            "heading_by_command": self.external.outcome,
             "roll_deg": None if attitude is None else round(attitude.roll_rad / DEG, 3),
             "pitch_deg": None if attitude is None else round(attitude.pitch_rad / DEG, 3),
             "heading_deg": None if attitude is None else round(attitude.yaw_rad / DEG % 360.0, 2) % 360.0,

@@ -81,14 +81,7 @@ def stand_of(
 
 
 class Carrier:
-    """Carries the attitude of one IMU.
-
-    Args:
-        core: what all share.
-        imu: which one carries.
-        in_force: what the last calibration found.
-        alignment: of the gradienter.
-    """
+    """Carries the attitude of one IMU."""
 
     def __init__(self, core: Core, imu: Imu, in_force: InForce, alignment: AlignmentInForce) -> None:
         self.imu = imu

@@ -27,13 +27,7 @@ DECLINATION_EVERY_S: Final = 60.0
 
 
 class PoseNow:
-    """Takes samples, tells the pose.
-
-    Args:
-        core: what all share.
-        alignment: of the gradienter.
-        carried: the attitude that is right in flight, too, while there is one; None: none is carried.
-    """
+    """Takes samples, tells the pose; `carried` gives the attitude that is right in flight, too, while there is one."""
 
     def __init__(self, core: Core, alignment: AlignmentInForce, carried: Callable[[], Object | None] | None) -> None:
         self._core, self._alignment, self._carried = core, alignment, carried

@@ -19,18 +19,10 @@ _ROUNDING_S: Final = 1e-6
 
 
 class Sender:
-    """Sends what is due.
-
-    Args:
-        link: the connection.
-        rate_hz: of what the autopilot consumes.
-        full: whether ground stations are shown the attitude too.
-    """
+    """Sends the autopilot what is due; ground stations too, if `full`."""
 
     def __init__(self, link: MavlinkLink, rate_hz: float, *, full: bool) -> None:
         self.sent = 0
-        self.unsent = 0
-        """For which the connection had no room."""
         self.rate_hz = 0.0
         """Of late."""
         self._link, self._full = link, full
@@ -55,8 +47,6 @@ class Sender:
         self._last_s, self._left_s = t_s, now_s
         if self._link.send(vision_position_estimate(firmware, attitude, reset_counter)):
             self.sent += 1
-        else:
-            self.unsent += 1
         if self._full and now_s - self._shown_s >= SHOWN_EVERY_S:
             self._shown_s = now_s
             for message in attitude_messages(attitude):

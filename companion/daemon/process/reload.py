@@ -82,13 +82,7 @@ def _show(parameters: OwnParameters, name: str, value: float) -> None:
 
 
 class Reloader:
-    """Reads the file again and applies it.
-
-    Args:
-        service: the running daemon.
-        path: of the configuration file.
-        offload: for the disk.
-    """
+    """Reads the file again and applies it."""
 
     def __init__(self, service: Service, path: Path, offload: Offload) -> None:
         self._service, self._path, self._offload = service, path, offload

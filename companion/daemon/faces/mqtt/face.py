@@ -40,15 +40,7 @@ FLUSH_S: Final = 1.0
 
 
 class MqttFace:
-    """One broker's view of the daemon; `run` it.
-
-    Args:
-        core: what all share; while it only listens, the broker is reached and nothing is done there.
-        settings: which broker, which topics.
-        answers: the same that the command line gets.
-        conductor: what runs.
-        pose: how the aircraft stands.
-    """
+    """One broker's view of the daemon; `run` it. Where the daemon only listens, the broker is left alone."""
 
     def __init__(self, core: Core, settings: Mqtt, answers: Answers, conductor: Conductor, pose: PoseNow) -> None:
         self._settings, self._answers, self._conductor = settings, answers, conductor
