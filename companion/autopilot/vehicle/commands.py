@@ -112,7 +112,7 @@ class Commands:
     def _finish(self, command: int, result: int | None) -> None:
         self._timers.pop(command).cancel()
         request = self._in_flight.pop(command)
-        self.results["no answer" if result is None else _result_name(result)] += 1
+        self.results["no answer" if result is None else result_name(result)] += 1
         request.settle(result)
         self._next(command)
 
@@ -136,6 +136,7 @@ class Commands:
             self._finish(message.command, message.result)
 
 
-def _result_name(result: int) -> str:
+def result_name(result: int) -> str:
+    """As the dialect calls a MAV_RESULT."""
     known = mavlink.enums["MAV_RESULT"].get(result)
     return known.name if known is not None else str(result)

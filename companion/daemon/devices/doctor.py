@@ -11,7 +11,7 @@ from typing import Final
 from companion.config.sections import Config
 from companion.configured.devices import serial_devices
 from companion.errors import LinkError
-from companion.links.serial.faults import PortFault, port_faults, same_ports, unnamed
+from companion.links.serial.faults import port_faults, same_ports, unnamed
 from companion.links.serial.listening import Heard, listen
 from companion.links.serial.ports import ROOT, list_ports
 from companion.links.system.request import Object
@@ -86,7 +86,7 @@ def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> l
     among = list_ports(root)
     fast = {sensor.name for sensor in sensors if sensor.kind == "imu"}
     found = [
-        _of_fault(name, port, fault)
+        Diagnosis(name, fault.good, str(fault), fault.remedy, port)
         for name, port in ports.items()
         for fault in port_faults(port, is_fast=name in fast, ours=ours, among=among, root=root)
     ]
@@ -94,10 +94,6 @@ def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> l
         words = f"{first} and {second} are one and the same port, {device}"
         found.append(Diagnosis(second, good=False, words=f"{words}: give each its own", remedy="", port=device))
     return found
-
-
-def _of_fault(name: str, port: str, fault: PortFault) -> Diagnosis:
-    return Diagnosis(name, fault.good, str(fault), fault.remedy, port)
 
 
 async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -> list[Diagnosis]:

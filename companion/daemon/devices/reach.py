@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 PX4_LINKS: Final = 3
 SILENT_S: Final = 5.0
-"""Without a heartbeat for so long a ground station is not there, or not to be heard."""
+"""How long without a heartbeat a ground station still counts as there."""
 RETRY_S: Final = 10.0
 
 

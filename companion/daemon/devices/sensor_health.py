@@ -23,7 +23,7 @@ RENEW_POLLED_AFTER_S: Final = 6.0
 """One that must be asked is given time to be asked, and to answer."""
 GOOD_AFTER_S: Final = 1.0
 AGAIN_S: Final = 60.0
-"""The same trouble within so long of its last line is said in the detailed log only: a loose wire must not fill it."""
+"""How soon after its last line the same trouble is said in the detailed log only: a loose wire must not fill it."""
 
 
 class SensorHealth:

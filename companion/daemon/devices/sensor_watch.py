@@ -29,7 +29,7 @@ TILTED_DEG: Final = 3.0
 """Far more than the mean of a second in somebody's hands is off, and 300 steps of the coarsest gradienter."""
 TILTED_SECONDS: Final = 3
 BEFORE_S: Final = 3.0
-"""So long before the first of its equal headings a compass may have begun to hang: until then it was near them."""
+"""How long before the first of its equal headings a compass may have begun to hang: until then it was near them."""
 QUIET_S: Final = 3.0
 """An IMU that is so far behind the others is no witness: the autopilot's, while its offsets are being written."""
 LATE_S: Final = 1.0

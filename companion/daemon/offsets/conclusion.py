@@ -13,6 +13,7 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.firmware.px4 import needs_reboot, stale_tilt_deg
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.float32 import same_float32
+from companion.autopilot.vehicle.commands import result_name
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.collector.rolling import Window
 from companion.calibration.machine import Event, Machine
@@ -179,7 +180,7 @@ class Conclusion:
         reboot = mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
         result = await self._vehicle.commands.send(reboot, 1.0, timeout_s=ANSWER_S)
         if result not in (mavlink.MAV_RESULT_ACCEPTED, None):
-            raise NotRebootedError(f"not rebooted: {self._vehicle.name} refused ({_word(result or 0)})")
+            raise NotRebootedError(f"not rebooted: {self._vehicle.name} refused ({result_name(result or 0)})")
         # No answer proves nothing: it may have gone down with it.
         back_s = loop.time() + BACK_WITHIN_S
         while self._vehicle.boots == boots or self._vehicle.arm_state is not ArmState.DISARMED:
@@ -208,8 +209,3 @@ class Conclusion:
             except (AutopilotRebootedError, ParameterTimeoutError):
                 continue
         return await self._parameters.read(name)
-
-
-def _word(result: int) -> str:
-    known = mavlink.enums["MAV_RESULT"].get(result)
-    return known.name if known is not None else str(result)

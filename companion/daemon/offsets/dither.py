@@ -47,7 +47,7 @@ SLACK_S: Final = 6.0
 MOST_VOID: Final = 6
 """Steps that may be void in one dither before it is given up."""
 BACK_WITHIN_S: Final = 20.0
-"""The recovery is waited for so long before the job ends without it."""
+"""How long the recovery is waited for before the job ends without it."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

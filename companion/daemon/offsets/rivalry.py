@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 
 
 JUST_NOW_S: Final = 20.0
-"""So long after a landing or a start a rewritten offset is taken for the work of who acts then."""
+"""How long after a landing or a start a rewritten offset is taken for the work of who acts then."""
 
 
 class Rivalry:
