@@ -16,7 +16,6 @@ from companion.report.analysis import history
 from companion.report.markup import Child, Markup, join, number, tag
 from companion.report.page import (
     AXES,
-    CLASSES,
     MAX_IMUS,
     MAX_WARNINGS,
     NAMES,
@@ -32,7 +31,7 @@ from companion.report.page import (
     with_sigma,
     written_count,
 )
-from companion.report.seconds import allan_figure, stillness
+from companion.report.seconds import stillness
 from companion.samples import Triad, Vector
 
 MAX_WRITTEN: Final = 60
@@ -80,7 +79,6 @@ def calibration_page(material: Material, now: datetime.datetime) -> str:
         _armings(material),
         _pose(record),
         stillness(material.trace, material.no_trace),
-        _allan(material),
         _drift(material),
     )
 
@@ -342,33 +340,7 @@ def _angle(value: float | None, sigma: float | None, sign: str) -> Markup:
     return join(shown, " ± ", width, " deg")
 
 
-# ------------------------------------------------------------------------------------------ Allan deviation, drift
-
-
-def _allan(material: Material) -> Markup:
-    parts: list[Child] = [tag("h2", "Allan deviation")]
-    trace = material.trace
-    if trace is None:
-        parts.append(card("", f"Not shown: {material.no_trace}"))
-        return tag("section", *parts)
-    shown: list[Child] = []
-    parts.append(
-        tag(
-            "p",
-            "How much the mean over so many seconds still scatters. Along the dotted line it is white noise, which"
-            " averaging takes away; below the dashed floor the sensor's profile promises nothing.",
-            class_="soft",
-        )
-    )
-    for imu in trace.imus[:MAX_IMUS]:
-        figures = [figure for triad in TRIADS if (figure := allan_figure(trace, imu, triad)) is not None]
-        if figures:
-            shown.append(tag("div", *figures, class_="pairs"))
-        else:
-            shown.append(card("", f"IMU {imu.name}: too few still seconds."))
-    parts += shown
-    parts.append(svg.legend(*zip(CLASSES, AXES, strict=True), ("white", "white noise"), ("floor", "sensor's floor")))
-    return tag("section", *parts)
+# ---------------------------------------------------------------------------------------------------------- drift
 
 
 def _drift(material: Material) -> Markup:
@@ -383,16 +355,8 @@ def _drift(material: Material) -> Markup:
             points = history(material.earlier, name, triad)
             if len(points) < 2:
                 continue
-            heading = f"{name} {NAMES[triad].lower()}"
-            figures += [
-                tag(
-                    "div",
-                    tag("h3", f"{NAMES[triad]} against {against}"),
-                    drift(points, triad, against, name=heading, this=material.number)
-                    or card("", f"No {against} is known of them."),
-                )
-                for against in ("time", "temperature")
-            ]
+            plots = drift(points, triad, name=f"{name} {NAMES[triad].lower()}", this=material.number)
+            figures.append(tag("div", tag("h3", NAMES[triad]), plots or card("", "No time is known of them.")))
         if figures:
             parts += [tag("h3", f"IMU {name}"), tag("div", *figures, class_="pairs")]
     if len(parts) == 1:

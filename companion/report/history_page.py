@@ -125,15 +125,9 @@ def _biases(records: Sequence[tuple[int, Record]]) -> Markup:
         figures: list[Child] = []
         for triad in TRIADS:
             points = history(records, name, triad)
-            figures += [
-                tag(
-                    "div",
-                    tag("h3", f"{NAMES[triad]} against {against}"),
-                    drift(points, triad, against, name=f"{name} {triad}") or card("", f"No {against} is known."),
-                )
-                for against in ("time", "temperature")
-                if points
-            ]
+            if points:
+                plots = drift(points, triad, name=f"{name} {triad}") or card("", "No time is known.")
+                figures.append(tag("div", tag("h3", f"{NAMES[triad]} against time"), plots))
         parts.append(tag("div", *figures, class_="pairs") if figures else card("", "No finished calibration."))
     if len(names) > MAX_IMUS:
         parts.append(card("caution", f"{len(names) - MAX_IMUS} more IMUs are not shown."))

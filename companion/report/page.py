@@ -12,7 +12,7 @@ from companion.calibration.noise.allan import NoiseProfile
 from companion.calibration.solution.record import Arming, Record
 from companion.physics.units import DEG_H, MG
 from companion.report import svg
-from companion.report.analysis import Point, clock_is_sound, slope
+from companion.report.analysis import Point, clock_is_sound
 from companion.report.markup import Child, Markup, join, number, tag
 from companion.samples import Triad
 
@@ -67,13 +67,11 @@ text{font:13px system-ui,sans-serif;fill:var(--fg)}.mid{text-anchor:middle}.end{
 .band{fill:var(--band)}.sx{color:var(--x)}.sy{color:var(--y)}.sz{color:var(--z)}
 .dot{fill:none;stroke:currentColor;stroke-width:7.2;stroke-linecap:round}
 .mark{fill:currentColor;stroke:none}.bar{fill:none;stroke:currentColor;stroke-width:1.6}
-.curve{fill:none;stroke:currentColor;stroke-width:1.4}.stroke{fill:none;stroke:currentColor;stroke-width:2.2}
+.stroke{fill:none;stroke:currentColor;stroke-width:2.2}
 .bad{color:var(--bad)}.ok{color:var(--good)}.warn{color:var(--warn)}
 .use{color:var(--fg)}.mark.stat{color:var(--fg);fill:var(--bg);stroke:var(--fg);stroke-width:1.8}
 .ring{fill:none;stroke:var(--fg);stroke-width:2}
 .floor{fill:none;stroke:var(--fg);stroke-width:1.8;stroke-dasharray:7 4}
-.white{fill:none;stroke:var(--fg);stroke-width:1.4;stroke-dasharray:2 3}
-.fit{fill:none;stroke:var(--soft);stroke-width:1.6;stroke-dasharray:7 4}
 .still{fill:var(--good)}.moving{fill:var(--bad)}.fault{fill:none;stroke:var(--bad);stroke-width:2}
 .unknown{fill:var(--rule)}.used{fill:var(--fg)}
 @media print{:root{color-scheme:light;--bg:#fff;--fg:#000}body{max-width:none}figure,.card{break-inside:avoid}}
@@ -137,73 +135,41 @@ def with_sigma(value: float, sigma: float, unit: float, sign: str = "+") -> tupl
 
 
 def drift(
-    points: Sequence[Point], triad: Triad, against: str, *, name: str, this: int | None = None, height: float = 84.0
+    points: Sequence[Point], triad: Triad, *, name: str, this: int | None = None, height: float = 84.0
 ) -> Markup | None:
-    """Three plots, one an axis, of a bias against "time" or "temperature"; None where there is nothing to show."""
+    """Three plots, one an axis, of a bias against time; None where there is nothing to show."""
     unit, unit_name = UNITS[triad]
-    by_time = against == "time"
-    numbered = by_time and not clock_is_sound(points)
-    if numbered:
-        shown = [(float(point.number), point) for point in points]
-    else:
-        given = [(point.unix_s if by_time else point.temperature_degc, point) for point in points]
-        shown = [(x, point) for x, point in given if x is not None]
+    numbered = not clock_is_sound(points)
+    given = [(float(point.number) if numbered else point.unix_s, point) for point in points]
+    shown = [(x, point) for x, point in given if x is not None]
     if not shown:
         return None
     places = [x for x, _ in shown]
-    if not by_time:
-        across, label = svg.linear(places, least=1.0), "IMU temperature, degC"
-    elif numbered:
+    across, label = svg.times(places), "time (UTC)"
+    if numbered:
         across, label = svg.linear(places, least=2.0), "number of the calibration (clock not sound)"
-    else:
-        across, label = svg.times(places), "time (UTC)"
     plots: list[Markup] = []
     for axis in range(3):
         ends = [
             ((point.bias[axis] - point.sigma_use[axis]) / unit, (point.bias[axis] + point.sigma_use[axis]) / unit)
             for _, point in shown
         ]
-        up = svg.linear([end for pair in ends for end in pair], ticks=3)
         plot = svg.Plot(
             across,
-            up,
-            name=f"{name} {AXES[axis]}: bias against {against}",
+            svg.linear([end for pair in ends for end in pair], ticks=3),
+            name=f"{name} {AXES[axis]}: bias against time",
             height=height,
             x_label=label if axis == 2 else None,
             y_label=f"{AXES[axis]}, {unit_name}",
         )
-        fit = None if by_time else slope([point for _, point in shown], axis)
-        if fit is not None:
-            line = [(x, (fit.at_mean + fit.per_k * (x - fit.mean_degc)) / unit) for x in (min(places), max(places))]
-            plot.line(line, "fit")
         plot.points([(x, point.bias[axis] / unit) for x, point in shown], CLASSES[axis], spans=ends)
         for x, point in shown:
             if point.number == this:
                 centre = plot.at(x, point.bias[axis] / unit)
                 plot.draw(tag("circle", cx=f"{centre[0]:.1f}", cy=f"{centre[1]:.1f}", r=8, class_="ring"))
         plots.append(plot.svg())
-    return tag("figure", *plots, _caption(points, shown, triad, against))
-
-
-def _caption(points: Sequence[Point], shown: Sequence[tuple[float, Point]], triad: Triad, against: str) -> Markup:
-    unit, unit_name = UNITS[triad]
-    words: list[Child] = []
-    if against == "temperature":
-        fits = [slope([point for _, point in shown], axis) for axis in range(3)]
-        if all(fits):
-            per_k = ", ".join(
-                f"{axis} {fit.per_k / unit:+.2g} ± {fit.sigma_per_k / unit:.1g}"
-                for axis, fit in zip(AXES, fits, strict=True)
-                if fit is not None
-            )
-            words.append(f"Dashed: the best line, {unit_name} per K: {per_k}. ")
-        else:
-            words.append("A line is drawn from 5 calibrations over 5 K on. ")
-        if len(shown) < len(points):
-            words.append(f"{len(points) - len(shown)} without a temperature are left out. ")
-    elif not clock_is_sound(points):
-        words.append("The companion's clock went back in between, so these stand in their order, not by time. ")
-    return tag("figcaption", *words, "Bars: one sigma for the next minutes.")
+    back = "The companion's clock went back in between, so these stand in their order, not by time. "
+    return tag("figure", *plots, tag("figcaption", back if numbered else None, "Bars: one sigma for the next minutes."))
 
 
 def arming_items(armings: Sequence[Arming]) -> Markup:

@@ -1,23 +1,19 @@
-"""Figures from the seconds of a calibration: verdicts, and Allan deviation."""
+"""Figures from the seconds of a calibration: the verdicts."""
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
-from companion.calibration.collector.trace import ImuTrace, Trace
+from companion.calibration.collector.trace import Trace
 from companion.report import svg
-from companion.report.analysis import Run, allan, runs
+from companion.report.analysis import Run, runs
 from companion.report.markup import Child, Markup, tag
-from companion.report.page import AXES, CLASSES, NAMES, UNITS, card
-from companion.samples import Triad
+from companion.report.page import card
 
 MAX_SOURCES: Final = 8
 MAX_RUNS: Final = 300
 MAX_EVENTS: Final = 15
 _ROW: Final = 26.0
-_DODGE: Final = (0.94, 1.0, 1.064)
-"""Factors on tau, so that the bars of three axes do not hide one another."""
 
 
 def stillness(trace: Trace | None, no_trace: str) -> Markup:
@@ -114,51 +110,3 @@ def _when(run: Run) -> str:
 
 def _short(name: str) -> str:
     return name if len(name) <= 10 else name[:9] + "…"
-
-
-def allan_figure(trace: Trace, imu: ImuTrace, triad: Triad) -> Markup | None:
-    """Allan deviation of one triad against the averaging time; None where too little was still."""
-    unit, unit_name = UNITS[triad]
-    title = tag("h3", f"{imu.name}: {NAMES[triad].lower()}, {unit_name}")
-    found = allan(trace, imu, triad)
-    if found is None or not found.points:
-        return None
-    model = imu.gyro_noise if triad == "gyro" else imu.accel_noise
-    step = imu.gyro_step_rad_s if triad == "gyro" else imu.accel_step_m_s2
-    points = [point for point in found.points if max(point.deviation) > 0.0]
-    if not points:
-        return tag("div", title, card("", "The readings never changed: too coarse for an Allan deviation."))
-    # White noise through the quadratic mean of the axes at 1 s.
-    first = points[0]
-    white = math.sqrt(sum(value**2 for value in first.deviation) / 3.0) * math.sqrt(first.tau_s)
-    longest = points[-1].tau_s
-    values = [value / unit for point in points for value in (*point.low, *point.high) if value > 0.0]
-    across = svg.logarithmic([0.9, float(max(longest, 2))])
-    up = svg.logarithmic([*values, model.floor / unit, white / math.sqrt(longest) / unit])
-    plot = svg.Plot(across, up, name=f"{imu.name} {triad}: Allan deviation", height=150.0, x_label="averaging time, s")
-    plot.level(model.floor / unit, "floor", "floor")
-    plot.line([(tau, white / math.sqrt(tau) / unit) for tau in (1.0, float(longest))], "white")
-    for axis, (class_, dodge) in enumerate(zip(CLASSES, _DODGE, strict=True)):
-        shown = [point for point in points if point.deviation[axis] > 0.0]
-        places = [(point.tau_s * dodge, point.deviation[axis] / unit) for point in shown]
-        spans = [(point.low[axis] / unit, point.high[axis] / unit) for point in shown]
-        plot.line(places, f"curve {class_}")
-        plot.points(places, class_, spans=spans)
-    words = f"{found.seconds} still seconds; N = {white / unit:.2g} {unit_name}·√s; bars: about one sigma."
-    if not found.of_result:
-        words += " There was no result: this is the longest still stretch."
-    if step > 0.0:
-        words += f" The telemetry comes in steps of {step / unit:.2g} {unit_name}: it adds noise of its own."
-    rows = [
-        tag(
-            "tr",
-            tag("td", f"{point.tau_s} s"),
-            *(
-                tag("td", f"{value / unit:.3g}", data_key=f"{imu.name}.{triad}.adev.{point.tau_s}.{axis}")
-                for axis, value in zip(AXES, point.deviation, strict=True)
-            ),
-        )
-        for point in points
-    ]
-    table = tag("details", tag("summary", "Figures"), tag("table", *rows))
-    return tag("figure", title, plot.svg(), tag("figcaption", words), table)

@@ -143,17 +143,6 @@ class Plot:
         if len(points) > 1:
             self._below.append(_path("M" + "L".join(_xy(*self.at(*point)) for point in points), class_))
 
-    def level(self, y: float, class_: str, words: str = "") -> None:
-        """A line across, with words at its left end."""
-        if not self._y.low <= y <= self._y.high:
-            return
-        _, height = self.at(self._x.low, y)
-        self._below.append(_path(f"M{_n(self._left)} {_n(height)}H{_n(WIDTH - _RIGHT)}", class_))
-        if words:
-            # Above the line, but never above the frame.
-            place = height - 4.0 if height > self._top + 16.0 else height + 13.0
-            self._parts.append(tag("text", words, x=_n(self._left + 4.0), y=_n(place), class_="note"))
-
     def points(
         self, points: Sequence[Pair], class_: str, *, spans: Sequence[Pair] = (), size: float = 1.0, shape: str = ""
     ) -> None:
@@ -181,11 +170,6 @@ class Plot:
             return
         marks = "".join(_marker(shape, *self.at(*point), _MARK * size) for point in points)
         self._parts.append(_path(marks, f"{'stroke' if shape == 'cross' else 'mark'} {class_}"))
-
-    def words(self, x: float, y: float, words: str, class_: str = "note") -> None:
-        """Words at a place."""
-        across, height = self.at(x, y)
-        self._parts.append(tag("text", words, x=_n(across), y=_n(height), class_=class_))
 
     def draw(self, *parts: Markup) -> None:
         """Anything else, on top."""
@@ -249,7 +233,7 @@ def legend(*entries: tuple[str, str]) -> Markup:
     shapes = {"sx": "circle", "sy": "square", "sz": "triangle", "bad": "cross"}
     parts = []
     for class_, words in entries:
-        if class_ in {"floor", "white", "fit"}:
+        if class_ == "floor":
             picture = _path("M1 8H23", class_)
         elif class_ in shapes:
             kind = "stroke" if shapes[class_] == "cross" else "mark"
