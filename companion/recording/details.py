@@ -71,12 +71,12 @@ def encode(detail: Any) -> bytes:
     return msgspec.msgpack.encode(detail, enc_hook=_plain)
 
 
-def decode(event: JournalEvent, data: bytes) -> Any:
+def decode(event: JournalEvent, data: bytes | None) -> Any:
     """The detail of an event of that kind.
 
     Raises:
         ValueError: it is nothing that this version could have written.
     """
-    if len(data) > MOST_BYTES:
-        raise ValueError(f"found {len(data)} bytes of detail; allowed: {MOST_BYTES}")
+    if data is None or len(data) > MOST_BYTES:
+        raise ValueError(f"found {data and len(data)} bytes of detail; allowed: {MOST_BYTES}")
     return msgspec.msgpack.decode(data, type=_TYPES[event], dec_hook=_array)

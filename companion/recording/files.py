@@ -185,9 +185,9 @@ class RecordingFile:
         self._writer.add_message(channel, at_ns, data, at_ns, self.messages & 0xFFFFFFFF)
 
     def _register(self, topic: str) -> int:
-        name = topics.schema_of(topic)
+        name, schema = topics.schema_of(topic)
         if name not in self._schemas:
-            data = msgspec.json.encode(topics.SCHEMAS[name])
+            data = msgspec.json.encode(schema)
             self._schemas[name] = self._writer.register_schema(name, "jsonschema", data)
         channel: int = self._writer.register_channel(topic, "json", self._schemas[name])
         return channel

@@ -117,4 +117,4 @@ def _event_entry(t_s: float, event: topics.JournalEvent, detail: Any) -> Entry:
 
 
 def _event(t_s: float, event: topics.JournalEvent, detail: Any) -> bytes:
-    return msgspec.json.encode(topics.JournalEntry(t_s, event, b"" if detail is None else details.encode(detail)))
+    return msgspec.json.encode(topics.JournalEntry(t_s, event, None if detail is None else details.encode(detail)))

@@ -7,13 +7,14 @@ left out of a message instead of being null, and what has no such form is a JSON
 from __future__ import annotations
 
 import math
+import types
 from collections.abc import Sequence
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 
-from companion.calibration.solution.record import ImuRecord, Record, to_json
-from companion.samples import CompassSample, ImuSample, TiltSample
+from companion.calibration.solution.record import Magnetic, Pose, Record, Site, to_json
+from companion.samples import CompassSample, ImuSample, TiltSample, Vector
 
 FORMAT_VERSION: Final = "2"
 METADATA: Final = "companion"
@@ -41,7 +42,7 @@ class JournalEntry(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
 
     t_s: float
     event: JournalEvent
-    detail: bytes = b""
+    detail: bytes | None = None
     """As `details.encode` made it; what it is depends on the event."""
 
 
@@ -54,11 +55,64 @@ class StartEntry(msgspec.Struct, frozen=True, gc=False):
     """Messages that were dropped right before, because the disk did not keep up."""
 
 
+class TiltEntry(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
+    """One reading of the gradienter."""
+
+    t_s: float
+    x_deg: float
+    y_deg: float
+    temperature_degc: float | None = None
+
+
+class CompassEntry(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
+    """One heading."""
+
+    t_s: float
+    heading_deg: float
+    pitch_deg: float | None = None
+    roll_deg: float | None = None
+
+
+class ImuResult(msgspec.Struct, frozen=True):
+    """One IMU of a calibration, as far as a plot can show it."""
+
+    name: str
+    samples: int
+    temperature_degc: float | None
+    gyro_bias_rad_s: Vector | None
+    gyro_sigma_stat_rad_s: Vector | None
+    gyro_sigma_use_rad_s: Vector | None
+    accel_bias_m_s2: Vector | None
+    accel_sigma_stat_m_s2: Vector | None
+    accel_sigma_use_m_s2: Vector | None
+    residual_gyro_rad_s: Vector | None
+    residual_accel_m_s2: Vector | None
+    warnings: tuple[str, ...]
+    written: tuple[str, ...]
+
+
 class RecordEntry(msgspec.Struct, frozen=True, gc=False):
     """The exact record out of a message on the record's topic."""
 
     t_s: float
     record: str
+
+
+class RecordView(msgspec.Struct, frozen=True):
+    """A calibration has ended: its figures as far as a schema can hold them, and the exact record as a text."""
+
+    t_s: float
+    record: str
+    state: str
+    reason: str
+    warnings: tuple[str, ...]
+    started_at: str
+    duration_s: float
+    system_id: int | None
+    pose: Pose | None
+    site: Site | None
+    magnetic: Magnetic | None
+    imus: tuple[ImuResult, ...]
 
 
 def imu_json(sample: ImuSample, message: str | None) -> bytes:
@@ -87,29 +141,28 @@ class ImuEntry(msgspec.Struct, frozen=True, gc=False):
 
 def tilt_json(sample: TiltSample) -> bytes:
     """One reading of the gradienter."""
-    fields = {"t_s": sample.t_s, "x_deg": sample.x_deg, "y_deg": sample.y_deg}
-    return msgspec.json.encode(_without_none({**fields, "temperature_degc": sample.temperature_degc}))
+    return msgspec.json.encode(TiltEntry(sample.t_s, sample.x_deg, sample.y_deg, sample.temperature_degc))
 
 
 def compass_json(sample: CompassSample) -> bytes:
     """One heading."""
-    fields = {"t_s": sample.t_s, "heading_deg": sample.heading_deg}
-    return msgspec.json.encode(_without_none({**fields, "pitch_deg": sample.pitch_deg, "roll_deg": sample.roll_deg}))
+    return msgspec.json.encode(CompassEntry(sample.t_s, sample.heading_deg, sample.pitch_deg, sample.roll_deg))
 
 
 def record_json(record: Record, t_s: float) -> bytes:
-    """A record: its figures as far as a schema can hold them, and the whole of it as a text."""
-    plain = msgspec.to_builtins(record)
-    view = {key: plain[key] for key in ("state", "reason", "warnings", "started_at", "duration_s", "system_id")}
-    view["pose"], view["site"] = plain["pose"] or {}, plain["site"] or {}
-    view["magnetic"] = plain["magnetic"]
-    view["imus"] = [{key: item for key, item in _imu(imu).items() if item is not None} for imu in record.imus]
-    return msgspec.json.encode(_without_none({"t_s": t_s, **view, "record": to_json(record).decode()}))
+    """A record: its figures, and the whole of it as a text."""
+    fields = {field: getattr(record, field) for field in RecordView.__struct_fields__ if field not in _MADE_HERE}
+    imus = tuple(
+        ImuResult(**{field: _plain(getattr(imu, field)) for field in ImuResult.__struct_fields__})
+        for imu in record.imus
+    )
+    entry = RecordView(t_s=t_s, record=to_json(record).decode(), imus=imus, **fields)
+    return msgspec.json.encode(_without_none(msgspec.to_builtins(entry)))
 
 
-def is_finite(values: Sequence[float]) -> bool:
-    """Whether JSON can hold these."""
-    return all(map(math.isfinite, values))
+def _plain(value: Any) -> Any:
+    """Of the parameters that were written, their names."""
+    return tuple(value) if isinstance(value, dict) else value
 
 
 def _nine(values: Sequence[float]) -> str:
@@ -120,131 +173,54 @@ def _known(value: float | None) -> bool:
     return value is not None and math.isfinite(value)
 
 
-def _without_none(fields: dict[str, Any]) -> dict[str, Any]:
-    return {
-        key: _without_none(item) if isinstance(item, dict) else item for key, item in fields.items() if item is not None
-    }
+def _without_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_none(item) for key, item in value.items() if item is not None}
+    if isinstance(value, list | tuple):
+        return [_without_none(item) for item in value]
+    return value
 
 
-def _imu(imu: ImuRecord) -> dict[str, Any]:
-    return {
-        "name": imu.name,
-        "samples": imu.samples,
-        "temperature_degc": imu.temperature_degc,
-        **{key: getattr(imu, key) for key in _TRIADS},
-        "warnings": list(imu.warnings),
-        "written": list(imu.written),
-    }
-
+_MADE_HERE: Final = frozenset({"t_s", "record", "imus"})
 
 # --- schemas
 
-_NUMBER: Final = {"type": "number"}
-_INTEGER: Final = {"type": "integer"}
-_TEXT: Final = {"type": "string"}
-_BASE64: Final = {"type": "string", "contentEncoding": "base64"}
-_TRIAD: Final = {"type": "array", "items": _NUMBER, "minItems": 3, "maxItems": 3}
-_TEXTS: Final = {"type": "array", "items": _TEXT}
-_TRIADS: Final = (
-    "gyro_bias_rad_s",
-    "gyro_sigma_stat_rad_s",
-    "gyro_sigma_use_rad_s",
-    "accel_bias_m_s2",
-    "accel_sigma_stat_m_s2",
-    "accel_sigma_use_m_s2",
-    "residual_gyro_rad_s",
-    "residual_accel_m_s2",
-)
+
+def _schema(kind: Any) -> dict[str, Any]:
+    """Of a type, in the few words that Foxglove knows."""
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        hints = get_type_hints(kind)
+        return {
+            "type": "object",
+            "properties": {name: _schema(hint) for name, hint in hints.items()},
+            "required": [name for name, hint in hints.items() if type(None) not in get_args(hint)],
+            "additionalProperties": False,
+        }
+    parts = [part for part in get_args(kind) if part is not type(None)]
+    if get_origin(kind) is tuple:
+        length = {} if Ellipsis in parts else {"minItems": len(parts), "maxItems": len(parts)}
+        return {"type": "array", "items": _schema(parts[0]), **length}
+    if kind in _PLAIN:
+        return _PLAIN[kind]
+    return _schema(parts[0] if parts and isinstance(kind, types.UnionType) else str)
 
 
-def _object(required: str, **properties: Any) -> dict[str, Any]:
-    return {
-        "type": "object",
-        "properties": properties,
-        "required": required.split(),
-        "additionalProperties": False,
-    }
-
-
-SCHEMAS: Final[dict[str, dict[str, Any]]] = {
-    "companion.RawBytes": _object("t_s", t_s=_NUMBER, data=_BASE64),
-    "companion.Imu": _object(
-        "t_s gyro_rad_s accel_m_s2",
-        t_s=_NUMBER,
-        gyro_rad_s=_TRIAD,
-        accel_m_s2=_TRIAD,
-        temperature_degc=_NUMBER,
-        sequence=_INTEGER,
-        t_device_s=_NUMBER,
-        message=_TEXT,
-    ),
-    "companion.Gradienter": _object(
-        "t_s x_deg y_deg", t_s=_NUMBER, x_deg=_NUMBER, y_deg=_NUMBER, temperature_degc=_NUMBER
-    ),
-    "companion.Compass": _object(
-        "t_s heading_deg", t_s=_NUMBER, heading_deg=_NUMBER, pitch_deg=_NUMBER, roll_deg=_NUMBER
-    ),
-    "companion.Journal": _object("t_s event", t_s=_NUMBER, event=_TEXT, detail=_BASE64),
-    "companion.Start": _object("t_s lost", t_s=_NUMBER, lost=_INTEGER),
-    "companion.Record": _object(
-        "t_s state reason warnings started_at duration_s imus record",
-        t_s=_NUMBER,
-        state=_TEXT,
-        reason=_TEXT,
-        warnings=_TEXTS,
-        started_at=_TEXT,
-        duration_s=_NUMBER,
-        system_id=_INTEGER,
-        pose=_object(
-            "",
-            theta_deg=_NUMBER,
-            gamma_deg=_NUMBER,
-            psi_deg=_NUMBER,
-            sigma_deg=_object("", theta=_NUMBER, gamma=_NUMBER, psi=_NUMBER),
-        ),
-        site=_object(
-            "",
-            latitude_deg=_NUMBER,
-            height_m=_NUMBER,
-            gravity_m_s2=_NUMBER,
-            declination_deg=_NUMBER,
-            source=_TEXT,
-        ),
-        magnetic=_object(
-            "",
-            heading_bound_deg=_NUMBER,
-            heading_from=_TEXT,
-            field_gauss=_NUMBER,
-            field_expected_gauss=_NUMBER,
-            inclination_deg=_NUMBER,
-            inclination_expected_deg=_NUMBER,
-            device_minus_field_deg=_NUMBER,
-            wander_deg=_NUMBER,
-        ),
-        imus={
-            "type": "array",
-            "items": _object(
-                "name samples warnings written",
-                name=_TEXT,
-                samples=_INTEGER,
-                temperature_degc=_NUMBER,
-                **dict.fromkeys(_TRIADS, _TRIAD),
-                warnings=_TEXTS,
-                written=_TEXTS,
-            ),
-        },
-        record=_TEXT,
-    ),
+_PLAIN: Final[dict[Any, dict[str, Any]]] = {
+    float: {"type": "number"},
+    int: {"type": "integer"},
+    str: {"type": "string"},
+    bytes: {"type": "string", "contentEncoding": "base64"},
+}
+_KINDS: Final[dict[str, type[msgspec.Struct]]] = {
+    START: StartEntry,
+    JOURNAL: JournalEntry,
+    RECORD: RecordView,
+    GRADIENTER: TiltEntry,
+    COMPASS: CompassEntry,
 }
 
 
-def schema_of(topic: str) -> str:
-    """The name of a topic's schema."""
-    known = {
-        START: "companion.Start",
-        JOURNAL: "companion.Journal",
-        RECORD: "companion.Record",
-        GRADIENTER: "companion.Gradienter",
-        COMPASS: "companion.Compass",
-    }
-    return known.get(topic) or ("companion.Imu" if topic.startswith(IMU) else "companion.RawBytes")
+def schema_of(topic: str) -> tuple[str, dict[str, Any]]:
+    """The name of a topic's schema, and the schema."""
+    kind = _KINDS.get(topic) or (ImuEntry if topic.startswith(IMU) else RawBytes)
+    return f"companion.{kind.__name__.removesuffix('Entry').removesuffix('View')}", _schema(kind)
