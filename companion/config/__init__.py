@@ -12,7 +12,7 @@ from typing import Final
 
 import msgspec
 
-from companion.config.profiles import Saved, none_saved, with_saved_profiles
+from companion.config.profiles import Saved, with_saved_profiles
 from companion.config.rules import check_together
 from companion.config.sections import Config
 from companion.config.words import brief, explain, refuse_unknown_keys
@@ -25,7 +25,7 @@ MOST_LINE: Final = 4096
 """Characters of one line: what TOML takes to read a key grows with the square of its dots."""
 
 
-def load(path: Path, saved: Saved = none_saved) -> Config:
+def load(path: Path, saved: Saved | None = None) -> Config:
     """Read and check a configuration file; `saved` says where saved noise profiles are.
 
     Raises:
@@ -41,7 +41,7 @@ def load(path: Path, saved: Saved = none_saved) -> Config:
     return parse(text, str(path), saved)
 
 
-def parse(text: str, name: str, saved: Saved = none_saved) -> Config:
+def parse(text: str, name: str, saved: Saved | None = None) -> Config:
     """Check the text of a configuration file; `name` stands for the file in messages, `saved` as for `load`.
 
     Raises:

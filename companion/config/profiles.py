@@ -38,23 +38,7 @@ Saved = Callable[[Path], SavedProfiles | None]
 """The saved profiles of a storage directory; None: they are not to be looked for, and a name stays a name."""
 
 
-class _NoneSaved:
-    def names(self) -> Sequence[str]:
-        return ()
-
-    def noise(self, name: str) -> Noise:
-        raise StorageError(f"no profile {name!r}")
-
-    def instead(self, name: str, error: StorageError) -> Noise | None:
-        return None
-
-
-def none_saved(_directory: Path) -> SavedProfiles:
-    """Only the catalogue's names are taken."""
-    return _NoneSaved()
-
-
-def with_saved_profiles(config: Config, name: str, saved: Saved) -> Config:
+def with_saved_profiles(config: Config, name: str, saved: Saved | None) -> Config:
     """The configuration with the figures of saved profiles in the place of their names.
 
     Raises:
@@ -66,8 +50,9 @@ def with_saved_profiles(config: Config, name: str, saved: Saved) -> Config:
         if isinstance(imu.profile, Noise):
             raise ConfigError(f"{key} a table; allowed: {_allowed(())}")
         if imu.profile is not None and imu.profile not in CATALOGUE:
-            store = saved(config.storage.path)
-            if store is not None:
+            if saved is None:
+                raise _unknown(imu.profile, (), key)
+            if (store := saved(config.storage.path)) is not None:
                 imu = msgspec.structs.replace(imu, profile=_found(store, imu.profile, key))
         imus.append(imu)
     return msgspec.structs.replace(config, imu=imus)
@@ -82,9 +67,13 @@ def _found(store: SavedProfiles, wanted: str, key: str) -> Noise:
         if (instead := store.instead(wanted, error)) is not None:
             return instead
         raise ConfigError(f"{key} {wanted!r}, a saved profile: {error}") from None
+    raise _unknown(wanted, names, key)
+
+
+def _unknown(wanted: str, names: Sequence[str], key: str) -> ConfigError:
     near = difflib.get_close_matches(wanted, [*CATALOGUE, *names], n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise ConfigError(f"{key} {shown(wanted)}; allowed: {_allowed(names)}{hint}")
+    return ConfigError(f"{key} {shown(wanted)}; allowed: {_allowed(names)}{hint}")
 
 
 def _allowed(names: Sequence[str]) -> str:

@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.alignment.align_model import DOWN, Ground, Model, Priors, Row, Stand, Unknowns
+from companion.calibration.alignment.align_model import DOWN, Ground, Model, Part, Priors, Row, Stand, Unknowns
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
 from companion.physics.gradienter import Law, up_in_sensor
@@ -244,21 +244,22 @@ def _units(model: Model, row: Row) -> float:
 
 
 def _imu(model: Model, at: Unknowns, covariance: Matrix, k: int) -> ImuAlignment:
-    def figures(part: slice, value: Array) -> Figures:
-        sigma = np.sqrt(np.diag(covariance)[part])
-        before = model.sigma[part]
-        return Figures(value.copy(), sigma, (before > 0.0) & (sigma < DETERMINED * before))
+    def figures(part: Part) -> Figures:
+        place = model.imu(k, part)
+        sigma = np.sqrt(np.diag(covariance)[place])
+        before = model.sigma[place]
+        return Figures(at.imus[k, part].copy(), sigma, (before > 0.0) & (sigma < DETERMINED * before))
 
     level, by = _level_bias(model, at, k)
     return ImuAlignment(
         name=model.names[k],
         level_bias_m_s2=level,
         level_covariance_m2_s4=by @ covariance @ by.T,
-        accel_bias_m_s2=figures(model.accel_bias(k), at.accel_bias[k]),
-        scale=figures(model.scale(k), at.scale[k]),
-        shear=figures(model.shear(k), at.shear[k]),
-        misalignment_rad=figures(model.misalignment(k), at.misalignment_rad[k]),
-        gyro_bias_rad_s=figures(model.gyro_bias(k), at.gyro_bias[k]),
+        accel_bias_m_s2=figures(Part.ACCEL_BIAS),
+        scale=figures(Part.SCALE),
+        shear=figures(Part.SHEAR),
+        misalignment_rad=figures(Part.MISALIGNMENT),
+        gyro_bias_rad_s=figures(Part.GYRO_BIAS),
     )
 
 
@@ -269,15 +270,16 @@ def _level_bias(model: Model, at: Unknowns, k: int) -> tuple[Array, Matrix]:
     """
     gravity, up = at.gravity_m_s2, LEVEL
     by = np.zeros((3, model.size))
-    by[:, model.misalignment(k)] = gravity * np.array([[0.0, -up[2], up[1]], [up[2], 0.0, -up[0]], [-up[1], up[0], 0]])
-    by[:, model.scale(k)] = gravity * np.diag(up)
-    by[:, model.shear(k)] = gravity * np.array([[up[1], up[2], 0.0], [up[0], 0.0, up[2]], [0.0, up[0], up[1]]])
-    by[:, model.accel_bias(k)] = np.eye(3)
+    by[:, model.imu(k, Part.MISALIGNMENT)] = gravity * np.array(
+        [[0.0, -up[2], up[1]], [up[2], 0.0, -up[0]], [-up[1], up[0], 0]]
+    )
+    by[:, model.imu(k, Part.SCALE)] = gravity * np.diag(up)
+    by[:, model.imu(k, Part.SHEAR)] = gravity * np.array(
+        [[up[1], up[2], 0.0], [up[0], 0.0, up[2]], [0.0, up[0], up[1]]]
+    )
+    by[:, model.imu(k, Part.ACCEL_BIAS)] = np.eye(3)
     by[:, model.gravity] = up[:, None]
-    value = (
-        by[:, model.misalignment(k)] @ at.misalignment_rad[k]
-        + by[:, model.scale(k)] @ at.scale[k]
-        + by[:, model.shear(k)] @ at.shear[k]
-        + at.accel_bias[k]
+    value = np.sum(
+        [by[:, model.imu(k, part)] @ at.imus[k, part] for part in Part if part is not Part.GYRO_BIAS], axis=0
     )
     return value, by

@@ -21,6 +21,7 @@ All derivatives are analytic; an attitude error eps is C = (I - [eps x]) C_0, as
 from __future__ import annotations
 
 import dataclasses
+import enum
 import math
 from collections.abc import Callable, Sequence
 from typing import Final, Literal
@@ -102,6 +103,16 @@ class Row:
     name: str = ""
 
 
+class Part(enum.IntEnum):
+    """What is sought of an IMU, three figures each: of x, y, z, and of the shear xy, xz, yz."""
+
+    MISALIGNMENT = 0
+    SCALE = 1
+    SHEAR = 2
+    ACCEL_BIAS = 3
+    GYRO_BIAS = 4
+
+
 @dataclasses.dataclass(slots=True, eq=False)
 class Unknowns:
     """Everything that is sought, at its present value."""
@@ -112,13 +123,8 @@ class Unknowns:
     rate_rad_s: Array
     attitudes: list[Matrix]
     """C_k, body from ground."""
-    misalignment_rad: Array
-    """(imus, 3)."""
-    scale: Array
-    shear: Array
-    """(imus, 3): xy, xz, yz."""
-    accel_bias: Array
-    gyro_bias: Array
+    imus: Array
+    """(imus, parts, 3), SI units."""
 
 
 class Model:
@@ -143,12 +149,14 @@ class Model:
         sigma[self.rate] = np.sqrt(np.diag(ground.rate_covariance))
         self.damped = 3 * len(stands) + (2 if sigma[2] > 0.0 else 0)
         """How many parameters only the readings determine."""
-        for k in range(count):
-            sigma[self.misalignment(k)] = priors.misalignment_deg * DEG
-            sigma[self.scale(k)] = priors.scale
-            sigma[self.shear(k)] = priors.shear
-            sigma[self.accel_bias(k)] = priors.accel_bias_m_s2
-            sigma[self.gyro_bias(k)] = priors.gyro_bias_rad_s
+        each = [
+            priors.misalignment_deg * DEG,
+            priors.scale,
+            priors.shear,
+            priors.accel_bias_m_s2,
+            priors.gyro_bias_rad_s,
+        ]
+        sigma[self._first_imu :] = np.tile(np.repeat(each, 3), count)
         self.sigma = sigma
         """Of every parameter before any reading; 0: not sought."""
 
@@ -158,35 +166,15 @@ class Model:
         """Attitude error of a stand, counted from 0."""
         return slice(self._poses + 3 * stand, self._poses + 3 * stand + 3)
 
-    def _imu(self, imu: int, part: int) -> slice:
+    def imu(self, imu: int, part: Part) -> slice:
+        """One part of an IMU, counted from 0."""
         start = self._first_imu + 15 * imu + 3 * part
         return slice(start, start + 3)
-
-    def misalignment(self, imu: int) -> slice:
-        """Of an IMU, counted from 0; likewise the others."""
-        return self._imu(imu, 0)
-
-    def scale(self, imu: int) -> slice:
-        """Of x, y, z."""
-        return self._imu(imu, 1)
-
-    def shear(self, imu: int) -> slice:
-        """xy, xz, yz."""
-        return self._imu(imu, 2)
-
-    def accel_bias(self, imu: int) -> slice:
-        """Of x, y, z."""
-        return self._imu(imu, 3)
-
-    def gyro_bias(self, imu: int) -> slice:
-        """Of x, y, z."""
-        return self._imu(imu, 4)
 
     # --- values
 
     def begin(self, attitudes: list[Matrix]) -> Unknowns:
         """A first guess from attitudes alone."""
-        count = len(self.names)
         spots = [a.T @ DOWN for a, stand in zip(attitudes, self.stands, strict=True) if stand.on_spot]
         return Unknowns(
             offset_rad=np.zeros(2),
@@ -194,11 +182,7 @@ class Model:
             gravity_m_s2=self.ground.gravity_m_s2,
             rate_rad_s=self.ground.rate_rad_s.copy(),
             attitudes=list(attitudes),
-            misalignment_rad=np.zeros((count, 3)),
-            scale=np.zeros((count, 3)),
-            shear=np.zeros((count, 3)),
-            accel_bias=np.zeros((count, 3)),
-            gyro_bias=np.zeros((count, 3)),
+            imus=np.zeros((len(self.names), len(Part), 3)),
         )
 
     def step(self, at: Unknowns, by: Array) -> None:
@@ -209,12 +193,7 @@ class Model:
         at.rate_rad_s = at.rate_rad_s + by[self.rate]
         for k in range(len(self.stands)):
             at.attitudes[k] = _turned(-by[self.pose(k)]) @ at.attitudes[k]
-        for k in range(len(self.names)):
-            at.misalignment_rad[k] += by[self.misalignment(k)]
-            at.scale[k] += by[self.scale(k)]
-            at.shear[k] += by[self.shear(k)]
-            at.accel_bias[k] += by[self.accel_bias(k)]
-            at.gyro_bias[k] += by[self.gyro_bias(k)]
+        at.imus += by[self._first_imu :].reshape(at.imus.shape)
 
     def _values(self, at: Unknowns) -> Array:
         """The parameters that have a prior, as they are; zero for the others."""
@@ -222,12 +201,7 @@ class Model:
         values[self.offset] = at.offset_rad
         values[self.gravity] = at.gravity_m_s2 - self.ground.gravity_m_s2
         values[self.rate] = at.rate_rad_s - self.ground.rate_rad_s
-        for k in range(len(self.names)):
-            values[self.misalignment(k)] = at.misalignment_rad[k]
-            values[self.scale(k)] = at.scale[k]
-            values[self.shear(k)] = at.shear[k]
-            values[self.accel_bias(k)] = at.accel_bias[k]
-            values[self.gyro_bias(k)] = at.gyro_bias[k]
+        values[self._first_imu :] = at.imus.ravel()
         return values
 
     # --- residuals
@@ -284,26 +258,26 @@ class Model:
 
     def _accelerometer(self, rows: _Rows, at: Unknowns, where: tuple[int, int], imu: ImuStand, up: Array) -> None:
         k, i = where
-        stretch = np.eye(3) + np.diag(at.scale[i]) + np.tensordot(at.shear[i], _SHEAR, axes=1)
-        aligned = up - np.cross(at.misalignment_rad[i], up)
+        stretch = np.eye(3) + np.diag(at.imus[i, Part.SCALE]) + np.tensordot(at.imus[i, Part.SHEAR], _SHEAR, axes=1)
+        aligned = up - np.cross(at.imus[i, Part.MISALIGNMENT], up)
         gravity = at.gravity_m_s2
-        read = imu.accel_m_s2 - stretch @ aligned * gravity - at.accel_bias[i]
+        read = imu.accel_m_s2 - stretch @ aligned * gravity - at.imus[i, Part.ACCEL_BIAS]
         with rows.add(Row("accelerometer", k + 1, imu.name), read, imu.accel_sigma_m_s2) as by:
-            by[:, self.pose(k)] = gravity * stretch @ (np.eye(3) - skew(at.misalignment_rad[i])) @ skew(up)
-            by[:, self.misalignment(i)] = gravity * stretch @ skew(up)
-            by[:, self.scale(i)] = gravity * np.diag(aligned)
-            by[:, self.shear(i)] = gravity * (_SHEAR @ aligned).T
-            by[:, self.accel_bias(i)] = np.eye(3)
+            by[:, self.pose(k)] = gravity * stretch @ (np.eye(3) - skew(at.imus[i, Part.MISALIGNMENT])) @ skew(up)
+            by[:, self.imu(i, Part.MISALIGNMENT)] = gravity * stretch @ skew(up)
+            by[:, self.imu(i, Part.SCALE)] = gravity * np.diag(aligned)
+            by[:, self.imu(i, Part.SHEAR)] = gravity * (_SHEAR @ aligned).T
+            by[:, self.imu(i, Part.ACCEL_BIAS)] = np.eye(3)
             by[:, self.gravity] = (stretch @ aligned)[:, None]
 
     def _gyro(self, rows: _Rows, at: Unknowns, where: tuple[int, int], imu: ImuStand) -> None:
         k, i = where
         rate = at.attitudes[k] @ at.rate_rad_s
-        read = imu.gyro_rad_s - rate - at.gyro_bias[i]
+        read = imu.gyro_rad_s - rate - at.imus[i, Part.GYRO_BIAS]
         with rows.add(Row("gyro", k + 1, imu.name), read, imu.gyro_sigma_rad_s) as by:
             by[:, self.pose(k)] = skew(rate)
             by[:, self.rate] = at.attitudes[k]
-            by[:, self.gyro_bias(i)] = np.eye(3)
+            by[:, self.imu(i, Part.GYRO_BIAS)] = np.eye(3)
 
 
 class _Rows:

@@ -16,8 +16,6 @@ from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 class Intake(ABC):
     """The streams, and what is known of each. Nothing that a sample holds makes it raise."""
 
-    _field: FieldHeading | None = None
-
     def __init__(
         self,
         keep: int,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -32,7 +32,7 @@ from companion.calibration.seconds.batches import Batch
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Floats, vector
 from companion.physics.units import DEG_H, MG
-from companion.samples import Vector
+from companion.samples import Triad, Vector
 
 WHITE_SHARE: Final = 0.09
 """White variance over floor variance below which more averaging buys nothing: white part 30 % of the floor."""
@@ -103,13 +103,13 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     accel_sigma_use_m_s2: Vector
     temperature_degc: float | None
     warnings: tuple[str, ...]
-    hidden: dict[Literal["gyro", "accel"], Hidden] = {}
+    hidden: dict[Triad, Hidden] = {}
     """By triad, where the noise spreads the integers too little for a mean."""
 
     dithered: bool = False
     """Its means come from a dither, in which the telemetry followed every step of the offsets."""
 
-    def refused(self, part: Literal["gyro", "accel"]) -> str | None:
+    def refused(self, part: Triad) -> str | None:
         """Why a triad's means are no measurement although they have a figure; None when they are one."""
         found = self.hidden.get(part)
         return found.words if found is not None and found.useless else None
@@ -199,10 +199,7 @@ def estimates(
     measured = np.maximum(white_noise(slots, level), whole.least)
     white = np.maximum(measured, _per_axis([m.white for m in gyros], [m.white for m in accels]))
     flicker = _flicker(slots, level, measured, flicker)
-    quantum, half_step = _quantisation(
-        batches,
-        steps,
-    )
+    quantum, half_step = _quantisation(batches, steps)
     quantum, half_step = np.where(whole.of, whole.hidden, quantum), np.where(whole.of, whole.unknown, half_step)
     # Where a ramp is seen, the next H seconds lie between "it ends now" and "it goes on": the mean over them is off
     # by anything from nothing to slope * H / 2.
@@ -344,39 +341,37 @@ def _lost(batches: Sequence[Batch]) -> float:
     return missing / (missing + came)
 
 
-def _hidden(imu: ImuInput, gyro: Estimate, accel: Estimate) -> dict[Literal["gyro", "accel"], Hidden]:
-    found: dict[Literal["gyro", "accel"], Hidden] = {}
-    part: Literal["gyro", "accel"]
-    for part, triad, size, grid, finer in (
-        ("gyro", gyro, f"{imu.gyro_step_rad_s / DEG_H:.0f} deg/h", imu.gyro_grid_rad_s, imu.gyro_grid_rad_s / DEG_H),
-        ("accel", accel, f"{imu.accel_step_m_s2 / MG:.1f} mg", imu.accel_grid_m_s2, imu.accel_grid_m_s2 / MG),
+def _hidden(imu: ImuInput, gyro: Estimate, accel: Estimate) -> dict[Triad, Hidden]:
+    found: dict[Triad, Hidden] = {}
+    part: Triad
+    for part, triad, step, grid, unit in (
+        ("gyro", gyro, f"{imu.gyro_step_rad_s / DEG_H:.0f} deg/h", imu.gyro_grid_rad_s / DEG_H, "deg/h"),
+        ("accel", accel, f"{imu.accel_step_m_s2 / MG:.1f} mg", imu.accel_grid_m_s2 / MG, "mg"),
     ):
-        if not triad.undecided.any():
-            if grid > 0.0 and (triad.edge_rms > EDGE_RMS).any():
-                found[part] = Hidden(
-                    f"{part} {imu.name}: the sensor has coarse steps of its own ({finer:.3g} {size.split()[1]}) below"
-                    " the integers, sigma widened; push.dither = true takes them away",
-                    useless=False,
-                )
-            continue
-        useless = bool(triad.useless.any())
-        axes = "".join(_AXIS[axis] for axis in range(3) if (triad.useless if useless else triad.undecided)[axis])
-        what = "around 0 the mean is not known" if useless else "up to half a step may be hidden, sigma widened"
-        found[part] = Hidden(
-            f"{part} {imu.name} {axes}: integer steps of {size} and too little noise for them, {what}; set"
-            " push.dither = true (or use IMU 1 where it sends HIGHRES_IMU)",
-            useless,
-        )
+        if triad.undecided.any():
+            useless = bool(triad.useless.any())
+            axes = _axes(triad.useless if useless else triad.undecided)
+            what = "around 0 the mean is not known" if useless else "up to half a step may be hidden, sigma widened"
+            found[part] = Hidden(
+                f"{part} {imu.name} {axes}: integer steps of {step} and too little noise for them, {what}; set"
+                " push.dither = true (or use IMU 1 where it sends HIGHRES_IMU)",
+                useless,
+            )
+        elif grid > 0.0 and (triad.edge_rms > EDGE_RMS).any():
+            found[part] = Hidden(
+                f"{part} {imu.name}: the sensor has coarse steps of its own ({grid:.3g} {unit}) below"
+                " the integers, sigma widened; push.dither = true takes them away",
+                useless=False,
+            )
     return found
 
 
+def _axes(which: NDArray[np.bool_]) -> str:
+    return "".join(axis for axis, is_it in zip(_AXIS, which.tolist(), strict=True) if is_it)
+
+
 def _warnings(
-    imu: ImuInput,
-    batches: Sequence[Batch],
-    gyro: Estimate,
-    accel: Estimate,
-    temperatures: list[float],
-    rejected: int,
+    imu: ImuInput, batches: Sequence[Batch], gyro: Estimate, accel: Estimate, temperatures: list[float], rejected: int
 ) -> list[str]:
     found: list[str] = []
     if gyro.ramp_per_s.any():
@@ -385,12 +380,10 @@ def _warnings(
     if accel.ramp_per_s.any():
         rate = float(np.abs(accel.ramp_per_s).max()) / MG * 60.0
         found.append(f"warm-up: accel {imu.name} drifts {rate:.2f} mg per minute")
-    for part, triad in (("gyro", gyro), ("accel", accel)):
-        axes = "".join(_AXIS[axis] for axis in range(3) if triad.half_step[axis] and not triad.undecided[axis])
-        if axes:
+    for part, triad, grid in (("gyro", gyro, imu.gyro_grid_rad_s), ("accel", accel, imu.accel_grid_m_s2)):
+        if axes := _axes(triad.half_step & ~triad.undecided):
             found.append(f"{part} {imu.name} {axes}: fewer than 3 distinct readings, half a step may be hidden")
-        axes = "".join(_AXIS[axis] for axis in range(3) if triad.edge_rms[axis] > EDGE_RMS)
-        if axes and not (imu.gyro_grid_rad_s if part == "gyro" else imu.accel_grid_m_s2):
+        if not grid and (axes := _axes(triad.edge_rms > EDGE_RMS)):
             why = "a coarser step inside the sensor?"
             found.append(f"{part} {imu.name} {axes}: integers not spread like noise ({why}), sigma widened")
     if (lost := _lost(batches)) > _LOST_WARNING:
