@@ -53,8 +53,8 @@ quick: $(VENV)/.dev
 
 # Both parts always run, and both have to be green. Real autopilots (sitl) want a core of their own.
 test: $(VENV)/.dev
-	@$(PYTEST) -n $(WAITING) -m 'real_clock and not sitl' $(if $(DURATIONS),--write-durations); waiting=$$?; \
-	$(PYTEST) -n $(JOBS) -m 'not real_clock or sitl' $(if $(DURATIONS),--write-durations) && exit $$waiting
+	@$(PYTEST) -n $(JOBS) -m 'not real_clock or sitl' $(if $(DURATIONS),--write-durations); working=$$?; \
+	$(PYTEST) -n $(WAITING) -m 'real_clock and not sitl' $(if $(DURATIONS),--write-durations) && exit $$working
 
 long: $(VENV)/.dev
 	@TESTS=long $(PYTEST) -n $(JOBS)

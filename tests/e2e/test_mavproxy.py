@@ -99,7 +99,7 @@ def test_what_the_documentation_says_to_type(tmp_path: Path) -> None:
             await station.type(choose)
             await station.prints(r"Set vehicle 1:191")
             await station.type(calibrate)
-            await station.prints(r"Got COMMAND_ACK: USER_1: IN_PROGRESS", within_s=5.0)
+            await station.prints(r"Got COMMAND_ACK: USER_1: IN_PROGRESS", within_s=30.0)
             await station.prints(r"AP: Calibration started: keep the aircraft still")
             await station.prints(r"Got COMMAND_ACK: USER_1: ACCEPTED", within_s=60.0)
             figures = await station.prints(r"AP: Calibration done: sigma [\d.]+ deg/h, [\d.]+ mg")
@@ -150,7 +150,7 @@ def test_over_a_signed_link(tmp_path: Path) -> None:
             await station.type("vehicle 1:191")
             await station.prints(r"Set vehicle 1:191")
             await station.type("long MAV_CMD_USER_2 0 0 0 0 0 0 0")
-            await station.prints(r"Got COMMAND_ACK: USER_2: ACCEPTED", within_s=10.0)
+            await station.prints(r"Got COMMAND_ACK: USER_2: ACCEPTED", within_s=30.0)
             status = await line.daemon.status()
             assert status is not None
             assert status["vehicle"]["signing"]["good"]

@@ -14,7 +14,6 @@ import pytest
 from companion.calibration.machine import State
 from companion.config import parse
 from companion.daemon.faces.mqtt import face
-from companion.daemon.faces.mqtt.face import FLUSH_S
 from companion.daemon.process.service import Service
 from companion.links.mqtt import client as link
 from tests.support.broker import BEST, KINDS, Broker, Kind, broker, hurry, peer
@@ -59,14 +58,18 @@ def test_the_last_will_after_the_daemon_was_killed(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-def test_a_daemon_that_is_stopped_says_goodbye_and_ends_at_once(tmp_path: Path) -> None:
+def test_a_daemon_that_is_stopped_says_goodbye_and_ends_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(face, "FLUSH_S", 30.0)
+
     async def main() -> None:
         async with broker(tmp_path) as one, peer(one) as watcher:
             async with alone(tmp_path, one.section()) as service:
                 await until_connected(service)
                 await watcher.until(f"{BASE}/status", is_(b"online"))
                 began_s = asyncio.get_running_loop().time()
-            assert asyncio.get_running_loop().time() - began_s < FLUSH_S
+            assert asyncio.get_running_loop().time() - began_s < 30.0
             await watcher.until(f"{BASE}/status", is_(b"offline"))
 
     asyncio.run(main())
@@ -132,7 +135,7 @@ def test_something_that_listens_and_says_nothing(tmp_path: Path, monkeypatch: py
                 while len(connected) == seen:
                     await asyncio.sleep(0.02)
             began_s = loop.time()
-        assert loop.time() - began_s < 5.0  # stopped in the middle of an attempt
+        assert loop.time() - began_s < 30.0  # stopped in the middle of an attempt
         for writer in connected:
             writer.close()
         server.close()

@@ -116,7 +116,7 @@ def test_a_write_is_over_when_it_is_known_to_be_and_else_the_menders(
         assert ledger.pending is not over
         assert on_disk(tmp_path) == (None if over else OLD)
         if not over:
-            assert await asyncio.wait_for(ledger.interrupted(), 1.0) == OLD
+            assert await asyncio.wait_for(ledger.interrupted(), 30.0) == OLD
             await ledger.undone()
             assert not ledger.pending
             assert on_disk(tmp_path) is None
@@ -218,6 +218,6 @@ def test_what_a_daemon_that_died_left_open_is_found_at_the_start(tmp_path: Path)
         ChangeLog(tmp_path).journal.write(OLD)
         ledger = opened(tmp_path)
         assert ledger.pending
-        assert await asyncio.wait_for(ledger.interrupted(), 1.0) == OLD
+        assert await asyncio.wait_for(ledger.interrupted(), 30.0) == OLD
 
     asyncio.run(main())

@@ -130,7 +130,7 @@ def test_bytes_arrive_with_the_time_of_the_loop(path: Path) -> None:
                 await port.state(connected=True)
                 before_s = asyncio.get_running_loop().time()
                 os.write(pty.master, b"123.4, 18.6, -0.5\r\n")
-                data, t_s = await asyncio.wait_for(port.chunks.get(), 10)
+                data, t_s = await asyncio.wait_for(port.chunks.get(), 40)
                 assert data == b"123.4, 18.6, -0.5\r\n"
                 assert before_s <= t_s <= asyncio.get_running_loop().time()
                 assert port.link.last_byte_s == t_s
@@ -171,7 +171,7 @@ def test_a_fast_stream_is_collected_and_a_byte_after_it_wakes_the_loop(
                 await collecting(port, pty)
                 for number in range(5):
                     os.write(pty.master, bytes([number]))
-                chunk, _ = await asyncio.wait_for(port.chunks.get(), 10)
+                chunk, _ = await asyncio.wait_for(port.chunks.get(), 40)
                 assert chunk == bytes(range(5))  # written in one turn of the loop, they come together
                 async with asyncio.timeout(40):
                     while port.link._collecting is not None:
@@ -196,7 +196,7 @@ def test_a_moment_without_bytes_does_not_end_the_collecting(path: Path, monkeypa
                         await asyncio.sleep(0.001)
                 for number in range(5):
                     os.write(pty.master, bytes([number]))
-                chunk, _ = await asyncio.wait_for(port.chunks.get(), 10)
+                chunk, _ = await asyncio.wait_for(port.chunks.get(), 40)
                 assert chunk == bytes(range(5))
                 assert port.link._collecting is not None
 
@@ -297,7 +297,7 @@ def test_what_waits_is_taken_with_a_stream_that_is_collected_and_is_not_lost_whe
                 together.put(take, b"waits", 1.0)
                 assert got.empty()
                 if end != "silence":
-                    assert await asyncio.wait_for(got.get(), 10) == b"waits"
+                    assert await asyncio.wait_for(got.get(), 40) == b"waits"
                     assert is_driven(together)
                     together.put(take, b"waits", 2.0)
                 if end == "pulled out":
@@ -306,8 +306,8 @@ def test_what_waits_is_taken_with_a_stream_that_is_collected_and_is_not_lost_whe
                     port.link.budget = Budget(bytes_per_s=0.0, burst_bytes=3)
                     os.write(pty.master, bytes(10))
                 if end != "stopped":
-                    assert await asyncio.wait_for(got.get(), 10) == b"waits"
-                    async with asyncio.timeout(10):
+                    assert await asyncio.wait_for(got.get(), 40) == b"waits"
+                    async with asyncio.timeout(40):
                         while is_driven(together):
                             await asyncio.sleep(0.001)
             assert not is_driven(together)
@@ -668,7 +668,7 @@ def server() -> Iterator[tuple[socket.socket, str]]:
 
 
 async def accept(listening: socket.socket) -> socket.socket:
-    peer, _ = await asyncio.wait_for(asyncio.get_running_loop().sock_accept(listening), 10)
+    peer, _ = await asyncio.wait_for(asyncio.get_running_loop().sock_accept(listening), 40)
     return peer
 
 

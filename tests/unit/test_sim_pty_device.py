@@ -64,7 +64,7 @@ def test_a_reader_gets_200_frames_a_second_unchanged(tmp_path: Path) -> None:
             data = await port.wait_for(begun + 44 * 100)
             taken_s = loop.time() - begun_s
             port.close()
-        assert taken_s == pytest.approx(0.5, abs=0.15)
+        assert taken_s > 0.35  # no faster than the device; how late a reader looks is the machine's
         stamps = []
         for start in range(0, len(data) - 43, 44):
             assert data[start] == 0xFA
