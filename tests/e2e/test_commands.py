@@ -34,7 +34,7 @@ class Said(NamedTuple):
         return json.loads(self.out)
 
 
-async def companion(*words: str, within_s: float = 60.0) -> Said:
+async def companion(*words: str, within_s: float = 150.0) -> Said:
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "companion", *words, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
     )
@@ -253,8 +253,9 @@ def test_check_without_a_daemon_says_what_is_wrong(tmp_path: Path) -> None:
             broken.write_text(line.config.read_text().replace(str(tmp_path / "compass"), str(tmp_path / "nothing")))
             bad = await companion("-c", str(broken), "check", "--seconds", "1.5", "--json")
             assert bad.code == FAILED
-            (finding,) = [finding for finding in bad.json["findings"] if not finding["good"]]
-            assert finding["name"] == "compass"
+            # On a busy machine others may have said nothing in so short a time.
+            (finding,) = [each for each in bad.json["findings"] if each["name"] == "compass"]
+            assert not finding["good"]
             assert "nothing" in finding["words"]
             assert "compass" in bad.json["reason"]
 

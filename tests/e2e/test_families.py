@@ -36,7 +36,7 @@ from sim.udp import open_udp
 POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
 AT_ONCE = 3
 """Daemons side by side: more would want more than one core."""
-WITHIN_S = 40.0
+WITHIN_S = 90.0
 
 CONFIG = """
 [mavlink]

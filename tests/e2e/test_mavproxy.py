@@ -36,7 +36,7 @@ class MavProxy:
         self._process.stdin.write(line.encode() + b"\n")
         await self._process.stdin.drain()
 
-    async def prints(self, pattern: str, *, after: int = 0, within_s: float = 30.0) -> str:
+    async def prints(self, pattern: str, *, after: int = 0, within_s: float = 90.0) -> str:
         """Wait until it has printed this, at or after a place in what was printed."""
         assert self._process.stdout is not None
         try:

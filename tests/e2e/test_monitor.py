@@ -45,7 +45,7 @@ class Watched:
     def close(self) -> None:
         asyncio.get_running_loop().remove_reader(self._ours)
 
-    async def until(self, seen: Callable[[str], Any], within_s: float = 60.0) -> None:
+    async def until(self, seen: Callable[[str], Any], within_s: float = 150.0) -> None:
         """Wait until something has been printed."""
         async with asyncio.timeout(within_s):
             while not seen(self.text):

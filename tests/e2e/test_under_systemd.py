@@ -49,7 +49,7 @@ def opened(folder: Path) -> str:
     return text
 
 
-async def until(condition: Callable[[], Awaitable[bool]], within_s: float = 30.0) -> None:
+async def until(condition: Callable[[], Awaitable[bool]], within_s: float = 90.0) -> None:
     """Wait for something that systemd does in its own time."""
     async with asyncio.timeout(within_s):
         while not await condition():

@@ -200,7 +200,7 @@ class Peer:
         await self._client.publish(topic, data, qos=qos, retain=retain)
 
     async def until(
-        self, topic: str, fits: Callable[[Heard], bool] = lambda heard: True, within_s: float = 40.0
+        self, topic: str, fits: Callable[[Heard], bool] = lambda heard: True, within_s: float = 90.0
     ) -> Heard:
         """The first message on a topic that fits, whether it has come already or comes yet."""
 
@@ -217,7 +217,7 @@ class Peer:
         assert heard is not None
         return heard
 
-    async def response(self, base: str, command: str, transaction: object, *states: str, within_s: float = 40.0) -> Any:
+    async def response(self, base: str, command: str, transaction: object, *states: str, within_s: float = 90.0) -> Any:
         """The response to a transaction, in one of some states if any are given."""
 
         def fits(heard: Heard) -> bool:

@@ -59,7 +59,7 @@ class Tab:
         assert "exceptionDetails" not in reply, reply["exceptionDetails"]
         return reply["result"].get("value")
 
-    async def until(self, expression: str, within_s: float = 30.0) -> Any:
+    async def until(self, expression: str, within_s: float = 90.0) -> Any:
         """Wait until an expression is true, looked at whenever the page is drawn; its value."""
         script = f"""new Promise((done, fail) => {{
             const end = performance.now() + {within_s * 1000};

@@ -127,7 +127,7 @@ class Listening:
     def counts(self) -> dict[str, int]:
         return dict(self.sensor.health.counts)
 
-    async def until(self, condition: Callable[[], Any], within_s: float = 10.0) -> float:
+    async def until(self, condition: Callable[[], Any], within_s: float = 60.0) -> float:
         """Wait for something to become true; how long it took. Fails when it does not."""
         loop = asyncio.get_running_loop()
         since_s = loop.time()

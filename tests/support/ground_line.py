@@ -43,7 +43,7 @@ class GroundLine(NamedTuple):
     started: list[asyncio.subprocess.Process]
     """Every command, so that none outlives a test."""
 
-    async def ground(self, command: str, *words: str, chosen: bool = True, within_s: float = 60.0) -> Said:
+    async def ground(self, command: str, *words: str, chosen: bool = True, within_s: float = 150.0) -> Said:
         """`companion ground COMMAND --url ... WORDS`; `chosen`: with --system 1, so that it looks for no others."""
         return await finish(await self.start(command, *words, chosen=chosen), within_s)
 
@@ -71,7 +71,7 @@ async def _end(started: list[asyncio.subprocess.Process]) -> None:
             await process.communicate()
 
 
-async def finish(process: asyncio.subprocess.Process, within_s: float = 60.0) -> Said:
+async def finish(process: asyncio.subprocess.Process, within_s: float = 150.0) -> Said:
     """Wait for its end."""
     async with asyncio.timeout(within_s):
         out, err = await process.communicate()

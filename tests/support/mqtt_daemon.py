@@ -48,14 +48,14 @@ async def alone(folder: Path, section: str) -> AsyncIterator[Service]:
             await task
 
 
-async def until_connected(service: Service, *, connected: bool = True, within_s: float = 40.0) -> None:
+async def until_connected(service: Service, *, connected: bool = True, within_s: float = 90.0) -> None:
     assert service.faces.mqtt is not None
     async with asyncio.timeout(within_s):
         while service.status()["mqtt"]["connected"] != connected:
             await asyncio.sleep(0.02)
 
 
-async def until_problem(service: Service, words: str, within_s: float = 40.0) -> str:
+async def until_problem(service: Service, words: str, within_s: float = 90.0) -> str:
     async with asyncio.timeout(within_s):
         while words not in (service.status()["mqtt"].get("last_error") or ""):
             await asyncio.sleep(0.02)
@@ -71,7 +71,7 @@ def says(state: str) -> Callable[[Heard], bool]:
 
 
 async def until_bad(service: Service, words: str) -> None:
-    async with asyncio.timeout(40.0):
+    async with asyncio.timeout(90.0):
         while words not in service.status()["mqtt"]["summary"]:
             await asyncio.sleep(0.05)
     assert service.status()["mqtt"]["connected"]

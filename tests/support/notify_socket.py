@@ -50,7 +50,7 @@ class NotifySocket:
         """The last STATUS; empty before the first."""
         return next((message["STATUS"] for _, message in reversed(self.messages) if "STATUS" in message), "")
 
-    async def until(self, key: str, words: str = "1", within_s: float = 30.0, count: int = 1) -> dict[str, str]:
+    async def until(self, key: str, words: str = "1", within_s: float = 90.0, count: int = 1) -> dict[str, str]:
         """Wait until so many messages have come in which `key` contains the words; the last of these.
 
         Raises:
