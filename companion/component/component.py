@@ -46,7 +46,7 @@ class Component:
         """The system id under which we were heard last."""
         self._next_heartbeat_s = -math.inf
         self.turns = 0
-        """Of the working loop, so that it is seen to go on."""
+        """Turns of the working loop, so that it is seen to go on."""
         self.permission = Permission(senders)
         self.parameters = OwnParameters(link, self.texts.say, self._woken.set, self.permission)
         self._commands = CommandServer(link, service, self.texts.say, self._woken.set, self.permission)

@@ -1,6 +1,6 @@
 """Who may have the component do something: as `mavlink.allow` says; reading is everybody's.
 
-A sender's ids are what it says they are. Against somebody who lies only signatures help (links.mavlink_signing).
+A sender's ids are what it says they are. Against impostors only signatures help (`links/mavlink/signing.py`).
 """
 
 from __future__ import annotations

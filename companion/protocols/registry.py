@@ -42,7 +42,7 @@ class ProtocolInfo:
     sigma_deg: float | None = None
     """How well such a device's tilt (gradienter) or heading (compass, level) is known where nobody says better."""
     tilted_sigma_deg: float | None = None
-    """Of a compass that does not stand level; None: as `sigma_deg`."""
+    """The same for a compass that does not stand level; None: as `sigma_deg`."""
     law: Law | None = None
     """What the documents say a gradienter's two readings are; None: they do not, the user must."""
 

@@ -29,11 +29,11 @@ TIMEOUT_S: Final = 40.0
 """ArduPilot gives up after some 30 s."""
 
 _LOST_AFTER_S: Final = 3.0
-"""The old offsets still in force so long after the command left: it has not arrived, or it was refused."""
+"""How long after the command old offsets still in force mean that it has not arrived, or was refused."""
 
 _LOOK_S: Final = 0.25
 _AFTERWARDS_S: Final = 0.5
-"""Between the last offset and the end of the command: the saving, and the EKF's reset."""
+"""Time from the last offset to the end of the command: the saving, and the EKF's reset."""
 
 Outcome = Literal["reset", "not converged", "unanswered", "not run"]
 

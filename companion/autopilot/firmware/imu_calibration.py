@@ -24,7 +24,7 @@ from companion.autopilot.parameters.float32 import float32, same_float32
 from companion.autopilot.parameters.writer import Change
 from companion.calibration.solution.solve import ImuSolution
 from companion.errors import CalibrationRefusedError
-from companion.physics.frames import Array, Matrix
+from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG
 from companion.samples import Vector
 
@@ -184,7 +184,7 @@ def output_step(calibration: ImuCalibration, changes: Sequence[Change]) -> tuple
     gyro = np.array([by_name.get(name, 0.0) for name in names.gyro_offset])
     accel = np.array([by_name.get(name, 0.0) for name in names.accel_offset])
     rotation = calibration.orientation
-    return _plain(-rotation @ gyro), _plain(-rotation @ (np.asarray(calibration.accel_scale) * accel))
+    return vector(-rotation @ gyro), vector(-rotation @ (np.asarray(calibration.accel_scale) * accel))
 
 
 def whole_bias(
@@ -196,7 +196,7 @@ def whole_bias(
     """
     rotation = calibration.orientation
     gyro = np.asarray(gyro_residual_rad_s) + rotation @ np.asarray(calibration.gyro_offset_rad_s)
-    return _plain(gyro), _plain(np.asarray(accel_residual_m_s2) + rotation @ accel_taken_off(calibration))
+    return vector(gyro), vector(np.asarray(accel_residual_m_s2) + rotation @ accel_taken_off(calibration))
 
 
 def whole_of(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:
@@ -230,9 +230,4 @@ def _require_plausible(what: str, vector: Vector, limit: float, unit: float, wor
 
 def _vector(values: Array) -> Vector:
     x, y, z = (float32(float(value)) for value in values)
-    return x, y, z
-
-
-def _plain(values: Array) -> Vector:
-    x, y, z = (float(value) for value in values)
     return x, y, z

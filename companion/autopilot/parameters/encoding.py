@@ -20,7 +20,7 @@ _FORMATS: Final[dict[int, str]] = {
     mavlink.MAV_PARAM_TYPE_INT32: "<i",
 }
 _HEADER_BYTES: Final = {0xFE: 6, 0xFD: 10}
-"""Of MAVLink 1 and 2, by the first byte of a packet."""
+"""Length of the header of MAVLink 1 and 2, by the first byte of a packet."""
 
 REAL32: Final[int] = mavlink.MAV_PARAM_TYPE_REAL32
 

@@ -13,7 +13,7 @@ from typing import Final
 from companion.autopilot.vehicle.vehicle import Vehicle
 
 SLOWEST: Final = 5.0
-"""So many of our seconds are given for one of the autopilot's, not more."""
+"""The most of our seconds that are given for one of the autopilot's."""
 POLL_S: Final = 0.05
 
 

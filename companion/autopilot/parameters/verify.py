@@ -20,7 +20,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from companion.physics.frames import Array, Matrix
+from companion.physics.frames import Array, Matrix, vector
 from companion.samples import Vector
 
 SIGMAS: Final = 4.0
@@ -138,7 +138,7 @@ def judge(seen: Observation) -> Verdict:
         axes=axes,
         fraction=fraction,
         fraction_sigma=fraction_sigma,
-        residual=(float(residual[0]), float(residual[1]), float(residual[2])),
+        residual=vector(residual),
         problems=tuple(problems),
         warnings=tuple(hidden) if together != "seen" else (),
     )

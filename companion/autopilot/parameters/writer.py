@@ -42,11 +42,11 @@ __all__ = ["Change", "ParameterWriter", "RebootedWhileWritingError", "WriteFaile
 logger = logging.getLogger(__name__)
 
 HOLD_S: Final = 2.5
-"""So long a value on the way (`Change.via`) stays: PX4 looks at its parameters at most once a second (autopilots 9.2),
+"""How long a value on the way (`Change.via`) stays: PX4 looks at its parameters at most once a second (autopilots 9.2),
 and 2.5 s is what a real one was tried with (9.3.2)."""
 
 TAKEN_S: Final = 1.3
-"""So long after the last value of a way PX4 has taken it into use; until then the one on the way acts."""
+"""How long after the last value PX4 has taken it into use; until then the one on the way acts."""
 
 _LATE_ECHO_S: Final = 0.3
 """Let answers to earlier writes pass before reading back: ArduPilot answers to X with Y and Z, old ones, as well."""

@@ -17,7 +17,7 @@ from companion.attitude.estimator import Attitude
 from companion.autopilot.vehicle.vehicle import Firmware
 
 NOWHERE_VARIANCE_M2: Final = 1e4
-"""Of the position that is none: ArduPilot bounds its sigma to 100 m."""
+"""Variance of a position that is none: ArduPilot bounds its sigma to 100 m."""
 _X, _Y, _Z, _ROLL, _PITCH, _YAW = 0, 6, 11, 15, 18, 20
 """Where the diagonal stands in the upper right triangle, row by row."""
 _U32: Final = 2**32

@@ -107,7 +107,7 @@ class ImuStream:
         self.problem = f"waiting for the autopilot to start IMU {instance}"
         """Why there are no samples, one line; empty while there are."""
         self.turns = 0
-        """Of `run`, one at least every `BEAT_WITHIN_S`, whether samples come or not."""
+        """Turns of `run`, one at least every `BEAT_WITHIN_S`, whether samples come or not."""
         self.rejected: Counter[str] = Counter()
         """Messages that gave no sample, by reason."""
         self._vehicle, self._instance = vehicle, instance

@@ -123,14 +123,14 @@ class BootWatch:
 
     def _on_boot_ms(self, message: Any, t_s: float) -> None:
         if self._sent(message):
-            self._take(message.time_boot_ms * 1e-3, t_s)
+            self._follow(message.time_boot_ms * 1e-3, t_s)
 
     def _on_boot_us(self, message: Any, t_s: float) -> None:
         # The field may carry UTC instead; no autopilot has been up since the nineteen-seventies.
         if self._sent(message) and message.time_usec * 1e-6 < EARLIEST_S:
-            self._take(message.time_usec * 1e-6, t_s)
+            self._follow(message.time_usec * 1e-6, t_s)
 
-    def _take(self, boot_s: float, t_s: float) -> None:
+    def _follow(self, boot_s: float, t_s: float) -> None:
         restarted = self._clock.rebooted(boot_s, t_s)
         self._heard.set()
         if restarted:

@@ -246,7 +246,7 @@ class Vehicle:
         if not is_aircraft(message):
             return
         if self.system_id is None and self._latch.takes(message, t_s):
-            self._take(message)
+            self._latch_on(message)
         if not self.sent(message):
             return
         now_s = asyncio.get_running_loop().time()
@@ -265,7 +265,9 @@ class Vehicle:
         self._found.set()
         for heard in self._heartbeat_waiters:
             heard.set()
-        self._watch_for_loss()
+        if self._lost_timer is not None:
+            self._lost_timer.cancel()
+        self._lost_timer = asyncio.get_running_loop().call_later(HEARTBEAT_TIMEOUT_S, self._lose)
         if was_lost:
             self._ask_soon()
             self._tell("found")
@@ -283,7 +285,8 @@ class Vehicle:
         if firmware == "other":
             return False  # some device that pretends; whether it is armed means nothing
         if not self._lost:
-            self._notice_conflict()
+            self._arming.two_seen(asyncio.get_running_loop().time())
+            self._log_conflict()
             return False
         # Another firmware has been flashed while we heard nothing.
         self.firmware = firmware
@@ -302,17 +305,13 @@ class Vehicle:
             self._heartbeat_link_id = link_id
         return link_id == self._heartbeat_link_id
 
-    def _notice_conflict(self) -> None:
-        self._arming.two_seen(asyncio.get_running_loop().time())
-        self._log_conflict()
-
     def _log_conflict(self) -> None:
         conflict = self.conflict
         if conflict is not None and not self._conflict_logged:
             logger.error("%s: %s; nothing is written", self.name, conflict)
         self._conflict_logged = conflict is not None
 
-    def _take(self, message: mavlink.MAVLink_heartbeat_message) -> None:
+    def _latch_on(self, message: mavlink.MAVLink_heartbeat_message) -> None:
         self.system_id, self.component_id = message.get_srcSystem(), message.get_srcComponent()
         self._link.join((self.system_id, self.component_id))
         self.firmware = firmware_of(message)
@@ -320,12 +319,6 @@ class Vehicle:
         self._wanted.add(mavlink.MAVLink_global_position_int_message, 1.0)
         self._wanted.add(mavlink.MAVLink_autopilot_version_message, None)
         self._tick()
-
-    def _watch_for_loss(self) -> None:
-        loop = asyncio.get_running_loop()
-        if self._lost_timer is not None:
-            self._lost_timer.cancel()
-        self._lost_timer = loop.call_later(HEARTBEAT_TIMEOUT_S, self._lose)
 
     def _lose(self) -> None:
         self._lost = True
@@ -367,7 +360,8 @@ class Vehicle:
     def _on_restart(self) -> None:
         now_s = asyncio.get_running_loop().time()
         if now_s - self._restarted_s < _RESTARTS_S:
-            self._notice_conflict()
+            self._arming.two_seen(now_s)
+            self._log_conflict()
         self._restarted_s = now_s
         self._restarted()
 

@@ -42,7 +42,7 @@ class MavlinkLink:
     def __init__(self, *, system_id: int = 1, component_id: int = 191) -> None:
         self.component_id = component_id
         self.turns = 0
-        """Of whatever carries the link's bytes, so that it is seen to go on."""
+        """Turns of whatever carries the link's bytes, so that it is seen to go on."""
         self.received: Counter[str] = Counter()
         """Messages by type, plus "bad" (failed checks), "unknown" (not in the dialect) and "handler error"."""
         self.sent = 0

@@ -167,9 +167,9 @@ class _Speaker(_Udp):
         self.link.attach(lambda data: self.send_to(data, None))
 
     def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
-        self.link.arrived(data, self.now_s(), self._take)
+        self.link.arrived(data, self.now_s(), self._receive)
 
-    def _take(self, datagram: bytes, t_s: float) -> None:
+    def _receive(self, datagram: bytes, t_s: float) -> None:
         self.link.receive_datagram(datagram, t_s, lambda sender: None)
 
 
@@ -186,9 +186,9 @@ class _Listener(_Udp):
         """Those of them that have spoken for the autopilot."""
 
     def datagram_received(self, data: bytes, addr: Peer) -> None:
-        self.link.arrived(data, self.now_s(), functools.partial(self._take, addr))
+        self.link.arrived(data, self.now_s(), functools.partial(self._receive, addr))
 
-    def _take(self, peer: Peer, datagram: bytes, t_s: float) -> None:
+    def _receive(self, peer: Peer, datagram: bytes, t_s: float) -> None:
         self.link.receive_datagram(datagram, t_s, lambda sender: self._hear(peer, sender, t_s))
 
     def _hear(self, peer: Peer, sender: Sender, t_s: float) -> None:

@@ -232,7 +232,7 @@ class MqttLink:
             keepalive=self.settings.keepalive_s,
             properties=properties,
             timeout=GREETING_DEADLINE_S,
-            queue_type=_inbox(self._take),
+            queue_type=_inbox(self._deliver),
             logger=_quiet,
         )
 
@@ -266,9 +266,9 @@ class MqttLink:
     async def _receive(self, client: aiomqtt.Client) -> None:
         """Wait for the end of the connection; what comes is dealt with as it comes (`_inbox`)."""
         async for message in client.messages:
-            self._take(message)
+            self._deliver(message)
 
-    def _take(self, message: aiomqtt.Message) -> None:
+    def _deliver(self, message: aiomqtt.Message) -> None:
         topic = message.topic.value
         self._echoed |= self._will is not None and topic == self._will[0]
         try:

@@ -1,4 +1,4 @@
-"""Password and certificates, read anew for every connection: what was mended is found without a restart."""
+"""Password and certificates, read anew for every connection: what was corrected is found without a restart."""
 
 from __future__ import annotations
 

@@ -25,15 +25,15 @@ LEAVE_DEADLINE_S: Final = 1.0
 MAX_PACKET_BYTES: Final = 64 * 1024
 """That the broker may send us; told to it where it speaks MQTT 5."""
 MAX_GREETING_BYTES: Final = 1024
-"""Of the only packet whose properties the library decodes, at some 30 us a byte on a PC."""
+"""The longest greeting, the only packet whose properties the library decodes (some 30 us a byte on a PC)."""
 BYTES_PER_S: Final = 64 * 1024
-"""So much is taken for long; the rest waits at the broker."""
+"""The rate that is taken for long; the rest waits at the broker."""
 PACKET_COST_BYTES: Final = 256
 """What a packet counts beyond its length: even the shortest is work."""
 FLOOD_S: Final = 4.0
 """A flood that lasts so long ends the connection, before the answer that is lost behind it is missed."""
 QUIET_S: Final = 2.0
-"""So long within bounds, and a flood is over."""
+"""How long within bounds ends a flood."""
 
 CONNACK: Final = 0x20
 PUBLISH: Final = 0x30
@@ -46,7 +46,7 @@ _QOS: Final = 0x06
 _QOS_2: Final = 0x04
 _MQTT_5: Final = 5
 _DIGITS: Final = 4
-"""Of a length, at most."""
+"""The most bytes that a length has."""
 
 
 class BrokerFaultError(LinkError):

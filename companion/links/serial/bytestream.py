@@ -25,26 +25,26 @@ READ_BYTES = 4096
 """As much as a tty buffers: one wake-up empties the port, so one time stamp holds for all that it brought."""
 QUICK_READS = 20
 QUICK_S = 0.0015
-"""So many reads, that far apart in the mean or less, are a stream whose every byte would wake the loop."""
+"""How many reads, and how close together in the mean, mark a stream whose every byte would wake the loop."""
 COLLECT_S = 0.0205
-"""So long such a stream is collected before the next read: a wake-up costs far more than the bytes that it brings.
+"""How long such a stream is collected before the next read: a wake-up costs far more than the bytes that it brings.
 
 What it brings is stamped that much late at worst (where the device has no clock of its own), as behind a USB adapter.
 A little more than the 20 ms within which an autopilot takes one heading (autopilots section 6): each read brings one.
 """
 JUDGED_S = 0.1
-"""So often it is looked at whether a stream is still one to be collected: what comes in bunches is no other stream."""
+"""How often a stream is judged anew, whether to collect it: what comes in bunches is no other stream."""
 FULLEST_LINE = 0.9
-"""Of a line's time, where its stream may be collected."""
+"""The greatest share of a line's time that a stream may fill to be collected."""
 OUT_BUFFER_BYTES = 16384
 """Over a second at 115200 baud; what waits longer than that is better dropped than sent."""
 LONGEST_PAUSE_S = 1.0
-"""Between two attempts: whatever has come back is open again within 3 s, the opening itself included."""
+"""The longest pause between attempts: whatever has come back is open again within 3 s, the opening included."""
 BEAT_S = 1.0
 BEAT_WITHIN_S = 8.0
 """An open that takes all the time it may, and the longest pause after it."""
 FLOOD_PAUSE_S = 0.05
-"""So long a port that brings too much is left alone."""
+"""How long a port that brings too much is left alone."""
 DISCARD_BYTES = 65536
 DISCARD_READS = 16
 """After a pause so much is thrown away at the most, a millisecond's work; the rest waits in the kernel, not here."""
@@ -119,7 +119,7 @@ class ByteLink:
         self.reconnects = 0
         """How often the port was opened again after it had been open."""
         self.turns = 0
-        """Of `run`, one at least every `BEAT_WITHIN_S`, whether bytes come or not."""
+        """Turns of `run`, one at least every `BEAT_WITHIN_S`, whether bytes come or not."""
         self.last_byte_s: float | None = None
         """The loop's time of the last read that brought bytes."""
         self._on_bytes, self._on_turn = on_bytes, on_turn

@@ -28,7 +28,7 @@ from companion.protocols.guess import (
 )
 
 SILENT_S: Final = 3.0
-"""So long the first setting is listened to before it is called silent: what speaks is seen at every speed."""
+"""How long the first setting is listened to before the port is called silent: a talker is seen at every speed."""
 LINE_S: Final = 1.0
 LINE_MOST_S: Final = 2.5
 """For a device that sends once a second: two of its frames."""

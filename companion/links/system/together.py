@@ -32,7 +32,7 @@ class Together:
         self._waiting: list[tuple[Take, bytes, float]] = []
         self._drivers = 0
         self._turns = 0
-        """Of the drivers, since something was taken."""
+        """Turns of the drivers since something was taken."""
         self._taking = False
 
     @property

@@ -29,7 +29,7 @@ from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 
 HOLD_S: Final = 3.0
-"""So long a sentence keeps its precedence after it was last heard."""
+"""How long a sentence keeps its precedence after it was last heard."""
 
 North = Literal["magnetic", "true"] | None
 

@@ -16,9 +16,9 @@ from companion.protocols.decoding.clock import SampleTimes
 from companion.samples import Sample
 
 AHEAD_S = 0.5
-"""So far ahead of its line no stream gets: a baud rate then means nothing on that port (USB without a UART)."""
+"""How far a stream may be ahead of its line; beyond, a baud rate means nothing on that port (USB without a UART)."""
 _STALL_S = 10.0
-"""So long what came may have waited unread."""
+"""How long bytes may have waited unread."""
 
 
 class RejectedError(Exception):
@@ -46,7 +46,7 @@ class Decoder(ABC):
         self.seconds_per_byte = seconds_per_byte
         self.times = SampleTimes(self.device_clock_wraps_s, self.sequence_modulus)
         self.frame_bytes = 0
-        """Of the latest frame that gave samples; 0 where the decoder does not tell."""
+        """Length of the latest frame that gave samples; 0 where the decoder does not tell."""
         self._read_s: float | None = None
         self._ahead_s = 0.0
         self.accepted = 0

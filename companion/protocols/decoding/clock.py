@@ -27,7 +27,7 @@ STEP_S: Final = 0.005
 """If no sample of a whole `SPAN_S` came with less delay than this, the offset itself is another one now."""
 SPAN_S: Final = 1.0
 SPAN_SAMPLES: Final = 20
-"""And of no fewer samples: of a few all may have had to wait for the adapter."""
+"""The fewest samples in a span: of a few all may have had to wait for the adapter."""
 
 LATE_S: Final = 1.0
 """A sample that seems later than this is dropped: as old as that nobody waits for it, or its clock is wrong."""

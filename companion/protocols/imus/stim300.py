@@ -132,9 +132,9 @@ RANGE_NOT_KNOWN = "accelerometer range not known"
 OUTPUT_UNIT = "output unit"
 
 REST_TICKS: Final = 2000
-"""So many internal samples at rest, a second, decide the accelerometers' range."""
+"""How many internal samples at rest (a second of them) decide the accelerometers' range."""
 REST_DEG_S: Final = 3.0
-"""Of the rate, for "at rest"; a turn-on bias is a tenth of it."""
+"""The fastest rate that counts as "at rest"; a turn-on bias is a tenth of it."""
 
 _ASSUMED_BITS = 19
 _BITS = (16, 18, 19, 20, 21)

@@ -191,7 +191,7 @@ class VectorNavDecoder(FrameDecoder):
         super().__init__(seconds_per_byte)
         self._layouts: dict[bytes, Layout] = {}
         self._header = b""
-        """Of the last good frame: the next one most likely has it too."""
+        """Header of the last good frame: the next one most likely has it too."""
 
     def _next(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         if buffer[at] == _SYNC:

@@ -81,7 +81,7 @@ class WitMotionDecoder(FrameDecoder):
         if following != FRAME_BYTES:
             return self._reject(ALONE, at + 1)
         self._good_at = origin + end
-        self._take(buffer, at, origin, samples)
+        self._read_frame(buffer, at, origin, samples)
         return end
 
     def _no_frame(self, size: int, at: int) -> int:
@@ -90,7 +90,7 @@ class WitMotionDecoder(FrameDecoder):
         self.skipped += 1
         return at + 1
 
-    def _take(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> None:
+    def _read_frame(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> None:
         kind, end = buffer[at + 1], origin + at + FRAME_BYTES
         accel = self._accel
         if accel is not None and not (kind == _GYRO and accel[0] == origin + at):

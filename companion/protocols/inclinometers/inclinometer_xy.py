@@ -25,7 +25,7 @@ _SINGLE_AXIS = re.compile(rb"[+-]\d\d\.\d{2,3}")
 _ECHO = re.compile(rb"[A-Za-z*]{1,8}")
 _DAMAGED = re.compile(rb"[\x00\x80-\xff]")
 _SURE = 4
-"""So many readings running with fewer decimals than before are the device's way; fewer of them have lost a digit."""
+"""How many readings in a row with fewer decimals than before make them the device's way; fewer have lost a digit."""
 
 _SPOILED: Literal["spoiled"] = "spoiled"
 
