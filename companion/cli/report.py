@@ -1,4 +1,4 @@
-"""`companion report`: a page about one calibration, or about all of an aircraft, in one file."""
+"""`companion report`: a page about one calibration, in one file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from companion.cli.terminal import DONE, FAILED, USAGE, AddCommand, count, load_config, print_json, print_lines
+from companion.cli.terminal import DONE, FAILED, USAGE, AddCommand, load_config, print_json, print_lines
 from companion.errors import CompanionError, ConfigError, StorageError
 
 if TYPE_CHECKING:
@@ -17,25 +17,19 @@ if TYPE_CHECKING:
 
 def add_command(add: AddCommand) -> None:
     """Add `report`."""
-    sub = add("report", report, "make a page (one HTML file) of a calibration, or of all: needs no daemon, no network")
+    sub = add("report", report, "make a page (one HTML file) of a calibration: needs no daemon, no network")
     sub.add_argument(
         "record", nargs="?", metavar="RECORD", help="its number, or the beginning of its time (default: the latest)"
     )
-    sub.add_argument("--history", action="store_true", help="all calibrations of an aircraft instead of one")
     sub.add_argument("-o", "--output", metavar="FILE", help="default: companion-report-….html here; - is stdout")
     sub.add_argument(
         "--storage", type=Path, metavar="DIR", help="the folder with records/ (default: as in the configuration)"
     )
-    sub.add_argument("--vehicle", type=count, metavar="ID", help="with --history: of this system id")
-    sub.add_argument("-n", "--limit", type=count, default=200, metavar="N", help="with --history: the latest N")
 
 
 async def report(options: argparse.Namespace) -> int:
     """`companion report`."""
     as_json = getattr(options, "json", False)
-    if options.history and options.record is not None:
-        print_lines("companion report: RECORD and --history exclude one another", error=True)
-        return USAGE
     if options.output == "-" and as_json:
         print_lines("companion report: -o - and --json both want stdout", error=True)
         return USAGE
@@ -80,20 +74,13 @@ def _make(
     options: argparse.Namespace, directory: Path, profiles: dict[str, NoiseProfile]
 ) -> tuple[Path | None, list[str]]:
     from companion.report.calibration_page import calibration_page
-    from companion.report.history_page import history_page
     from companion.report.source import Storage
     from companion.storage.atomic import write_atomically
 
     now = datetime.datetime.now(tz=datetime.UTC)
-    storage = Storage(directory)
-    if options.history:
-        material = storage.history(options.vehicle, options.limit)
-        content, damaged = history_page(material, now), list(material.damaged)
-        name = "companion-report-history.html"
-    else:
-        one = storage.calibration(options.record, profiles)
-        content, damaged = calibration_page(one, now), list(one.damaged)
-        name = f"companion-report-{one.number:06d}.html"
+    one = Storage(directory).calibration(options.record, profiles)
+    content, damaged = calibration_page(one, now), list(one.damaged)
+    name = f"companion-report-{one.number:06d}.html"
     if options.output == "-":
         # As the file says of itself, whatever the terminal speaks.
         sys.stdout.buffer.write(content.encode("utf-8", "replace"))

@@ -49,7 +49,6 @@ h3{font-size:1.05rem;margin:1.2em 0 .3em}p{margin:.4em 0}ul{margin:.3em 0;paddin
 .card.alarm{border-color:var(--bad)}.card.caution{border-color:var(--warn)}.card.fine{border-color:var(--good)}
 .pairs h3{margin-top:.7em}.setting{table-layout:fixed}.setting .name td{border:0;text-align:left;padding-top:.6em}
 .setting .values td{padding-top:0;text-align:left}
-.no{white-space:nowrap;overflow-wrap:normal;width:3.5em}
 small{display:block;color:var(--soft);font-size:.82rem}.setting td{font-size:.97rem}
 .pairs{display:grid;
 grid-template-columns:repeat(auto-fit,minmax(min(100%,400px),1fr));gap:0 28px;align-items:start}
@@ -58,7 +57,7 @@ svg.key{display:inline-block;width:24px;height:16px}
 table{border-collapse:collapse;width:100%;max-width:640px;font-variant-numeric:tabular-nums}
 th,td{padding:.32em .3em;border-bottom:1px solid var(--rule);text-align:right;vertical-align:top}
 th{font-size:.88rem;color:var(--soft);font-weight:600}th:first-child,td:first-child{text-align:left}
-td.left,th.left{text-align:left}.mono{font-family:ui-monospace,monospace;font-size:.92rem}
+.mono{font-family:ui-monospace,monospace;font-size:.92rem}
 .legend span{display:inline-flex;align-items:center;margin-right:1em;font-size:.92rem}
 text{font:13px system-ui,sans-serif;fill:var(--fg)}.mid{text-anchor:middle}.end{text-anchor:end}
 .label{font-weight:600}.halo{paint-order:stroke;stroke:var(--bg);stroke-width:4px}
@@ -67,7 +66,7 @@ text{font:13px system-ui,sans-serif;fill:var(--fg)}.mid{text-anchor:middle}.end{
 .band{fill:var(--band)}.sx{color:var(--x)}.sy{color:var(--y)}.sz{color:var(--z)}
 .dot{fill:none;stroke:currentColor;stroke-width:7.2;stroke-linecap:round}
 .mark{fill:currentColor;stroke:none}.bar{fill:none;stroke:currentColor;stroke-width:1.6}
-.stroke{fill:none;stroke:currentColor;stroke-width:2.2}
+
 .bad{color:var(--bad)}.ok{color:var(--good)}.warn{color:var(--warn)}
 .use{color:var(--fg)}.mark.stat{color:var(--fg);fill:var(--bg);stroke:var(--fg);stroke-width:1.8}
 .ring{fill:none;stroke:var(--fg);stroke-width:2}

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from companion.calibration.solution.record import Arming, Record
 from companion.errors import StorageError
-from companion.report import calibration_page, history_page
+from companion.report import calibration_page
 from companion.report.page import Profiles
 from companion.storage.bounded import BoundedList
 from companion.storage.records import Entry, RecordStore
 
 MAX_EARLIER: Final = 60
 """Calibrations in the drift plots of the page of one."""
-MAX_HISTORY: Final = 200
-"""On the page over the history: it stays below half a megabyte."""
 
 
 class Storage:
@@ -83,44 +80,6 @@ class Storage:
             profiles=profiles,
             damaged=problems,
         )
-
-    def history(self, vehicle: int | None, limit: int) -> history_page.Material:
-        """All calibrations of one aircraft, and those that failed before any was heard.
-
-        Args:
-            vehicle: its system id; None: that of the latest calibration that knew it.
-            limit: at most so many, the latest.
-
-        Raises:
-            StorageError: there is none of this aircraft.
-        """
-        readable = [(entry.number, entry.record) for entry in self.entries if entry.record is not None]
-        known = list(
-            dict.fromkeys(record.system_id for _, record in reversed(readable) if record.system_id is not None)
-        )
-        if vehicle is None:
-            vehicle = known[0] if known else None
-        elif vehicle not in known:
-            there = ", ".join(map(str, known)) or "none that was heard"
-            raise StorageError(f"no calibration of vehicle {vehicle} (there are: {there})")
-        own = [(number, record) for number, record in readable if record.system_id in (vehicle, None)]
-        shown = own[-min(limit, MAX_HISTORY) :]
-        return history_page.Material(
-            vehicle=vehicle,
-            records=shown,
-            left_out=len(own) - len(shown),
-            others=[other for other in known if other != vehicle],
-            armings=self._armings_of(vehicle, own, readable),
-            damaged=self.damaged,
-        )
-
-    def _armings_of(
-        self, vehicle: int | None, own: Sequence[tuple[int, Record]], every: Sequence[tuple[int, Record]]
-    ) -> list[Arming]:
-        """An arming names a calibration, not a vehicle: left out is what is known to be another's."""
-        ours = {record.started_at for _, record in own}
-        others = {record.started_at for _, record in every} - ours
-        return [arming for arming in self._armings if arming.calibration not in others]
 
     def _find(self, wanted: str | None) -> tuple[Entry, Record]:
         if wanted is None:

@@ -153,7 +153,7 @@ class Plot:
             class_: `sx`, `sy`, `sz` or another of the style sheet.
             spans: lower and upper end of every point's bar.
             size: over the usual one.
-            shape: "circle", "square", "triangle", "cross"; by the class if left out.
+            shape: "circle", "square", "triangle"; by the class if left out.
         """
         if not points:
             return
@@ -169,7 +169,7 @@ class Plot:
             self._parts.append(_path("".join(f"M{_xy(*self.at(*point))}h.01" for point in points), f"dot {class_}"))
             return
         marks = "".join(_marker(shape, *self.at(*point), _MARK * size) for point in points)
-        self._parts.append(_path(marks, f"{'stroke' if shape == 'cross' else 'mark'} {class_}"))
+        self._parts.append(_path(marks, f"mark {class_}"))
 
     def draw(self, *parts: Markup) -> None:
         """Anything else, on top."""
@@ -230,14 +230,13 @@ def strip(left: float, right: float, middle: float, height: float, class_: str) 
 
 def legend(*entries: tuple[str, str]) -> Markup:
     """Markers with words, of (class, words)."""
-    shapes = {"sx": "circle", "sy": "square", "sz": "triangle", "bad": "cross"}
+    shapes = {"sx": "circle", "sy": "square", "sz": "triangle"}
     parts = []
     for class_, words in entries:
         if class_ == "floor":
             picture = _path("M1 8H23", class_)
         elif class_ in shapes:
-            kind = "stroke" if shapes[class_] == "cross" else "mark"
-            picture = _path(_marker(shapes[class_], 12.0, 8.0, 5.0), f"{kind} {class_}")
+            picture = _path(_marker(shapes[class_], 12.0, 8.0, 5.0), f"mark {class_}")
         elif class_ in {"stat", "use"}:
             picture = _path(_marker("circle", 12.0, 8.0, 5.0), f"mark {class_}")
         else:
@@ -257,8 +256,6 @@ def _marker(shape: str, x: float, y: float, r: float) -> str:
         return f"M{_xy(x - side / 2, y - side / 2)}h{_n(side)}v{_n(side)}h{_n(-side)}z"
     if shape == "triangle":
         return f"M{_xy(x, y - 1.25 * r)}l{_xy(1.15 * r, 2.1 * r)}h{_n(-2.3 * r)}z"
-    if shape == "cross":
-        return f"M{_xy(x - r, y - r)}l{_xy(2 * r, 2 * r)}m{_xy(-2 * r, 0.0)}l{_xy(2 * r, -2 * r)}"
     return f"M{_xy(x - r, y)}a{_n(r)} {_n(r)} 0 1 0 {_n(2 * r)} 0a{_n(r)} {_n(r)} 0 1 0 {_n(-2 * r)} 0"
 
 

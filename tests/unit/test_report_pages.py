@@ -20,10 +20,8 @@ from companion.calibration.solution.record import Magnetic
 from companion.cli import main
 from companion.physics.units import DEG_H, MG
 from companion.report import calibration_page as calibration
-from companion.report import history_page as whole
 from companion.report import page, svg
 from companion.report.calibration_page import calibration_page
-from companion.report.history_page import history_page
 from companion.report.source import Storage
 from companion.samples import Vector
 from companion.storage.records import RecordStore
@@ -159,35 +157,15 @@ def test_the_points_of_a_plot_lie_where_their_values_are() -> None:
     assert (float(low), float(high)) == pytest.approx((places[0][1], places[1][1]), abs=0.11)
 
 
-def test_every_calibration_of_a_long_history_is_drawn(tmp_path: Path) -> None:
-    records = a_season(tmp_path, 60)
-    done = [one for one in records if one.state == "done"]
-    content = history_page(Storage(tmp_path).history(None, 200), NOW)
-    found = Page(content)
-    drawn = [held["d"] or "" for tag, held in found.tags if tag == "path" and held.get("class") == "dot sx"]
-    # 2 IMUs, 2 triads.
-    assert [course.count("M") for course in drawn] == [len(done)] * 4
-    assert "…" not in "".join(drawn)
-    assert f"{len(records)} calibrations: {len(done)} done" in found.text
-
-
-@pytest.mark.parametrize("what", ["calibration", "history"])
-def test_a_page_needs_nothing_else_and_stays_small(tmp_path: Path, what: str) -> None:
+def test_a_page_needs_nothing_else_and_stays_small(tmp_path: Path) -> None:
     names = [f"imu {k}" for k in range(9)]
     store = RecordStore(tmp_path)
     for k in range(230):
         one = record(k, imus=tuple(imu_record(name, k) for name in names), warnings=tuple(["x" * 5000] * 100))
         store.save(one, white_trace(one, 590) if k == 229 else None)
-    storage = Storage(tmp_path)
-    content = (
-        calibration_page(storage.calibration(None, {}), NOW)
-        if what == "calibration"
-        else history_page(storage.history(None, 10_000), NOW)
-    )
+    content = calibration_page(Storage(tmp_path).calibration(None, {}), NOW)
     assert len(content.encode()) < LARGEST
     found = Page(content)
-    if what == "history":
-        assert "30 older ones are not shown" in found.text
     assert "5 more IMUs are not shown" in found.text
     assert not re.search(r"https?:|//[a-z]|url\(|@import|javascript:", content.replace("http-equiv", ""), re.IGNORECASE)
     tags = {tag for tag, _ in found.tags}
@@ -223,7 +201,6 @@ def test_nothing_from_a_file_becomes_a_tag(tmp_path: Path) -> None:
     for content in (
         calibration_page(storage.calibration("1", {}), NOW),
         calibration_page(storage.calibration("2", {}), NOW),
-        history_page(storage.history(None, 20), NOW),
     ):
         found = Page(content)
         assert {tag for tag, _ in found.tags} <= {
@@ -284,22 +261,6 @@ def test_a_clock_that_went_back_is_said_and_order_is_used(tmp_path: Path) -> Non
     assert "number of the calibration" in found.text
 
 
-def test_the_history_names_failures_armings_others_and_the_damaged(tmp_path: Path) -> None:
-    records = a_season(tmp_path, 30)
-    store = RecordStore(tmp_path)
-    store.save(record(31, system_id=7))
-    store.save(record(32, system_id=1))
-    (tmp_path / "records" / "000002.json").write_bytes(b'{"format_version": 1, "st')
-    found = Page(history_page(Storage(tmp_path).history(None, 200), NOW))
-    assert "30 calibrations: 23 done, 4 failed, 3 cancelled" in found.text
-    assert "Other vehicles in these records: 7 (--vehicle 7)" in found.text
-    assert "000002.json: not a readable record" in found.text
-    assert "failed: 4 times, last 2026-05-06 06:30 UTC" in found.text
-    assert found.text.count("UNCALIBRATED:") == sum(k % 2 == 0 and one.state != "done" for k, one in enumerate(records))
-    other = Page(history_page(Storage(tmp_path).history(7, 200), NOW))
-    assert "1 calibrations: 1 done" in other.text
-
-
 # -------------------------------------------------------------------------------------------------------- the command
 
 
@@ -311,10 +272,8 @@ def test_the_command_writes_a_file_and_says_where(tmp_path: Path, capsys: pytest
     assert main([*arguments, "-c", str(tmp_path / "none.toml")]) == 0
     assert json.loads(capsys.readouterr().out) == {"state": "done", "reason": "", "file": str(target)}
     assert "Calibration 5" in Page(target.read_text()).text
-    assert main([*arguments[:-1], "--history"]) == 0
+    assert main(["report", "2026-05-01 11:3", *arguments[1:-1]]) == 0
     assert capsys.readouterr().out == f"{target}\n"
-    assert "Calibrations of vehicle 1" in Page(target.read_text()).text
-    assert main(["report", "2026-05-01 11:3", *arguments[1:]]) == 0
     assert "Calibration 2 " in Page(target.read_text()).text
     # Read-only: nothing in the storage was touched.
     assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "kept").rglob("*")}
@@ -327,7 +286,6 @@ def test_the_command_writes_a_file_and_says_where(tmp_path: Path, capsys: pytest
         (["2"], "000002.json: not a readable record"),
         (["2026"], "no calibration '2026'"),
         (["2026-05"], "2 calibrations begin with '2026-05'; the latest are number 1, 3"),
-        (["--history", "--vehicle", "9"], "no calibration of vehicle 9 (there are: 1)"),
         (["-o", "{folder}/none/x.html"], "there is no folder "),
     ],
 )
@@ -348,7 +306,7 @@ def test_no_record_at_all_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert main(["report", "--storage", str(tmp_path), "--json"]) == 1
     assert "no calibration yet" in json.loads(capsys.readouterr().out)["reason"]
     (tmp_path / "records").mkdir()
-    assert main(["report", "--history", "--storage", str(tmp_path)]) == 1
+    assert main(["report", "--storage", str(tmp_path)]) == 1
     assert "no calibration yet" in capsys.readouterr().err
     assert main(["report", "-c", str(tmp_path / "none.toml")]) == 2
     assert "--storage DIR" in capsys.readouterr().err
@@ -390,7 +348,6 @@ def test_damaged_armings_are_named(tmp_path: Path) -> None:
     a_season(tmp_path, 2)
     (tmp_path / "armings.json").write_bytes(b"[{]")
     assert "armings.json:" in Page(_calibration(tmp_path)).text
-    assert "armings.json:" in Page(history_page(Storage(tmp_path).history(None, 5), NOW)).text
 
 
 def test_gyros_alone_are_shown_alone(tmp_path: Path) -> None:
@@ -441,12 +398,8 @@ def test_whatever_a_record_holds_gives_pages(
         number=2, record=last, trace=white_trace(last, 12), no_trace="", earlier=records, armings=[], profiles={},
         damaged=[words],
     )  # fmt: skip
-    every = whole.Material(vehicle=1, records=records, left_out=0, others=[], armings=[arming(record())], damaged=[])
-    for content in (calibration_page(one, NOW), history_page(every, NOW)):
-        drawn = [held for tag, held in Page(content).tags if tag in {"path", "rect", "circle", "text"}]
-        assert not any(
-            re.search("nan|inf", str(value)) for held in drawn for key, value in held.items() if key != "class"
-        )
+    drawn = [held for tag, held in Page(calibration_page(one, NOW)).tags if tag in {"path", "rect", "circle", "text"}]
+    assert not any(re.search("nan|inf", str(value)) for held in drawn for key, value in held.items() if key != "class")
 
 
 # ---------------------------------------------------------------------------------------------------------- a browser
@@ -459,10 +412,7 @@ CHROMIUM = shutil.which("chromium")
 def test_a_browser_shows_it_on_a_phone_without_scrolling_sideways(tmp_path: Path, scheme: str) -> None:
     a_season(tmp_path / "kept", 8)
     storage = Storage(tmp_path / "kept")
-    pages = {
-        "one": calibration_page(storage.calibration(None, {}), NOW),
-        "history": history_page(storage.history(None, 200), NOW),
-    }
+    content = calibration_page(storage.calibration(None, {}), NOW)
     # Windows cannot be as narrow as a phone, and the page forbids scripts: it is looked at inside of another one.
     probe = """<!DOCTYPE html><html style="color-scheme: light dark"><title>unseen</title>
     <iframe width="390" height="3000" style="border: 0" sandbox="allow-same-origin" srcdoc="%s"></iframe><script>
@@ -476,23 +426,22 @@ def test_a_browser_shows_it_on_a_phone_without_scrolling_sideways(tmp_path: Path
                 " BG=" + getComputedStyle(inside.body).backgroundColor;
         };
     </script>"""
-    for name, content in pages.items():
-        path = tmp_path / f"{name}.html"
-        path.write_text(probe % html.escape(content))
-        done = subprocess.run(
-            [
-                str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
-                "--disable-background-networking", "--disable-component-update", "--disable-sync",
-                f"--blink-settings=preferredColorScheme={0 if scheme == 'dark' else 1}",
-                f"--user-data-dir={tmp_path / 'profile'}", "--window-size=390,3000", "--dump-dom", path.as_uri(),
-            ],
-            capture_output=True, text=True, timeout=60, check=False,
-        )  # fmt: skip
-        found = re.search(r"<title>WIDE=(\d+) CUT=(\d+) ([^<]*) BG=([^<]*)</title>", done.stdout)
-        assert found is not None, done.stderr[-2000:]
-        assert int(found[1]) <= 390
-        assert int(found[2]) == 0, f"cut off: {found[3]}"
-        assert found[4] == ("rgb(13, 13, 13)" if scheme == "dark" else "rgb(255, 255, 255)")
+    path = tmp_path / "one.html"
+    path.write_text(probe % html.escape(content))
+    done = subprocess.run(
+        [
+            str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
+            "--disable-background-networking", "--disable-component-update", "--disable-sync",
+            f"--blink-settings=preferredColorScheme={0 if scheme == 'dark' else 1}",
+            f"--user-data-dir={tmp_path / 'profile'}", "--window-size=390,3000", "--dump-dom", path.as_uri(),
+        ],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    found = re.search(r"<title>WIDE=(\d+) CUT=(\d+) ([^<]*) BG=([^<]*)</title>", done.stdout)
+    assert found is not None, done.stderr[-2000:]
+    assert int(found[1]) <= 390
+    assert int(found[2]) == 0, f"cut off: {found[3]}"
+    assert found[4] == ("rgb(13, 13, 13)" if scheme == "dark" else "rgb(255, 255, 255)")
 
 
 def test_light_and_dark_text_have_contrast_for_sunlight() -> None:
