@@ -139,7 +139,7 @@ class AttitudeService:
         self._wanted.heard(message, t_s)
         flies = self._fixed_wing and self.carrier.phase == "flight"
         good = flies and math.isfinite(message.airspeed) and message.airspeed > SLOWEST_AIRSPEED_M_S
-        self.carrier.airspeed_m_s = message.airspeed if good else None
+        self.carrier.flies_at(message.airspeed if good else None)
         self._airspeed_s = t_s
 
     # --- the rhythm
@@ -167,10 +167,10 @@ class AttitudeService:
 
     async def _turn(self, now_s: float) -> None:
         if now_s - self._airspeed_s > AIRSPEED_OLD_S:
-            self.carrier.airspeed_m_s = None
+            self.carrier.flies_at(None)
         if self._autopilot_imu is not None:
             kind = self._autopilot_imu.stream.kind
-            self.carrier.gyro_step_rad_s = kind.gyro_step_rad_s if kind is not None and kind.truncates else 0.0
+            self.carrier.steps_by(kind.gyro_step_rad_s if kind is not None and kind.truncates else 0.0)
         if self._vehicle.alive:
             self._wanted.ask_for_missing(now_s)
         self.health.judge(now_s)

@@ -13,7 +13,6 @@ from typing import Any, Final
 
 import msgspec
 
-from companion.component.own_parameters import OwnParameters
 from companion.config import load
 from companion.config.sections import Config
 from companion.config.senders import Senders
@@ -22,32 +21,11 @@ from companion.daemon.faces.flight_line import AT_ARM
 from companion.daemon.offload import Offload
 from companion.daemon.process.service import Service
 from companion.errors import ConfigError
-from companion.physics.units import DEG_H, MG
 from companion.storage.profiles import ProfileStore
 
 logger = logging.getLogger(__name__)
 
 Apply = Callable[[Service, Any], None]
-
-
-def _gyro_target(service: Service, deg_h: float) -> None:
-    service.calibrating.conductor.retarget(gyro_sigma_rad_s=deg_h * DEG_H)
-    _show(service.faces.component.parameters, "CMP_GYR_TGT", deg_h)
-
-
-def _accel_target(service: Service, mg: float) -> None:
-    service.calibrating.conductor.retarget(accel_sigma_m_s2=mg * MG)
-    _show(service.faces.component.parameters, "CMP_ACC_TGT", mg)
-
-
-def _at_arm(service: Service, value: Any) -> None:
-    service.calibrating.conductor.switch(at_arm=value)
-    _show(service.faces.component.parameters, "CMP_AT_ARM", float(AT_ARM.index(value)))
-
-
-def _push(service: Service, value: bool) -> None:  # noqa: FBT001 - as all in the table
-    service.calibrating.conductor.switch(push=value)
-    _show(service.faces.component.parameters, "CMP_PUSH", float(value))
 
 
 def _stop_rivals(service: Service, value: bool) -> None:  # noqa: FBT001 - as all in the table
@@ -62,23 +40,28 @@ def _log_level(_service: Service, value: str) -> None:
     logging.getLogger().setLevel(value.upper())
 
 
+def _parameter(name: str, number: Callable[[Any], float] = float) -> Apply:
+    """Of what a ground station can set as well: as if it had."""
+
+    def apply(service: Service, value: Any) -> None:
+        try:
+            service.faces.component.parameters.change(name, number(value))
+        except ValueError as error:
+            logger.warning("%s; ground stations see the old value", error)
+
+    return apply
+
+
 RELOADABLE: Final[Mapping[str, Apply]] = {
-    "calibration.target_gyro_sigma_deg_h": _gyro_target,
-    "calibration.target_accel_sigma_mg": _accel_target,
-    "calibration.at_arm": _at_arm,
-    "push.parameters": _push,
+    "calibration.target_gyro_sigma_deg_h": _parameter("CMP_GYR_TGT"),
+    "calibration.target_accel_sigma_mg": _parameter("CMP_ACC_TGT"),
+    "calibration.at_arm": _parameter("CMP_AT_ARM", AT_ARM.index),
+    "push.parameters": _parameter("CMP_PUSH"),
     "push.stop_rivals": _stop_rivals,
     "mavlink.allow": _allow,
     "log.level": _log_level,
 }
 """What can change without a restart, and how."""
-
-
-def _show(parameters: OwnParameters, name: str, value: float) -> None:
-    try:
-        parameters.set(name, value)
-    except ValueError as error:
-        logger.warning("%s; ground stations see the old value", error)
 
 
 class Reloader:
