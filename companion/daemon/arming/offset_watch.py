@@ -31,13 +31,7 @@ class _Known(msgspec.Struct, frozen=True):
 
 
 class OffsetWatch:
-    """Compares; `poll` often.
-
-    Args:
-        vehicle: whether it restarted.
-        imus: the autopilot's IMUs by name.
-        lost: told which IMU's offsets are ours no longer, and why.
-    """
+    """Compares; `poll` often. `lost` is told which IMU's offsets are ours no longer, and why."""
 
     def __init__(self, vehicle: Vehicle, imus: Mapping[str, AutopilotImu], lost: Callable[[str, Why], object]) -> None:
         self._vehicle, self._imus, self._lost = vehicle, imus, lost

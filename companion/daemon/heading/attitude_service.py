@@ -6,7 +6,7 @@ import asyncio
 import logging
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Final
+from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -23,12 +23,12 @@ from companion.daemon.heading.difference import Difference
 from companion.daemon.heading.health import Health
 from companion.daemon.heading.sender import Sender, is_sane
 from companion.daemon.heading.source import carrying_imu, without_truncation
+from companion.links.system.request import Object
 from companion.physics.units import DEG
 from companion.samples import ImuSample, Sample
 
 logger = logging.getLogger(__name__)
 
-Object = dict[str, Any]
 
 TICK_S: Final = 0.1
 LOOK_S: Final = 0.5

@@ -41,11 +41,11 @@ def turn_between(ours: Quaternion, theirs: Quaternion) -> Triple:
 
 
 class Difference:
-    """Listens to ATTITUDE of the latched autopilot.
+    """Listens to ATTITUDE of the latched autopilot; ours comes back from other stations under our own number.
 
     Args:
         link: the connection.
-        vehicle: whose attitude counts; ours comes back from other stations under our own component's number.
+        vehicle: whose attitude counts.
         now: our attitude at the last sample.
         kept_at: what is remembered of an instant before.
     """

@@ -28,11 +28,7 @@ SETTLED_AFTER_S: Final = 3.0
 
 
 async def run(config: Config, path: Path) -> None:
-    """Run the daemon until SIGTERM or SIGINT.
-
-    Args:
-        config: what to run.
-        path: the file that it was read from, and is read from again on SIGHUP.
+    """Run the daemon until SIGTERM or SIGINT; on SIGHUP the file is read again.
 
     Raises:
         CompanionError: it cannot start.

@@ -57,10 +57,7 @@ class Service:
         self.faces = Faces(core, self.devices, self.offsets, self.calibrating, self.arming, self.heading, self.recorder)
 
     async def run(self, on_ready: Callable[[], object] = lambda: None) -> None:
-        """Run until cancelled, reachable on the control socket.
-
-        Args:
-            on_ready: called when it can be talked to.
+        """Run until cancelled, reachable on the control socket from `on_ready` on.
 
         Raises:
             CompanionError: it cannot start (another daemon runs, or works with the same storage).
@@ -77,9 +74,7 @@ class Service:
     async def serve(self, *, mavlink: bool = True, ports: bool = True) -> None:
         """Do the work until cancelled, then leave the autopilot in order.
 
-        Args:
-            mavlink: open the configured MAVLink connection (else the link has been put on a wire already).
-            ports: open the serial ports (else somebody hands their bytes to `devices.sensors`).
+        Without `mavlink` the link has been put on a wire already; without `ports` somebody hands bytes to the sensors.
         """
         for subsystem in (self.devices, self.offsets, self.calibrating):
             subsystem.load()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 
@@ -23,10 +23,10 @@ from companion.daemon.faces.mqtt.summary import Pace, summary
 from companion.daemon.faces.mqtt.topics import OFFLINE, ONLINE, Topics, base_of, client_id_of
 from companion.daemon.heading.pose_now import PoseNow
 from companion.links.mqtt.client import Incoming, MqttLink
+from companion.links.system.request import Object
 
 logger = logging.getLogger(__name__)
 
-Object = dict[str, Any]
 
 LOOK_S: Final = 0.2
 """The attitude goes out at every look: at most 5 a second."""

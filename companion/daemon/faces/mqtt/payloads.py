@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 
 from companion.calibration.request import What, is_time_limit
+from companion.links.system.request import Object
 from companion.printable import printable
 
-Object = dict[str, Any]
 Transaction = str | int | None
 
 MAX_PAYLOAD_BYTES: Final = 4096

@@ -16,28 +16,22 @@ import asyncio
 import logging
 import re
 from collections import OrderedDict
-from collections.abc import AsyncIterator, Callable
-from typing import Any, Final, Protocol
+from collections.abc import Callable
+from typing import Final, Protocol
 
+from companion.daemon.core import Handler
 from companion.daemon.faces.mqtt.payloads import Misfit, Request, Transaction, parse
 from companion.errors import CompanionError
+from companion.links.system.request import Object
 
 logger = logging.getLogger(__name__)
 
-Object = dict[str, Any]
 
 MAX_PENDING: Final = 8
 """Requests that wait for their end, such as cancels of a calibration in the middle of a write."""
 REMEMBERED: Final = 32
 REMEMBER_S: Final = 600.0
 _COMMAND = re.compile(r"[A-Za-z0-9_-]{1,32}")
-
-
-class Ask(Protocol):
-    """The daemon's answers, as `Answers.answer`."""
-
-    def __call__(self, request: Object, face: str) -> AsyncIterator[Object]:
-        """Answer one request."""
 
 
 class Respond(Protocol):
@@ -65,7 +59,7 @@ class Requests:
         on_retained: told once of each command of which a retained request lies at the broker.
     """
 
-    def __init__(self, ask: Ask, respond: Respond, on_retained: Callable[[str], None]) -> None:
+    def __init__(self, ask: Handler, respond: Respond, on_retained: Callable[[str], None]) -> None:
         self._ask, self._respond, self._on_retained = ask, respond, on_retained
         self._tasks: set[asyncio.Task[None]] = set()
         self._known: OrderedDict[tuple[str, Transaction], _Known] = OrderedDict()

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
-Object = dict[str, Any]
+from companion.links.system.request import Object
 
 LEAST_S: Final = 1.0
 SLOW_S: Final = 10.0
