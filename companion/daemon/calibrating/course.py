@@ -116,9 +116,7 @@ class Course:
             measured = window = await self._measuring.measure(job)
             if await self._pusher.offsets_still_hold(push=self.push):
                 if self.push:
-                    window = await self._ditherer.refine(
-                        measured, job, draft, lambda words: job.progress(MEASURED_PERCENT, words)
-                    )
+                    window = await self._ditherer.refine(measured, job, draft)
                 if window is measured or await self._pusher.offsets_still_hold(push=self.push):
                     return measured, window
             # The window holds telemetry under other offsets than those now in force.

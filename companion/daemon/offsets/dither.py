@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import msgspec
@@ -51,7 +51,7 @@ BACK_WITHIN_S: Final = 20.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class _Job:
+class _Work:
     """One IMU's dither."""
 
     name: str
@@ -80,7 +80,7 @@ class Ditherer:
         self._profiles = {imu.name: noise_profile(imu.profile) for imu in core.config.imu}
         self._horizon_s = 180.0
 
-    async def refine(self, window: Window, job: Job, draft: Draft, progress: Callable[[str], None]) -> Window:
+    async def refine(self, window: Window, job: Job, draft: Draft) -> Window:
         """Dither every IMU of the window that needs it; returns the window with their means in place.
 
         Raises:
@@ -105,20 +105,18 @@ class Ditherer:
                 continue
             writes = self._parameters.writes
             self._machine.on(Event.DITHER)
-            result = await self._dither(each, imu, job, progress)
+            result = await self._dither(each, imu, job)
             writes = self._parameters.writes - writes
             draft.warn(each.name, f"imu {each.name}: offsets dithered and put back, {writes} parameter writes")
             found.append(_with(each, result))
         return msgspec.structs.replace(window, imus=tuple(found))
 
-    async def _dither(
-        self, window: ImuWindow, imu: AutopilotImu, job: Job, progress: Callable[[str], None]
-    ) -> Dithered:
+    async def _dither(self, window: ImuWindow, imu: AutopilotImu, job: Job) -> Dithered:
         work = self._prepare(window, imu)
         with imu.changing():
             try:
                 async with self._ledger.transaction(self._journal(work), stepwise=True):
-                    done = await self._steps(work, job, progress)
+                    done = await self._steps(work, job)
                     await self._ledger.undone()
             except (CompanionError, JobCancelledError) as error:
                 if not self._ledger.pending:
@@ -131,13 +129,13 @@ class Ditherer:
             raise AutopilotError(f"imu {work.name}: somebody changed its offsets while they were dithered")
         return combine(done, work.steps_si, self._profiles[window.name], self._horizon_s)
 
-    async def _steps(self, work: _Job, job: Job, progress: Callable[[str], None]) -> list[Step]:
+    async def _steps(self, work: _Work, job: Job) -> list[Step]:
         """All steps, and the old values again."""
         in_force = work.before
         done: list[Step] = []
         voids = 0
         while len(done) < STEPS:
-            progress(f"dithering IMU {work.imu.instance}: step {len(done) + 1}/{STEPS}")
+            job.progress(0.0, f"dithering IMU {work.imu.instance}: step {len(done) + 1}/{STEPS}")
             job.lasts((STEPS - len(done)) * self._step_s())
             self._check(job, work)
             wanted = work.values[len(done)]
@@ -152,7 +150,7 @@ class Ditherer:
             logger.info("dithering %s: step %d is void: %s", work.name, len(done) + 1, why)
             if voids > MOST_VOID:
                 raise CalibrationRefusedError(f"imu {work.name}: not still while its offsets dithered: {why}")
-        progress(f"dithering IMU {work.imu.instance}: putting its offsets back")
+        job.progress(0.0, f"dithering IMU {work.imu.instance}: putting its offsets back")
         await self._writer.restore([Change(name, before, in_force[name]) for name, before in work.before.items()])
         return done
 
@@ -160,7 +158,7 @@ class Ditherer:
         """What a step takes: writing it, the telemetry showing it, whole seconds of it, the last of them complete."""
         return WRITE_S + SETTLE_S.get(self._vehicle.firmware or "", 2.5) + SECONDS + 1.0
 
-    def _prepare(self, window: ImuWindow, imu: AutopilotImu) -> _Job:
+    def _prepare(self, window: ImuWindow, imu: AutopilotImu) -> _Work:
         calibration, kind = imu.in_force, imu.stream.kind
         if kind is None or not kind.truncates:
             raise AutopilotError(f"imu {window.name}: its integer telemetry has gone")
@@ -169,9 +167,9 @@ class Ditherer:
         reading = np.array([*window.gyro_rad_s, *window.accel_m_s2]) / steps_si
         shifts = shifts_lsb(reading, alternate=px4)
         values = tuple(_offsets(calibration, shift * steps_si) for shift in shifts)
-        return _Job(window.name, imu, calibration, steps_si, values, self._vehicle.boots)
+        return _Work(window.name, imu, calibration, steps_si, values, self._vehicle.boots)
 
-    def _journal(self, work: _Job) -> ChangeSet:
+    def _journal(self, work: _Work) -> ChangeSet:
         return ChangeSet(
             system_id=self._vehicle.system_id or 0,
             changes=tuple(
@@ -182,7 +180,7 @@ class Ditherer:
             ),
         )
 
-    def _check(self, job: Job, work: _Job) -> None:
+    def _check(self, job: Job, work: _Work) -> None:
         job.check_cancelled()
         if self._vehicle.arm_state is ArmState.ARMED:
             raise CalibrationRefusedError("armed while the offsets dithered")
@@ -190,7 +188,7 @@ class Ditherer:
             raise AutopilotError("the autopilot rebooted while the offsets dithered")
         job.check_time()
 
-    async def _collect(self, work: _Job, values: Mapping[str, float], job: Job) -> tuple[Step, str | None]:
+    async def _collect(self, work: _Work, values: Mapping[str, float], job: Job) -> tuple[Step, str | None]:
         """The seconds of one step, after the telemetry has had time to show it, and who says that it moved."""
         loop = asyncio.get_running_loop()
         written = moment(self._vehicle)
