@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from companion.calibration.seconds.batches import MAX_SAMPLES, Batch, BatchSource
+from companion.calibration.seconds.batch import Batch
+from companion.calibration.seconds.batches import MAX_SAMPLES, BatchSource
 
 
 def fill(source: BatchSource, rows: list[tuple[float, ...]], start_s: float, rate_hz: float, **more: float) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.collector.sources import SourceStatus
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.errors import CalibrationRefusedError
 from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.samples import ImuSample

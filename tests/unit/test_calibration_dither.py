@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from companion.calibration.collector.sources import integer_batches
 from companion.calibration.means.dither import SECONDS, STEPS, Step, combine, shifts_lsb, why_void
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG_H, MG
 from tests.support.still_aircraft import QUIET, imu

@@ -13,7 +13,7 @@ import pytest
 from companion.calibration.collector.rolling import RollingCollector, Window
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.calibration.stillness.settling import AT_ONCE, UNKNOWN_DEG, Lag, Settling
 from companion.config.sections import Compass
 from companion.config.sections import Gradienter as Section

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from companion.calibration.means.pose_windows import heading_window, tilt_window
 from companion.calibration.means.windows import ImuInput, imu_estimates
 from companion.calibration.noise.allan import AllanModel, NoiseProfile, noise_profile, slope_variance
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H
 from tests.support.allan import use_variance

@@ -9,7 +9,7 @@ import msgspec
 from companion.calibration.means.estimates import Found
 from companion.calibration.means.pose_windows import FieldWindow, HeadingWindow, TiltWindow, heading_window, tilt_window
 from companion.calibration.means.windows import Window
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.errors import CalibrationRefusedError
 
 

@@ -22,7 +22,7 @@ from companion.calibration.means.estimates import Estimates, Found, Work
 from companion.calibration.means.pose_models import CompassModel, GradienterModel
 from companion.calibration.means.pose_windows import HeadingWindow, TiltWindow
 from companion.calibration.means.windows import ImuInput, ImuWindow, Window
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.calibration.stillness.gates import ImuGate
 from companion.calibration.stillness.heading_watch import HeadingWatch
 from companion.calibration.stillness.settling import AT_ONCE, Lag

@@ -19,7 +19,7 @@ import numpy as np
 
 from companion.calibration.noise.allan import NoiseProfile, floor_variance
 from companion.calibration.noise.robust import median
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Floats
 

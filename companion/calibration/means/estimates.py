@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import msgspec
 
 from companion.calibration.means.windows import ImuEstimate, ImuInput, imu_estimates
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.errors import CalibrationRefusedError
 
 Found = list[ImuEstimate] | CalibrationRefusedError

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from companion.calibration.means.quantised import MIN_BEYOND_TWO, Cells, Fit, fit, shape_variance, truncation_edges
 from companion.calibration.noise.robust import HUBER_C as FLOAT_HUBER_C
 from companion.calibration.noise.robust import median
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
 
 Integers = NDArray[np.int64]

@@ -10,7 +10,7 @@ import numpy as np
 
 from companion.calibration.noise.allan import white_noise
 from companion.calibration.noise.robust import huber_mean
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
 
 _MAX_DECIMALS: Final = 4

@@ -28,7 +28,7 @@ from companion.calibration.noise.allan import (
     white_noise,
 )
 from companion.calibration.noise.robust import huber_line, median, robust_mean
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Floats, vector
 from companion.physics.units import DEG_H, MG

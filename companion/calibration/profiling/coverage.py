@@ -17,7 +17,7 @@ from companion.calibration.noise.allan import NoiseProfile, allan_variance
 from companion.calibration.noise.robust import median
 from companion.calibration.profiling.profile_fit import LEAST_STILL_S, TRIADS, fit_profile
 from companion.calibration.profiling.rest import CHANNELS, MIN_SECONDS, Rest
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
 from companion.samples import Triad
 

@@ -97,7 +97,7 @@ def rests(t_s: Floats, readings: Floats, temperature_degc: Floats | None, name: 
             gate.accept(batch, settled=stretch.begun)
             kept.append(batch)
         else:
-            obstacles[" ".join(verdict.words.split()[:3])] += 1
+            obstacles[verdict.what] += 1
             if stretch.start is None:
                 end()
     end()

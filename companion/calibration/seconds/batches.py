@@ -14,17 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.seconds.batch import (
-    MAX_LEVELS,
-    Batch,
-    Counts,
-    first_of_each,
-    missing_of,
-    summary,
-    unrolled,
-)
-
-__all__ = ["MAX_LEVELS", "MAX_SAMPLES", "Batch", "BatchSource", "Counts"]
+from companion.calibration.seconds.batch import Batch, first_of_each, missing_of, summary, unrolled
 
 MAX_SAMPLES: Final = 4096
 """Kept of one slot; what comes beyond is dropped and counted. Ten times the fastest stream."""

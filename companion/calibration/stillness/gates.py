@@ -34,7 +34,7 @@ from companion.calibration.noise.channels import (
     mean_over,
     scatter_of_difference,
 )
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, MG
 
@@ -106,6 +106,8 @@ class Verdict(msgspec.Struct, frozen=True):
     words: str = ""
     fault: bool = False
     """Whether it is the device, not the aircraft, that is in the way."""
+    what: str = ""
+    """Of a movement the same without its figures; of a fault as it is."""
 
 
 STILL: Final = Verdict(still=True)
@@ -117,11 +119,11 @@ def _words(what: str, found: float, allowed: float, unit: str) -> Verdict:
         left, right = f"{found:.{digits}f}", f"{allowed:.{digits}f}"
         if left != right:
             break
-    return Verdict(still=False, words=f"{what} {left} {unit} > {right}")
+    return Verdict(still=False, words=f"{what} {left} {unit} > {right}", what=what)
 
 
 def _fault(words: str) -> Verdict:
-    return Verdict(still=False, words=words, fault=True)
+    return Verdict(still=False, words=words, fault=True, what=words)
 
 
 def _motion(

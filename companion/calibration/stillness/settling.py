@@ -15,7 +15,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
 
 UNKNOWN_DEG: Final = 5.0

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.component.statustext import Say, Severity, Weight
 from companion.physics.frames import Array, Matrix
 from companion.protocols.stream_health import Trouble

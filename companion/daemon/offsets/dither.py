@@ -25,7 +25,7 @@ from companion.calibration.machine import Event, Machine
 from companion.calibration.means.dither import SECONDS, STEPS, Dithered, Step, combine, shifts_lsb, why_void
 from companion.calibration.means.windows import ImuWindow
 from companion.calibration.noise.allan import noise_profile
-from companion.calibration.seconds.batches import Batch
+from companion.calibration.seconds.batch import Batch
 from companion.calibration.solution.draft import Draft
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
