@@ -38,6 +38,11 @@ def breathing(items: Iterable[Any]) -> Iterator[Any]:
             time.sleep(BREATH_S)
 
 
+MOST_UNPACKED: Final = 8 * 1024 * 1024
+"""Of one second: more than may wait in the journal."""
+_NOT_IN_IT: Final = frozenset({topics.PAST, topics.START, topics.RECORD})
+
+
 class Past:
     """What has been in the journal lately. Used by one thread at a time.
 
@@ -91,11 +96,31 @@ class Past:
         self._bytes = 0
 
     def beginning(self, t_s: float) -> list[Message]:
-        """What a recording begins with that begins at `t_s`."""
-        import zstandard
-
+        """What a recording that begins at `t_s` begins with: its start, what is in force, each second in a piece."""
         start: Message = (topics.START, t_s, msgspec.json.encode(topics.StartEntry(t_s, 0)))
-        found = [start, *self._in_force.values()]
-        for _, packed, _ in self._seconds:
-            found += msgspec.msgpack.decode(zstandard.decompress(packed), type=list[Message])
-        return found
+        past = [
+            (topics.PAST, ended_s, msgspec.json.encode(topics.PastEntry(ended_s, packed)))
+            for ended_s, packed, _ in self._seconds
+        ]
+        return [start, *self._in_force.values(), *past]
+
+
+def unpacked(packed: bytes) -> list[Message]:
+    """The messages of a second.
+
+    Raises:
+        ValueError: it is nothing that this version could have written.
+    """
+    import zstandard
+
+    try:
+        # What a frame says of itself is made room for, whatever the limit is.
+        if zstandard.frame_content_size(packed) > MOST_UNPACKED:
+            raise ValueError(f"a second of more than {MOST_UNPACKED} bytes")
+        data = zstandard.decompress(packed, MOST_UNPACKED)
+    except zstandard.ZstdError as error:
+        raise ValueError(f"a second cannot be unpacked: {error}") from None
+    found = msgspec.msgpack.decode(data, type=list[Message])
+    if any(topic in _NOT_IN_IT for topic, _, _ in found):
+        raise ValueError("a second holds what it may not")
+    return found

@@ -21,7 +21,7 @@ METADATA: Final = "companion"
 """Name of the metadata record with versions and times."""
 CONFIG: Final = "configuration.json"
 """Name of the attachment with the configuration in force."""
-START, JOURNAL, RECORD = "/companion/start", "/companion/journal", "/companion/record"
+START, PAST, JOURNAL, RECORD = "/companion/start", "/companion/past", "/companion/journal", "/companion/record"
 MAVLINK_IN, MAVLINK_OUT = "/mavlink/in", "/mavlink/out"
 SERIAL, IMU = "/serial/", "/imu/"
 """Topics of raw bytes and of samples begin so; the device's or the IMU's name follows."""
@@ -53,6 +53,15 @@ class StartEntry(msgspec.Struct, frozen=True, gc=False):
     """What happened before that is the past, which it begins with."""
     lost: int
     """Messages that were dropped right before, because the disk did not keep up."""
+
+
+class PastEntry(msgspec.Struct, frozen=True, gc=False):
+    """A second before the recording, as far as a replay needs it."""
+
+    t_s: float
+    """Its end."""
+    packed: bytes
+    """[[topic, t_s, data], ...] as MessagePack, compressed by zstd."""
 
 
 class TiltEntry(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
@@ -213,6 +222,7 @@ _PLAIN: Final[dict[Any, dict[str, Any]]] = {
 }
 _KINDS: Final[dict[str, type[msgspec.Struct]]] = {
     START: StartEntry,
+    PAST: PastEntry,
     JOURNAL: JournalEntry,
     RECORD: RecordView,
     GRADIENTER: TiltEntry,

@@ -24,7 +24,7 @@ from companion.configured import models
 from companion.configured.devices import Role, SerialDevice, collect, parts_of, serial_devices
 from companion.errors import CalibrationRefusedError, StorageError
 from companion.protocols.decoding.base import Decoder
-from companion.recording import details, topics
+from companion.recording import details, past, topics
 from companion.recording.files import versions
 from companion.recording.walk import Attachment, Message, Metadata, Recording
 from companion.replay.calibrations import Calibrations, Replayed
@@ -76,6 +76,7 @@ class Replay:
         self._notes: list[str] = []
         self._strange: Counter[str] = Counter()
         self._first_s: float | None = None
+        self._past_bytes = 0
         self._now_s = 0.0
 
     def run(self) -> Result:
@@ -160,6 +161,7 @@ class Replay:
     def _handler_of(self, topic: str) -> Callable[[bytes], None] | None:
         known: dict[str, Callable[[bytes], None]] = {
             topics.START: self._start,
+            topics.PAST: self._take_past,
             topics.JOURNAL: self._take_event,
             topics.RECORD: self._take_record,
             topics.MAVLINK_IN: self._take_mavlink,
@@ -208,6 +210,14 @@ class Replay:
         }
         self._telemetry = Telemetry()
         self._calibrations.begin()
+
+    def _take_past(self, data: bytes) -> None:
+        entry = msgspec.json.decode(data, type=topics.PastEntry)
+        self._past_bytes += len(entry.packed)
+        if self._past_bytes > past.MOST_BYTES:
+            raise ValueError(f"more than {past.MOST_BYTES} bytes of what was before")
+        for topic, _, message in past.unpacked(entry.packed):
+            self._message(topic, message)
 
     def _take_serial(self, name: str, data: bytes) -> None:
         raw = _raw.decode(data)

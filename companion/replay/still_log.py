@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import datetime
 import itertools
-import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -105,11 +104,7 @@ def read_logs(paths: Sequence[Path], columns: str | None = None, csv_name: str =
 
 def _read_recording(path: Path) -> list[StillLog]:
     imu_entry = msgspec.json.Decoder(topics.ImuEntry)
-    others: dict[str, msgspec.json.Decoder[Any]] = {
-        topics.JOURNAL: msgspec.json.Decoder(topics.JournalEntry),
-        topics.START: msgspec.json.Decoder(topics.StartEntry),
-    }
-    began_s = -math.inf
+    journal = msgspec.json.Decoder(topics.JournalEntry)
     breaks: list[float] = []
     entries: dict[str, list[topics.ImuEntry]] = {}
     truncated: set[str] = set()
@@ -118,20 +113,14 @@ def _read_recording(path: Path) -> list[StillLog]:
     for item in Recording(path):
         if isinstance(item, Message):
             imu = item.topic.startswith(topics.IMU)
-            decoder = imu_entry if imu else others.get(item.topic)
-            if decoder is None:
+            if not imu and item.topic != topics.JOURNAL:
                 continue
             try:
-                entry = decoder.decode(item.data)
+                entry = (imu_entry if imu else journal).decode(item.data)
             except msgspec.MsgspecError as error:
                 raise StorageError(
                     f"{path}: a message on {item.topic} cannot be used by this version ({error})"
                 ) from None
-            if isinstance(entry, topics.StartEntry):
-                began_s = entry.t_s
-                continue
-            if entry.t_s < began_s:
-                continue  # the file before has it too
             if isinstance(entry, topics.JournalEntry):
                 if entry.event in BREAKING:
                     breaks.append(entry.t_s)

@@ -17,6 +17,7 @@ from companion.cli import main as companion
 from companion.config import parse
 from companion.recording import topics
 from companion.recording.files import versions
+from companion.recording.past import unpacked
 from companion.recording.walk import MAGIC, Message, Recording
 
 MB = 1 << 20
@@ -185,6 +186,26 @@ DETAILS = {
         {"name": "fc", "rotation": [[]] * 9, "profile": {"name": "x", "gyro": {}, "accel": {}}}
     ),
 }
+
+
+@pytest.mark.parametrize(
+    "packed_second",
+    [
+        frame_of(256 * MB, said=True),
+        frame_of(256 * MB, said=False),
+        zstandard.compress(msgspec.msgpack.encode([(topics.PAST, 1.0, b"")])),
+        zstandard.compress(b"\xdd\xff\xff\xff\xff"),
+        b"no frame",
+    ],
+)
+def test_a_second_of_before_that_would_fill_the_memory_is_refused(packed_second: bytes) -> None:
+    tracemalloc.start()
+    try:
+        with pytest.raises((ValueError, msgspec.MsgspecError)):
+            unpacked(packed_second)
+        assert tracemalloc.get_traced_memory()[1] < MOST
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("what", DETAILS)
