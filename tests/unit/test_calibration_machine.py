@@ -51,8 +51,14 @@ def test_users_see_the_words_that_other_programs_rely_on() -> None:
     assert {state.shown for state in State} == {
         "idle", "waiting", "collecting", "solving", "writing", "verifying", "done", "failed", "cancelled"
     }  # fmt: skip
-    assert {state.shown for state in State if state.is_writing} == {"solving", "writing", "verifying"}
-    assert not State.SOLVING.is_writing
+
+
+def test_nothing_counts_as_right_from_the_first_write_until_it_is_concluded() -> None:
+    into_rest = {State.WAITING, State.DONE, State.FAILED, State.CANCELLED}
+    for old in (State.DITHERING, State.WRITING, State.VERIFYING, State.RESTARTING, State.SETTLING, State.UNDOING):
+        assert old.is_writing
+        assert all(new.is_writing or new in into_rest for (state, _), new in TRANSITIONS.items() if state is old)
+    assert not any(state.is_writing for state in (*RESTING, State.WAITING, State.COLLECTING, State.SOLVING))
 
 
 def test_an_event_out_of_place_is_a_programs_fault() -> None:
