@@ -103,14 +103,13 @@ async def _end(options: argparse.Namespace, reply: Object) -> int:
 
 async def replay(options: argparse.Namespace) -> int:
     """`companion replay`."""
-    from companion.recording.walk import MAGIC
+    from companion.recording.walk import is_text
 
     try:
-        with options.file.open("rb") as file:
-            head = file.read(len(MAGIC))
+        text = is_text(options.file)
     except OSError as error:
         raise ConfigError(f"companion replay: {options.file}: {error.strerror or error}") from None
-    if head and not MAGIC.startswith(head) and b"\0" not in head:
+    if text:
         return _replay_csv(options)
     return _replay_recording(options)
 

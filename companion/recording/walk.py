@@ -36,7 +36,6 @@ class Message(msgspec.Struct, frozen=True, gc=False):
     """One message on a topic; `data` is JSON."""
 
     topic: str
-    log_time_ns: int
     data: bytes
 
 
@@ -59,6 +58,17 @@ Item = Message | Metadata | Attachment
 
 class _DamagedError(Exception):
     """What follows cannot be read; its argument says why."""
+
+
+def is_text(path: Path) -> bool:
+    """Whether a file is no recording but looks like a log in text.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        head = file.read(len(MAGIC))
+    return bool(head) and not MAGIC.startswith(head) and b"\0" not in head
 
 
 class Recording:
@@ -136,12 +146,12 @@ class Recording:
         while at < size:
             if data[at] == _MESSAGE and size - at >= _WHOLE_HEAD.size:
                 # A million of these: no call, and no object of those that nobody wants.
-                _, length, channel, _, log_time_ns, _ = _WHOLE_HEAD.unpack_from(data, at)
+                _, length, channel, *_ = _WHOLE_HEAD.unpack_from(data, at)
                 begin, at = at + _WHOLE_HEAD.size, at + _HEAD.size + length
                 if not begin <= at <= size:
                     raise _DamagedError("damaged: a message does not end where it should")
                 if channel in topic_of:
-                    yield Message(topic_of[channel], log_time_ns, data[begin:at])
+                    yield Message(topic_of[channel], data[begin:at])
                 continue
             kind, begin, at = _record(data, at)
             if kind == _MESSAGE:

@@ -16,7 +16,7 @@ from companion.config.sections import Config, Noise
 from companion.errors import StorageError
 from companion.physics.frames import Floats
 from companion.recording import topics
-from companion.recording.walk import MAGIC, Attachment, Message, Metadata, Recording
+from companion.recording.walk import Attachment, Message, Metadata, Recording, is_text
 from companion.replay.csv_columns import read_arrays
 from companion.replay.csv_log import NAME
 
@@ -85,11 +85,10 @@ def read_logs(paths: Sequence[Path], columns: str | None = None, csv_name: str =
     found: list[StillLog] = []
     for path in paths:
         try:
-            with path.open("rb") as file:
-                head = file.read(len(MAGIC))
+            text = is_text(path)
         except OSError as error:
             raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
-        if head and not MAGIC.startswith(head) and b"\0" not in head:
+        if text:
             t_s, readings, temperature = read_arrays(path, columns)
             found.append(
                 StillLog(
