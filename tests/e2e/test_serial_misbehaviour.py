@@ -477,7 +477,9 @@ def test_a_device_that_starts_anew_and_says_who_it_is(path: Path, caplog: pytest
             await one.data()
             device.muted = True
             await asyncio.sleep(0.9)
+            before = one.sensor.link.bytes_received
             device.say(b"HMR3300 V1.00\r\n")
+            await one.until(lambda: one.sensor.link.bytes_received > before)
             device.muted = False
             await one.data(RECOVERY_S)
             await one.until(lambda: one.counts.get("restarted") == 1)
