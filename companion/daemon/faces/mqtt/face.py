@@ -113,8 +113,10 @@ class MqttFace:
             else:
                 self._withdraw(link, topics)
             await link.flush(FLUSH_S)
-            running.cancel()
-            await asyncio.wait([running])
+            # A publication that is answered in that moment swallows the cancellation (asyncio.wait_for of Python 3.11).
+            while not running.done():
+                running.cancel()
+                await asyncio.wait([running], timeout=LOOK_S)
 
     def _withdraw(self, link: MqttLink, topics: Topics) -> None:
         """Have the broker forget everything under a topic that is ours no longer."""
