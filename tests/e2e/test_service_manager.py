@@ -104,7 +104,7 @@ def test_ready_status_watchdog_and_stop(tmp_path: Path, *, abstract: bool) -> No
     ("patch", "name"),
     [
         ('hang(InForce, "measure")', "estimator"),
-        ('hang(ByteLink, "_until_lost", lambda self: self.name == "compass")', "sensor compass"),
+        ('hang(ByteLink, "_once", lambda self: self.name == "compass")', "sensor compass"),
         ("Component.run = for_ever", "MAVLink component"),
     ],
     ids=["estimator", "sensor", "mavlink"],
