@@ -61,9 +61,7 @@ def _decode(buffer: bytes, at: int, stop: int, t_s: float) -> list[Sample]:
     """The samples in a packet that begins at `at`, whose checksum is right and begins at `stop`."""
     if buffer[at + 2] != _SENSOR_DATA:
         raise RejectedError(reasons.REPLY if buffer[at + 2] < _SENSOR_DATA else reasons.NOTHING_OF_USE)
-    accel_g: Vector | None = None
-    gyro_rad_s: Vector | None = None
-    mag_gauss: Vector | None = None
+    found: dict[int, Vector] = {}
     t_device_s: float | None = None
     field = at + 4
     while field < stop:
@@ -71,23 +69,16 @@ def _decode(buffer: bytes, at: int, stop: int, t_s: float) -> list[Sample]:
         if length < 2 or field + length > stop:
             raise RejectedError(reasons.FIELD_COUNT)
         kind = buffer[field + 1]
-        if kind == _GPS_TIME:
+        if kind == _GPS_TIME or _ACCEL <= kind <= _MAG:
             if length != 14:
                 raise RejectedError(reasons.FIELD_COUNT)
-            t_device_s, _week, _flags = _TIME.unpack_from(buffer, field + 2)
-        elif _ACCEL <= kind <= _MAG:
-            if length != 14:
-                raise RejectedError(reasons.FIELD_COUNT)
-            vector = _VECTOR.unpack_from(buffer, field + 2)
-            if kind == _ACCEL:
-                accel_g = vector
-            elif kind == _GYRO:
-                gyro_rad_s = vector
+            if kind == _GPS_TIME:
+                t_device_s, _week, _flags = _TIME.unpack_from(buffer, field + 2)
+                check_vector((t_device_s, 0.0, 0.0))
             else:
-                mag_gauss = vector
+                found[kind] = _VECTOR.unpack_from(buffer, field + 2)
         field += length
-    if t_device_s is not None:
-        check_vector((t_device_s, 0.0, 0.0))
+    accel_g, gyro_rad_s, mag_gauss = found.get(_ACCEL), found.get(_GYRO), found.get(_MAG)
     accel_m_s2 = _ABSENT
     if accel_g is not None:
         x, y, z = accel_g
