@@ -56,7 +56,7 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
 
 
 def _parser() -> Parser:
-    from companion.cli import align, client, ground, install, local, monitor, profile, recordings, report, setup
+    from companion.cli import align, client, ground, install, local, monitor, profile, recordings, report
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -111,7 +111,7 @@ def _parser() -> Parser:
     undo.add_argument(
         "--force", action="store_true", help="leave what somebody else has changed since, and put the rest back"
     )
-    setup.add_command(add)
+    add("autopilot-setup", client.setup, "what the autopilot needs set to take in our heading")
     history = add("history", client.history, "list past calibrations")
     history.add_argument("-n", "--limit", type=count, default=20, metavar="N", help="the latest N (default 20)")
     report.add_command(add)

@@ -82,3 +82,25 @@ async def history(options: argparse.Namespace) -> int:
     numbers = reply.get("numbers", [])
     answer = {"numbers": numbers, "records": records, "armings": armings}
     return finish(options, reply, answer, show.history_lines(numbers, records, armings), good=True)
+
+
+async def setup(options: argparse.Namespace) -> int:
+    """`companion autopilot-setup`."""
+    reply = await request(options, {"command": "autopilot-setup"})
+    answer = {key: value for key, value in reply.items() if key != "kind"}
+    good = reply["kind"] != "error"
+    return finish(options, reply, answer, setup_lines(answer) if good else [], good=good)
+
+
+def setup_lines(answer: Object) -> list[str]:
+    """The set-up as a person reads it."""
+    lines = [f"{answer['state']}: {answer['reason']}"]
+    for row in answer["parameters"]:
+        now, wanted = _number(row["now"]), _number(row["wanted"])
+        change = f"{now} -> {wanted}" if now != wanted else now
+        lines.append(f"  {row['parameter']:16} {change:12}  {row['why']}")
+    return [*lines, *(f"risk: {risk}" for risk in answer["risks"])]
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else f"{value:g}"

@@ -132,7 +132,7 @@ async def _interruptible(station: Station) -> AsyncIterator[None]:
 
 
 def _key(path: Path) -> bytes:
-    from companion.links.mavlink.keys import read_key
+    from companion.links.mavlink.signing import read_key
 
     try:
         return read_key(path)

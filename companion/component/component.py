@@ -7,8 +7,7 @@ import math
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.component.arm_authorisation import ArmAuthoriser
-from companion.component.arming_script import ArmingScript
+from companion.component.arm_authorisation import ArmAuthoriser, ArmingScript
 from companion.component.commands import CommandServer
 from companion.component.identity import heartbeat
 from companion.component.own_parameters import OwnParameters

@@ -19,7 +19,7 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.parameters.float32 import float32
+from companion.autopilot.parameters.wire import float32
 from companion.component.permission import Permission
 from companion.component.statustext import Say, Severity, Weight
 from companion.errors import CompanionError

@@ -5,24 +5,92 @@ has found a system, and Param, a parameter client with retries. Its `send_comman
 keeps the progress to itself, repeats with confirmation 0 (which is a new request) and does not ask again when the
 final answer was lost: `exchange` does that.
 
+MAVSDK 4.1 has no signing: where there is a key it is given whole messages that were checked, over its own `raw://`
+connection, and what it sends is signed; the link itself is the companion's then.
+
 MAVSDK calls back in threads of its own; everything here goes on in the event loop.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any, ClassVar, Final
 
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
 from companion.errors import AutopilotError, ConfigError, LinkError
 from companion.ground.exchange import Ack
 from companion.ground.heard import Heard, Target
-from companion.links.mavlink.transport import parse_url
+from companion.links.mavlink.link import MavlinkLink, Message
+from companion.links.mavlink.signing import Signing
+from companion.links.mavlink.transport import parse_url, run_transport
 
 logger = logging.getLogger(__name__)
+
+
+class SignedLink:
+    """Between MAVSDK and the link.
+
+    Args:
+        sdk: a `mavsdk.Mavsdk` with a raw connection.
+        own: system and component that MAVSDK sends as.
+        key: 32 bytes.
+    """
+
+    def __init__(self, sdk: Any, own: tuple[int, int], key: bytes) -> None:
+        self._sdk = sdk
+        self._loop = asyncio.get_running_loop()
+        self._from_sdk = mavlink.MAVLink(None)
+        self._from_sdk.robust_parsing = True
+        self.link = MavlinkLink(system_id=own[0], component_id=own[1])
+        self.signing = self.link.signing = Signing(required=True)
+        self.signing.key = key
+        for kind in mavlink.mavlink_map.values():
+            self.link.subscribe(kind, self._hand_over)
+        sdk.subscribe_raw_bytes_to_be_sent(self._in_a_thread)
+
+    def words(self) -> str:
+        """What was dropped, for people; empty when nothing was."""
+        if not self.signing.doubted:
+            return ""
+        counts = ", ".join(f"{count} {reason}" for reason, count in self.signing.doubted.most_common())
+        return f"messages dropped because of their signature: {counts}"
+
+    def _hand_over(self, message: Message, _t_s: float) -> None:
+        self._sdk.pass_received_raw_bytes(bytes(message.get_msgbuf()))
+
+    def _in_a_thread(self, data: bytes) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended meanwhile
+            self._loop.call_soon_threadsafe(self._send, data)
+
+    def _send(self, data: bytes) -> None:
+        for message in self._from_sdk.parse_buffer(data) or ():
+            if message.get_msgId() in mavlink.mavlink_map:
+                self.link.send(message)
+
+
+@asynccontextmanager
+async def open_signed(sdk: Any, own: tuple[int, int], url: str, key: bytes) -> AsyncIterator[SignedLink]:
+    """Carry what MAVSDK sends and hears over a url, signed, until the context ends.
+
+    Raises:
+        LinkError: the url is none.
+        mavsdk.MavsdkError: MAVSDK refuses the raw connection.
+    """
+    await asyncio.to_thread(sdk.add_any_connection_with_handle, "raw://")
+    signed = SignedLink(sdk, own, key)
+    carrying = asyncio.create_task(run_transport(signed.link, url), name="signed link")
+    try:
+        yield signed
+    finally:
+        carrying.cancel()
+        await asyncio.wait([carrying])
+
 
 INSTALL: Final = "install it with: pip install '.[ground]' (in the folder of the companion's sources)"
 _SCHEMES: Final = {"udpin": "udpin", "udpout": "udpout", "tcp": "tcpout", "serial": "serial"}
@@ -176,8 +244,6 @@ async def open_link(url: str, heard: Heard, key: bytes | None = None) -> AsyncIt
         direct = MavlinkDirectServer(sdk.server_component_by_id(own.component_id))
         link = GroundLink(sdk, direct, own, heard)
         if key is not None:
-            from companion.ground.signed_link import open_signed
-
             async with open_signed(sdk, own, url, key) as signed:
                 link.unbelieved = signed.words
                 yield link

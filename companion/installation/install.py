@@ -6,7 +6,10 @@ can be done again and again.
 
 from __future__ import annotations
 
+import enum
+import hashlib
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -16,9 +19,90 @@ from typing import Final, Literal
 
 import companion
 from companion.errors import CompanionError
-from companion.installation import files
-from companion.installation.files import Place, Shipped
 from companion.storage.atomic import remove_durably, write_atomically
+
+EXECUTABLE: Final = "/opt/companion/bin/companion"
+"""As the shipped unit names it."""
+SERIAL_GROUP: Final = "dialout"
+"""Likewise: who may open serial ports on Debian."""
+
+_STAMP: Final = "# Put here by `companion install-service`; sha256 of what follows: "
+_STAMPED: Final = re.compile(re.escape(_STAMP).encode() + rb"([0-9a-f]{64})\n")
+
+
+class Place(enum.Enum):
+    """Below which folder a file goes."""
+
+    LIBRARY = "lib"
+    """`lib` of a prefix: the installation's own. What the owner changes goes to /etc (`systemctl edit`)."""
+    CONFIGURATION = "etc"
+    """/etc/companion: the owner's own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shipped:
+    """One file: its name in `systemd/`, and where it goes."""
+
+    source: str
+    place: Place
+    target: str
+
+
+SERVICE: Final = Shipped("companion.service", Place.LIBRARY, "systemd/system/companion.service")
+RULES: Final = Shipped("rules.d/70-companion.rules", Place.LIBRARY, "udev/rules.d/70-companion.rules")
+MODULES: Final = Shipped("modules-load.d/companion.conf", Place.LIBRARY, "modules-load.d/companion.conf")
+SAMPLE: Final = Shipped("companion.toml", Place.CONFIGURATION, "companion.toml.sample")
+OURS: Final = (SERVICE, RULES, MODULES, SAMPLE)
+"""What is replaced by a new version."""
+CONFIGURATION: Final = Shipped("companion.toml", Place.CONFIGURATION, "companion.toml")
+"""What is put there once and then belongs to the aircraft's owner."""
+
+
+def folder() -> Path:
+    """Where the shipped files are: inside the package of a wheel, else at the top of the checkout.
+
+    Raises:
+        CompanionError: neither is there.
+    """
+    here = Path(__file__).resolve().parent
+    for candidate in (here / "systemd", here.parents[1] / "systemd"):
+        if (candidate / SERVICE.source).is_file():
+            return candidate
+    raise CompanionError(f"the files of the service are not beside {here}: the installation is not complete")
+
+
+def content(shipped: Shipped, *, executable: str = EXECUTABLE, serial_group: str = SERIAL_GROUP) -> bytes:
+    """A shipped file as it is to be installed, without its stamp.
+
+    Raises:
+        CompanionError: it is missing, or the executable's path cannot stand in a unit.
+    """
+    text = (folder() / shipped.source).read_text(encoding="utf-8")
+    if shipped is SERVICE:
+        if not re.fullmatch(r"/[\w.+/@-]+", executable):
+            raise CompanionError(f"{executable!r} cannot stand in a unit; allowed: an absolute path without spaces")
+        text = text.replace(f"ExecStart={EXECUTABLE} ", f"ExecStart={executable} ")
+        text = text.replace(f"={SERIAL_GROUP}\n", f"={serial_group}\n")
+        text = text.replace(f"_GROUP={SERIAL_GROUP}\n", f"_GROUP={serial_group}\n")
+    return text.encode()
+
+
+def stamped(data: bytes) -> bytes:
+    """The data behind a first line by which a later change by hand is recognised."""
+    return f"{_STAMP}{hashlib.sha256(data).hexdigest()}\n".encode() + data
+
+
+def without_stamp(data: bytes) -> bytes:
+    """What was stamped."""
+    match = _STAMPED.match(data)
+    return data[match.end() :] if match is not None else data
+
+
+def is_untouched(data: bytes) -> bool:
+    """Whether a file is as some version of us has put it there."""
+    match = _STAMPED.match(data)
+    return match is not None and hashlib.sha256(data[match.end() :]).hexdigest().encode() == match[1]
+
 
 MODE: Final = 0o644
 """Anybody may read them; passwords have files of their own."""
@@ -79,7 +163,7 @@ class Target:
         except OSError:
             lines = []
         groups = {line.partition(":")[0] for line in lines}
-        return next((group for group in SERIAL_GROUPS if group in groups), files.SERIAL_GROUP)
+        return next((group for group in SERIAL_GROUPS if group in groups), SERIAL_GROUP)
 
 
 def own_executable() -> str:
@@ -98,13 +182,13 @@ def install(target: Target, run: Run | None = None) -> Iterator[Step]:
         _check_user(target, "install-service")
         _check_reach(target.executable)
     group = target.serial_group()
-    sample = files.content(files.CONFIGURATION)
-    before = _read(target.path(files.SAMPLE))
-    samples = [sample] if before is None else [sample, files.without_stamp(before)]
-    for shipped in files.OURS:
-        wanted = files.stamped(files.content(shipped, executable=target.executable, serial_group=group))
+    sample = content(CONFIGURATION)
+    before = _read(target.path(SAMPLE))
+    samples = [sample] if before is None else [sample, without_stamp(before)]
+    for shipped in OURS:
+        wanted = stamped(content(shipped, executable=target.executable, serial_group=group))
         yield _put(target, target.path(shipped), wanted)
-    configuration = target.path(files.CONFIGURATION)
+    configuration = target.path(CONFIGURATION)
     found = _read(configuration)
     edited = found is not None and found not in samples
     if edited:
@@ -129,10 +213,10 @@ def uninstall(target: Target, run: Run | None = None) -> Iterator[Step]:
         _check_user(target, "uninstall-service")
         if _systemd_runs():
             yield _command(target, run or _run, "systemctl", "disable", "--now", "companion.service")
-    for shipped in files.OURS:
-        yield _take(target, target.path(shipped), files.is_untouched, "changed by hand")
-    sample = files.content(files.CONFIGURATION)
-    yield _take(target, target.path(files.CONFIGURATION), lambda data: data == sample, "yours")
+    for shipped in OURS:
+        yield _take(target, target.path(shipped), is_untouched, "changed by hand")
+    sample = content(CONFIGURATION)
+    yield _take(target, target.path(CONFIGURATION), lambda data: data == sample, "yours")
     if target.is_this_machine:
         yield from _reload(target, run or _run)
     state = target.root / "var/lib/private/companion"
@@ -146,7 +230,7 @@ def _put(target: Target, path: Path, wanted: bytes) -> Step:
         return Step(str(path), "unchanged")
     if found is None:
         return _write(target, path, wanted, "written")
-    if files.is_untouched(found):
+    if is_untouched(found):
         return _write(target, path, wanted, "updated")
     return Step(str(path), "kept", "changed by hand; remove it to get the new one")
 

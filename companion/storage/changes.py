@@ -15,7 +15,7 @@ from typing import Final
 
 import msgspec
 
-from companion.autopilot.firmware.written import CALIBRATION
+from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.storage.atomic import remove_durably, write_atomically

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import pytest
 
-from companion.cli.setup import setup_lines
+from companion.cli.client import setup_lines
 from tests.e2e.test_attitude_push import flight
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.installation import files
+from companion.installation import install as installing
 from tests.support.booted_systemd import Machine, booted, why_not
 from tests.support.live_aircraft import QUICK, live_aircraft
 
@@ -120,7 +120,7 @@ async def serial_ports_alone(machine: Machine) -> None:
     """Under the unit's device rules even root opens serial ports, pseudo-terminals and nothing else."""
     lines = [
         line
-        for line in files.content(files.SERVICE).decode().splitlines()
+        for line in installing.content(installing.SERVICE).decode().splitlines()
         if line.startswith(("DevicePolicy", "DeviceAllow"))
     ]
     code = (

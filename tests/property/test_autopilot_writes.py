@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.float32 import same_float32
+from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.parameters.writer import Change, ParameterWriter, WriteFailedError
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.errors import NotDisarmedError

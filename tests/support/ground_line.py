@@ -11,8 +11,7 @@ from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from companion.links.mavlink.keys import read_key
-from companion.links.mavlink.signing import ticks_of
+from companion.links.mavlink.signing import read_key, ticks_of
 from sim.companion_process import CompanionProcess
 from sim.motions import Motion
 from sim.pty_device import PtyDevice

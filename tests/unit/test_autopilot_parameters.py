@@ -11,7 +11,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.float32 import float32, same_float32
+from companion.autopilot.parameters.wire import float32, same_float32
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.errors import (
     AutopilotRebootedError,

@@ -13,8 +13,7 @@ import pytest
 
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
-from companion.autopilot.firmware.px4 import needs_reboot, warnings_about
-from companion.autopilot.firmware.px4_slots import NO_IMU, Slot, SlotMemory
+from companion.autopilot.firmware.px4 import NO_IMU, Slot, SlotMemory, needs_reboot, warnings_about
 from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.writer import ParameterWriter

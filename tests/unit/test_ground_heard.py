@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.daemon.faces import flight_line
-from companion.ground import words
+from companion.ground import heard as ground_heard
 from companion.ground.heard import Fields, Heard, Target, Vehicle
 
 ARDUPILOT, PX4, NO_AUTOPILOT = 3, 12, 8
@@ -108,17 +108,17 @@ def test_nothing_on_the_wire_raises(messages: list[tuple[str, dict[str, object]]
 
 def test_nobody_there_is_one_line_with_what_was_heard_and_what_to_try() -> None:
     heard = Heard(191)
-    nothing = words.nobody_heard(heard, "udpin:0.0.0.0:14550", None, 5.0)
+    nothing = ground_heard.nobody_heard(heard, "udpin:0.0.0.0:14550", None, 5.0)
     for part in ("nothing heard", "udpin:0.0.0.0:14550", "5 s", "--url"):
         assert part in nothing
     beat(heard, 255, 190, type=GCS)
-    assert "only 255/190 (a ground station)" in words.nobody_heard(heard, "url", None, 5.0)
+    assert "only 255/190 (a ground station)" in ground_heard.nobody_heard(heard, "url", None, 5.0)
     beat(heard, 1, 1, type=QUADROTOR, autopilot=PX4)
-    px4 = words.nobody_heard(heard, "url", 3, 5.0)
+    px4 = ground_heard.nobody_heard(heard, "url", 3, 5.0)
     for part in ("component 191", "of system 3", "system 1 (PX4)", "companion run", "MAV_1_FORWARD"):
         assert part in px4
     beat(heard, 1, 1, type=QUADROTOR, autopilot=ARDUPILOT)
-    ardupilot = words.nobody_heard(heard, "url", None, 5.0)
+    ardupilot = ground_heard.nobody_heard(heard, "url", None, 5.0)
     assert "MAV_1_FORWARD" not in ardupilot
     assert "forwarded" in ardupilot
     for line in (nothing, px4, ardupilot):
@@ -131,11 +131,11 @@ def test_nobody_there_is_one_line_with_what_was_heard_and_what_to_try() -> None:
      (None, None, "")],
 )  # fmt: skip
 def test_figures(gyro: float | None, accel: float | None, expected: str) -> None:
-    assert words.figures(gyro, accel) == expected
+    assert ground_heard.figures(gyro, accel) == expected
 
 
 def test_the_numbers_mean_on_the_ground_what_they_mean_in_the_daemon() -> None:
-    assert flight_line.AT_ARM == words.AT_ARM
+    assert flight_line.AT_ARM == ground_heard.AT_ARM
     assert {value: state for state, value in flight_line.STATE_NUMBER.items()} == {
-        value: state for value, state in words.RESULTS.items() if state is not None
+        value: state for value, state in ground_heard.RESULTS.items() if state is not None
     }

@@ -15,8 +15,8 @@ import pytest
 
 from companion import cli
 from companion.errors import CompanionError
-from companion.installation import files
 from companion.installation import install as installation
+from companion.installation import install as installing
 from companion.installation.install import Target, install, uninstall, unreachable
 from tests.support.systemd import SYSTEMD_ANALYZE, needs_systemd_analyze
 
@@ -70,7 +70,7 @@ def test_an_unedited_sample_of_an_older_version_is_brought_up_to_date(tmp_path: 
     list(install(target(tmp_path)))
     new = (tmp_path / CONFIGURATION).read_bytes()
     (tmp_path / CONFIGURATION).write_bytes(b"# older\n")
-    (tmp_path / SAMPLE).write_bytes(files.stamped(b"# older\n"))
+    (tmp_path / SAMPLE).write_bytes(installing.stamped(b"# older\n"))
     again = outcomes(tmp_path, list(install(target(tmp_path))))
     assert (again[SAMPLE], again[CONFIGURATION]) == ("updated", "updated")
     assert (tmp_path / CONFIGURATION).read_bytes() == new
@@ -155,17 +155,17 @@ def test_the_service_of_a_debian_package_is_left_to_it(
 
 
 def test_the_files_are_found_in_a_checkout_and_in_a_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    project = Path(files.__file__).parents[2]
-    assert files.folder() == project / "systemd"
+    project = Path(installing.__file__).parents[2]
+    assert installing.folder() == project / "systemd"
     building = tomllib.loads((project / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]
     ((source, place),) = building["wheel"]["force-include"].items()
     shutil.copytree(project / source, tmp_path / place)
     assert source in building["sdist"]["include"]
-    monkeypatch.setattr(files, "__file__", str(tmp_path / "companion/installation/files.py"))
-    assert files.folder() == tmp_path / "companion/installation/systemd"
+    monkeypatch.setattr(installing, "__file__", str(tmp_path / "companion/installation/install.py"))
+    assert installing.folder() == tmp_path / "companion/installation/systemd"
     shutil.rmtree(tmp_path / place)
     with pytest.raises(CompanionError, match="the installation is not complete"):
-        files.folder()
+        installing.folder()
 
 
 # --- what systemd says to it
@@ -196,7 +196,7 @@ def test_the_exposure_of_the_unit(tmp_path: Path) -> None:
 def test_the_unit_keeps_trying_and_asks_for_nothing_newer_than_systemd_252() -> None:
     settings = [
         line.partition("=")
-        for line in files.content(files.SERVICE).decode().splitlines()
+        for line in installing.content(installing.SERVICE).decode().splitlines()
         if "=" in line and not line.startswith("#")
     ]
     values: dict[str, list[str]] = {}
@@ -210,6 +210,6 @@ def test_the_unit_keeps_trying_and_asks_for_nothing_newer_than_systemd_252() -> 
     assert {"char-ttyUSB rw", "char-ttyACM rw", "char-ttyAMA rw", "char-ttyS rw"} <= set(values["DeviceAllow"])
     assert all(value.startswith("char-") for value in values["DeviceAllow"])
     # Each class that a driver brings later has its driver loaded before us.
-    modules = files.content(files.MODULES).decode().splitlines()
+    modules = installing.content(installing.MODULES).decode().splitlines()
     assert {"usbserial", "cdc_acm"} <= set(modules)
     assert any("systemd-modules-load.service" in value for value in values["After"])

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.errors import LinkError
-from companion.links.mavlink.keys import read_key
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.signing import (
     EPOCH_S,
@@ -21,6 +20,7 @@ from companion.links.mavlink.signing import (
     TICKS_PER_S,
     Signing,
     SigningClock,
+    read_key,
     sign,
 )
 

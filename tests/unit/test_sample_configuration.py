@@ -12,9 +12,9 @@ import pytest
 
 from companion.config import parse
 from companion.config.sections import Config, Imu
-from companion.installation import files
+from companion.installation import install as installing
 
-SAMPLE = files.content(files.CONFIGURATION).decode()
+SAMPLE = installing.content(installing.CONFIGURATION).decode()
 EVERYTHING = re.sub(r"^#(?=[a-z\[])", "", SAMPLE, flags=re.MULTILINE)
 """With every key that is commented out switched on."""
 

@@ -8,7 +8,8 @@ import pytest
 
 from companion import cli
 from companion.errors import CompanionError, ConfigError
-from companion.installation import files, udev
+from companion.installation import install as installing
+from companion.installation import udev
 from companion.links.serial.ports import list_ports
 from tests.support.usb_tree import UsbTree, needs_udevadm
 
@@ -40,7 +41,7 @@ def tree(tmp_path: Path) -> UsbTree:
 def rules(tmp_path: Path) -> Path:
     folder = tmp_path / "rules"
     folder.mkdir()
-    (folder / "70-companion.rules").write_bytes(files.content(files.RULES))
+    (folder / "70-companion.rules").write_bytes(installing.content(installing.RULES))
     return folder
 
 

@@ -1,12 +1,26 @@
-"""Which firmware's ways of correcting an IMU apply."""
+"""Which firmware's ways of correcting an IMU apply, and every parameter that the companion ever writes.
+
+Nothing but what stands in `CALIBRATION` is kept, or believed of a file. Its ranges are wide enough for whatever an
+autopilot may have had before, which an undo puts back; far too narrow for nonsense.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from typing import Final
 
 from companion.autopilot.firmware import ardupilot, px4
-from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.autopilot.firmware.px4_slots import SlotMemory
+from companion.autopilot.firmware.imu_calibration import (
+    MAX_ACCEL_OFFSET_M_S2,
+    MAX_ACCEL_RESIDUAL_M_S2,
+    MAX_GYRO_OFFSET_RAD_S,
+    MAX_GYRO_RESIDUAL_RAD_S,
+    ImuCalibration,
+    ImuParameters,
+)
+from companion.autopilot.firmware.px4 import SLOTS, SlotMemory
+from companion.autopilot.firmware.rivals import rivals_of
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.errors import AutopilotError
@@ -38,3 +52,61 @@ async def read_calibration(
 def settle_s(firmware: Firmware | None) -> float:
     """How long after a write the telemetry may still show the old offsets."""
     return _SETTLE_S.get(firmware or "other", 2.0)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Range:
+    """The values of one parameter; both ends are in it."""
+
+    low: float
+    high: float
+    whole: bool = False
+    unit: str = ""
+
+    def holds(self, value: float) -> bool:
+        """Whether a value is one of them; NaN is not."""
+        return self.low <= value <= self.high and not (self.whole and value != int(value))
+
+    def __str__(self) -> str:
+        kind = "whole numbers " if self.whole else ""
+        return f"{kind}{self.low:.3g} to {self.high:.3g}{self.unit and f' {self.unit}'}"
+
+
+Ranges = Mapping[str, Range]
+"""By parameter."""
+
+_GYRO_RAD_S: Final = MAX_GYRO_OFFSET_RAD_S + MAX_GYRO_RESIDUAL_RAD_S + 0.05
+"""An offset from which a calibration still comes to a plausible one, or a step beyond it on the way: the far one, or a
+dither's 36 steps of 1 mrad/s."""
+_ACCEL_M_S2: Final = MAX_ACCEL_OFFSET_M_S2 + MAX_ACCEL_RESIDUAL_M_S2 + 0.4
+"""Likewise; a dither's 36 steps are of 1 mg."""
+
+GYRO_OFFSET: Final = Range(-_GYRO_RAD_S, _GYRO_RAD_S, unit="rad/s")
+ACCEL_OFFSET: Final = Range(-_ACCEL_M_S2, _ACCEL_M_S2, unit="m/s^2")
+_CALTEMP: Final = Range(-300.0, 200.0, unit="deg C")
+"""-300: not known."""
+_DEVICE_ID: Final = Range(0.0, 2.0**24, whole=True)
+_SWITCH: Final = Range(0.0, 255.0, whole=True)
+
+
+def _offsets(names: ImuParameters) -> dict[str, Range]:
+    return {**dict.fromkeys(names.gyro_offset, GYRO_OFFSET), **dict.fromkeys(names.accel_offset, ACCEL_OFFSET)}
+
+
+def _ardupilot() -> dict[str, Range]:
+    found: dict[str, Range] = {}
+    for names in map(ardupilot.parameters_of, ardupilot.INSTANCES):
+        # Its own gyro calibration, which we start, sets the last two: what it has overwritten is put back.
+        found |= {**_offsets(names), names.gyro_caltemp: _CALTEMP, names.gyro_id: _DEVICE_ID}
+    return found
+
+
+def _px4() -> dict[str, Range]:
+    return {name: one for slot in range(SLOTS) for name, one in _offsets(px4.parameters_of(slot, slot)).items()}
+
+
+CALIBRATION: Final[Mapping[Firmware, Ranges]] = {
+    "ardupilot": {**_ardupilot(), **dict.fromkeys(rivals_of("ardupilot"), _SWITCH)},
+    "px4": {**_px4(), **dict.fromkeys(rivals_of("px4"), _SWITCH)},
+}
+"""By a calibration and its undo."""

@@ -19,7 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.ardupilot import INSTANCES, parameters_of
 from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.float32 import same_float32
+from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.errors import AutopilotError, AutopilotRebootedError, NotDisarmedError
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.float32 import same_float32
+from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.errors import AutopilotError
 

@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 
 from companion.autopilot.firmware.rivals import Rival
-from companion.autopilot.parameters.float32 import float32, same_float32
+from companion.autopilot.parameters.wire import float32, same_float32
 from companion.autopilot.parameters.writer import Change
 from companion.calibration.solution.solve import ImuSolution
 from companion.errors import CalibrationRefusedError

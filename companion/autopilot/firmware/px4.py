@@ -5,6 +5,12 @@
 
 so the level adjustment, unlike ArduPilot's trim, does turn IMU data. A thermal calibration (TC_*) takes its part off
 before the offsets and may be on or off.
+
+The offsets of a sensor stand in the slot that holds its device id, CAL_GYROn_ID and CAL_ACCn_ID. SCALED_IMU, 2 and 3
+show the first, second and third pair of a gyro and an accelerometer, in the order in which their drivers started, and
+no message says which device id that is (autopilots 4.1, 4.5). PX4 itself prefers the slot of the same number, so the
+order of the slots is a good guess; whether it was right shows only in the telemetry after a write. What was learned
+that way is remembered here, by device id.
 """
 
 from __future__ import annotations
@@ -12,21 +18,108 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ACCEL_SCALE_RANGE, FarStep, ImuCalibration, ImuParameters
-from companion.autopilot.firmware.px4_slots import PREFIX, SLOTS, Sensor, Slot, SlotMemory
-from companion.autopilot.firmware.rivals import read_rivals
+from companion.autopilot.firmware.rivals import RivalMemory, read_rivals
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.values import read_integer, read_offsets, read_scales
+from companion.autopilot.parameters.client import ParameterClient, read_integer, read_offsets, read_scales
 from companion.errors import AutopilotError, AutopilotRebootedError
 from companion.physics.frames import Matrix, rotation_matrix
 from companion.physics.units import MG
 from companion.rotations import ROTATION_NAMES
 from companion.samples import Vector
+
+Sensor = Literal["gyro", "accel"]
+
+SLOTS: Final = 4
+NO_IMU: Final = 0
+PREFIX: Final[dict[Sensor, str]] = {"gyro": "CAL_GYRO", "accel": "CAL_ACC"}
+WORDS: Final[dict[Sensor, str]] = {"gyro": "gyro", "accel": "accelerometer"}
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Slot:
+    """One slot that holds a device id."""
+
+    number: int
+    device_id: int
+    enabled: bool
+
+
+class SlotMemory:
+    """Which device is which IMU; since the last restart: which offsets are in use, which rivals act."""
+
+    def __init__(self) -> None:
+        self._instance_of: dict[tuple[Sensor, int], int] = {}
+        self._enabled: dict[Sensor, int] = {}
+        self._in_use: dict[tuple[str, str, str], tuple[int, Vector]] = {}
+        self.rivals = RivalMemory()
+
+    def learn(self, sensor: Sensor, device_id: int, instance: int) -> None:
+        """The offsets in the slot of this device act on the telemetry of this IMU (NO_IMU: of none)."""
+        for other in [key for key, known in self._instance_of.items() if key[0] == sensor and known == instance]:
+            if instance != NO_IMU:
+                del self._instance_of[other]
+        self._instance_of[sensor, device_id] = instance
+
+    def known(self, sensor: Sensor, device_id: int) -> int | None:
+        """The IMU that a device was seen to be; NO_IMU: none in the telemetry."""
+        return self._instance_of.get((sensor, device_id))
+
+    def holds_strangers(self, sensor: Sensor, imus: int) -> bool:
+        """Whether more slots are in use than there may be IMUs: then one may be of a sensor that is not there."""
+        return self._enabled.get(sensor, 0) > imus
+
+    def forget(self) -> None:
+        """What was learned cannot be true."""
+        self._instance_of.clear()
+
+    def brought_into_use(self, names: tuple[str, str, str], vector: Vector, boots: int) -> None:
+        """A vector of offsets was written in two steps, so that the firmware uses it, until a restart."""
+        self._in_use[names] = (boots, vector)
+
+    def in_use(self, names: tuple[str, str, str], vector: Vector, boots: int) -> bool:
+        """Whether this very vector is known to be used."""
+        return self._in_use.get(names) == (boots, vector)
+
+    def choose(self, sensor: Sensor, instance: int, slots: tuple[Slot, ...], like: int | None = None) -> Slot:
+        """The slot to write for an IMU: the one that is known, else the best guess.
+
+        Args:
+            sensor: of which kind.
+            instance: 1 to 3.
+            slots: all that hold a device id, in order.
+            like: the device id of the IMU's other half; of a chip that is both, it is the same.
+        """
+        prefix, word = PREFIX[sensor], WORDS[sensor]
+        self._enabled[sensor] = sum(slot.enabled for slot in slots)
+        if not slots:
+            raise AutopilotError(
+                f"PX4 has no {word} in {prefix}0_ID to {prefix}{SLOTS - 1}_ID: calibrate its {word}s once with the"
+                " ground station, so that it knows them"
+            )
+        own = next((slot for slot in slots if self.known(sensor, slot.device_id) == instance), None)
+        if own is None:
+            free = [slot for slot in slots if self.known(sensor, slot.device_id) is None] or [
+                slot for slot in slots if self.known(sensor, slot.device_id) == NO_IMU
+            ]
+            own = next((slot for slot in free if slot.device_id == like), None)
+            if own is None and instance <= len(slots) and slots[instance - 1] in free:
+                own = slots[instance - 1]
+            if own is None and instance <= len(slots):
+                own = next((slot for slot in free if slot.enabled), None)
+        if own is None:
+            raise AutopilotError(
+                f"the autopilot has no IMU {instance}: only {len(slots)} of {prefix}0_ID to {prefix}{SLOTS - 1}_ID"
+                f" hold a {word}"
+            )
+        if not own.enabled:
+            raise AutopilotError(f"IMU {instance}: {prefix}{own.number}_PRIO = 0, so PX4 has this {word} switched off")
+        return own
+
 
 IGNORED_STEP: Final = 0.01
 """A vector of offsets no farther than this (rad/s, m/s^2) from the one in use is ignored (autopilots 4.2)."""

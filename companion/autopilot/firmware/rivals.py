@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from typing import Final, Literal
 
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.values import read_integer
+from companion.autopilot.parameters.client import ParameterClient, read_integer
 from companion.autopilot.vehicle.vehicle import Firmware
 
 Acts = Literal["at a start", "while still", "after a flight"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar, Literal
 
-from companion.autopilot.parameters.float32 import float32
+from companion.autopilot.parameters.wire import float32
 from companion.calibration.solution.record import WrittenParameter
 from companion.errors import AutopilotError, AutopilotRebootedError, NotDisarmedError
 

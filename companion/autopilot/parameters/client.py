@@ -16,11 +16,20 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.parameters.encoding import REAL32, decode, encode, is_integer
-from companion.autopilot.parameters.float32 import float32, same_float32
-from companion.autopilot.parameters.inbox import Inbox, Rebooted, Refusal
+from companion.autopilot.parameters.wire import (
+    REAL32,
+    Inbox,
+    Rebooted,
+    Refusal,
+    decode,
+    encode,
+    float32,
+    is_integer,
+    same_float32,
+)
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.errors import (
+    AutopilotError,
     AutopilotRebootedError,
     NotDisarmedError,
     ParameterMismatchError,
@@ -29,6 +38,7 @@ from companion.errors import (
 )
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.listeners import Listeners, Unsubscribe
+from companion.samples import Vector
 
 _NO_ERROR: Final = 0
 _DOES_NOT_EXIST: Final = 1
@@ -332,3 +342,31 @@ def _wire_name(name: str) -> bytes:
     if len(data) > 16:  # the codec would cut it, and the rest may be another parameter's name
         raise ValueError(f"{name!r} is longer than the 16 characters of a MAVLink parameter name")
     return data
+
+
+async def read_offsets(parameters: ParameterClient, names: tuple[str, str, str]) -> Vector:
+    """Three offsets; any finite ones will do, for they are only added to."""
+    return await _read_vector(parameters, names, -math.inf, math.inf)
+
+
+async def read_scales(parameters: ParameterClient, names: tuple[str, str, str]) -> Vector:
+    """Three scales, which will be divided by."""
+    return await _read_vector(parameters, names, 0.5, 2.0)
+
+
+async def read_integer(parameters: ParameterClient, name: str) -> int | None:
+    """A whole number, or None where the firmware has no such parameter."""
+    value = await parameters.read_optional(name)
+    if value is None:
+        return None
+    if not math.isfinite(value):
+        raise AutopilotError(f"{name} is {value}; a whole number was expected")
+    return round(value)
+
+
+async def _read_vector(parameters: ParameterClient, names: tuple[str, str, str], low: float, high: float) -> Vector:
+    x, y, z = [await parameters.read(name) for name in names]
+    for name, value in zip(names, (x, y, z), strict=True):
+        if not math.isfinite(value) or not low <= value <= high:
+            raise AutopilotError(f"{name} is {value:.9g}; this cannot be right, calibrate the accelerometers first")
+    return x, y, z

@@ -25,8 +25,8 @@ from companion.autopilot.parameters.change import (
     WriteFailedError,
 )
 from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.float32 import same_float32
 from companion.autopilot.parameters.pace import let_pass, moment
+from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.solution.record import Outcome, WrittenParameter
 from companion.errors import (

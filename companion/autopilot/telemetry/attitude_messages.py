@@ -3,10 +3,14 @@
 VISION_POSITION_ESTIMATE and not ODOMETRY: of an attitude without a position PX4 takes ODOMETRY for one in a frame of
 its own, not north's, and ArduPilot demands such a frame in so many words; and Euler angles have no norm that could be
 off by more than the 1e-5 that PX4 allows. Neither firmware fuses roll and pitch.
+
+PX4 uses our time stamps only after 500 exchanges of TIMESYNC (50 s at its 10 Hz) of less than 10 ms each; until then it
+takes what arrives for new (autopilots 4.5). ArduPilot asks every 10 s, for its log.
 """
 
 from __future__ import annotations
 
+import asyncio
 import math
 from typing import Final
 
@@ -14,7 +18,8 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.attitude.estimator import Attitude
-from companion.autopilot.vehicle.vehicle import Firmware
+from companion.autopilot.vehicle.vehicle import Firmware, Vehicle
+from companion.links.mavlink.link import MavlinkLink
 
 NOWHERE_VARIANCE_M2: Final = 1e4
 """Variance of a position that is none: ArduPilot bounds its sigma to 100 m."""
@@ -69,3 +74,18 @@ def attitude_messages(
         mavlink.MAVLink_attitude_message(boot_ms, *angles, *attitude.rate_rad_s),
         mavlink.MAVLink_attitude_quaternion_message(boot_ms, w, x, y, z, *attitude.rate_rad_s),
     )
+
+
+class TimesyncResponder:
+    """Answers the latched autopilot, with the clock that stamps what we send; ask for it with `close` to stop."""
+
+    def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
+        self.answered = 0
+        self._link, self._vehicle = link, vehicle
+        self.close = link.subscribe(mavlink.MAVLink_timesync_message, self._on_timesync)
+
+    def _on_timesync(self, message: mavlink.MAVLink_timesync_message, _t_s: float) -> None:
+        if message.tc1 == 0 and self._vehicle.sent(message):
+            now_ns = round(asyncio.get_running_loop().time() * 1e9)
+            self._link.send(mavlink.MAVLink_timesync_message(now_ns, message.ts1))
+            self.answered += 1

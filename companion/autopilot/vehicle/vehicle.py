@@ -2,7 +2,7 @@
 
 Whoever writes to it asks `arm_state` immediately before every message that leaves. A heartbeat tells the past: the
 state is UNKNOWN as soon as the last one is 2 s old, and after a restart until the next one. It is DISARMED only when no
-armed heartbeat has come under the vehicle's ids for 3 s, from whomever (`arming_watch`).
+armed heartbeat has come under the vehicle's ids for 3 s, from whomever (`heartbeats`).
 """
 
 from __future__ import annotations
@@ -15,11 +15,17 @@ from typing import Final, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.vehicle.arming_watch import ArmingWatch, ArmState
 from companion.autopilot.vehicle.boot_clock import BootWatch
-from companion.autopilot.vehicle.commands import Commands
-from companion.autopilot.vehicle.latch import Firmware, Latch, firmware_of, is_aircraft, version_text
-from companion.autopilot.vehicle.standing_requests import StandingRequests
+from companion.autopilot.vehicle.commands import Commands, StandingRequests
+from companion.autopilot.vehicle.heartbeats import (
+    ArmingWatch,
+    ArmState,
+    Firmware,
+    Latch,
+    firmware_of,
+    is_aircraft,
+    version_text,
+)
 from companion.autopilot.vehicle.whereabouts import TimeAndPlace
 from companion.links.mavlink.link import Handler, M, MavlinkLink, Message
 from companion.links.system.listeners import Listeners, Unsubscribe

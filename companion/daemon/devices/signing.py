@@ -19,9 +19,8 @@ from companion.component.statustext import Say, Severity, Weight
 from companion.config.sections import Config
 from companion.daemon.offload import Offload
 from companion.errors import LinkError, StorageError
-from companion.links.mavlink.keys import read_key
 from companion.links.mavlink.link import MavlinkLink
-from companion.links.mavlink.signing import TICKS_PER_S, Reason, Signing, SigningClock, uptime_s
+from companion.links.mavlink.signing import TICKS_PER_S, Reason, Signing, SigningClock, read_key, uptime_s
 from companion.storage import signing_time
 from companion.storage.signing_time import SigningTime, this_boot
 

@@ -7,7 +7,7 @@ import contextlib
 from collections.abc import Callable, Sequence
 
 from companion.autopilot.firmware.imu_calibration import accel_taken_off
-from companion.autopilot.firmware.px4_slots import SlotMemory
+from companion.autopilot.firmware.px4 import SlotMemory
 from companion.configured import models
 from companion.configured.devices import Role, collect, serial_devices
 from companion.daemon.core import Core, Subsystem, Task

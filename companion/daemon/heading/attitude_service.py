@@ -10,8 +10,8 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.autopilot.vehicle.standing_requests import StandingRequests
-from companion.autopilot.vehicle.timesync import TimesyncResponder
+from companion.autopilot.telemetry.attitude_messages import TimesyncResponder
+from companion.autopilot.vehicle.commands import StandingRequests
 from companion.component.statustext import Severity, Weight
 from companion.configured import models
 from companion.daemon.arming.in_force import InForce

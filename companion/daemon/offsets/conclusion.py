@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.firmware.px4 import needs_reboot, stale_tilt_deg
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.parameters.float32 import same_float32
+from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.commands import result_name
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.collector.rolling import Window

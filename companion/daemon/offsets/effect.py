@@ -16,7 +16,7 @@ import numpy as np
 
 from companion.autopilot.firmware.firmwares import settle_s
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
-from companion.autopilot.firmware.px4_slots import Sensor
+from companion.autopilot.firmware.px4 import Sensor
 from companion.autopilot.parameters.pace import has_passed, moment
 from companion.autopilot.parameters.verify import Observation, Verdict, judge
 from companion.autopilot.parameters.writer import Change

@@ -12,8 +12,7 @@ import numpy as np
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.gyro_calibration import Outcome as FirmwareOutcome
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for, whole_of
-from companion.autopilot.firmware.px4 import warnings_about
-from companion.autopilot.firmware.px4_slots import SlotMemory
+from companion.autopilot.firmware.px4 import SlotMemory, warnings_about
 from companion.autopilot.parameters.writer import Change
 from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.calibration.solution.draft import Draft

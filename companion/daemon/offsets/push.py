@@ -11,8 +11,8 @@ from typing import Final
 
 from companion.autopilot.firmware.gyro_calibration import GyroParameters
 from companion.autopilot.parameters.change import NothingWrittenError, WriteFailedError
-from companion.autopilot.parameters.float32 import same_float32
 from companion.autopilot.parameters.verify import Verdict
+from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.collector.rolling import Window

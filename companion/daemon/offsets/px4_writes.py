@@ -1,6 +1,6 @@
 """What a write to PX4 needs besides the writing: whose output it moves, and which offsets are in use at all.
 
-Which slot belongs to which SCALED_IMU is a guess (autopilot.px4_slots) until a far value is in force and seen in the
+Which slot belongs to which SCALED_IMU is a guess (autopilot.firmware.px4) until a far value is in force and seen in the
 telemetry of all IMUs. The far step is large beside noise and truncation, and each IMU that is written makes another
 one, so a second of samples tells them apart; the small change itself often could not be seen at all.
 """
@@ -20,7 +20,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step, vector_changes
-from companion.autopilot.firmware.px4_slots import NO_IMU, WORDS, Sensor, SlotMemory
+from companion.autopilot.firmware.px4 import NO_IMU, WORDS, Sensor, SlotMemory
 from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.parameters.pace import let_pass, moment
 from companion.autopilot.parameters.writer import ParameterWriter

@@ -10,7 +10,7 @@ from typing import Final
 
 from companion.autopilot.firmware.gyro_calibration import wait_until_over
 from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.float32 import same_float32
+from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.parameters.writer import Change, ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.solution.record import WrittenParameter
