@@ -5,9 +5,10 @@ the validity goes into result_param2, the reason into progress, and an answer th
 own system id is ignored. An attempt brings two requests, and retransmissions of both; each gets an answer, but people
 are told once.
 
-ArduPilot's arming script (companion/lua/companion_arming.lua) gets the verdict twice a second, from the working loop and
-from nowhere else: it closes the gate when nothing has come for 3 s, so a loop that hangs closes it too. Carried by TUNNEL: unlike PARAM_SET it wears no flash, unlike NAMED_VALUE_FLOAT it is addressed to the autopilot alone, so that no
-radio link carries it on to the ground, and it has room for the reason as text.
+ArduPilot's arming script (companion/lua/companion_arming.lua) gets the verdict twice a second, from the working loop
+and from nowhere else: it closes the gate when nothing has come for 3 s, so that a loop that hangs closes it too.
+Carried by TUNNEL: unlike PARAM_SET it wears no flash, unlike NAMED_VALUE_FLOAT it is addressed to the autopilot alone,
+so that no radio link carries it on to the ground, and it has room for the reason as text.
 Payload: "CMPA", version 1, verdict (0 wait, 1 accept, 2 refuse, 3 nothing is gated any more), then the reason, ASCII.
 """
 
