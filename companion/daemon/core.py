@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
 from typing import Any, Final
 
 from companion.autopilot.parameters.client import ParameterClient
@@ -13,18 +13,18 @@ from companion.calibration.collector.rolling import Window
 from companion.component.statustext import Severity, StatusText, Weight
 from companion.config.sections import Config
 from companion.configured import models
-from companion.daemon.offload import Offload
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.request import Object
 from companion.recording.collector import RecordedCollector
 
 TICK_S: Final = 0.2
 """How often the seconds that are over end, also of sources that say nothing."""
-
 Handler = Callable[[Object, str], AsyncIterator[Object]]
 """Answers a request that came by a face (second), with any number of replies."""
 Task = tuple[str, Callable[[], Coroutine[Any, Any, None]]]
 """A name, and what runs under it until it is cancelled."""
+Offload = Callable[..., Awaitable[Any]]
+"""Runs a blocking call elsewhere: `asyncio.to_thread` in the daemon."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from companion.config import parse
-from companion.daemon.offload import Offload
+from companion.daemon.core import Offload
 from companion.daemon.process.service import Service
 from companion.links.mavlink.link import MavlinkLink
 from sim.aircraft import Pose, Site, VirtualAircraft

@@ -15,7 +15,7 @@ from companion.component.component import Component
 from companion.component.permission import MAX_REMEMBERED, Permission
 from companion.config import parse
 from companion.config.senders import Senders
-from companion.daemon.process.reload import RELOADABLE
+from companion.daemon.process.run import RELOADABLE
 from companion.daemon.process.service import Service
 from companion.errors import ConfigError
 from tests.support.component import (

@@ -19,9 +19,8 @@ from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.config import parse
 from companion.config.sections import Imu
 from companion.configured import models
-from companion.daemon.heading.difference import turn_between
-from companion.daemon.heading.sender import Sender, is_sane
-from companion.daemon.heading.source import settings_of, without_truncation
+from companion.daemon.heading.attitude_service import Sender, is_sane
+from companion.daemon.heading.carrier import settings_of, turn_between, without_truncation
 from companion.errors import AutopilotError
 from companion.links.mavlink.link import MavlinkLink
 from companion.samples import ImuSample

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.daemon.faces import flight_line
+from companion.daemon.faces import subsystem as faces
 from companion.ground import heard as ground_heard
 from companion.ground.heard import Fields, Heard, Target, Vehicle
 
@@ -135,7 +135,7 @@ def test_figures(gyro: float | None, accel: float | None, expected: str) -> None
 
 
 def test_the_numbers_mean_on_the_ground_what_they_mean_in_the_daemon() -> None:
-    assert flight_line.AT_ARM == ground_heard.AT_ARM
-    assert {value: state for state, value in flight_line.STATE_NUMBER.items()} == {
+    assert faces.AT_ARM == ground_heard.AT_ARM
+    assert {value: state for state, value in faces.STATE_NUMBER.items()} == {
         value: state for value, state in ground_heard.RESULTS.items() if state is not None
     }

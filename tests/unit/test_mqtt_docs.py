@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from companion.config import parse
+from companion.daemon.faces.mqtt.face import Topics
 from companion.daemon.faces.mqtt.payloads import KEYS, Request
 from companion.daemon.faces.mqtt.payloads import parse as parse_request
-from companion.daemon.faces.mqtt.topics import Topics
 
 DOCS = (Path(__file__).parents[2] / "docs" / "mqtt.md").read_text(encoding="utf-8")
 ROWS = dict(re.findall(r"^\| `([a-z/]+)` \|(.*)\|$", DOCS, re.MULTILINE))

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from companion.component.service import Refusal
-from companion.daemon.calibrating.commands import RequestRefusedError
+from companion.daemon.calibrating.subsystem import RequestRefusedError
 from companion.daemon.faces.mqtt.payloads import Misfit, Request, parse
 from companion.daemon.faces.mqtt.requests import MAX_PENDING, REMEMBER_S, REMEMBERED, Requests
 from tests.support.virtual_time import run_virtual

@@ -10,7 +10,7 @@ from companion.calibration.solution.record import AlignmentUsed
 from companion.calibration.solution.solve import GradienterModel
 from companion.config.sections import Config
 from companion.configured import models
-from companion.daemon.offload import Offload
+from companion.daemon.core import Offload
 from companion.links.system.listeners import Listeners
 from companion.storage.alignment import AlignmentStore
 

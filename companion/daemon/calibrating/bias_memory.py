@@ -1,4 +1,4 @@
-"""Earlier biases of each IMU: whose they are, what they say of today, and what today adds.
+"""What is kept of calibrations: the records, and the biases of each IMU with what they say of today.
 
 A change of sensor, profile or mounting forgets them. What was calibrated in this run of the daemon, with the sensor
 powered all the while, is remembered besides: it says most.
@@ -6,6 +6,7 @@ powered all the while, is remembered besides: it says most.
 
 from __future__ import annotations
 
+import datetime
 import logging
 import os
 from collections.abc import Mapping, Sequence
@@ -23,7 +24,9 @@ from companion.calibration.solution.history import Point, PowerUp
 from companion.calibration.solution.joint import Whole, points
 from companion.calibration.solution.pose_effect import pose_effect
 from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, expect, expect_today
+from companion.calibration.solution.record import Record
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
+from companion.component.statustext import Severity
 from companion.config.sections import Noise
 from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.core import Core
@@ -33,6 +36,7 @@ from companion.errors import StorageError
 from companion.physics.frames import vector
 from companion.samples import Triad
 from companion.storage.biases import KEEP_POINTS, BiasStore, KnownImu
+from companion.storage.records import RecordStore
 
 logger = logging.getLogger(__name__)
 
@@ -280,3 +284,57 @@ def _host() -> str:
         return _BOOT_ID.read_text(encoding="ascii").strip()
     except (OSError, ValueError):
         return os.urandom(8).hex()
+
+
+class Results:
+    """Keeps records, each with the readings that it was made of."""
+
+    def __init__(self, core: Core, store: RecordStore, memory: BiasMemory) -> None:
+        self._store, self._memory = store, memory
+        self._collector, self._say, self._offload = core.collector, core.say, core.offload
+        self.last: Record | None = None
+
+    def load(self) -> None:
+        """Find the latest one of those on disk; blocking."""
+        try:
+            self.last = next(iter(self._store.history(limit=1)), None)
+        except StorageError as error:
+            logger.warning("%s; the daemon goes on without earlier records", error)
+
+    async def keep(self, record: Record, started_s: float, measured_s: tuple[float, float] | None) -> None:
+        """Keep a record that is worth it; what cannot be kept is said."""
+        self.last = record
+        seen = self._collector.snapshot(started_s, measured_s)
+
+        def save() -> None:
+            try:
+                trace = seen.trace(record.started_at)
+            except Exception:
+                # What is nice to look at later must not cost the record.
+                logger.exception("the readings of this calibration cannot be kept")
+                trace = None
+            self._store.save(record, trace)
+
+        try:
+            if record.is_worth_keeping:
+                await self._offload(save)
+        except StorageError as error:
+            logger.error("%s", error)  # noqa: TRY400 - the traceback tells nothing more
+            self._say(Severity.WARNING, f"Record not kept: {error}")
+
+    async def undone(self, system_id: int) -> None:
+        """What the last calibration of this vehicle has written is in force no more."""
+        now = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
+        last = self.last
+        if last is not None and last.state == "done" and last.system_id == system_id:
+            self.last = msgspec.structs.replace(last, undone_at=now) if has_written(last) else last
+            await self._memory.forget(last.started_at)
+        try:
+            await self._offload(self._store.mark_undone, system_id, now)
+        except StorageError as error:
+            logger.error("the history does not show the undo: %s", error)  # noqa: TRY400 - one line
+
+
+def has_written(record: Record) -> bool:
+    """Whether anything of it has come into the autopilot."""
+    return any(imu.written for imu in record.imus)

@@ -25,11 +25,10 @@ from companion.component.statustext import Severity, Weight
 from companion.config.sections import AtArm
 from companion.daemon.calibrating.align_steps import Plan
 from companion.daemon.calibrating.aligner import Aligner
+from companion.daemon.calibrating.bias_memory import Results, has_written
 from companion.daemon.calibrating.course import Course
 from companion.daemon.calibrating.measuring import Measuring
-from companion.daemon.calibrating.results import Results, has_written
-from companion.daemon.calibrating.start_limit import StartLimit
-from companion.daemon.calibrating.why_not import Obstacle, Rung, obstacle
+from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
 from companion.daemon.core import Core
 from companion.daemon.job import ALIGNMENT, Job, JobCancelledError
 from companion.daemon.offsets.recovery import Recovery

@@ -3,28 +3,149 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
+from typing import Final
 
 import msgspec
 
 from companion.calibration.machine import Machine
+from companion.calibration.request import What, is_time_limit
 from companion.calibration.solution.record import Record
+from companion.component.service import Refusal
+from companion.daemon.calibrating.align_steps import HEADINGS, Plan
 from companion.daemon.calibrating.aligner import Aligner
 from companion.daemon.calibrating.alignment import AlignmentInForce
-from companion.daemon.calibrating.bias_memory import BiasMemory
-from companion.daemon.calibrating.commands import Commands
+from companion.daemon.calibrating.bias_memory import BiasMemory, Results
 from companion.daemon.calibrating.conductor import Conductor
-from companion.daemon.calibrating.course import Course
+from companion.daemon.calibrating.course import Course, Solving
 from companion.daemon.calibrating.measuring import Measuring
-from companion.daemon.calibrating.results import Results
-from companion.daemon.calibrating.solving import Solving
+from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.offsets.conclusion import Conclusion
+from companion.daemon.job import ALIGNMENT, Job
 from companion.daemon.offsets.dither import Ditherer
+from companion.daemon.offsets.push import Conclusion
 from companion.daemon.offsets.subsystem import Offsets
+from companion.errors import CalibrationRefusedError
 from companion.links.system.request import Object
 from companion.storage.records import RecordStore
+
+PROGRESS_EVERY_S: Final = 0.2
+ALIGN_TIMEOUT_S: Final = 900.0
+"""An alignment that nobody ends must not keep calibrations from starting for ever."""
+
+
+class RequestRefusedError(CalibrationRefusedError):
+    """A request was not taken; `kind` as in `Refusal`."""
+
+    def __init__(self, refusal: Refusal) -> None:
+        super().__init__(refusal.reason)
+        self.kind = refusal.kind
+
+
+class Commands:
+    """Turns requests into what the conductor does, and what comes of it into replies.
+
+    Each raises `RequestRefusedError` where it is not taken, and another `CompanionError` where it cannot be carried
+    out.
+    """
+
+    def __init__(self, conductor: Conductor, alignment: AlignmentInForce) -> None:
+        self._conductor, self._alignment = conductor, alignment
+
+    def by_name(self) -> Mapping[str, Handler]:
+        """Which handler answers which command."""
+        return {"calibrate": self._calibrate, "align": self._align, "cancel": self._cancel, "undo": self._undo}
+
+    async def _calibrate(self, request: Object, face: str) -> AsyncIterator[Object]:
+        try:
+            what = What[str(request.get("what", "both")).upper()]
+        except KeyError as error:
+            raise CalibrationRefusedError(f"calibrate: {error} is not understood") from None
+        timeout_s = request.get("timeout_s")
+        if timeout_s is not None and not is_time_limit(timeout_s):
+            raise CalibrationRefusedError(
+                f"calibrate: 'timeout_s': found {timeout_s!r}; allowed: a number of seconds above 0"
+            )
+        reboot = request.get("reboot") is True
+        job = _accepted(self._conductor.start_calibration(what, f"{face} calibrate", timeout_s, reboot=reboot))
+        if not request.get("wait"):
+            yield {"kind": "result", "state": self._conductor.state.shown, "reason": "calibration started"}
+            return
+        async for reply in self._progress(job):
+            yield reply
+        yield {"kind": "result", "record": msgspec.to_builtins(job.record)}
+
+    async def _cancel(self, _request: Object, face: str) -> AsyncIterator[Object]:
+        running = self._conductor.cancel(f"{face} cancel")
+        if running and self._conductor.job is not None:
+            await asyncio.shield(self._conductor.job.finished)
+        reason = self._conductor.reason if running else "nothing was running"
+        yield {"kind": "result", "state": self._conductor.state.shown, "reason": reason}
+
+    async def _undo(self, request: Object, face: str) -> AsyncIterator[Object]:
+        job = _accepted(self._conductor.start_undo(f"{face} undo", force=request.get("force") is True))
+        result = await asyncio.shield(job.finished)
+        written = msgspec.to_builtins(job.written)
+        yield {"kind": "result", "state": result.outcome, "reason": result.reason, "written": written}
+
+    async def _align(self, request: Object, face: str) -> AsyncIterator[Object]:
+        """Show, forget or measure the alignment."""
+        action = request.get("action")
+        if action == "show":
+            yield {"kind": "result", **self._shown()}
+        elif action == "forget":
+            if (busy := self._conductor.why_not((Rung.BUSY,))) is not None:
+                raise CalibrationRefusedError(busy.words)
+            was = await self._alignment.forget()
+            words = "the configuration's zero and sigma are in force" if was else "there was no alignment to forget"
+            yield {"kind": "result", "state": "done", "reason": words}
+        else:
+            job = self._start_alignment(request, face)
+            async for reply in self._progress(job):
+                yield {**reply, "job": ALIGNMENT}
+            result = job.finished.result()
+            yield {
+                "kind": "result",
+                "state": result.outcome,
+                "reason": result.reason,
+                "alignment": msgspec.to_builtins(job.alignment),
+            }
+
+    def _shown(self) -> Object:
+        alignment = self._alignment
+        if alignment.used is not None:
+            state, reason = "in force", ""
+        elif alignment.unused is not None:
+            state, reason = "not used", alignment.unused
+        else:
+            state, reason = "none", "no alignment is kept: companion align zero measures one"
+        return {"state": state, "reason": reason, "alignment": msgspec.to_builtins(alignment.record)}
+
+    def _start_alignment(self, request: Object, face: str) -> Job:
+        action, headings = request.get("action"), request.get("headings", 2)
+        timeout_s = request.get("timeout_s")
+        timeout_s = ALIGN_TIMEOUT_S if timeout_s is None else timeout_s
+        if action not in ("zero", "tilts") or headings not in (2, HEADINGS) or not is_time_limit(timeout_s):
+            raise CalibrationRefusedError(f"align: {request} is not understood")
+        plan = Plan(action, headings, quick=request.get("quick") is True)
+        return _accepted(self._conductor.start_alignment(plan, f"{face} align", float(timeout_s)))
+
+    async def _progress(self, job: Job) -> AsyncIterator[Object]:
+        while job.is_running:
+            yield {
+                "kind": "progress",
+                "state": self._conductor.state.shown,
+                "percent": self._conductor.progress_percent,
+                "text": job.words,
+            }
+            await asyncio.wait([job.finished], timeout=PROGRESS_EVERY_S)
+
+
+def _accepted(answer: Job | Refusal) -> Job:
+    if isinstance(answer, Refusal):
+        raise RequestRefusedError(answer)
+    return answer
 
 
 class Calibrating(Subsystem):

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from companion.configured.devices import Role, SerialDevice, parts_of
+from companion.daemon.core import Offload
 from companion.daemon.devices.sensor_health import SensorHealth, line_of
-from companion.daemon.offload import Offload
 from companion.links.serial.bytestream import ByteLink
 from companion.links.serial.ports import find_holders
 from companion.links.system.budget import Budget

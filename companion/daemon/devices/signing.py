@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.component.statustext import Say, Severity, Weight
 from companion.config.sections import Config
-from companion.daemon.offload import Offload
+from companion.daemon.core import Offload
 from companion.errors import LinkError, StorageError
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.signing import TICKS_PER_S, Reason, Signing, SigningClock, read_key, uptime_s

@@ -3,27 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, get_args
 
 import msgspec
 
+from companion.calibration.solution.record import ImuRecord
 from companion.component.component import Component
+from companion.component.own_parameters import OwnParameters
+from companion.component.service import JobResult
+from companion.config.sections import AtArm, Config
 from companion.config.senders import Senders
 from companion.daemon.arming.subsystem import Arming
+from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.faces.answers import Answers
-from companion.daemon.faces.flight_line import define_parameters
 from companion.daemon.faces.headline import Headlines
 from companion.daemon.heading.subsystem import Heading
+from companion.daemon.job import Job
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.recorder.recorder import Recorder
+from companion.errors import ConfigError
 from companion.links.system.request import Object
+from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
     from companion.daemon.faces.mqtt.face import MqttFace
     from companion.web.server import Page
+
+
+AT_ARM: Final[tuple[AtArm, ...]] = ("off", "warn", "gate")
+STATE_NUMBER: Final = {"done": 1.0, "failed": 2.0, "cancelled": 3.0}
+LARGEST: Final = 1e6
 
 
 class Faces(Subsystem):
@@ -107,3 +119,54 @@ def _page(core: Core, answers: Answers) -> Page | None:
     from companion.web.server import Page
 
     return Page(core.config.web.bind, core.config.storage.path, answers.answer, answers.look, core.offload)
+
+
+def define_parameters(parameters: OwnParameters, config: Config, conductor: Conductor) -> None:
+    """Define CMP_*: targets, at_arm and push may be set; the last result is shown.
+
+    What a ground station sets holds until the daemon restarts: the configuration file is the aircraft owner's.
+    """
+    assert set(AT_ARM) == set(get_args(AtArm))
+    wanted = config.calibration
+
+    def set_gyro_target(deg_h: float) -> None:
+        conductor.retarget(gyro_sigma_rad_s=deg_h * DEG_H)
+
+    def set_accel_target(mg: float) -> None:
+        conductor.retarget(accel_sigma_m_s2=mg * MG)
+
+    def set_push(value: float) -> None:
+        conductor.switch(push=bool(_whole("CMP_PUSH", value)))
+
+    def set_at_arm(value: float) -> None:
+        conductor.switch(at_arm=AT_ARM[_whole("CMP_AT_ARM", value)])
+
+    parameters.define("CMP_GYR_TGT", wanted.target_gyro_sigma_deg_h, 0.01, LARGEST, set_gyro_target)
+    parameters.define("CMP_ACC_TGT", wanted.target_accel_sigma_mg, 0.0001, LARGEST, set_accel_target)
+    parameters.define("CMP_PUSH", float(config.push.parameters), 0.0, 1.0, set_push)
+    parameters.define("CMP_AT_ARM", float(AT_ARM.index(wanted.at_arm)), 0.0, 2.0, set_at_arm)
+    parameters.define("CMP_STATE", 0.0, 0.0, 3.0, read_only=True)
+    parameters.define("CMP_GYR_SIG", 0.0, 0.0, LARGEST, read_only=True)
+    parameters.define("CMP_ACC_SIG", 0.0, 0.0, LARGEST, read_only=True)
+
+    def show(job: Job, result: JobResult) -> None:
+        del result
+        if (record := job.record) is None:
+            return
+        parameters.set("CMP_STATE", STATE_NUMBER[record.state])
+        parameters.set("CMP_GYR_SIG", _worst(record.imus, "gyro_sigma_use_rad_s", DEG_H))
+        parameters.set("CMP_ACC_SIG", _worst(record.imus, "accel_sigma_use_m_s2", MG))
+
+    conductor.watch(show)
+
+
+def _whole(name: str, value: float) -> int:
+    if value != round(value):
+        raise ConfigError(f"{name}: found {value:g}; allowed: a whole number")
+    return round(value)
+
+
+def _worst(imus: tuple[ImuRecord, ...], sigma: str, unit: float) -> float:
+    """The largest sigma of all axes in its unit; 0 where nothing was found."""
+    values = [value for imu in imus for value in getattr(imu, sigma) or ()]
+    return min(max(values, default=0.0) / unit, LARGEST)

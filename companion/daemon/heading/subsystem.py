@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
+from companion.autopilot.firmware.heading_parameters import RISKS, changes_for, wanted_for
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.heading.autopilot_setup import autopilot_setup
 from companion.daemon.heading.pose_now import PoseNow
 from companion.links.system.request import Object
 
 if TYPE_CHECKING:
     from companion.daemon.heading.attitude_service import AttitudeService
+
+
+REBOOT: Final = "restart the autopilot then: until that it goes on as before"
 
 
 class Heading(Subsystem):
@@ -54,3 +57,39 @@ def _attitude(core: Core, devices: Devices, calibrating: Calibrating, arming: Ar
     from companion.daemon.heading.attitude_service import AttitudeService
 
     return AttitudeService(core, devices, arming.in_force, calibrating.alignment)
+
+
+async def autopilot_setup(core: Core) -> Object:
+    """What is set, what should be, and what to do.
+
+    Raises:
+        AutopilotError: it does not answer, or cannot take in a heading.
+    """
+    firmware = core.vehicle.firmware
+    wanted = wanted_for(firmware)
+    found = await core.parameters.read_many([one.parameter for one in wanted], optional=True)
+    changes = changes_for(firmware, found)
+    if changes:
+        todo = ", ".join(f"{change.parameter} {change.after:g}" for change in changes)
+        reason = f"set {todo}; {REBOOT}"
+    elif core.config.push.attitude == "off":
+        reason = 'the autopilot is set up, but push.attitude is "off": the heading never comes'
+    else:
+        reason = "the autopilot is set up"
+    return {
+        "kind": "result",
+        "state": "not applied" if changes else "applied",
+        "reason": reason,
+        "firmware": firmware,
+        "parameters": [
+            {
+                "parameter": one.parameter,
+                "now": now,
+                "wanted": None if now is None else one.after(now),
+                "why": one.why,
+            }
+            for one in wanted
+            for now in (found.get(one.parameter),)
+        ],
+        "risks": list(RISKS.get(firmware or "other", ())),
+    }

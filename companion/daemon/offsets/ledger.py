@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator
 
 from companion.autopilot.parameters.change import NothingWrittenError, WriteFailedError
 from companion.autopilot.vehicle.vehicle import Firmware
-from companion.daemon.offload import Offload
+from companion.daemon.core import Offload
 from companion.errors import AutopilotError, StorageError
 from companion.storage.changes import ChangeLog, ChangeSet
 

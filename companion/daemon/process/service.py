@@ -10,12 +10,11 @@ from companion.config.sections import Config
 from companion.configured import models
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
-from companion.daemon.core import Core, Task
+from companion.daemon.core import Core, Offload, Task
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.faces.control import ControlServer
 from companion.daemon.faces.subsystem import Faces
 from companion.daemon.heading.subsystem import Heading
-from companion.daemon.offload import Offload
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.recorder.recorder import Recorder
 from companion.links.mavlink.link import MavlinkLink

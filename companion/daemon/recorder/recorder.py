@@ -10,35 +10,39 @@ import asyncio
 import dataclasses
 import logging
 import time
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final, TypeVar
 
 import msgspec
 
+from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.collector.rolling import Window
 from companion.calibration.request import What, is_time_limit
 from companion.calibration.solution.prior import Expectation
 from companion.calibration.solution.site import Whereabouts
 from companion.component.service import JobResult
+from companion.config.sections import Config
+from companion.configured import models
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task
+from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import Job
-from companion.daemon.recorder.surroundings import Surroundings
 from companion.errors import StorageError
 from companion.links.mavlink.link import Direction
 from companion.links.system.request import Object
 from companion.recording import topics
-from companion.recording.details import Solved
+from companion.recording.details import Offsets, Solved
 from companion.recording.files import FOLDER_MODE, Beginning, RecordingFile, Ring, is_available, versions
+from companion.recording.journal import Journal
 from companion.recording.past import Message, Past
 from companion.recording.redact import KeyFilter
 
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
-
 FLUSH_S: Final = 1.0
 """What a power cut costs."""
 RETRY_S: Final = 60.0
@@ -49,6 +53,37 @@ PROGRESS_S: Final = 0.5
 HANGS_S: Final = 5.0
 """So long at most the daemon's end waits for the disk."""
 HOW_TO_INSTALL: Final = "recording needs more than is installed: pip install 'companion[recording]'"
+
+
+class Surroundings:
+    """What a replay needs to know of the world, and the raw bytes do not say in one place."""
+
+    def __init__(self, config: Config, vehicle: Vehicle, imus: Iterable[AutopilotImu], journal: Journal) -> None:
+        self._journal = journal
+        self._config, self._vehicle, self._imus = config, vehicle, {imu.name: imu for imu in imus}
+        self._seen: dict[str, ImuCalibration | None] = dict.fromkeys(self._imus)
+        self._where: Whereabouts | None = None
+
+    def read_offsets(self) -> Offsets:
+        """What the autopilot takes off each of its IMUs; None where that is not known."""
+        return {name: imu.calibration for name, imu in self._imus.items()}
+
+    def look(self, now_s: float) -> None:
+        """Note what has changed."""
+        offsets = self.read_offsets()
+        if any(offsets[name] is not before for name, before in self._seen.items()):
+            self._seen = offsets
+            self._journal.set_in_force(now_s, "offsets", offsets)
+        where = models.whereabouts(self._config, self._vehicle)
+        if self._where is None or _coarse(where) != _coarse(self._where):
+            self._where = where
+            self._journal.set_in_force(now_s, "place", where)
+
+
+def _coarse(where: Whereabouts) -> tuple[object, ...]:
+    """As far as a change of the place matters: a GNSS receiver is never quite still."""
+    degrees = [None if value is None else round(value, 3) for value in (where.latitude_deg, where.longitude_deg)]
+    return *degrees, None if where.height_m is None else round(where.height_m, -1), where.source, where.date
 
 
 @dataclasses.dataclass(slots=True)

@@ -19,14 +19,11 @@ from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.core import Core
 from companion.daemon.faces.answers import Answers
 from companion.daemon.faces.mqtt.requests import Requests
-from companion.daemon.faces.mqtt.summary import Pace, summary
-from companion.daemon.faces.mqtt.topics import OFFLINE, ONLINE, Topics, base_of, client_id_of
 from companion.daemon.heading.pose_now import PoseNow
 from companion.links.mqtt.client import Incoming, MqttLink
 from companion.links.system.request import Object
 
 logger = logging.getLogger(__name__)
-
 
 LOOK_S: Final = 0.2
 """The attitude goes out at every look: at most 5 a second."""
@@ -37,6 +34,103 @@ AFTER_FAULT_S: Final = 30.0
 STATE_S: Final = 0.5
 ANSWER_AT_END_S: Final = 0.5
 FLUSH_S: Final = 1.0
+ONLINE = b"online"
+OFFLINE = b"offline"
+LEAST_S: Final = 1.0
+SLOW_S: Final = 10.0
+_COPIED = ("state", "reason", "progress", "waiting_for", "vehicle", "warnings", "fault", "putting_back", "last")
+_ARMING = ("at_arm", "verdict", "words", "state", "in_force")
+
+
+def summary(status: Object) -> Object:
+    """The state as others show it: without the figures that change with every look."""
+    return {
+        **{key: status[key] for key in _COPIED},
+        "arming": {key: status["arming"][key] for key in _ARMING},
+        "devices": [
+            {
+                "name": device["name"],
+                "kind": device["kind"],
+                "good": device["good"],
+                "problem": None if device["good"] else device["summary"],
+            }
+            for device in status["devices"]
+        ],
+    }
+
+
+class Pace:
+    """Says when a state is worth a message.
+
+    At once when the state itself changes, within a second when anything else does; every ten seconds when only words
+    change that tell how long ago something was.
+    """
+
+    def __init__(self) -> None:
+        self._said: Object | None = None
+        self._said_s = 0.0
+
+    def is_due(self, state: Object, now_s: float) -> bool:
+        """Whether to send it now; if so, it counts as sent."""
+        said = self._said
+        if said == state:
+            return False
+        due = (
+            said is None
+            or said["state"] != state["state"]
+            or now_s - self._said_s >= (SLOW_S if _lasting(said) == _lasting(state) else LEAST_S)
+        )
+        if due:
+            self._said, self._said_s = state, now_s
+        return due
+
+
+def _lasting(state: Object) -> Object:
+    return {**state, "arming": {**state["arming"], "in_force": None, "words": None}}
+
+
+class Topics:
+    """All topics under one base, such as "companion/1"."""
+
+    def __init__(self, base: str) -> None:
+        self.base = base
+        self.status = f"{base}/status"
+        self.state = f"{base}/state"
+        self.record = f"{base}/calibration/state"
+        self.progress = f"{base}/calibration/progress"
+        self.attitude = f"{base}/attitude"
+        self.requests = f"{base}/request/+"
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """Those that the broker keeps."""
+        return self.status, self.state, self.record
+
+    def request(self, command: str) -> str:
+        """Where a command is asked for."""
+        return f"{self.base}/request/{command}"
+
+    def response(self, command: str) -> str:
+        """Where a command is answered."""
+        return f"{self.base}/response/{command}"
+
+    def command_in(self, topic: str) -> str | None:
+        """The command that a request's topic names; None for another topic."""
+        prefix = f"{self.base}/request/"
+        return topic.removeprefix(prefix) if topic.startswith(prefix) else None
+
+
+def base_of(settings: Mqtt, system_id: int) -> str:
+    """What the topics of a vehicle begin with."""
+    return settings.base_topic or f"companion/{system_id}"
+
+
+def client_id_of(settings: Mqtt, base: str) -> str:
+    """Who we are to the broker.
+
+    The same after every restart: so our own old connection, and its last will with it, gives way to the new one.
+    """
+    return settings.client_id or base.replace("/", "-")
 
 
 class MqttFace:
