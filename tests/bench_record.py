@@ -22,7 +22,7 @@ from typing import Any, Final
 
 from companion.calibration.request import What
 from companion.component.service import Refusal
-from companion.storage.atomic import write_atomically
+from companion.storage.state import write_atomically
 from sim.pty_device import PtyDevice
 from sim.scenario import Scenario
 from sim.udp import UdpEnd

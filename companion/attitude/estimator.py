@@ -16,8 +16,7 @@ from typing import Final, Literal
 import msgspec
 import numpy as np
 
-from companion.attitude.heading import STEEP_RAD, HeadingAid, innovation_of_heading
-from companion.attitude.leveller import Leveller
+from companion.attitude.corrections import STEEP_RAD, HeadingAid, Leveller, innovation_of_heading
 from companion.attitude.quaternion import (
     Quaternion,
     Triple,

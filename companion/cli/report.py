@@ -75,7 +75,7 @@ def _make(
 ) -> tuple[Path | None, list[str]]:
     from companion.report.calibration_page import calibration_page
     from companion.report.source import Storage
-    from companion.storage.atomic import write_atomically
+    from companion.storage.state import write_atomically
 
     now = datetime.datetime.now(tz=datetime.UTC)
     one = Storage(directory).calibration(options.record, profiles)

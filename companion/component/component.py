@@ -14,7 +14,7 @@ from companion.component.own_parameters import OwnParameters
 from companion.component.permission import Permission
 from companion.component.service import ArmGate, CalibrationService, VehicleView
 from companion.component.statustext import Severity, StatusText, Weight
-from companion.config.senders import Senders
+from companion.config.sections import Senders
 from companion.links.mavlink.link import MavlinkLink
 
 HEARTBEAT_PERIOD_S = 1.0

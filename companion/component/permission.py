@@ -9,7 +9,7 @@ import logging
 from collections import Counter
 from typing import Final
 
-from companion.config.senders import EVERYBODY, Senders
+from companion.config.sections import EVERYBODY, Senders
 
 logger = logging.getLogger(__name__)
 

@@ -8,8 +8,7 @@ import math
 import re
 from collections.abc import Iterator
 
-from companion.config.sections import Compass, Config, Gradienter, Imu, Mavlink, Mounting, Mqtt
-from companion.config.senders import ALLOWED, Senders
+from companion.config.sections import ALLOWED, Compass, Config, Gradienter, Imu, Mavlink, Mounting, Mqtt, Senders
 from companion.config.words import allowed
 from companion.errors import ConfigError
 from companion.rotations import ROTATIONS_DEG

@@ -19,7 +19,7 @@ from typing import Final, Literal
 
 import companion
 from companion.errors import CompanionError
-from companion.storage.atomic import remove_durably, write_atomically
+from companion.storage.state import remove_durably, write_atomically
 
 EXECUTABLE: Final = "/opt/companion/bin/companion"
 """As the shipped unit names it."""

@@ -8,11 +8,10 @@ from collections.abc import Sequence
 from typing import Final
 
 from companion.calibration.collector.rolling import ImuInput, RollingCollector, Settings, Window
-from companion.calibration.means.pose_models import CompassModel, GradienterModel
+from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.stillness.settling import AT_ONCE, Lag
 from companion.links.system.listeners import Listeners
-from companion.recording.details import Means
-from companion.recording.journal import Journal
+from companion.recording.journal import Journal, Means
 from companion.samples import CompassSample, ImuSample, TiltSample
 
 WINDOWS_KEPT: Final = 240

@@ -43,7 +43,7 @@ class JournalEntry(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     t_s: float
     event: JournalEvent
     detail: bytes | None = None
-    """As `details.encode` made it; what it is depends on the event."""
+    """As `journal.encode` made it; what it is depends on the event."""
 
 
 class StartEntry(msgspec.Struct, frozen=True, gc=False):

@@ -1,18 +1,24 @@
-"""The calibrations of a recording again: from the means that were taken to the record that was written."""
+"""The calibrations of a recording again, from the means that were taken to the record that was written.
+
+What no recording can tell again is taken from the recorded one; the others are compared to the last bit.
+"""
 
 from __future__ import annotations
 
-from typing import Final
+import datetime
+from collections.abc import Mapping
+from typing import Any, Final
 
 import msgspec
 
-from companion.autopilot.firmware.imu_calibration import whole_of
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
 from companion.calibration.collector.measurement import Measurement
-from companion.calibration.collector.rolling import RollingCollector, Window
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.means.windows import Window
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.joint import weigh
-from companion.calibration.solution.record import AlignmentUsed, Record
+from companion.calibration.solution.record import AlignmentUsed, ImuRecord, Record
 from companion.calibration.solution.site import Whereabouts
 from companion.calibration.solution.solve import ImuSolution, Solution, solve_at
 from companion.config.sections import Config
@@ -20,9 +26,105 @@ from companion.configured import models
 from companion.configured.models import aligned
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array
-from companion.recording.details import Offsets, Solved
-from companion.replay.again import record_again, refined_window
-from companion.replay.compare import Difference, differences
+from companion.recording.journal import Offsets, Solved
+
+_SIGMAS = {
+    "gyro_bias_rad_s": "gyro_sigma_use_rad_s",
+    "residual_gyro_rad_s": "gyro_sigma_use_rad_s",
+    "accel_bias_m_s2": "accel_sigma_use_m_s2",
+    "residual_accel_m_s2": "accel_sigma_use_m_s2",
+}
+
+
+class Difference(msgspec.Struct, frozen=True):
+    """One field that is not the same."""
+
+    field: str
+    """Such as imus[fc].gyro_bias_rad_s[0]."""
+    recorded: Any
+    replayed: Any
+    sigmas: float | None
+    """By how many sigma_use a bias differs; None for anything else."""
+
+    def __str__(self) -> str:
+        size = "" if self.sigmas is None else f" ({self.sigmas:.2g} sigma)"
+        return f"{self.field}: recorded {self.recorded!r}, replayed {self.replayed!r}{size}"
+
+
+def differences(recorded: Record, replayed: Record) -> list[Difference]:
+    """Every field in which they differ, even by the last bit."""
+    found: list[Difference] = []
+    _compare("", msgspec.to_builtins(recorded), msgspec.to_builtins(replayed), None, found)
+    return found
+
+
+def _compare(path: str, recorded: Any, replayed: Any, sigma: Any, found: list[Difference]) -> None:
+    if isinstance(recorded, dict) and isinstance(replayed, dict):
+        for key in {**recorded, **replayed}:
+            inner = recorded.get(_SIGMAS.get(key, ""))
+            _compare(f"{path}.{key}" if path else key, recorded.get(key), replayed.get(key), inner, found)
+    elif isinstance(recorded, list | tuple) and isinstance(replayed, list | tuple) and len(recorded) == len(replayed):
+        for index, (one, other) in enumerate(zip(recorded, replayed, strict=True)):
+            name = one.get("name", index) if isinstance(one, dict) else index
+            inner = sigma[index] if isinstance(sigma, list | tuple) and index < len(sigma) else None
+            _compare(f"{path}[{name}]", one, other, inner, found)
+    elif recorded != replayed:
+        sigmas = None
+        if isinstance(sigma, float) and sigma > 0.0 and isinstance(recorded, float) and isinstance(replayed, float):
+            sigmas = abs(replayed - recorded) / sigma
+        found.append(Difference(path, recorded, replayed, sigmas))
+
+
+def record_again(recorded: Record, solution: Solution, solved_with: Mapping[str, ImuCalibration | None]) -> Record:
+    """The record of a calibration from a solution that was worked out again.
+
+    Args:
+        recorded: as the daemon wrote it.
+        solution: the new one.
+        solved_with: the offsets that were in force when it was measured, by IMU.
+    """
+    draft = Draft(datetime.datetime.fromtimestamp(0.0, tz=datetime.UTC), recorded.system_id, solution)
+    corrected = {imu.name for imu in recorded.imus if imu.residual_gyro_rad_s or imu.residual_accel_m_s2}
+    for found in solution.imus:
+        calibration = solved_with.get(found.name)
+        if calibration is not None and found.name in corrected:
+            draft.whole[found.name] = whole_of(calibration, found)
+    words = in_words(solution)
+    reason = recorded.reason
+    if recorded.state == "done":
+        reason = words + (reason[len(words) :] if reason.startswith(words) else "")
+    again = draft.record(recorded.state, reason, recorded.duration_s)
+    before = {imu.name: imu for imu in recorded.imus}
+    return msgspec.structs.replace(
+        again,
+        started_at=recorded.started_at,
+        alignment=recorded.alignment,
+        # Records of earlier versions have none.
+        cross_covariance=again.cross_covariance if recorded.cross_covariance else (),
+        duration_s=recorded.duration_s,
+        warnings=_with_rest(again.warnings, recorded.warnings),
+        imus=tuple(_imu_again(imu, before.get(imu.name)) for imu in again.imus),
+    )
+
+
+def refined_window(window: Window, refined: Window | None) -> Window:
+    """The window with the means that a dither has found."""
+    if refined is None:
+        return window
+    found = {imu.name: imu for imu in refined.imus if imu.dithered}
+    return msgspec.structs.replace(window, imus=tuple(found.get(imu.name, imu) for imu in window.imus))
+
+
+def _with_rest(ours: tuple[str, ...], recorded: tuple[str, ...]) -> tuple[str, ...]:
+    """Our warnings first, as ever; then those that come from the autopilot."""
+    return (*ours, *recorded[len(ours) :])
+
+
+def _imu_again(imu: ImuRecord, recorded: ImuRecord | None) -> ImuRecord:
+    if recorded is None:
+        return imu
+    return msgspec.structs.replace(imu, written=recorded.written, warnings=_with_rest(imu.warnings, recorded.warnings))
+
 
 WINDOWS_KEPT: Final = 4000
 """Means that were taken, for a calibration that may come of them."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from companion.calibration.collector.measurement import Measurement
 from companion.calibration.collector.rolling import RollingCollector, Settings, Window
-from companion.calibration.means.pose_windows import HeadingWindow, TiltWindow
+from companion.calibration.means.pose import HeadingWindow, TiltWindow
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What

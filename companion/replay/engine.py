@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import datetime
 import functools
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
+from companion.autopilot.telemetry import imu_messages
+from companion.autopilot.telemetry.imu_messages import ImuMessage, Reading
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.record import Record, from_json
@@ -23,12 +25,64 @@ from companion.config.sections import Config
 from companion.configured import models
 from companion.configured.devices import Role, SerialDevice, collect, parts_of, serial_devices
 from companion.errors import CalibrationRefusedError, StorageError
+from companion.links.mavlink.link import MavlinkLink
 from companion.protocols.decoding.base import Decoder
-from companion.recording import details, past, topics
+from companion.recording import journal, past, topics
 from companion.recording.files import versions
 from companion.recording.walk import Attachment, Message, Metadata, Recording
 from companion.replay.calibrations import Calibrations, Replayed
-from companion.replay.telemetry import Telemetry
+from companion.samples import ImuSample
+
+PENDING: Final = 4000
+"""Telemetry that nobody has counted yet is remembered so long."""
+
+_NOT_THE_SAME: Final = "a sample does not decode as it did"
+_NOT_THERE: Final = "a sample is not in the MAVLink bytes"
+
+
+class Telemetry:
+    """Decodes what came over the link, and finds in it the samples that went into the collector."""
+
+    def __init__(self) -> None:
+        self._link = MavlinkLink()
+        self._pending: dict[str, deque[tuple[float, Reading]]] = {}
+        for each in {*sum(imu_messages.ARDUPILOT.values(), ()), *sum(imu_messages.PX4.values(), ())}:
+            self._listen(each)
+
+    def _listen(self, kind: ImuMessage) -> None:
+        pending = self._pending[kind.kind.message] = deque(maxlen=PENDING)
+
+        def take(message: Any, t_s: float) -> None:
+            reading = kind.decode(message)
+            if isinstance(reading, Reading):
+                pending.append((t_s, reading))
+
+        self._link.subscribe(kind.message, take)
+
+    def receive(self, data: bytes | None, t_s: float) -> None:
+        """Bytes that came; None: the link was opened anew."""
+        if data is None:
+            self._link.attach(None)
+        else:
+            self._link.receive(data, t_s)
+
+    def sample(self, entry: topics.ImuEntry) -> tuple[ImuSample, str | None]:
+        """The sample of the autopilot that was recorded so, from its message; and what is strange about that, if so."""
+        pending = self._pending.get(entry.message or "")
+        while pending:
+            t_s, reading = pending.popleft()
+            if reading.t_device_s == entry.t_device_s:
+                sample = ImuSample(
+                    t_s, reading.gyro_rad_s, reading.accel_m_s2, entry.temperature_degc, None, reading.t_device_s
+                )
+                # As the recording wrote it.
+                again = msgspec.json.decode(topics.imu_json(sample, entry.message), type=topics.ImuEntry)
+                return sample, _NOT_THE_SAME if again != entry else None
+        sample = ImuSample(
+            entry.t_s, entry.gyro_rad_s, entry.accel_m_s2, entry.temperature_degc, None, entry.t_device_s
+        )
+        return sample, _NOT_THERE
+
 
 __all__ = ["Replay", "Replayed", "Result"]
 
@@ -255,7 +309,7 @@ class Replay:
         if entry.event == "tick":
             collector.tick(entry.t_s)
             return
-        detail = details.decode(entry.event, entry.detail)
+        detail = journal.decode(entry.event, entry.detail)
         match entry.event:
             case "window":
                 try:

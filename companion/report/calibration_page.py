@@ -12,7 +12,6 @@ from companion.calibration.collector.trace import Trace
 from companion.calibration.noise.allan import AllanModel
 from companion.calibration.solution.record import Arming, ImuRecord, Outcome, Record
 from companion.report import svg
-from companion.report.analysis import history
 from companion.report.markup import Child, Markup, join, number, tag
 from companion.report.page import (
     AXES,
@@ -31,7 +30,7 @@ from companion.report.page import (
     with_sigma,
     written_count,
 )
-from companion.report.seconds import stillness
+from companion.report.seconds import history, stillness
 from companion.samples import Triad, Vector
 
 MAX_WRITTEN: Final = 60

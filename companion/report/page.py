@@ -12,8 +12,8 @@ from companion.calibration.noise.allan import NoiseProfile
 from companion.calibration.solution.record import Arming, Record
 from companion.physics.units import DEG_H, MG
 from companion.report import svg
-from companion.report.analysis import Point, clock_is_sound
 from companion.report.markup import Child, Markup, join, number, tag
+from companion.report.seconds import Point, clock_is_sound
 from companion.samples import Triad
 
 UNITS: Final[Mapping[Triad, tuple[float, str]]] = {"gyro": (DEG_H, "deg/h"), "accel": (MG, "mg")}

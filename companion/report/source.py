@@ -9,8 +9,8 @@ from companion.calibration.solution.record import Arming, Record
 from companion.errors import StorageError
 from companion.report import calibration_page
 from companion.report.page import Profiles
-from companion.storage.bounded import BoundedList
 from companion.storage.records import Entry, RecordStore
+from companion.storage.state import BoundedList
 
 MAX_EARLIER: Final = 60
 """Calibrations in the drift plots of the page of one."""

@@ -18,8 +18,7 @@ import msgspec
 from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.vehicle.vehicle import Firmware
-from companion.storage.atomic import remove_durably, write_atomically
-from companion.storage.state import StateFile
+from companion.storage.state import StateFile, remove_durably, write_atomically
 
 _UNDO: Final = re.compile(r"undo-(\d{1,3})\.json")
 _SYSTEM_IDS: Final = range(1, 256)

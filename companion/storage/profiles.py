@@ -17,8 +17,7 @@ from companion.calibration.noise.allan import PROFILES, AllanModel, NoiseProfile
 from companion.config.profiles import CATALOGUE
 from companion.config.sections import Noise
 from companion.errors import ConfigError, StorageError
-from companion.storage.atomic import write_atomically
-from companion.storage.state import UNREADABLE, read_regular, sealed, unsealed
+from companion.storage.state import UNREADABLE, read_regular, sealed, unsealed, write_atomically
 
 logger = logging.getLogger(__name__)
 

@@ -15,8 +15,7 @@ from companion.calibration.collector import trace as traces
 from companion.calibration.collector.trace import Trace
 from companion.calibration.solution.record import Record, from_json, to_json
 from companion.errors import StorageError
-from companion.storage.atomic import remove_durably, write_atomically
-from companion.storage.state import UNREADABLE, read_regular, sealed, unsealed
+from companion.storage.state import UNREADABLE, read_regular, remove_durably, sealed, unsealed, write_atomically
 
 logger = logging.getLogger(__name__)
 

@@ -1,8 +1,8 @@
-"""Files of state: JSON with a checksum of its own, read with suspicion, and set aside where it cannot be used.
+"""Files of state: there whole or not at all, with a checksum, read with suspicion, set aside where they are unusable.
 
 No content of such a file may end or hold up the daemon, or be half believed. What lies in its place and is no regular
-file (a FIFO, a device, a folder) is not even opened. The checksum is the last key of the object, the SHA-256 of the
-bytes before it; a file from before there were checksums is believed as far as its content goes.
+file (a FIFO, a device, a folder) is not even opened. The checksum is the last key of the JSON object, the SHA-256 of
+the bytes before it; a file from before there were checksums is believed as far as its content goes.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import logging
 import os
 import re
 import stat
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
@@ -22,7 +23,61 @@ import msgspec
 
 from companion import formats
 from companion.errors import StorageError
-from companion.storage.atomic import remove_durably, write_atomically
+
+
+def write_atomically(path: Path, data: bytes, *, mode: int = 0o600) -> None:
+    """Replace a file's content so that a power cut at any byte leaves the old or the new content.
+
+    Temporary file in the same folder, fsync, rename, fsync of the folder.
+
+    Args:
+        path: of the file.
+        data: its new content.
+        mode: its permissions.
+
+    Raises:
+        StorageError: one line that names the file and the operating system's reason.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                os.fchmod(file.fileno(), mode)
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                os.unlink(temporary)
+            raise
+        _sync_folder(path.parent)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def remove_durably(path: Path) -> None:
+    """Remove a file so that it stays removed after a power cut; a file already gone is no error.
+
+    Raises:
+        StorageError: one line that names the file and the operating system's reason.
+    """
+    try:
+        path.unlink(missing_ok=True)
+        if path.parent.is_dir():
+            _sync_folder(path.parent)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be removed: {error.strerror or error}") from error
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
 
 logger = logging.getLogger(__name__)
 
@@ -160,3 +215,41 @@ def set_aside(path: Path) -> str:
         os.replace(path, path.with_name(name))
         return f"set aside as {name}"
     return "it cannot be set aside either"
+
+
+class _Entries(msgspec.Struct, Generic[T], frozen=True):
+    entries: list[T]
+
+
+class BoundedList(Generic[T]):
+    """The latest `keep` entries, oldest first; one that cannot be used is set aside, since nothing hangs on it."""
+
+    def __init__(self, path: Path, kind: type[T], keep: int) -> None:
+        # Before there were checksums, the list was all there was.
+        self._file: StateFile[_Entries[T] | list[T]] = StateFile(path, _Entries[kind] | list[kind])  # type: ignore[valid-type]
+        self._keep = keep
+
+    def read(self) -> list[T]:
+        """The latest entries, for the daemon; a file that cannot be used counts as empty."""
+        return _listed(self._file.take())[-self._keep :]
+
+    def all(self) -> list[T]:
+        """All entries, for whoever changes nothing.
+
+        Raises:
+            StorageError: the file cannot be used.
+        """
+        return _listed(self._file.read())
+
+    def append(self, entry: T) -> None:
+        """Add an entry.
+
+        Raises:
+            StorageError: it could not be written.
+        """
+        entries = [*self.read(), entry][-self._keep :]
+        self._file.write(_Entries(entries))
+
+
+def _listed(found: _Entries[T] | list[T] | None) -> list[T]:
+    return found.entries if isinstance(found, _Entries) else found or []

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from companion.errors import StorageError
-from companion.storage.atomic import write_atomically
-from companion.storage.state import read_regular
+from companion.storage.state import read_regular, write_atomically
 
 logger = logging.getLogger(__name__)
 

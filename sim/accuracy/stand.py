@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from companion.calibration.collector.rolling import RollingCollector, Settings, Window
-from companion.calibration.means.pose_models import CompassModel, GradienterModel
+from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.request import What
 from companion.calibration.solution.site import LocalEarth, local_earth

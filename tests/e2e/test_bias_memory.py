@@ -16,7 +16,7 @@ from companion.calibration.solution.record import Record
 from companion.daemon.job import Job
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
-from companion.storage.biases import KEEP_POINTS, BiasStore
+from companion.storage.learned import KEEP_POINTS, BiasStore
 from sim.devices import Gradienter
 from sim.imu_model import DEG_H, MG
 from tests.e2e.test_calibration import calibrated

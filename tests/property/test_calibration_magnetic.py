@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.means.pose_windows import FieldUnit
+from companion.calibration.means.pose import FieldUnit
 from companion.calibration.means.windows import Window
 from companion.calibration.request import What
 from companion.calibration.solution.site import Whereabouts, local_earth

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from companion.calibration.collector.rolling import RollingCollector, Status
 from companion.calibration.noise.robust import huber_line, huber_mean
-from companion.calibration.seconds.batches import BatchSource
+from companion.calibration.seconds.batch import BatchSource
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import rotation_matrix
 from companion.rotations import ROTATION_NAMES

@@ -12,13 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.calibration.solution.record import Arming
-from companion.storage.alignment import AlignmentStore
-from companion.storage.biases import BiasStore
-from companion.storage.bounded import BoundedList
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
+from companion.storage.learned import AlignmentStore, BiasStore
 from companion.storage.records import RecordStore
 from companion.storage.signing_time import FILE, load
-from companion.storage.state import sealed
+from companion.storage.state import BoundedList, sealed
 
 NAMES = st.sampled_from(
     ["INS_GYROFFS_X", "INS_ACC2OFFS_Y", "CAL_GYRO0_XOFF", "CAL_ACC3_ZOFF", "INS_GYR_ID", "ARMING_CHECK", "", "A" * 40]

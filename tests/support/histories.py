@@ -21,8 +21,8 @@ from companion.calibration.solution.record import (
 )
 from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
-from companion.storage.atomic import write_atomically
 from companion.storage.records import RecordStore
+from companion.storage.state import write_atomically
 
 FIRST = datetime.datetime(2026, 5, 1, 6, 30, tzinfo=datetime.UTC)
 GYRO_DEG_H = (162.234, 169.563, -98.289)

@@ -22,9 +22,8 @@ from companion.config import parse
 from companion.config.sections import Config
 from companion.configured import models
 from companion.recording import journal, topics
-from companion.recording.details import Means
 from companion.recording.files import Beginning, RecordingFile, versions
-from companion.recording.journal import Entry, Journal
+from companion.recording.journal import Entry, Journal, Means
 from companion.recording.past import Past
 from companion.samples import CompassSample, ImuSample, TiltSample
 

@@ -8,8 +8,7 @@ import math
 import msgspec
 import numpy as np
 
-from companion.calibration.means.field_heading import FieldHeading
-from companion.calibration.means.pose_windows import FieldUnit, FieldWindow, HeadingWindow
+from companion.calibration.means.pose import FieldHeading, FieldUnit, FieldWindow, HeadingWindow
 from companion.calibration.means.windows import Window
 from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.calibration.solution.solve import CompassModel, GradienterModel

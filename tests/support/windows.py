@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.means.pose_windows import HeadingWindow, TiltWindow
+from companion.calibration.means.pose import HeadingWindow, TiltWindow
 from companion.calibration.means.windows import ImuWindow, Window
 
 Array = NDArray[np.float64]

@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from companion.calibration.seconds.batch import Batch
-from companion.calibration.seconds.batches import MAX_SAMPLES, BatchSource
+from companion.calibration.seconds.batch import MAX_SAMPLES, Batch, BatchSource
 
 
 def fill(source: BatchSource, rows: list[tuple[float, ...]], start_s: float, rate_hz: float, **more: float) -> None:

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.means.field_heading import FieldHeading
-from companion.calibration.means.pose_models import CompassModel, GradienterModel, vehicle_heading_rad
-from companion.calibration.stillness.heading_watch import HeadingWatch
+from companion.calibration.means.pose import CompassModel, FieldHeading, GradienterModel, vehicle_heading_rad
+from companion.calibration.stillness.settling import HeadingWatch
 from companion.physics.frames import wrap_deg
 from companion.physics.units import DEG
 from companion.samples import CompassSample, MagSample, TiltSample

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.collector.stop import is_enough
+from companion.calibration.collector.outlook import is_enough
 from companion.calibration.means.windows import ImuEstimate, ImuInput, imu_estimates, integer_steps
 from companion.calibration.noise.allan import NoiseProfile
-from companion.calibration.seconds.batch import MAX_LEVELS, Batch
-from companion.calibration.seconds.batches import BatchSource
+from companion.calibration.seconds.batch import MAX_LEVELS, Batch, BatchSource
 from companion.physics.units import DEG_H, MG
 from tests.support.still_aircraft import QUIET, imu, settings
 

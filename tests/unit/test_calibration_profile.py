@@ -10,7 +10,7 @@ from companion.calibration.noise.allan import AllanModel, NoiseProfile, allan_mo
 from companion.calibration.profiling.coverage import Kept, coverage, keeps
 from companion.calibration.profiling.profile_fit import Finding, fit_profile
 from companion.calibration.profiling.rest import Rest, Rests, rests, seconds_of
-from companion.calibration.seconds.batches import BatchSource
+from companion.calibration.seconds.batch import BatchSource
 from companion.errors import CalibrationRefusedError
 from tests.support.made_noise import DEG, DEG_H, FLICKER_OF_FLOOR, MG, adis16405, slow
 from tests.support.recordings import Recording, px4, shared, xio, xsens_counts

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import stats
 
-from companion.calibration.means.ramps import slope_limit
-from companion.calibration.noise.robust import HUBER_C, huber_line, huber_mean, median, robust_mean
+from companion.calibration.noise.robust import HUBER_C, huber_line, huber_mean, median, robust_mean, slope_limit
 from companion.physics.frames import Floats
 
 

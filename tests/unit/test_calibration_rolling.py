@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from companion.calibration.collector import measurement
 from companion.calibration.collector.rolling import RollingCollector, Settings
-from companion.calibration.means import estimates
 from companion.calibration.noise.allan import AllanModel, NoiseProfile
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG, DEG_H, MG
@@ -506,7 +506,7 @@ def test_an_estimate_worked_out_elsewhere_is_the_window_that_would_have_been(mon
     found = work.run()
     there.collector.accept(work, found)
     assert there.collector.pending(there.now_s) is None
-    monkeypatch.setattr(estimates, "imu_estimates", lambda *_, **__: pytest.fail("worked out on the spot"))
+    monkeypatch.setattr(measurement, "imu_estimates", lambda *_, **__: pytest.fail("worked out on the spot"))
     assert there.collector.window(there.now_s) == expected
     assert there.collector.status(there.now_s).waiting_for is None
 
@@ -517,7 +517,7 @@ def test_while_the_next_estimate_is_worked_out_the_status_gives_the_one_before(
     feed = feeder(SILENT)
     feed.run(20.0)
     before = feed.collector.status(feed.now_s).progress
-    monkeypatch.setattr(estimates, "imu_estimates", lambda *_, **__: pytest.fail("worked out on the spot"))
+    monkeypatch.setattr(measurement, "imu_estimates", lambda *_, **__: pytest.fail("worked out on the spot"))
     feed.run(1.0)
     assert feed.collector.pending(feed.now_s) is not None
     assert before <= feed.collector.status(feed.now_s).progress < 1.0

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.noise.channels import lower_quartile
-from companion.calibration.seconds.batch import Batch
-from companion.calibration.seconds.batches import BatchSource
+from companion.calibration.seconds.batch import Batch, BatchSource
 from companion.calibration.stillness.gates import (
     GLRT_RATIO,
     ImuGate,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.means.pose_windows import heading_window, tilt_window
+from companion.calibration.means.pose import heading_window, tilt_window
 from companion.calibration.means.windows import ImuInput, imu_estimates
 from companion.calibration.noise.allan import AllanModel, NoiseProfile, noise_profile, slope_variance
 from companion.calibration.seconds.batch import Batch

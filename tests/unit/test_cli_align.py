@@ -16,7 +16,7 @@ from companion import cli
 from companion.calibration.alignment.align_record import AlignmentRecord, GradienterSettings
 from companion.cli.align import alignment_lines
 from companion.errors import StorageError
-from companion.storage.alignment import AlignmentStore
+from companion.storage.learned import AlignmentStore
 from companion.storage.state import unsealed
 
 CONFIG = '[mavlink]\nurl = "tcp:h:1"\n[[imu]]\nname = "a"\nsource = "autopilot"\n[control]\nsocket = "{}"\n'
@@ -89,7 +89,7 @@ KILLED = """
 import sys
 from pathlib import Path
 import msgspec
-from companion.storage.alignment import AlignmentStore
+from companion.storage.learned import AlignmentStore
 store = AlignmentStore(Path(sys.argv[1]))
 record = store.read()
 print("begun", flush=True)

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.component.component import Component
 from companion.component.permission import MAX_REMEMBERED, Permission
 from companion.config import parse
-from companion.config.senders import Senders
+from companion.config.sections import Senders
 from companion.daemon.process.run import RELOADABLE
 from companion.daemon.process.service import Service
 from companion.errors import ConfigError

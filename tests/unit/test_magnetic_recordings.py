@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.means.pose_windows import FieldWindow, HeadingWindow
+from companion.calibration.means.pose import FieldWindow, HeadingWindow
 from companion.calibration.solution.magnetic import Heading, assess
 from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
 from companion.physics.earth import MagneticField

@@ -17,7 +17,7 @@ from companion.config import parse
 from companion.config.sections import Config, Noise
 from companion.configured import models
 from companion.errors import ConfigError, StorageError
-from companion.recording import details, topics
+from companion.recording import journal, topics
 from companion.recording.files import Beginning, RecordingFile, versions
 from companion.recording.journal import Entry
 from companion.recording.past import Past
@@ -369,7 +369,7 @@ def recording(
         if written_s is not None and t >= written_s:
             gyro[1] += 100.0 * DEG_H
         if t == written_s:
-            event = topics.JournalEntry(t, "reset", details.encode(("offsets written", None)))
+            event = topics.JournalEntry(t, "reset", journal.encode(("offsets written", None)))
             entries.append((topics.JOURNAL, t, msgspec.json.encode, (event,)))
         sample = ImuSample(t, tuple(gyro), tuple(accel), 25.0)
         entries.append((topics.IMU + imu, t, topics.imu_json, (sample, message)))

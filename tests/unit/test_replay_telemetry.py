@@ -8,7 +8,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.recording import topics
-from companion.replay.telemetry import Telemetry
+from companion.replay.engine import Telemetry
 
 DIALECT: Any = mavlink
 
@@ -20,7 +20,7 @@ def test_what_came_too_long_ago_or_not_yet_is_not_found(
     reading: int, found: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A sample behind a hundred readings that nobody counted, of which thirty are remembered."""
-    monkeypatch.setattr("companion.replay.telemetry.PENDING", 30)
+    monkeypatch.setattr("companion.replay.engine.PENDING", 30)
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     telemetry = Telemetry()
     for number in range(100):

@@ -17,9 +17,9 @@ from companion.calibration.collector.trace import Trace
 from companion.calibration.solution.record import ImuRecord, Record, WrittenParameter, to_json
 from companion.errors import StorageError
 from companion.storage import records as records_module
-from companion.storage.atomic import remove_durably, write_atomically
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from companion.storage.records import RecordStore
+from companion.storage.state import remove_durably, write_atomically
 
 
 def _record(reason: str) -> Record:
@@ -90,7 +90,7 @@ def test_order_is_content_then_name_then_folder(tmp_path: Path, monkeypatch: pyt
 
 _WRITER = """
 import sys, pathlib
-from companion.storage.atomic import write_atomically
+from companion.storage.state import write_atomically
 path, n = pathlib.Path(sys.argv[1]), 0
 while True:
     n += 1

@@ -12,7 +12,7 @@ import pytest
 
 from companion.calibration.solution.history import Measured, Point, PowerUp
 from companion.errors import StorageError
-from companion.storage.biases import KEEP_IMUS, KEEP_POINTS, BiasStore, KnownImu
+from companion.storage.learned import KEEP_IMUS, KEEP_POINTS, BiasStore, KnownImu
 
 ONE = Measured(bias=(0.1, 1e-17, -3.0), sigma_stat=(1.0, 2.0, 3.0), sigma_use=(4.0, 5.0, 6.0), sigma_shared=(0, 0, 0))
 

@@ -18,13 +18,11 @@ import pytest
 from companion.calibration.solution.record import Arming
 from companion.errors import StorageError
 from companion.storage import signing_time
-from companion.storage.alignment import AlignmentStore
-from companion.storage.biases import BiasStore
-from companion.storage.bounded import BoundedList
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
+from companion.storage.learned import AlignmentStore, BiasStore
 from companion.storage.profiles import ProfileStore, read_profile
 from companion.storage.records import RecordStore
-from companion.storage.state import MOST_ASIDE, sealed, unsealed
+from companion.storage.state import MOST_ASIDE, BoundedList, sealed, unsealed
 from companion.web.access import kept_token
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 
 from companion.calibration.collector.sources import Source, compass_source, gradienter_source, imu_source
-from companion.calibration.means.field_heading import FieldHeading
-from companion.calibration.means.pose_models import CompassModel, GradienterModel
+from companion.calibration.means.pose import CompassModel, FieldHeading, GradienterModel
 from companion.calibration.means.windows import ImuInput, integer_steps
 from companion.calibration.stillness.gates import ImuGate, Verdict
 from companion.calibration.stillness.settling import Lag

@@ -13,19 +13,24 @@ from typing import Final
 import msgspec
 
 from companion.calibration.collector.intake import Intake
-from companion.calibration.collector.measurement import Measurement, PoseSeconds
-from companion.calibration.collector.outlook import Glance, Obstacle, Status, obstacle, settling
+from companion.calibration.collector.measurement import Estimates, Found, Measurement, PoseSeconds, Work
+from companion.calibration.collector.outlook import (
+    Glance,
+    Obstacle,
+    Settings,
+    Status,
+    expected_s,
+    is_enough,
+    obstacle,
+    settling,
+)
 from companion.calibration.collector.sources import Source, SourceStatus
-from companion.calibration.collector.stop import Settings, expected_s, is_enough
 from companion.calibration.collector.trace import Snapshot, TraceLog
-from companion.calibration.means.estimates import Estimates, Found, Work
-from companion.calibration.means.pose_models import CompassModel, GradienterModel
-from companion.calibration.means.pose_windows import HeadingWindow, TiltWindow
+from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.calibration.means.windows import ImuInput, ImuWindow, Window
 from companion.calibration.seconds.batch import Batch
 from companion.calibration.stillness.gates import ImuGate
-from companion.calibration.stillness.heading_watch import HeadingWatch
-from companion.calibration.stillness.settling import AT_ONCE, Lag
+from companion.calibration.stillness.settling import AT_ONCE, HeadingWatch, Lag
 from companion.calibration.stillness.stretch import Stretch
 from companion.errors import CalibrationRefusedError
 

@@ -10,8 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.seconds.batch import Batch
-from companion.calibration.seconds.batches import BatchSource
+from companion.calibration.seconds.batch import Batch, BatchSource
 from companion.calibration.stillness.gates import ImuGate, PoseGate, Verdict, compass_gate, gradienter_gate
 from companion.calibration.stillness.settling import Lag, Settling
 

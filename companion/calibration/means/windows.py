@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.calibration.means.integers import integer_columns
-from companion.calibration.means.pose_windows import FieldWindow, HeadingWindow, TiltWindow
+from companion.calibration.means.pose import FieldWindow, HeadingWindow, TiltWindow
 from companion.calibration.means.quantised import EDGE_RMS
-from companion.calibration.means.ramps import RAMP_BATCHES, is_ramp
 from companion.calibration.noise.allan import (
     FLOOR_OF_FLICKER,
     PROFILES,
@@ -27,7 +26,7 @@ from companion.calibration.noise.allan import (
     slope_variance,
     white_noise,
 )
-from companion.calibration.noise.robust import huber_line, median, robust_mean
+from companion.calibration.noise.robust import RAMP_BATCHES, huber_line, is_ramp, median, robust_mean
 from companion.calibration.seconds.batch import Batch
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Floats, vector

@@ -15,8 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.means.pose_models import CompassModel, vehicle_heading_rad
-from companion.calibration.means.pose_windows import FieldWindow, HeadingWindow
+from companion.calibration.means.pose import CompassModel, FieldWindow, HeadingWindow, vehicle_heading_rad
 from companion.calibration.solution.record import Magnetic
 from companion.calibration.solution.site import LocalEarth
 from companion.physics.earth import MagneticField

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from companion.calibration.collector.rolling import ImuWindow, TiltWindow, Window
-from companion.calibration.means.pose_models import CompassModel, GradienterModel, up_in_vehicle, vehicle_heading_rad
+from companion.calibration.means.pose import CompassModel, GradienterModel, up_in_vehicle, vehicle_heading_rad
 from companion.calibration.request import What
 from companion.calibration.solution import magnetic
 from companion.calibration.solution.bias import (

@@ -1,22 +1,28 @@
-"""Has the fluid come to rest? A gradienter, or a compass that averages, goes on moving after the aircraft has stopped.
+"""What a pose sensor says after a movement, and what it says without one.
 
-Both follow the truth with a time constant: the fluid of a field gradienter is left with a tenth of what is missing
-after every second (BEI INC manual; sensors.md 2.2 and 2.7). The gate on its movement sees only the steep beginning of
-that. So whenever the IMUs say that a second was not still, what the sensor is off by at its end is taken from its own
-readings, and its seconds count again once that has died away to a tenth of its sigma. The IMUs' own seconds count
-meanwhile: nobody who stands still waits longer.
+A gradienter, or a compass that averages, goes on moving after the aircraft has stopped: both follow the truth with a
+time constant; the fluid of a field gradienter is left with a tenth of what is missing after every second (BEI INC
+manual; sensors.md 2.2 and 2.7). The gate on its movement sees only the steep beginning of that. So whenever the IMUs
+say that a second was not still, what the sensor is off by at its end is taken from its own readings, and its seconds
+count again once that has died away to a tenth of its sigma. The IMUs' own seconds count meanwhile: nobody who stands
+still waits longer.
+
+And a compass that turns while nothing else does shows that not the aircraft turns, but the field.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
+from collections.abc import Sequence
 from typing import Final
 
 import msgspec
 import numpy as np
 
 from companion.calibration.seconds.batch import Batch
-from companion.physics.frames import Floats
+from companion.calibration.stillness.gates import Verdict
+from companion.physics.frames import Floats, wrap_deg
 
 UNKNOWN_DEG: Final = 5.0
 """What it may be off by after a movement during which nothing was heard of it."""
@@ -95,3 +101,49 @@ class Settling:
 
     def _turn(self, difference: Floats) -> Floats:
         return np.asarray(np.mod(difference + 180.0, 360.0) - 180.0) if self._circle else difference
+
+
+SMOOTHED_OVER: Final = 5
+"""Seconds of headings behind a value, so that noise does not look like wandering."""
+BLIND_S: Final = 5
+"""So long may others say nothing (offsets are written, and readings forgotten) before it begins anew."""
+
+
+class HeadingWatch:
+    """The range of the heading since the gyros and the gradienter last moved."""
+
+    def __init__(self) -> None:
+        self._begin()
+
+    def _begin(self) -> None:
+        self._first_deg: float | None = None
+        self._latest: deque[float] = deque(maxlen=SMOOTHED_OVER)
+        self._range_deg: tuple[float, float] | None = None
+        self._blind = 0
+
+    def take(self, heading: Batch | None, others: Sequence[Verdict]) -> None:
+        """One second: its heading, where one came, and what the gates of all other sources said."""
+        if any(not verdict.still and not verdict.fault for verdict in others) or not others:
+            self._begin()
+            return
+        if any(verdict.fault for verdict in others):
+            self._blind += 1
+            return
+        if self._blind > BLIND_S:
+            self._begin()
+        self._blind = 0
+        if heading is None:
+            return
+        value = float(heading.mean[0])
+        if self._first_deg is None:
+            self._first_deg = value
+        self._latest.append(wrap_deg(value - self._first_deg))
+        if len(self._latest) == SMOOTHED_OVER:
+            smooth_deg = sum(self._latest) / SMOOTHED_OVER
+            low_deg, high_deg = self._range_deg or (smooth_deg, smooth_deg)
+            self._range_deg = min(low_deg, smooth_deg), max(high_deg, smooth_deg)
+
+    @property
+    def wander_deg(self) -> float | None:
+        """How far apart its headings lay; None until it has seen enough."""
+        return None if self._range_deg is None else self._range_deg[1] - self._range_deg[0]

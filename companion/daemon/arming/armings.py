@@ -17,7 +17,7 @@ from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.readiness import Readiness
 from companion.daemon.core import Core
 from companion.errors import StorageError
-from companion.storage.bounded import BoundedList
+from companion.storage.state import BoundedList
 
 logger = logging.getLogger(__name__)
 

@@ -31,7 +31,7 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import ALIGNMENT, Job
 from companion.errors import AutopilotError, StorageError
-from companion.storage.bounded import BoundedList
+from companion.storage.state import BoundedList
 
 logger = logging.getLogger(__name__)
 

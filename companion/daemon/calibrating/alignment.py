@@ -12,7 +12,7 @@ from companion.config.sections import Config
 from companion.configured import models
 from companion.daemon.core import Offload
 from companion.links.system.listeners import Listeners
-from companion.storage.alignment import AlignmentStore
+from companion.storage.learned import AlignmentStore
 
 logger = logging.getLogger(__name__)
 

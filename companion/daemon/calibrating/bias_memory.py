@@ -35,7 +35,7 @@ from companion.daemon.devices.sensors import SerialSensor
 from companion.errors import StorageError
 from companion.physics.frames import vector
 from companion.samples import Triad
-from companion.storage.biases import KEEP_POINTS, BiasStore, KnownImu
+from companion.storage.learned import KEEP_POINTS, BiasStore, KnownImu
 from companion.storage.records import RecordStore
 
 logger = logging.getLogger(__name__)

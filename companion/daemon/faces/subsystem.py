@@ -11,8 +11,7 @@ from companion.calibration.solution.record import ImuRecord
 from companion.component.component import Component
 from companion.component.own_parameters import OwnParameters
 from companion.component.service import JobResult
-from companion.config.sections import AtArm, Config
-from companion.config.senders import Senders
+from companion.config.sections import AtArm, Config, Senders
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.subsystem import Calibrating

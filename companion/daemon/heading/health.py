@@ -8,8 +8,8 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.attitude.corrections import REFUSED_S
 from companion.attitude.estimator import Attitude
-from companion.attitude.heading import REFUSED_S
 from companion.attitude.quaternion import (
     Quaternion,
     Triple,

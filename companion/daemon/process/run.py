@@ -16,8 +16,7 @@ from typing import Any, Final
 import msgspec
 
 from companion.config import load
-from companion.config.sections import Config
-from companion.config.senders import Senders
+from companion.config.sections import Config, Senders
 from companion.config.words import shown
 from companion.daemon.core import Offload
 from companion.daemon.faces.subsystem import AT_ARM

@@ -34,9 +34,8 @@ from companion.errors import StorageError
 from companion.links.mavlink.link import Direction
 from companion.links.system.request import Object
 from companion.recording import topics
-from companion.recording.details import Offsets, Solved
 from companion.recording.files import FOLDER_MODE, Beginning, RecordingFile, Ring, is_available, versions
-from companion.recording.journal import Journal
+from companion.recording.journal import Journal, Offsets, Solved
 from companion.recording.past import Message, Past
 from companion.recording.redact import KeyFilter
 

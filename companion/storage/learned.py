@@ -1,4 +1,4 @@
-"""What earlier calibrations found of each IMU: one small file, there whole or not at all."""
+"""What is known from before: the gradienter's alignment in force, and what earlier calibrations found of each IMU."""
 
 from __future__ import annotations
 
@@ -7,8 +7,19 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.solution.history import Point, check
+from companion.calibration.alignment import align_record
+from companion.calibration.solution import history
 from companion.storage.state import StateFile
+
+
+class AlignmentStore(StateFile[align_record.AlignmentRecord]):
+    """`alignment.json` in the storage directory."""
+
+    def __init__(self, directory: Path) -> None:
+        super().__init__(
+            directory / "alignment.json", align_record.AlignmentRecord, align_record.check, align_record.FORMAT_VERSION
+        )
+
 
 FORMAT_VERSION: Final = 1
 KEEP_POINTS: Final = 40
@@ -20,7 +31,7 @@ class KnownImu(msgspec.Struct, frozen=True, kw_only=True):
     """One IMU: which sensor that was, and its points, oldest first."""
 
     identity: dict[str, str]
-    points: tuple[Point, ...] = ()
+    points: tuple[history.Point, ...] = ()
 
 
 class _File(msgspec.Struct, frozen=True, kw_only=True):
@@ -56,4 +67,4 @@ class BiasStore:
 def _check(found: _File) -> None:
     for known in found.imus.values():
         for point in known.points:
-            check(point)
+            history.check(point)
