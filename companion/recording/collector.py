@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
-from companion.calibration.collector.rolling import ImuInput, RollingCollector, Settings, Window
-from companion.calibration.means.pose import CompassModel, GradienterModel
-from companion.calibration.stillness.settling import AT_ONCE, Lag
+from companion.calibration.collector.rolling import ImuInput, RollingCollector, Window
 from companion.links.system.listeners import Listeners
 from companion.recording.journal import Journal, Means
 from companion.samples import CompassSample, ImuSample, TiltSample
@@ -19,29 +16,9 @@ WINDOWS_KEPT: Final = 240
 
 
 class RecordedCollector(RollingCollector):
-    """`RollingCollector`, every call of which goes into a journal first.
+    """`RollingCollector`, every call of which goes into a journal first; made as that is."""
 
-    Args:
-        settings: as the base class.
-        imus: likewise.
-        gradienter: likewise.
-        compass: likewise.
-        gradienter_lag: likewise.
-        compass_lag: likewise.
-        field_by: likewise.
-    """
-
-    def __init__(
-        self,
-        settings: Settings,
-        imus: Sequence[ImuInput],
-        *,
-        gradienter: bool,
-        compass: bool,
-        gradienter_lag: Lag = AT_ONCE,
-        compass_lag: Lag = AT_ONCE,
-        field_by: tuple[CompassModel, GradienterModel | None] | None = None,
-    ) -> None:
+    def __init__(self, *arguments: Any, **named: Any) -> None:
         self.journal = Journal()
         self.windows: deque[tuple[int, Window]] = deque(maxlen=WINDOWS_KEPT)
         """The latest windows of whole stretches, with their numbers."""
@@ -51,15 +28,7 @@ class RecordedCollector(RollingCollector):
         self._messages: dict[str, str | None] = {}
         """By IMU, the autopilot's message that its samples come in."""
         self._windows_made = 0
-        super().__init__(
-            settings,
-            imus,
-            gradienter=gradienter,
-            compass=compass,
-            gradienter_lag=gradienter_lag,
-            compass_lag=compass_lag,
-            field_by=field_by,
-        )
+        super().__init__(*arguments, **named)
 
     def number_of(self, window: Window) -> int | None:
         """The number of a window that was made lately."""

@@ -13,8 +13,8 @@ from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 
-from companion.calibration.solution.record import Magnetic, Pose, Record, Site, to_json
-from companion.samples import CompassSample, ImuSample, TiltSample, Vector
+from companion.calibration.solution.record import Record, to_json
+from companion.samples import CompassSample, ImuSample, TiltSample
 
 FORMAT_VERSION: Final = "2"
 METADATA: Final = "companion"
@@ -82,46 +82,12 @@ class CompassEntry(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     roll_deg: float | None = None
 
 
-class ImuResult(msgspec.Struct, frozen=True):
-    """One IMU of a calibration, as far as a plot can show it."""
-
-    name: str
-    samples: int
-    temperature_degc: float | None
-    gyro_bias_rad_s: Vector | None
-    gyro_sigma_stat_rad_s: Vector | None
-    gyro_sigma_use_rad_s: Vector | None
-    accel_bias_m_s2: Vector | None
-    accel_sigma_stat_m_s2: Vector | None
-    accel_sigma_use_m_s2: Vector | None
-    residual_gyro_rad_s: Vector | None
-    residual_accel_m_s2: Vector | None
-    warnings: tuple[str, ...]
-    written: tuple[str, ...]
-
-
 class RecordEntry(msgspec.Struct, frozen=True, gc=False):
-    """The exact record out of a message on the record's topic."""
+    """A calibration has ended."""
 
     t_s: float
     record: str
-
-
-class RecordView(msgspec.Struct, frozen=True):
-    """A calibration has ended: its figures as far as a schema can hold them, and the exact record as a text."""
-
-    t_s: float
-    record: str
-    state: str
-    reason: str
-    warnings: tuple[str, ...]
-    started_at: str
-    duration_s: float
-    system_id: int | None
-    pose: Pose | None
-    site: Site | None
-    magnetic: Magnetic | None
-    imus: tuple[ImuResult, ...]
+    """The whole of it, as JSON."""
 
 
 def imu_json(sample: ImuSample, message: str | None) -> bytes:
@@ -159,19 +125,8 @@ def compass_json(sample: CompassSample) -> bytes:
 
 
 def record_json(record: Record, t_s: float) -> bytes:
-    """A record: its figures, and the whole of it as a text."""
-    fields = {field: getattr(record, field) for field in RecordView.__struct_fields__ if field not in _MADE_HERE}
-    imus = tuple(
-        ImuResult(**{field: _plain(getattr(imu, field)) for field in ImuResult.__struct_fields__})
-        for imu in record.imus
-    )
-    entry = RecordView(t_s=t_s, record=to_json(record).decode(), imus=imus, **fields)
-    return msgspec.json.encode(_without_none(msgspec.to_builtins(entry)))
-
-
-def _plain(value: Any) -> Any:
-    """Of the parameters that were written, their names."""
-    return tuple(value) if isinstance(value, dict) else value
+    """A record."""
+    return msgspec.json.encode(RecordEntry(t_s, to_json(record).decode()))
 
 
 def _nine(values: Sequence[float]) -> str:
@@ -181,16 +136,6 @@ def _nine(values: Sequence[float]) -> str:
 def _known(value: float | None) -> bool:
     return value is not None and math.isfinite(value)
 
-
-def _without_none(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_none(item) for key, item in value.items() if item is not None}
-    if isinstance(value, list | tuple):
-        return [_without_none(item) for item in value]
-    return value
-
-
-_MADE_HERE: Final = frozenset({"t_s", "record", "imus"})
 
 # --- schemas
 
@@ -224,7 +169,7 @@ _KINDS: Final[dict[str, type[msgspec.Struct]]] = {
     START: StartEntry,
     PAST: PastEntry,
     JOURNAL: JournalEntry,
-    RECORD: RecordView,
+    RECORD: RecordEntry,
     GRADIENTER: TiltEntry,
     COMPASS: CompassEntry,
 }
@@ -233,4 +178,4 @@ _KINDS: Final[dict[str, type[msgspec.Struct]]] = {
 def schema_of(topic: str) -> tuple[str, dict[str, Any]]:
     """The name of a topic's schema, and the schema."""
     kind = _KINDS.get(topic) or (ImuEntry if topic.startswith(IMU) else RawBytes)
-    return f"companion.{kind.__name__.removesuffix('Entry').removesuffix('View')}", _schema(kind)
+    return f"companion.{kind.__name__.removesuffix('Entry')}", _schema(kind)

@@ -25,12 +25,13 @@ from companion.report.page import (
     card,
     damaged,
     drift,
+    history,
     moment,
     page,
     with_sigma,
     written_count,
 )
-from companion.report.seconds import history, stillness
+from companion.report.seconds import stillness
 from companion.samples import Triad, Vector
 
 MAX_WRITTEN: Final = 60

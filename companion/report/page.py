@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Final
+
+import msgspec
 
 from companion import __version__
 from companion.calibration.noise.allan import NoiseProfile
@@ -13,14 +16,17 @@ from companion.calibration.solution.record import Arming, Record
 from companion.physics.units import DEG_H, MG
 from companion.report import svg
 from companion.report.markup import Child, Markup, join, number, tag
-from companion.report.seconds import Point, clock_is_sound
-from companion.samples import Triad
+from companion.samples import Triad, Vector
 
 UNITS: Final[Mapping[Triad, tuple[float, str]]] = {"gyro": (DEG_H, "deg/h"), "accel": (MG, "mg")}
 NAMES: Final[Mapping[Triad, str]] = {"gyro": "Gyro", "accel": "Accelerometer"}
 TRIADS: Final[tuple[Triad, ...]] = ("gyro", "accel")
 AXES: Final = ("x", "y", "z")
 CLASSES: Final = ("sx", "sy", "sz")
+_MOST: Final = 1e4
+"""SI units: beyond is a damaged file, which must not squash the rest of a plot."""
+_LATEST_S: Final = 230 * 365.25 * 86400
+"""The year 2200."""
 MAX_WARNINGS: Final = 40
 MAX_IMUS: Final = 4
 """Three of an autopilot and our own; more are said, not shown: a page stays below half a megabyte."""
@@ -131,6 +137,48 @@ def with_sigma(value: float, sigma: float, unit: float, sign: str = "+") -> tupl
     shown = abs(sigma / unit)
     digits = min(max(1 - math.floor(math.log10(shown)), 0), 5) if 0 < shown < 1e9 else 1
     return number(value, f"{sign}.{digits}f", value / unit), number(sigma, f".{digits}f", sigma / unit)
+
+
+class Point(msgspec.Struct, frozen=True):
+    """One triad of one IMU in one calibration of the history; SI units."""
+
+    number: int
+    unix_s: float | None
+    bias: Vector
+    sigma_use: Vector
+
+
+def history(records: Sequence[tuple[int, Record]], imu: str, triad: Triad) -> list[Point]:
+    """Biases of one triad over finished calibrations, in the order given; those that found none are left out."""
+    found: list[Point] = []
+    for which, record in records:
+        for one in record.imus:
+            bias, sigma = (
+                (one.gyro_bias_rad_s, one.gyro_sigma_use_rad_s)
+                if triad == "gyro"
+                else (one.accel_bias_m_s2, one.accel_sigma_use_m_s2)
+            )
+            if one.name != imu or record.state != "done" or bias is None or sigma is None:
+                continue
+            if max(map(abs, (*bias, *sigma))) < _MOST:
+                found.append(Point(which, unix_s(record.started_at), bias, sigma))
+    return found
+
+
+def unix_s(moment: str) -> float | None:
+    """Seconds since 1970 of an ISO 8601 time, which is UTC if it does not say; None: it is none of this age."""
+    try:
+        parsed = datetime.datetime.fromisoformat(moment)
+        seconds = (parsed if parsed.tzinfo else parsed.replace(tzinfo=datetime.UTC)).timestamp()
+    except (ValueError, OverflowError):
+        return None
+    return seconds if 0.0 <= seconds < _LATEST_S else None
+
+
+def clock_is_sound(points: Sequence[Point]) -> bool:
+    """Whether the times ascend: a field computer without a clock battery begins in the past at every boot."""
+    known = [point.unix_s for point in points]
+    return None not in known and all(a <= b for a, b in itertools.pairwise(known) if a is not None and b is not None)
 
 
 def drift(

@@ -1,27 +1,17 @@
-"""Was it still? The verdicts of a calibration second by second; and figures for plots of biases over the history."""
+"""Was it still? The verdicts of a calibration second by second."""
 
 from __future__ import annotations
 
-import datetime
-import itertools
-from collections.abc import Sequence
 from typing import Final, Literal
 
 import msgspec
 
 from companion.calibration.collector.trace import Trace, VerdictTrace
-from companion.calibration.solution.record import Record
 from companion.report import svg
 from companion.report.markup import Child, Markup, tag
 from companion.report.page import card
-from companion.samples import Triad, Vector
 
 State = Literal["still", "moving", "fault", "unknown"]
-
-_MOST: Final = 1e4
-"""SI units: beyond is a damaged file, which must not squash the rest of a plot."""
-_LATEST_S: Final = 230 * 365.25 * 86400
-"""The year 2200."""
 
 
 class Run(msgspec.Struct, frozen=True):
@@ -47,48 +37,6 @@ def runs(trace: Trace, verdict: VerdictTrace) -> list[Run]:
         else:
             found.append(Run(second, second, state, verdict.words[k] or ""))
     return found
-
-
-class Point(msgspec.Struct, frozen=True):
-    """One triad of one IMU in one calibration of the history; SI units."""
-
-    number: int
-    unix_s: float | None
-    bias: Vector
-    sigma_use: Vector
-
-
-def history(records: Sequence[tuple[int, Record]], imu: str, triad: Triad) -> list[Point]:
-    """Biases of one triad over finished calibrations, in the order given; those that found none are left out."""
-    found: list[Point] = []
-    for number, record in records:
-        for one in record.imus:
-            bias, sigma = (
-                (one.gyro_bias_rad_s, one.gyro_sigma_use_rad_s)
-                if triad == "gyro"
-                else (one.accel_bias_m_s2, one.accel_sigma_use_m_s2)
-            )
-            if one.name != imu or record.state != "done" or bias is None or sigma is None:
-                continue
-            if max(map(abs, (*bias, *sigma))) < _MOST:
-                found.append(Point(number, unix_s(record.started_at), bias, sigma))
-    return found
-
-
-def unix_s(moment: str) -> float | None:
-    """Seconds since 1970 of an ISO 8601 time, which is UTC if it does not say; None: it is none of this age."""
-    try:
-        parsed = datetime.datetime.fromisoformat(moment)
-        seconds = (parsed if parsed.tzinfo else parsed.replace(tzinfo=datetime.UTC)).timestamp()
-    except (ValueError, OverflowError):
-        return None
-    return seconds if 0.0 <= seconds < _LATEST_S else None
-
-
-def clock_is_sound(points: Sequence[Point]) -> bool:
-    """Whether the times ascend: a field computer without a clock battery begins in the past at every boot."""
-    known = [point.unix_s for point in points]
-    return None not in known and all(a <= b for a, b in itertools.pairwise(known) if a is not None and b is not None)
 
 
 MAX_SOURCES: Final = 8

@@ -60,7 +60,7 @@ def test_both_imus_are_calibrated_at_once_and_the_autopilot_is_right_afterwards(
                 assert rig.double.parameter(name) == written.read_back == np.float32(written.after)
             assert own.written == {}
             assert own.residual_gyro_rad_s is None
-            # The seconds behind the figures lie beside the record: their mean is the residual and the Earth's rate.
+            # The seconds behind the figures lie beside the record.
             (entry,) = rig.service.calibrating.store.entries()
             trace = rig.service.calibrating.store.trace(entry)
             assert trace is not None
@@ -68,13 +68,6 @@ def test_both_imus_are_calibrated_at_once_and_the_autopilot_is_right_afterwards(
             first, last = trace.measured
             used = [k for k, second in enumerate(trace.second) if first <= second < last and trace.good[k]]
             assert len(used) >= 10
-            for imu, seen in zip(record.imus, trace.imus, strict=True):
-                assert sum(seen.samples[k] for k in used) == imu.samples
-                rest = imu.residual_gyro_rad_s or imu.gyro_bias_rad_s
-                assert rest is not None
-                rates = [seen.gyro_rad_s[k] for k in used]
-                mean = np.mean([rate for rate in rates if rate is not None], axis=0)
-                assert np.abs(mean - rest).max() < 16.0 * DEG_H
             left = rig.double.residual(1, rig.now_s)
             assert np.abs(left.gyro_rad_s).max() < 20 * DEG_H
             assert np.abs(left.accel_m_s2).max() < 0.3 * MG

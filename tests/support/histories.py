@@ -114,38 +114,17 @@ def white_trace(
     of: Record,
     seconds: int = 40,
     *,
-    gyro_deg_h: float = 7.0,
-    accel_mg: float = 0.05,
-    seed: int = 7,
     moved: bool = False,
 ) -> Trace:
-    """A trace of white noise of that density (deg/h*sqrt(s), mg*sqrt(s)); `moved`: it never stood still for long."""
-    rng = np.random.default_rng(seed)
+    """A trace of every second; `moved`: it never stood still for long."""
     second = tuple(range(-5, seconds + 5))
     shaken = [moved and k % 9 in (3, 4) for k in range(len(second))]
     words = tuple("gyro fc 0.31 deg/s > 0.10" if shake else None for shake in shaken)
     names = [imu.name for imu in of.imus] or ["fc", "own"]
     profile = noise_profile("icm42688p")
-    imus = []
-    for name in names:
-        gyro = rng.normal(0.0, gyro_deg_h * DEG_H, (len(second), 3)) + np.multiply(GYRO_DEG_H, DEG_H)
-        accel = rng.normal(0.0, accel_mg * MG, (len(second), 3)) + np.array([0.85, 0.5, -9.75])
-        imus.append(
-            ImuTrace(
-                name=name,
-                profile=profile.name,
-                gyro_noise=profile.gyro,
-                accel_noise=profile.accel,
-                gyro_step_rad_s=0.0,
-                accel_step_m_s2=0.0,
-                samples=(100,) * len(second),
-                temperature_degc=(25.0,) * len(second),
-                gyro_rad_s=tuple(_axes(row) for row in gyro),
-                gyro_variance_rad2_s2=tuple(_axes(np.full(3, (gyro_deg_h * DEG_H) ** 2 * 100)) for _ in second),
-                accel_m_s2=tuple(_axes(row) for row in accel),
-                accel_variance_m2_s4=tuple(_axes(np.full(3, (accel_mg * MG) ** 2 * 100)) for _ in second),
-            )
-        )
+    imus = [
+        ImuTrace(name=name, profile=profile.name, gyro_noise=profile.gyro, accel_noise=profile.accel) for name in names
+    ]
     still: tuple[str | None, ...] = (None,) * len(second)
     silent = tuple("no data from gradienter for 3 s" if moved and 20 < k < 26 else None for k in range(len(second)))
     sources = [("imu", name, words if name == "fc" else still) for name in names]

@@ -154,7 +154,7 @@ def test_student_ratio_is_the_tabled_one(freedom: float, quantile: float) -> Non
 
 
 def test_profiles_carry_the_catalogue() -> None:
-    icm = noise_profile("ICM-42688-P")
+    icm = noise_profile("icm42688p")
     assert icm.gyro.white == pytest.approx(7.1 * DEG_H)
     assert icm.gyro.floor == pytest.approx(3.0 * DEG_H)
     assert icm.accel.white == pytest.approx(49.5e-3 * MG)
@@ -165,6 +165,6 @@ def test_profiles_carry_the_catalogue() -> None:
         assert use_variance(noise_profile(None).gyro, 1e9, 180.0) >= 0.99 * use_variance(profile.gyro, 1e9, 180.0)
 
 
-def test_unknown_profile_is_refused_with_the_nearest_name() -> None:
-    with pytest.raises(ConfigError, match=r"'bmi08'; did you mean 'bmi088'\? \(known: icm42688p"):
+def test_unknown_profile_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"'bmi08' \(known: icm42688p"):
         noise_profile("bmi08")

@@ -9,7 +9,7 @@ import pytest
 from companion.calibration.collector import trace as traces
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.collector.trace import MAX_SECONDS, Trace
-from tests.support.still_aircraft import BIAS, FORCE, GYRO_NOISE, RATE_HZ, Feeder, imu, settings
+from tests.support.still_aircraft import Feeder, imu, settings
 
 YAW_90 = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -26,7 +26,7 @@ def _trace(feed: Feeder, started_s: float, measured_s: tuple[float, float] | Non
     return feed.collector.snapshot(started_s, measured_s).trace("2026-05-01T10:00:00+00:00")
 
 
-def test_the_seconds_hold_what_was_fed_in_the_axes_of_the_vehicle() -> None:
+def test_every_second_of_the_window_has_the_verdict_of_every_source() -> None:
     feed = _feeder()
     feed.run(20.0)
     window = feed.collector.window(feed.now_s)
@@ -40,13 +40,7 @@ def test_the_seconds_hold_what_was_fed_in_the_axes_of_the_vehicle() -> None:
         ("imu", "fc"), ("imu", "own"), ("gradienter", "gradienter"), ("compass", "compass"),
     }  # fmt: skip
     assert all(words is None for one in trace.verdicts for words in one.words)
-    for found, rotation in zip(trace.imus, (np.eye(3), YAW_90), strict=True):
-        assert set(found.samples) == {RATE_HZ}
-        # A second's mean scatters by sigma / sqrt(n); 5 sigmas over 20 s and 3 axes.
-        off = np.array(found.gyro_rad_s) - rotation @ BIAS
-        assert np.abs(off).max() < 5 * GYRO_NOISE / np.sqrt(RATE_HZ)
-        assert np.allclose(np.array(found.accel_m_s2).mean(axis=0), rotation @ FORCE, atol=0.01)
-        assert np.allclose(np.array(found.gyro_variance_rad2_s2).mean(axis=0), GYRO_NOISE**2, rtol=0.2)
+    assert [found.name for found in trace.imus] == ["fc", "own"]
 
 
 def test_a_movement_is_kept_in_the_words_of_its_gate_although_the_stretch_is_forgotten() -> None:
@@ -73,21 +67,17 @@ def test_a_movement_is_kept_in_the_words_of_its_gate_although_the_stretch_is_for
     assert trace.second[-1] >= 20
 
 
-def test_a_silent_second_has_no_figures_and_says_so() -> None:
+def test_a_silent_second_says_so() -> None:
     feed = _feeder()
     feed.run(5.0)
     feed.change = lambda name, _t, rows: None if name == "own" else rows
     feed.run(4.0)
     feed.waiting_for()
     trace = _trace(feed, 1000.5, None)
-    own = next(imu for imu in trace.imus if imu.name == "own")
-    silent = [k for k, n in enumerate(own.samples) if n == 0][1:]  # the first second is not whole
-    assert silent
     verdict = next(one for one in trace.verdicts if one.name == "own")
-    for k in silent:
-        assert own.gyro_rad_s[k] is own.accel_m_s2[k] is own.gyro_variance_rad2_s2[k] is None
-        assert verdict.fault[k]
-        assert verdict.words[k] == "imu own was silent for a second"
+    silent = [k for k, words in enumerate(verdict.words) if words == "imu own was silent for a second"]
+    assert len(silent) >= 3
+    assert all(verdict.fault[k] for k in silent)
 
 
 def test_it_is_bounded_and_says_what_it_lost() -> None:
@@ -109,7 +99,6 @@ def test_it_comes_back_whole_and_ragged_ones_are_refused() -> None:
     for broken in (
         msgspec.structs.replace(trace, good=trace.good[1:]),
         msgspec.structs.replace(trace, second=trace.second[::-1]),
-        msgspec.structs.replace(trace, imus=(msgspec.structs.replace(trace.imus[0], samples=()),)),
     ):
         with pytest.raises(msgspec.ValidationError):
             traces.from_json(traces.to_json(broken))

@@ -6,8 +6,8 @@ import msgspec
 import pytest
 
 from companion.physics.units import DEG_H
-from companion.report import seconds
-from companion.report.seconds import Point, clock_is_sound, history, runs
+from companion.report.page import Point, clock_is_sound, history, unix_s
+from companion.report.seconds import runs
 from tests.support.histories import PER_K_DEG_H, record, white_trace
 
 
@@ -42,5 +42,5 @@ def test_the_history_holds_what_finished_in_its_order() -> None:
 
 def test_a_clock_that_went_back_or_is_unreadable_is_not_sound() -> None:
     assert not clock_is_sound([Point(k, at_s, (0.0,) * 3, (1.0,) * 3) for k, at_s in enumerate((100.0, 50.0))])
-    assert not clock_is_sound([Point(1, seconds.unix_s("yesterday"), (0.0,) * 3, (0.0,) * 3)])
-    assert seconds.unix_s("2026-05-01T10:00:00+02:00") == seconds.unix_s("2026-05-01T08:00:00")
+    assert not clock_is_sound([Point(1, unix_s("yesterday"), (0.0,) * 3, (0.0,) * 3)])
+    assert unix_s("2026-05-01T10:00:00+02:00") == unix_s("2026-05-01T08:00:00")

@@ -23,7 +23,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final, Literal
 
 import numpy as np
@@ -224,13 +224,13 @@ class Model:
             turn = attitude.T @ -skew(np.array([1.0, 0.0, 0.0]))
             across = forward[0] ** 2 + forward[1] ** 2
             off = math.remainder(stand.heading_rad - math.atan2(forward[1], forward[0]), 2.0 * math.pi)
-            with rows.add(Row("compass", k + 1), np.array([off]), np.array([stand.heading_sigma_rad])) as by:
-                by[:, self.pose(k)] = (forward[0] * turn[1] - forward[1] * turn[0]) / max(across, 1e-6)
+            by = rows.add(Row("compass", k + 1), np.array([off]), np.array([stand.heading_sigma_rad]))
+            by[:, self.pose(k)] = (forward[0] * turn[1] - forward[1] * turn[0]) / max(across, 1e-6)
             if stand.on_spot:
                 placement = np.full(2, self.priors.placement_deg * DEG)
-                with rows.add(Row("spot", k + 1), at.spot - (attitude.T @ DOWN)[:2], placement) as by:
-                    by[:, self.pose(k)] = (attitude.T @ -skew(DOWN))[:2]
-                    by[:, self.spot] = -np.eye(2)
+                by = rows.add(Row("spot", k + 1), at.spot - (attitude.T @ DOWN)[:2], placement)
+                by[:, self.pose(k)] = (attitude.T @ -skew(DOWN))[:2]
+                by[:, self.spot] = -np.eye(2)
         values = self._values(at)
         for part in (slice(p, p + 1) for p in range(self.size)):
             if self.sigma[part] > 0.0:
@@ -239,8 +239,8 @@ class Model:
                     self._poses <= part.start < self._first_imu
                 )
                 row = Row("zero" if is_zero else "nothing" if of_readings else "prior")
-                with rows.add(row, -values[part], self.sigma[part]) as by:
-                    by[0, part] = 1.0
+                by = rows.add(row, -values[part], self.sigma[part])
+                by[0, part] = 1.0
         return rows.stacked()
 
     def _gradienter(self, rows: _Rows, at: Unknowns, k: int, up: Array) -> None:
@@ -252,9 +252,9 @@ class Model:
         # On the sphere of directions the readings' Jacobian is the left inverse of that of the direction.
         by_up = np.linalg.pinv(up_jacobian(self._law, x_deg, y_deg)) @ self._mounting.T
         sigma = np.array(stand.tilt_sigma_deg) * DEG
-        with rows.add(Row("gradienter", k + 1), read * DEG - at.offset_rad, sigma) as by:
-            by[:, self.offset] = np.eye(2)
-            by[:, self.pose(k)] = by_up @ skew(up)
+        by = rows.add(Row("gradienter", k + 1), read * DEG - at.offset_rad, sigma)
+        by[:, self.offset] = np.eye(2)
+        by[:, self.pose(k)] = by_up @ skew(up)
 
     def _accelerometer(self, rows: _Rows, at: Unknowns, where: tuple[int, int], imu: ImuStand, up: Array) -> None:
         k, i = where
@@ -262,22 +262,22 @@ class Model:
         aligned = up - np.cross(at.imus[i, Part.MISALIGNMENT], up)
         gravity = at.gravity_m_s2
         read = imu.accel_m_s2 - stretch @ aligned * gravity - at.imus[i, Part.ACCEL_BIAS]
-        with rows.add(Row("accelerometer", k + 1, imu.name), read, imu.accel_sigma_m_s2) as by:
-            by[:, self.pose(k)] = gravity * stretch @ (np.eye(3) - skew(at.imus[i, Part.MISALIGNMENT])) @ skew(up)
-            by[:, self.imu(i, Part.MISALIGNMENT)] = gravity * stretch @ skew(up)
-            by[:, self.imu(i, Part.SCALE)] = gravity * np.diag(aligned)
-            by[:, self.imu(i, Part.SHEAR)] = gravity * (_SHEAR @ aligned).T
-            by[:, self.imu(i, Part.ACCEL_BIAS)] = np.eye(3)
-            by[:, self.gravity] = (stretch @ aligned)[:, None]
+        by = rows.add(Row("accelerometer", k + 1, imu.name), read, imu.accel_sigma_m_s2)
+        by[:, self.pose(k)] = gravity * stretch @ (np.eye(3) - skew(at.imus[i, Part.MISALIGNMENT])) @ skew(up)
+        by[:, self.imu(i, Part.MISALIGNMENT)] = gravity * stretch @ skew(up)
+        by[:, self.imu(i, Part.SCALE)] = gravity * np.diag(aligned)
+        by[:, self.imu(i, Part.SHEAR)] = gravity * (_SHEAR @ aligned).T
+        by[:, self.imu(i, Part.ACCEL_BIAS)] = np.eye(3)
+        by[:, self.gravity] = (stretch @ aligned)[:, None]
 
     def _gyro(self, rows: _Rows, at: Unknowns, where: tuple[int, int], imu: ImuStand) -> None:
         k, i = where
         rate = at.attitudes[k] @ at.rate_rad_s
         read = imu.gyro_rad_s - rate - at.imus[i, Part.GYRO_BIAS]
-        with rows.add(Row("gyro", k + 1, imu.name), read, imu.gyro_sigma_rad_s) as by:
-            by[:, self.pose(k)] = skew(rate)
-            by[:, self.rate] = at.attitudes[k]
-            by[:, self.imu(i, Part.GYRO_BIAS)] = np.eye(3)
+        by = rows.add(Row("gyro", k + 1, imu.name), read, imu.gyro_sigma_rad_s)
+        by[:, self.pose(k)] = skew(rate)
+        by[:, self.rate] = at.attitudes[k]
+        by[:, self.imu(i, Part.GYRO_BIAS)] = np.eye(3)
 
 
 class _Rows:
@@ -285,34 +285,20 @@ class _Rows:
 
     def __init__(self, size: int) -> None:
         self._size = size
-        self._residuals: list[Array] = []
-        self._derivatives: list[Matrix] = []
+        self._parts: list[tuple[Array, Matrix, Array]] = []
         self._labels: list[Row] = []
 
-    def add(self, row: Row, residual: Array, sigma: Array) -> _Filling:
-        """Add rows; their derivatives are filled in by whoever enters what this returns."""
+    def add(self, row: Row, residual: Array, sigma: Array) -> Matrix:
+        """Add rows; returns their derivatives, to be filled in."""
         derivative = np.zeros((len(residual), self._size))
         self._labels += [row] * len(residual)
-
-        def close() -> None:
-            self._residuals.append(residual / sigma)
-            self._derivatives.append(derivative / sigma[:, None])
-
-        return _Filling(derivative, close)
+        self._parts.append((residual, derivative, sigma))
+        return derivative
 
     def stacked(self) -> tuple[Array, Matrix, list[Row]]:
-        return np.concatenate(self._residuals), np.vstack(self._derivatives), self._labels
-
-
-class _Filling:
-    def __init__(self, derivative: Matrix, close: Callable[[], None]) -> None:
-        self._derivative, self._close = derivative, close
-
-    def __enter__(self) -> Matrix:
-        return self._derivative
-
-    def __exit__(self, *_: object) -> None:
-        self._close()
+        residuals = [residual / sigma for residual, _, sigma in self._parts]
+        derivatives = [derivative / sigma[:, None] for _, derivative, sigma in self._parts]
+        return np.concatenate(residuals), np.vstack(derivatives), self._labels
 
 
 def _turned(vector_rad: Array) -> Matrix:

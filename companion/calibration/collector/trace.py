@@ -1,16 +1,15 @@
 """What was seen second by second during a calibration: kept beside its record, for whoever asks later.
 
-The record holds results only. Whether the aircraft really stood still, and what the Allan deviation of its readings
-says, can be looked at afterwards only if the one-second batches are kept. Means are what the sensor said (offsets that
-its owner subtracts are subtracted), in the vehicle's FRD like everything in the record.
+The record holds results only. Whether the aircraft really stood still can be looked at afterwards only if the verdicts
+of its seconds are kept.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from typing import Final, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -22,9 +21,6 @@ from companion.calibration.noise.allan import AllanModel
 from companion.calibration.seconds.batch import Batch
 from companion.calibration.stillness.gates import Verdict
 from companion.physics.frames import Floats
-from companion.samples import Vector
-
-T = TypeVar("T")
 
 FORMAT_VERSION: Final = 1
 
@@ -34,12 +30,10 @@ some 1 MB in memory, 100 kB on disk with three IMUs."""
 
 MAX_WORDS: Final = 100
 _FARTHEST: Final = 100_000_000
-_DIGITS: Final = 7
-"""Significant ones: 0.1 ug on 1 g."""
 
 
 class ImuTrace(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU; every tuple has one entry a second, None (0 samples) where it said nothing."""
+    """One IMU."""
 
     name: str
     profile: str
@@ -48,16 +42,6 @@ class ImuTrace(msgspec.Struct, frozen=True, kw_only=True):
     """Of that profile, rad/s."""
     accel_noise: AllanModel
     """m/s^2."""
-    gyro_step_rad_s: float
-    """Of a stream of integers; 0 for floats."""
-    accel_step_m_s2: float
-    samples: tuple[int, ...]
-    temperature_degc: tuple[float | None, ...]
-    gyro_rad_s: tuple[Vector | None, ...]
-    gyro_variance_rad2_s2: tuple[Vector | None, ...]
-    """Of one sample."""
-    accel_m_s2: tuple[Vector | None, ...]
-    accel_variance_m2_s4: tuple[Vector | None, ...]
 
 
 class VerdictTrace(msgspec.Struct, frozen=True, kw_only=True):
@@ -105,9 +89,6 @@ def from_json(data: bytes) -> Trace:
     columns: list[Sequence[object]] = [trace.good]
     for verdict in trace.verdicts:
         columns += [verdict.words, verdict.fault]
-    for imu in trace.imus:
-        columns += [imu.samples, imu.temperature_degc, imu.gyro_rad_s, imu.gyro_variance_rad2_s2]
-        columns += [imu.accel_m_s2, imu.accel_variance_m2_s4]
     if any(len(column) != length for column in columns):
         raise msgspec.ValidationError(f"not every column has {length} seconds")
     if length > MAX_SECONDS or any(abs(second) > _FARTHEST for second in (*trace.second, *(trace.measured or ()))):
@@ -162,11 +143,25 @@ class Snapshot(msgspec.Struct, frozen=True):
                 for (kind, name), column in columns.items()
             ),
             imus=tuple(
-                _imu(self.inputs[name], column)
-                for (kind, name), column in columns.items()
-                if kind == "imu" and name in self.inputs
+                ImuTrace(
+                    name=imu.name,
+                    profile=imu.profile.name,
+                    gyro_noise=imu.profile.gyro,
+                    accel_noise=imu.profile.accel,
+                )
+                for imu in self.inputs.values()
             ),
         )
+
+    def rates_rad_s(self, imu: str) -> dict[int, Floats]:
+        """By second, the mean rate that an IMU has read, (3,) in the vehicle's axes."""
+        rotation = np.asarray(self.inputs[imu].rotation)
+        return {
+            slot: rotation @ one.batch.mean[:3]
+            for slot, _, seen in self.seconds
+            for one in seen
+            if one.kind == "imu" and one.name == imu and one.batch is not None
+        }
 
 
 class TraceLog:
@@ -202,37 +197,3 @@ def _words(seen: _Seen | None) -> str | None:
     if seen is None:
         return ""
     return None if seen.verdict.still else seen.verdict.words[:MAX_WORDS]
-
-
-def _imu(imu: ImuInput, column: Sequence[_Seen | None]) -> ImuTrace:
-    rotation = np.asarray(imu.rotation, dtype=np.float64)
-    # Axes are taken as independent, as everywhere: only their variances turn.
-    squared = np.square(rotation)
-    batches = [None if seen is None else seen.batch for seen in column]
-
-    def each(figure: Callable[[Batch], T]) -> tuple[T | None, ...]:
-        return tuple(None if batch is None else figure(batch) for batch in batches)
-
-    return ImuTrace(
-        name=imu.name,
-        profile=imu.profile.name,
-        gyro_noise=imu.profile.gyro,
-        accel_noise=imu.profile.accel,
-        gyro_step_rad_s=imu.gyro_step_rad_s,
-        accel_step_m_s2=imu.accel_step_m_s2,
-        samples=tuple(0 if batch is None else batch.n for batch in batches),
-        temperature_degc=tuple(None if degc is None else round(degc, 3) for degc in each(_temperature)),
-        gyro_rad_s=each(lambda batch: _rounded(rotation @ batch.mean[:3])),
-        gyro_variance_rad2_s2=each(lambda batch: _rounded(squared @ batch.variance[:3])),
-        accel_m_s2=each(lambda batch: _rounded(rotation @ batch.mean[3:])),
-        accel_variance_m2_s4=each(lambda batch: _rounded(squared @ batch.variance[3:])),
-    )
-
-
-def _temperature(batch: Batch) -> float | None:
-    return batch.temperature_degc
-
-
-def _rounded(values: Floats) -> Vector:
-    x, y, z = (float(f"{value:.{_DIGITS}g}") for value in values.tolist())
-    return x, y, z

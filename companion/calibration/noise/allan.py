@@ -6,7 +6,6 @@ random walk K (unit / sqrt(s)). Source: method section 2.2; IEEE Std 952.
 
 from __future__ import annotations
 
-import difflib
 import math
 from typing import Final
 
@@ -78,22 +77,17 @@ PROFILES: Final[dict[str, NoiseProfile]] = {
 }
 
 
-def noise_profile(name: str | Noise | None) -> NoiseProfile:
-    """The profile of that name, or of these figures; None gives the conservative one for an unknown part.
+def noise_profile(profile: str | Noise | None) -> NoiseProfile:
+    """The catalogue's of that name, or that of these figures; None: the cautious one for an unknown part.
 
     Raises:
-        ConfigError: no such profile; the message names the nearest and all known.
+        ConfigError: no such profile.
     """
-    if name is None:
-        return PROFILES["unknown"]
-    if isinstance(name, Noise):
-        return NoiseProfile(name.name, AllanModel(*name.gyro), AllanModel(*name.accel))
-    key = name.strip().lower().replace("-", "").replace("_", "").replace(" ", "")
-    if key in PROFILES:
-        return PROFILES[key]
-    near = difflib.get_close_matches(key, PROFILES, n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise ConfigError(f"no noise profile {name!r}{hint} (known: {', '.join(PROFILES)})")
+    if isinstance(profile, Noise):
+        return NoiseProfile(profile.name, AllanModel(*profile.gyro), AllanModel(*profile.accel))
+    if profile is not None and profile not in PROFILES:
+        raise ConfigError(f"no noise profile {profile!r} (known: {', '.join(PROFILES)})")
+    return PROFILES[profile or "unknown"]
 
 
 def phi(ratio: Floats | float) -> Floats:

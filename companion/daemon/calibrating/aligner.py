@@ -202,14 +202,8 @@ class Aligner:
         """By the gyros: the first IMU's means, second by second, about down."""
         name = now.imus[0].name
         bias = (before.imus[0].gyro_rad_s[2] + now.imus[0].gyro_rad_s[2]) / 2.0
-        trace = self._collector.snapshot(before.end_s, None).trace("")
-        origin = math.floor(before.end_s)
-        rates = next((imu.gyro_rad_s for imu in trace.imus if imu.name == name), ())
-        between = [
-            rate[2]
-            for second, rate in zip(trace.second, rates, strict=False)
-            if rate is not None and second + origin < now.start_s
-        ]
+        rates = self._collector.snapshot(before.end_s, None).rates_rad_s(name)
+        between = [float(rate[2]) for second, rate in rates.items() if second < now.start_s]
         return align_steps.turned_deg(between, bias)
 
     # --- the result
