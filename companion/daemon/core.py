@@ -10,6 +10,7 @@ from typing import Any, Final
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.collector.rolling import Window
+from companion.calibration.machine import Machine
 from companion.component.statustext import Severity, StatusText, Weight
 from companion.config.sections import Config
 from companion.configured import models
@@ -39,6 +40,8 @@ class Core:
     parameters: ParameterClient
     collector: RecordedCollector
     texts: StatusText
+    machine: Machine
+    """Where the calibration stands."""
     only_listening: str | None
     """Why nothing may be started although requests arrive: a check listens and must change nothing."""
 
@@ -63,7 +66,7 @@ class Core:
 
         vehicle = Vehicle(link, system_id=config.vehicle.system_id, is_carried=is_carried)
         parameters = ParameterClient(link, vehicle)
-        return cls(config, offload, link, vehicle, parameters, collector, StatusText(link), only_listening)
+        return cls(config, offload, link, vehicle, parameters, collector, StatusText(link), Machine(), only_listening)
 
     async def keep_ticking(self) -> None:
         """Tell the collector the time until cancelled: the only one in the daemon who does."""

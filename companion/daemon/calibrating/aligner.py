@@ -20,7 +20,7 @@ from companion.calibration.alignment.align import Alignment, align, in_words
 from companion.calibration.alignment.align_model import Ground, ImuStand, Stand
 from companion.calibration.alignment.align_record import AlignmentRecord, imu_record, stand_record
 from companion.calibration.collector.rolling import Window
-from companion.calibration.machine import Event, Machine
+from companion.calibration.machine import Event
 from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.calibration.solution.solve import GradienterModel, up_in_vehicle, vehicle_heading_rad
 from companion.component.statustext import Severity
@@ -73,14 +73,13 @@ class Aligner:
     def __init__(
         self,
         core: Core,
-        machine: Machine,
         imus: Mapping[str, AutopilotImu],
         measuring: Measuring,
         alignment: AlignmentInForce,
     ) -> None:
         self._core, self._config, self._vehicle, self._collector = core, core.config, core.vehicle, core.collector
         self._offload, self._say = core.offload, core.say
-        self._machine, self._imus, self._measuring, self._alignment = machine, imus, measuring, alignment
+        self._machine, self._imus, self._measuring, self._alignment = core.machine, imus, measuring, alignment
         self._stand_s = max(STAND_S, core.config.calibration.min_still_s)
 
     async def run(self, job: Job, plan: Plan) -> str:

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
 from companion.calibration.collector.rolling import Settings
-from companion.calibration.machine import Event, Machine, State
+from companion.calibration.machine import Event, State
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.record import Record
@@ -31,7 +31,7 @@ from companion.daemon.calibrating.measuring import Measuring
 from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
 from companion.daemon.core import Core
 from companion.daemon.job import ALIGNMENT, Job, JobCancelledError
-from companion.daemon.offsets.recovery import Recovery
+from companion.daemon.offsets.ledger import Recovery
 from companion.errors import CompanionError
 from companion.links.system.listeners import Listeners
 
@@ -46,14 +46,13 @@ class Conductor:
     def __init__(
         self,
         core: Core,
-        machine: Machine,
         measuring: Measuring,
         course: Course,
         aligner: Aligner,
         recovery: Recovery,
         results: Results,
     ) -> None:
-        self._machine, self._measuring = machine, measuring
+        self._machine, self._measuring = core.machine, measuring
         self._vehicle, self._collector, self._say = core.vehicle, core.collector, core.say
         self._course, self._aligner, self._recovery, self._results = course, aligner, recovery, results
         self._has_gradienter = core.config.gradienter is not None

@@ -15,7 +15,7 @@ import msgspec
 
 from companion.autopilot.parameters.change import WriteFailedError
 from companion.calibration.collector.rolling import Window
-from companion.calibration.machine import Event, Machine
+from companion.calibration.machine import Event
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.history import Point
@@ -123,7 +123,6 @@ class Course:
     def __init__(
         self,
         core: Core,
-        machine: Machine,
         measuring: Measuring,
         solving: Solving,
         ditherer: Ditherer,
@@ -131,7 +130,7 @@ class Course:
         pusher: Pusher,
         conclusion: Conclusion,
     ) -> None:
-        self._core, self._machine = core, machine
+        self._core, self._machine = core, core.machine
         self._measuring, self._solving, self._ditherer = measuring, solving, ditherer
         self._planner, self._pusher, self._conclusion = planner, pusher, conclusion
         self.push = core.config.push.parameters

@@ -11,7 +11,7 @@ import msgspec
 
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.collector.rolling import Settings, Status, Window
-from companion.calibration.machine import Event, Machine, State
+from companion.calibration.machine import Event, State
 from companion.calibration.request import What
 from companion.component.service import MEASURED_PERCENT
 from companion.component.statustext import Severity
@@ -43,8 +43,8 @@ class Stand(NamedTuple):
 class Measuring:
     """Of one aircraft, for one job at a time."""
 
-    def __init__(self, core: Core, machine: Machine, imus: Mapping[str, AutopilotImu]) -> None:
-        self._core, self._machine, self._imus = core, machine, imus
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
+        self._core, self._machine, self._imus = core, core.machine, imus
         self.settings = models.settings(core.config)
         """How good is good enough."""
         self._upsets: dict[str, int] = {}

@@ -8,7 +8,6 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.machine import Machine
 from companion.calibration.request import What, is_time_limit
 from companion.calibration.solution.record import Record
 from companion.component.service import Refusal
@@ -154,20 +153,17 @@ class Calibrating(Subsystem):
     def __init__(self, core: Core, devices: Devices, offsets: Offsets) -> None:
         config, imus = core.config, devices.imus
         self._core = core
-        machine = Machine()
         self.store = RecordStore(config.storage.path)
         self.alignment = AlignmentInForce(config, core.offload)
         self.memory = BiasMemory(core, imus, devices.sensors, self.alignment)
-        measuring = Measuring(core, machine, imus)
+        measuring = Measuring(core, imus)
         self.solving = Solving(core, self.alignment, self.memory)
-        ditherer = Ditherer(core, machine, imus, offsets.writer, offsets.ledger)
-        self.conclusion = Conclusion(core, machine, offsets.effect, offsets.firmware)
-        course = Course(
-            core, machine, measuring, self.solving, ditherer, offsets.planner, offsets.pusher, self.conclusion
-        )
-        aligner = Aligner(core, machine, imus, measuring, self.alignment)
+        ditherer = Ditherer(core, imus, offsets.writer, offsets.ledger)
+        self.conclusion = Conclusion(core, offsets.effect, offsets.firmware)
+        course = Course(core, measuring, self.solving, ditherer, offsets.planner, offsets.pusher, self.conclusion)
+        aligner = Aligner(core, imus, measuring, self.alignment)
         self._results = Results(core, self.store, self.memory)
-        self.conductor = Conductor(core, machine, measuring, course, aligner, offsets.recovery, self._results)
+        self.conductor = Conductor(core, measuring, course, aligner, offsets.recovery, self._results)
 
     def load(self) -> None:  # noqa: D102 - as in the base class
         self.alignment.load()

@@ -14,7 +14,7 @@ from typing import Final, Literal, NamedTuple
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.component.service import Refusal
 from companion.daemon.job import Job
-from companion.daemon.offsets.recovery import Recovery
+from companion.daemon.offsets.ledger import Recovery
 from companion.links.system.budget import Budget
 
 STARTS_PER_S: Final = 1.0

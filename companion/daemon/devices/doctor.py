@@ -44,8 +44,8 @@ class Configured:
 
 
 @dataclass(frozen=True, slots=True)
-class Diagnosis:
-    """One finding: whose, whether all is well, in words, and what to type (empty: nothing)."""
+class Finding:
+    """One line of the check: whose, whether all is well, in words, what to type (empty: nothing), and of which port."""
 
     name: str
     good: bool
@@ -70,33 +70,33 @@ def _ports(config: Config) -> dict[str, str]:
     return ports
 
 
-def where_it_may_be(config: Config, root: Path = ROOT) -> Diagnosis | None:
+def where_it_may_be(config: Config, root: Path = ROOT) -> Finding | None:
     """Where a device may be whose port is not there; None where nothing else is plugged in."""
     free = unnamed(list_ports(root), list(_ports(config).values()), root)
     if not free:
         return None
     words = f"nobody names {', '.join(free)}: companion ports --listen tells who speaks there"
-    return Diagnosis("ports", good=False, words=words, remedy="companion ports --listen")
+    return Finding("ports", good=False, words=words, remedy="companion ports --listen")
 
 
-def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> list[Diagnosis]:
+def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> list[Finding]:
     """What the system has against the configured ports."""
     sensors = configured_sensors(config)
     ports = _ports(config)
     among = list_ports(root)
     fast = {sensor.name for sensor in sensors if sensor.kind == "imu"}
     found = [
-        Diagnosis(name, fault.good, str(fault), fault.remedy, port)
+        Finding(name, fault.good, str(fault), fault.remedy, port)
         for name, port in ports.items()
         for fault in port_faults(port, is_fast=name in fast, ours=ours, among=among, root=root)
     ]
     for first, second, device in same_ports(ports, root):
         words = f"{first} and {second} are one and the same port, {device}"
-        found.append(Diagnosis(second, good=False, words=f"{words}: give each its own", remedy="", port=device))
+        found.append(Finding(second, good=False, words=f"{words}: give each its own", remedy="", port=device))
     return found
 
 
-async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -> list[Diagnosis]:
+async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -> list[Finding]:
     """Why no good samples come from a sensor, as far as its bytes tell.
 
     Args:
@@ -116,7 +116,7 @@ async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -
     speaks = {sensor.name: _protocol_heard(sensor, devices[sensor.name], tried) for sensor in sick}
     swapped = _swapped(sick, speaks)
     found = [
-        Diagnosis(
+        Finding(
             "ports",
             good=False,
             words=f"{a.name}'s port speaks {speaks[a.name]}, {b.name}'s port speaks {speaks[b.name]}: "
@@ -157,10 +157,10 @@ def _swapped(sick: Sequence[Configured], speaks: Mapping[str, str | None]) -> li
     ]
 
 
-def _explain(sensor: Configured, device: Object, heard: Heard | str | None, *, may_listen: bool) -> list[Diagnosis]:
-    def bad(words: str, remedy: str = "") -> list[Diagnosis]:
+def _explain(sensor: Configured, device: Object, heard: Heard | str | None, *, may_listen: bool) -> list[Finding]:
+    def bad(words: str, remedy: str = "") -> list[Finding]:
         said = f"{words}: {remedy}" if remedy else words
-        return [Diagnosis(sensor.name, good=False, words=said, remedy=remedy, port=sensor.port)]
+        return [Finding(sensor.name, good=False, words=said, remedy=remedy, port=sensor.port)]
 
     if isinstance(heard, str):
         return []  # its device's own line has said so

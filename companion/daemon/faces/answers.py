@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Sequence
 from typing import Final
 
 from companion.daemon.core import Handler, Subsystem, joined
-from companion.daemon.heading.pose_now import PoseNow
+from companion.daemon.heading.subsystem import PoseNow
 from companion.links.system.request import Object
 
 MONITOR_EVERY_S: Final = 0.5

@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping, Sequence
+import asyncio
+import math
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from companion.autopilot.firmware.heading_parameters import RISKS, changes_for, wanted_for
+from companion.calibration.solution.site import Whereabouts, local_earth
+from companion.calibration.solution.solve import up_in_vehicle, vehicle_heading_rad
+from companion.configured import models
 from companion.daemon.arming.subsystem import Arming
+from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.heading.pose_now import PoseNow
 from companion.links.system.request import Object
+from companion.physics.frames import roll_pitch_from_up
+from companion.physics.units import DEG
+from companion.samples import CompassSample, Sample, TiltSample
 
 if TYPE_CHECKING:
     from companion.daemon.heading.attitude_service import AttitudeService
 
 
 REBOOT: Final = "restart the autopilot then: until that it goes on as before"
+OLDEST_S: Final = 1.0
+"""A reading older than this is none."""
+DECLINATION_EVERY_S: Final = 60.0
 
 
 class Heading(Subsystem):
@@ -93,3 +104,85 @@ async def autopilot_setup(core: Core) -> Object:
         ],
         "risks": list(RISKS.get(firmware or "other", ())),
     }
+
+
+class PoseNow:
+    """Takes samples, tells the pose; `carried` gives the attitude that is right in flight, too, while there is one."""
+
+    def __init__(self, core: Core, alignment: AlignmentInForce, carried: Callable[[], Object | None] | None) -> None:
+        self._core, self._alignment, self._carried = core, alignment, carried
+        self._compass = models.compass_model(core.config.compass)
+        self._tilt: TiltSample | None = None
+        self._heading: CompassSample | None = None
+        self._declination_deg: float | None = None
+        self._looked_up_s = -math.inf
+
+    def take(self, sample: Sample) -> None:
+        """Take a reading of gradienter or compass."""
+        if isinstance(sample, TiltSample):
+            self._tilt = sample
+        elif isinstance(sample, CompassSample):
+            self._heading = sample
+
+    async def look(self) -> Object | None:
+        """As `now`, with the declination of the place looked up when it is time to."""
+        if self._compass is not None and self._compass.magnetic:
+            await self._look_up(asyncio.get_running_loop().time())
+        return self.now()
+
+    def now(self) -> Object | None:
+        """The pose as JSON can hold it; None without a fresh reading of the gradienter.
+
+        The heading is magnetic as long as the declination has not been looked up.
+        """
+        if self._carried is not None and (carried := self._carried()) is not None:
+            return carried
+        now_s = asyncio.get_running_loop().time()
+        tilt, heading = self._tilt, self._heading
+        gradienter = self._alignment.model()
+        if gradienter is None or tilt is None or now_s - tilt.t_s > OLDEST_S:
+            return None
+        try:
+            up = up_in_vehicle(gradienter, tilt.x_deg, tilt.y_deg)
+        except ValueError:
+            return None
+        roll, pitch = roll_pitch_from_up(up)
+        pose: Object = {
+            "roll_deg": round(roll / DEG, 3),
+            "pitch_deg": round(pitch / DEG, 3),
+            "heading_deg": None,
+            "north": None,
+            "source": "gradienter",
+            "still": self._core.collector.glance(now_s).obstacle is None,
+        }
+        if self._compass is not None and heading is not None and now_s - heading.t_s <= OLDEST_S:
+            heading_deg = vehicle_heading_rad(self._compass, heading.heading_deg, up) / DEG
+            north = "true"
+            if self._compass.magnetic:
+                north = "true" if self._declination_deg is not None else "magnetic"
+                heading_deg += self._declination_deg or 0.0
+            pose |= {
+                "heading_deg": round(heading_deg % 360.0, 2) % 360.0,
+                "north": north,
+                "source": "gradienter and compass",
+            }
+        return pose
+
+    def readings(self) -> dict[str, float | None]:
+        """What gradienter and compass themselves say at this moment, before any offset; None where nothing fresh."""
+        now_s = asyncio.get_running_loop().time()
+        tilt = self._tilt if self._tilt is not None and now_s - self._tilt.t_s <= OLDEST_S else None
+        heading = self._heading if self._heading is not None and now_s - self._heading.t_s <= OLDEST_S else None
+        return {
+            "gradienter_x_deg": None if tilt is None else round(tilt.x_deg, 4),
+            "gradienter_y_deg": None if tilt is None else round(tilt.y_deg, 4),
+            "compass_deg": None if heading is None else round(heading.heading_deg, 3),
+        }
+
+    async def _look_up(self, now_s: float) -> None:
+        """Looked up rarely: the aircraft does not get far in a minute, and the magnetic model takes its time."""
+        if now_s - self._looked_up_s >= DECLINATION_EVERY_S or self._declination_deg is None:
+            where: Whereabouts = models.whereabouts(self._core.config, self._core.vehicle)
+            if where.latitude_deg is not None:
+                self._looked_up_s = now_s
+                self._declination_deg = (await self._core.offload(local_earth, where)).site.declination_deg

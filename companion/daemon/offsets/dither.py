@@ -21,7 +21,7 @@ from companion.autopilot.parameters.writer import Change, ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.collector.rolling import Window
 from companion.calibration.collector.sources import integer_batches
-from companion.calibration.machine import Event, Machine
+from companion.calibration.machine import Event
 from companion.calibration.means.dither import SECONDS, STEPS, Dithered, Step, combine, shifts_lsb, why_void
 from companion.calibration.means.windows import ImuWindow
 from companion.calibration.noise.allan import noise_profile
@@ -71,12 +71,10 @@ class _Work:
 class Ditherer:
     """Replaces the means of IMUs whose integers do not tell, where the user has allowed it."""
 
-    def __init__(
-        self, core: Core, machine: Machine, imus: Mapping[str, AutopilotImu], writer: ParameterWriter, ledger: Ledger
-    ) -> None:
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], writer: ParameterWriter, ledger: Ledger) -> None:
         self.enabled = core.config.push.dither and core.config.push.parameters
         self._vehicle, self._parameters, self._collector = core.vehicle, core.parameters, core.collector
-        self._machine, self._imus, self._writer, self._ledger = machine, imus, writer, ledger
+        self._machine, self._imus, self._writer, self._ledger = core.machine, imus, writer, ledger
         self._profiles = {imu.name: noise_profile(imu.profile) for imu in core.config.imu}
         self._horizon_s = 180.0
 

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import dataclasses
 import logging
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -21,7 +21,7 @@ from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.commands import result_name
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.collector.rolling import Window
-from companion.calibration.machine import Event, Machine
+from companion.calibration.machine import Event
 from companion.calibration.solution.draft import Draft
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core
@@ -185,15 +185,11 @@ class Pusher:
 
     async def _no_longer_in_force(self, plan: Plan) -> list[str]:
         """What somebody has changed while we looked at the telemetry."""
-        changed: list[str] = []
         try:
-            for change in plan.changes:
-                now = await self._parameters.read(change.parameter)
-                if not same_float32(now, change.after):
-                    changed.append(f"{change.parameter} is {now:.6g}, somebody changed it right after the write")
+            now = await not_as_written(self._parameters.read, plan.changes)
         except AutopilotError as error:
-            changed.append(str(error))
-        return changed
+            return [str(error)]
+        return [f"{name} is {value:.6g}, somebody changed it right after the write" for name, value in now.items()]
 
     def _changing(self, plan: Plan, *, everything: bool) -> contextlib.AbstractContextManager[None]:
         """While offsets change: those of the plan's IMUs, or of all."""
@@ -209,6 +205,12 @@ class Pusher:
             raise NotDisarmedError("armed before the biases could be written; nothing was written")
         if self._vehicle.arm_state is ArmState.UNKNOWN:
             raise NotDisarmedError("no heartbeat, so nobody knows whether the aircraft is armed; nothing was written")
+
+
+async def not_as_written(read: Callable[[str], Awaitable[float]], changes: Sequence[Change]) -> dict[str, float]:
+    """What is no longer as it was written, by name, and what it is now."""
+    found = {change.parameter: (await read(change.parameter), change.after) for change in changes}
+    return {name: now for name, (now, after) in found.items() if not same_float32(now, after)}
 
 
 def _note_verdicts(plan: Plan, target: Target, verdicts: list[Verdict], draft: Draft) -> list[str]:
@@ -246,9 +248,9 @@ def why_not(calibrations: Sequence[ImuCalibration], changes: Sequence[Change]) -
 class Conclusion:
     """What follows a write that is done and stays: a restart where one was asked for, or the settling of the EKF."""
 
-    def __init__(self, core: Core, machine: Machine, effect: EffectWatch, firmware: FirmwareCalibration) -> None:
+    def __init__(self, core: Core, effect: EffectWatch, firmware: FirmwareCalibration) -> None:
         self._vehicle, self._parameters, self._say = core.vehicle, core.parameters, core.say
-        self._machine, self._effect, self._firmware = machine, effect, firmware
+        self._machine, self._effect, self._firmware = core.machine, effect, firmware
         self._stale: tuple[int, float] | None = None
         """Boots seen when a write left a stale tilt behind, and its size in degrees."""
 
@@ -324,7 +326,7 @@ class Conclusion:
         back_s = asyncio.get_running_loop().time() + BACK_WITHIN_S
         while self._vehicle.arm_state is ArmState.UNKNOWN and asyncio.get_running_loop().time() < back_s:
             await asyncio.sleep(POLL_S)
-        changed = await self._changed(plan.changes)
+        changed = await not_as_written(self._read, plan.changes)
         if changed:
             plan.mark(draft, changed, "failed")
             raise AutopilotError(f"the autopilot restarted and replaced {', '.join(changed)}: calibrate again")
@@ -335,9 +337,14 @@ class Conclusion:
         if harm is not None:
             raise NotRebootedError(harm)
         await self._reboot(go_on)
-        changed = await self._changed(plan.changes)
+        changed = await not_as_written(self._read, plan.changes)
         if changed:
-            raise AutopilotError("; ".join(changed.values()))
+            stored = {change.parameter: change.after for change in plan.changes}
+            after = (
+                f"{name} is {now:.6g} after the reboot, {stored[name]:.6g} had been stored"
+                for name, now in changed.items()
+            )
+            raise AutopilotError("; ".join(after))
         verdicts, unseen = await self._effect.look(plan, before, go_on, self._vehicle.boots)
         found = (verdicts or {}).items()
         problems = [f"imu {name}: {in_short(verdict)}" for name, each in found for verdict in each if not verdict.ok]
@@ -374,16 +381,6 @@ class Conclusion:
                     f"{self._vehicle.name} was rebooted and is not back, disarmed, within {BACK_WITHIN_S:.0f} s"
                 )
             await asyncio.sleep(POLL_S)
-
-    async def _changed(self, changes: Sequence[Change]) -> dict[str, str]:
-        """What is no longer as it was written, by name, in words."""
-        found: dict[str, str] = {}
-        for change in changes:
-            now = await self._read(change.parameter)
-            if not same_float32(now, change.after):
-                name = change.parameter
-                found[name] = f"{name} is {now:.6g} after the reboot, {change.after:.6g} had been stored"
-        return found
 
     async def _read(self, name: str) -> float:
         for _ in range(READ_ATTEMPTS - 1):

@@ -11,11 +11,10 @@ from companion.daemon.core import Core, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.offsets.effect import EffectWatch
 from companion.daemon.offsets.firmware_calibration import FirmwareCalibration
-from companion.daemon.offsets.ledger import Ledger
+from companion.daemon.offsets.ledger import Ledger, Recovery
 from companion.daemon.offsets.plan import Planner
 from companion.daemon.offsets.push import Pusher
 from companion.daemon.offsets.px4_writes import Px4Writes
-from companion.daemon.offsets.recovery import Recovery
 from companion.daemon.offsets.rivalry import Rivalry
 from companion.links.system.request import Object
 from companion.storage.changes import ChangeLog

@@ -5,31 +5,17 @@ With a daemon running the ports are its, so it is asked; otherwise every port is
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from pathlib import Path
 
 from companion.config.sections import Config
 from companion.configured.models import cannot_work, doubtful, profile_in_words
-from companion.daemon.devices.doctor import Diagnosis, sensor_findings, system_findings, where_it_may_be
+from companion.daemon.devices.doctor import Finding, sensor_findings, system_findings, where_it_may_be
 from companion.daemon.devices.sensor_health import ABSENT
 from companion.daemon.faces.control import ask, process_behind
 from companion.daemon.process.service import Service
 from companion.errors import DaemonDeniedError, DaemonUnreachableError
 from companion.links.system.request import Object
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Finding:
-    """One line of the check."""
-
-    name: str
-    good: bool
-    words: str
-    remedy: str = ""
-    """What to type, or to write into the configuration, where that can be said."""
-    port: str = ""
-    """Which port it is about."""
 
 
 async def run_check(config: Config, seconds: float) -> list[Finding]:
@@ -65,9 +51,8 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
         findings.append(Finding("signing", good=signing["good"], words=signing["summary"]))
     elsewhere = where_it_may_be(config)
     findings += [_device(device, elsewhere) for device in status["devices"]]
-    diagnoses = system_findings(config, list(ours))
-    diagnoses += await sensor_findings(config, status, may_listen=not is_running)
-    findings += map(_found, diagnoses)
+    findings += system_findings(config, list(ours))
+    findings += await sensor_findings(config, status, may_listen=not is_running)
     findings += [Finding("warning", good=True, words=words) for words in status["warnings"]]
     ground = status["ground_stations"]
     findings.append(Finding("ground stations", good=ground["good"], words=ground["summary"]))
@@ -86,16 +71,12 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
     return findings
 
 
-def _device(device: Object, elsewhere: Diagnosis | None) -> Finding:
+def _device(device: Object, elsewhere: Finding | None) -> Finding:
     """How a device does by its own account; and where it may be, if it is not where it should."""
     name, words, port = device["name"], device["summary"], device.get("port", "")
     if device.get("trouble") == ABSENT and port.startswith("/") and not os.path.exists(port) and elsewhere is not None:
         return Finding(name, good=False, words=f"{words}; {elsewhere.words}", remedy=elsewhere.remedy, port=port)
     return Finding(name, device["good"], words, port=port)
-
-
-def _found(diagnosis: Diagnosis) -> Finding:
-    return Finding(diagnosis.name, diagnosis.good, diagnosis.words, diagnosis.remedy, diagnosis.port)
 
 
 def _gate(config: Config, setup: Object) -> Finding:

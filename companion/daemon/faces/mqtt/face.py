@@ -19,7 +19,7 @@ from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.core import Core
 from companion.daemon.faces.answers import Answers
 from companion.daemon.faces.mqtt.requests import Requests
-from companion.daemon.heading.pose_now import PoseNow
+from companion.daemon.heading.subsystem import PoseNow
 from companion.links.mqtt.client import Incoming, MqttLink
 from companion.links.system.request import Object
 
