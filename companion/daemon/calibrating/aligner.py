@@ -28,7 +28,7 @@ from companion.configured import models
 from companion.daemon.calibrating import align_steps
 from companion.daemon.calibrating.align_steps import Plan, Seen
 from companion.daemon.calibrating.alignment import AlignmentInForce
-from companion.daemon.calibrating.measuring import POLL_S, Measuring
+from companion.daemon.calibrating.course import POLL_S, Measuring
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job

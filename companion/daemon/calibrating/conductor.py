@@ -26,8 +26,7 @@ from companion.config.sections import AtArm
 from companion.daemon.calibrating.align_steps import Plan
 from companion.daemon.calibrating.aligner import Aligner
 from companion.daemon.calibrating.bias_memory import Results, has_written
-from companion.daemon.calibrating.course import Course
-from companion.daemon.calibrating.measuring import Measuring
+from companion.daemon.calibrating.course import Course, Measuring
 from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
 from companion.daemon.core import Core
 from companion.daemon.job import ALIGNMENT, Job, JobCancelledError

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections.abc import Callable, Container, Mapping
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 
 from companion.autopilot.parameters.change import WriteFailedError
-from companion.calibration.collector.rolling import Window
-from companion.calibration.machine import Event
+from companion.autopilot.vehicle.vehicle import ArmState
+from companion.calibration.collector.rolling import Settings, Status, Window
+from companion.calibration.machine import Event, State
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.history import Point
@@ -29,12 +31,13 @@ from companion.configured import models
 from companion.daemon.calibrating import held_back
 from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.calibrating.bias_memory import BiasMemory
-from companion.daemon.calibrating.measuring import Measuring
 from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu, not_ready
 from companion.daemon.job import Job
 from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.plan import Planner
 from companion.daemon.offsets.push import Conclusion, Pusher
+from companion.errors import AutopilotError, CalibrationRefusedError
 from companion.links.system.listeners import Listeners
 from companion.samples import Triad
 
@@ -43,6 +46,118 @@ logger = logging.getLogger(__name__)
 WRONG_IMU_ATTEMPTS: Final = 3
 """Of three IMUs two may have been taken for the one that is meant."""
 _WATCHING: Final = "watching the telemetry take the new offsets"
+POLL_S: Final = 0.2
+"""A complete second is looked at when it is; this is how often for whatever else may change."""
+SAY_WAITING_EVERY_S: Final = 10.0
+READ_ATTEMPTS: Final = 2
+"""How often, within one calibration, the autopilot's offsets may fail to be read."""
+MOST_UPSETS: Final = 5
+"""How often, within one calibration, other offsets may come into force, or the autopilot restart."""
+
+
+class Stand(NamedTuple):
+    """How the aircraft stands at this moment."""
+
+    status: Status
+    waiting_for: str | None
+    """What is in the way of measuring."""
+    hold_still_s: int | None
+    """For how long to hold still, where nothing else is."""
+
+
+class Measuring:
+    """Of one aircraft, for one job at a time."""
+
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
+        self._core, self._machine, self._imus = core, core.machine, imus
+        self.settings = models.settings(core.config)
+        """How good is good enough."""
+        self._upsets: dict[str, int] = {}
+        """By IMU, how many there had been before this calibration."""
+
+    def retarget(self, settings: Settings) -> None:
+        """Change how good is good enough."""
+        self.settings = settings
+
+    def begin(self) -> None:
+        """A calibration begins, which may measure more than once."""
+        self._upsets = {name: imu.upsets for name, imu in self._imus.items()}
+
+    async def look(self, job: Job, if_armed: str) -> Stand:
+        """How it stands now.
+
+        Raises:
+            CalibrationRefusedError: armed since the job began (in those words), or out of time.
+        """
+        if job.armed or self._core.vehicle.arm_state is ArmState.ARMED:
+            raise CalibrationRefusedError(if_armed)
+        job.check_time()
+        await self._core.catch_up()
+        status = self._core.collector.status(asyncio.get_running_loop().time())
+        other = not_ready(self._core.vehicle, self._imus) or models.place_doubt(self._core.config, self._core.vehicle)
+        if other is not None or status.obstacle is None:
+            return Stand(status, other, None)
+        return Stand(status, status.obstacle.words, status.obstacle.hold_still_s)
+
+    def show(self, *, measuring: bool) -> None:
+        """Let the state table follow."""
+        if measuring and self._machine.state is State.WAITING:
+            self._machine.on(Event.STILL)
+        elif not measuring and self._machine.state is State.COLLECTING:
+            self._machine.on(Event.MOVED)
+
+    async def measure(self, job: Job) -> Window:
+        """Wait for stillness and for enough of it; returns the averages.
+
+        Raises:
+            CalibrationRefusedError: armed in the middle, out of time, or the readings fail their checks.
+            JobCancelledError: cancelled.
+        """
+        collector = self._core.collector
+        collector.retarget(self._wanted(job.what))
+        loop = asyncio.get_running_loop()
+        said, said_s = "", -math.inf
+        failures = {name: imu.failures for name, imu in self._imus.items()}
+        stop = collector.seconds.add(job.look_again)
+        try:
+            while True:
+                status, waiting_for, hold_still_s = await self.look(
+                    job, "armed during the measurement; nothing was written"
+                )
+                self._check_imus(failures)
+                self.show(measuring=waiting_for is None)
+                words = waiting_for or f"still for {status.still_s:.0f} s, measuring"
+                job.progress(MEASURED_PERCENT * status.progress, words, hold_still_s)
+                if waiting_for is None and status.enough:
+                    self._machine.on(Event.ENOUGH)
+                    job.progress(MEASURED_PERCENT, "working out the biases")
+                    return await self._core.window()
+                now_s = loop.time()
+                if waiting_for not in (None, said) and not job.automatic and now_s - said_s >= SAY_WAITING_EVERY_S:
+                    said, said_s = words, now_s
+                    self._core.say(Severity.INFO, f"Calibration: {waiting_for}")
+                await job.pause(POLL_S)
+        finally:
+            stop()
+
+    def _check_imus(self, failures: dict[str, int]) -> None:
+        for name, imu in self._imus.items():
+            failures[name] = min(failures[name], imu.failures)
+            if imu.failures - failures[name] >= READ_ATTEMPTS:
+                # Patience is for what can change by itself; an autopilot that does not answer is a fault.
+                raise AutopilotError(f"imu {name}: {imu.problem}")
+            if (upsets := imu.upsets - self._upsets.get(name, 0)) >= MOST_UPSETS:
+                raise AutopilotError(
+                    f"{imu.upset}, {upsets} times now: does something else write, or pretend to be the autopilot?"
+                )
+
+    def _wanted(self, what: What) -> Settings:
+        """The targets of what was asked for; the rest may be as bad as it likes."""
+        return msgspec.structs.replace(
+            self.settings,
+            target_gyro_sigma_rad_s=self.settings.target_gyro_sigma_rad_s if what.gyros else math.inf,
+            target_accel_sigma_m_s2=self.settings.target_accel_sigma_m_s2 if what.accelerometers else math.inf,
+        )
 
 
 class Solving:

@@ -16,8 +16,7 @@ from companion.daemon.calibrating.aligner import Aligner
 from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.calibrating.bias_memory import BiasMemory, Results
 from companion.daemon.calibrating.conductor import Conductor
-from companion.daemon.calibrating.course import Course, Solving
-from companion.daemon.calibrating.measuring import Measuring
+from companion.daemon.calibrating.course import Course, Measuring, Solving
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices

@@ -301,9 +301,7 @@ class AttitudeService:
             "alignments": self.carrier.alignments,
             "reset_counter": self.carrier.reset_counter % 256,
             "timesync_answers": self.timesync.answered,
-            "roll_deg": None if attitude is None else round(attitude.roll_rad / DEG, 3),
-            "pitch_deg": None if attitude is None else round(attitude.pitch_rad / DEG, 3),
-            "heading_deg": None if attitude is None else round(attitude.yaw_rad / DEG % 360.0, 2) % 360.0,
+            **_angles(attitude),
             "sigma_deg": None
             if attitude is None
             else dict(zip(("roll", "pitch", "heading"), (round(s / DEG, 3) for s in attitude.sigma_rad), strict=True)),
@@ -320,11 +318,14 @@ class AttitudeService:
         attitude = self.carrier.now() if self.health.pushing else None
         if attitude is None:
             return None
-        return {
-            "roll_deg": round(attitude.roll_rad / DEG, 3),
-            "pitch_deg": round(attitude.pitch_rad / DEG, 3),
-            "heading_deg": round(attitude.yaw_rad / DEG % 360.0, 2) % 360.0,
-            "north": "true",
-            "source": "attitude",
-            "still": self.carrier.still,
-        }
+        return {**_angles(attitude), "north": "true", "source": "attitude", "still": self.carrier.still}
+
+
+def _angles(attitude: Attitude | None) -> Object:
+    if attitude is None:
+        return {"roll_deg": None, "pitch_deg": None, "heading_deg": None}
+    return {
+        "roll_deg": round(attitude.roll_rad / DEG, 3),
+        "pitch_deg": round(attitude.pitch_rad / DEG, 3),
+        "heading_deg": round(attitude.yaw_rad / DEG % 360.0, 2) % 360.0,
+    }

@@ -167,8 +167,7 @@ class Health:
         wrong = self._wrong(now_s)
         self._compare(now_s)
         if wrong is not None:
-            self._stopped |= self.pushing
-            self.pushing, self.why_not, self._good_since_s = False, wrong, None
+            self.stop(wrong)
             return
         if self._good_since_s is None:
             self._good_since_s = now_s

@@ -19,7 +19,7 @@ from companion.autopilot.parameters.verify import Verdict
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.commands import result_name
-from companion.autopilot.vehicle.vehicle import ArmState
+from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.collector.rolling import Window
 from companion.calibration.machine import Event
 from companion.calibration.solution.draft import Draft
@@ -197,14 +197,19 @@ class Pusher:
         return changing(imu for name, imu in self._imus.items() if everything or name in ours)
 
     async def _wait_disarmed(self) -> None:
-        loop = asyncio.get_running_loop()
-        deadline_s = loop.time() + DISARMED_WITHIN_S
-        while self._vehicle.arm_state is ArmState.UNKNOWN and loop.time() < deadline_s:
-            await asyncio.sleep(POLL_S)
+        await _heartbeat(self._vehicle, DISARMED_WITHIN_S)
         if self._vehicle.arm_state is ArmState.ARMED:
             raise NotDisarmedError("armed before the biases could be written; nothing was written")
         if self._vehicle.arm_state is ArmState.UNKNOWN:
             raise NotDisarmedError("no heartbeat, so nobody knows whether the aircraft is armed; nothing was written")
+
+
+async def _heartbeat(vehicle: Vehicle, within_s: float) -> None:
+    """Wait for so long at most until it is known whether it is armed."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(within_s):
+            while vehicle.arm_state is ArmState.UNKNOWN:
+                await asyncio.sleep(POLL_S)
 
 
 async def not_as_written(read: Callable[[str], Awaitable[float]], changes: Sequence[Change]) -> dict[str, float]:
@@ -323,9 +328,7 @@ class Conclusion:
         Raises:
             AutopilotError: it is not, or the autopilot does not come back.
         """
-        back_s = asyncio.get_running_loop().time() + BACK_WITHIN_S
-        while self._vehicle.arm_state is ArmState.UNKNOWN and asyncio.get_running_loop().time() < back_s:
-            await asyncio.sleep(POLL_S)
+        await _heartbeat(self._vehicle, BACK_WITHIN_S)
         changed = await not_as_written(self._read, plan.changes)
         if changed:
             plan.mark(draft, changed, "failed")

@@ -369,11 +369,8 @@ class Recorder(Subsystem):
         return [("recorder", self.run)]
 
     def status(self) -> Object:  # noqa: D102
-        return {"recording": self._status()}
-
-    def _status(self) -> Object:
         ring, asked = self._ring, self._on_request
-        return {
+        recording: Object = {
             "fault": self.fault,
             "lost": self._journal.lost_in_all,
             "ring": None
@@ -388,6 +385,7 @@ class Recorder(Subsystem):
                 "lost": self._journal.lost_in_all - asked.lost_before,
             },
         }
+        return {"recording": recording}
 
 
 def _kept(folder: Path) -> Path:
