@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from companion.calibration.solution.history import Measured, Point, PowerUp
 from companion.calibration.solution.joint import Weighed, weigh
-from companion.calibration.solution.pose_effect import PoseEffect, pose_effect
-from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, expect
+from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, PoseEffect, expect, pose_effect
 from companion.calibration.solution.record import Pose, PoseSigma, Site
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 

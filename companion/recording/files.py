@@ -78,11 +78,6 @@ def is_available() -> bool:
 class RecordingFile:
     """One MCAP file in the making.
 
-    Args:
-        path: where.
-        opener: opens it.
-        free_bytes: what is left on the disk of a folder.
-
     Raises:
         StorageError: it cannot be created.
     """
@@ -209,14 +204,7 @@ class RecordingFile:
 
 
 class Ring:
-    """Files of limited size in all; the oldest go first.
-
-    Args:
-        folder: where; files are numbered, as the wall clock may be wrong in the field.
-        most_bytes: all of them together.
-        opener: opens each.
-        free_bytes: what is left on the disk of a folder.
-    """
+    """Files of limited size in all, numbered, as the wall clock may be wrong in the field; the oldest go first."""
 
     def __init__(
         self,

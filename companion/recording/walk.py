@@ -74,9 +74,6 @@ def is_text(path: Path) -> bool:
 class Recording:
     """An MCAP file, read once from front to end.
 
-    Args:
-        path: the file.
-
     Raises:
         StorageError: one line: it cannot be read, is empty, or is nothing of this kind.
     """

@@ -76,13 +76,7 @@ def _compare(path: str, recorded: Any, replayed: Any, sigma: Any, found: list[Di
 
 
 def record_again(recorded: Record, solution: Solution, solved_with: Mapping[str, ImuCalibration | None]) -> Record:
-    """The record of a calibration from a solution that was worked out again.
-
-    Args:
-        recorded: as the daemon wrote it.
-        solution: the new one.
-        solved_with: the offsets that were in force when it was measured, by IMU.
-    """
+    """The record of a calibration from a solution worked out again with the offsets in force when it was measured."""
     draft = Draft(datetime.datetime.fromtimestamp(0.0, tz=datetime.UTC), recorded.system_id, solution)
     corrected = {imu.name for imu in recorded.imus if imu.residual_gyro_rad_s or imu.residual_accel_m_s2}
     for found in solution.imus:
@@ -219,14 +213,7 @@ class Calibrations:
             self.again.append(Replayed(recorded, [], self._no_solution))
 
     def estimate(self, collector: RollingCollector, now_s: float, draft: Draft, seconds: float) -> Record:
-        """What a calibration would have found now.
-
-        Args:
-            collector: as it stands.
-            now_s: the samples' clock.
-            draft: of the record.
-            seconds: that it took.
-        """
+        """What a calibration would have found now."""
         try:
             draft.solution = self._solved(collector.window(now_s), What.BOTH)
         except CalibrationRefusedError as error:

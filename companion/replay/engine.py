@@ -107,11 +107,7 @@ class Result(msgspec.Struct, frozen=True):
 
 
 class Replay:
-    """One pass over one recording.
-
-    Args:
-        recording: the file.
-    """
+    """One pass over one recording."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording

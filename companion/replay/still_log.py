@@ -74,11 +74,6 @@ class StillLog(msgspec.Struct, frozen=True, kw_only=True):
 def read_logs(paths: Sequence[Path], columns: str | None = None, csv_name: str = NAME) -> list[StillLog]:
     """All IMUs in all files, one entry for each IMU and session.
 
-    Args:
-        paths: recordings (.mcap) and CSV logs.
-        columns: of CSV files that do not name theirs.
-        csv_name: what the IMU of a CSV file is called.
-
     Raises:
         StorageError: a file cannot be read, in one line.
     """

@@ -84,14 +84,7 @@ text{font:13px system-ui,sans-serif;fill:var(--fg)}.mid{text-anchor:middle}.end{
 
 
 def page(title: str, now: datetime.datetime, *body: Child, source: str = "from the records on this computer") -> str:
-    """A whole file.
-
-    Args:
-        title: of the tab.
-        now: when it was made, for the foot.
-        body: the parts.
-        source: of its figures, for the foot.
-    """
+    """A whole file."""
     foot = tag(
         "p",
         f"Made {now:%Y-%m-%d %H:%M} UTC by companion {__version__} {source}. All axes:"

@@ -48,11 +48,7 @@ class Storage:
             self.damaged.append(str(error))
 
     def calibration(self, wanted: str | None, profiles: Profiles) -> calibration_page.Material:
-        """One calibration.
-
-        Args:
-            wanted: its number, or the beginning of its time; None: the latest.
-            profiles: of today's configuration.
+        """One calibration, by its number or the beginning of its time; None: the latest.
 
         Raises:
             StorageError: there is none of that number or time, or it cannot be read.

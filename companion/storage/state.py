@@ -30,11 +30,6 @@ def write_atomically(path: Path, data: bytes, *, mode: int = 0o600) -> None:
 
     Temporary file in the same folder, fsync, rename, fsync of the folder.
 
-    Args:
-        path: of the file.
-        data: its new content.
-        mode: its permissions.
-
     Raises:
         StorageError: one line that names the file and the operating system's reason.
     """

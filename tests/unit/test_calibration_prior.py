@@ -14,8 +14,7 @@ from scipy import stats
 from companion.calibration.alignment.align_record import Determined, ImuAlignmentRecord
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.solution.history import Measured, Point, PowerUp, believed, by_power_up
-from companion.calibration.solution.pose_effect import pose_effect
-from companion.calibration.solution.prior import Expected, Now, expect, expect_today, student_limit
+from companion.calibration.solution.prior import Expected, Now, expect, expect_today, pose_effect, student_limit
 from companion.samples import Triad
 from tests.prior_study import CASES, Case, study
 from tests.support.windows import ned_from_body

@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import noise_profile
-from companion.calibration.noise.channels import lower_quartile
 from companion.calibration.seconds.batch import Batch, BatchSource
 from companion.calibration.stillness.gates import (
     GLRT_RATIO,
@@ -231,14 +230,6 @@ def test_compass_gate_works_across_north() -> None:
     assert gate.judge(batch_of(np.full((4, 1), 4.0), circle=True)).words == "compass moved by 3.98 deg > 3.00"
     turning = batch_of(np.array([[350.0], [354.0], [358.0], [2.0], [6.0]]), circle=True)
     assert gate.judge(turning).words.startswith("compass 5.")
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6, 7, 30, 59, 60])
-def test_the_lower_quartile_is_numpy_s_to_the_last_bit(count: int) -> None:
-    values = np.square(np.random.default_rng(count).normal(size=(count, 6)))
-    assert [lower_quartile(sorted(column)) for column in values.T.tolist()] == np.quantile(
-        values, 0.25, axis=0
-    ).tolist()
 
 
 def test_steady_seconds_are_those_since_the_last_bad_one() -> None:

@@ -105,12 +105,6 @@ def why_void(steps: Sequence[Step], latest: Step, steps_lsb: Floats) -> str | No
 def combine(steps: Sequence[Step], steps_lsb: Floats, profile: NoiseProfile, horizon_s: float) -> Dithered:
     """The means over all steps, with what averaging left and what the next minutes can expect.
 
-    Args:
-        steps: all of them.
-        steps_lsb: (6,) of the stream, SI units.
-        profile: noise of the IMU.
-        horizon_s: H of V(T, H).
-
     Raises:
         CalibrationRefusedError: a step is missing.
     """

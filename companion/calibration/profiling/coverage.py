@@ -47,8 +47,6 @@ class Kept(msgspec.Struct, frozen=True, kw_only=True):
     """Within 2 sigma of the bias; that the minute's own white noise is in what is seen of it is allowed for."""
     share_strict: float
     """Within 2 sigma_use as it stands."""
-    share_other: float
-    """As `share`, by the profile it is compared with."""
     share_naive: float
     """Within 2 s / sqrt(n), of all samples of the window."""
 
@@ -88,14 +86,7 @@ def keeps(
     means_s: Sequence[int] = MEANS_S,
     next_s: int = NEXT_S,
 ) -> list[Kept]:
-    """How often the seconds after a window came out as profiles say.
-
-    Args:
-        tests: stretches, and the profile that is to hold in them.
-        other: a profile to compare with.
-        means_s: lengths of windows.
-        next_s: how much is predicted.
-    """
+    """How often the seconds after a window came out as profiles say."""
     found = {mean_s: _Misses([], [], [], [], []) for mean_s in means_s}
     for rests, profile in tests:
         for mean_s, misses in found.items():
@@ -195,6 +186,5 @@ def _summary(triad: Triad, columns: slice, mean_s: int, misses: _Misses) -> Kept
         sigma_other=float(np.sqrt(median(np.ravel(other)))),
         share=share(use + seen),
         share_strict=share(use),
-        share_other=share(other + seen),
         share_naive=share(naive),
     )

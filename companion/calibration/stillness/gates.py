@@ -18,22 +18,14 @@ One set of constants serves all sensors; nothing here is tuned to a recording. T
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, insort
 from collections import deque
+from collections.abc import Sequence
 from typing import Final
 
 import msgspec
 import numpy as np
 
 from companion.calibration.noise.allan import NoiseProfile
-from companion.calibration.noise.channels import (
-    beyond,
-    farthest,
-    lower_quartile,
-    mean_of,
-    mean_over,
-    scatter_of_difference,
-)
 from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, MG
@@ -134,11 +126,23 @@ def _motion(
     The difference of the two variance estimates of white noise has a variance of about sigma^4 / n a channel; that
     sigma^2 is the batch's own white part within the bounds `rest`, for fast motion looks white in part.
     """
-    noise = mean_over(white)
-    slow = mean_over(variance) - noise
+    noise = _mean(white)
+    slow = _mean(variance) - noise
     least, most = rest
     chance = _CHANCE * min(max(noise, least), most) / math.sqrt(n * len(white)) if n >= MIN_IMU_SAMPLES else 0.0
     return math.sqrt(max(slow, 0.0)), math.sqrt(gate**2 + chance)
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Over a few channels, for which numpy takes ten times as long."""
+    return sum(values) / len(values)
+
+
+def _beyond(values: list[float], reference: Sequence[Floats], chance: list[float]) -> float:
+    """The largest difference of a channel from a mean, beyond what chance alone may make of it."""
+    scatter = math.sqrt(1.0 + 1.0 / len(reference))  # of the difference, over that of one mean
+    others: list[float] = np.mean(reference, axis=0).tolist()
+    return max(abs(value - other) - scatter * alone for value, other, alone in zip(values, others, chance, strict=True))
 
 
 def _lower_quartile(freedom: int) -> float:
@@ -148,21 +152,13 @@ def _lower_quartile(freedom: int) -> float:
 
 
 class ImuGate:
-    """The gate of one IMU: six channels, gyro in rad/s, then accelerometer in m/s^2, in any fixed axes.
-
-    Args:
-        name: as the pilot knows it.
-        profile: its noise.
-        steps: quantisation of gyro and accelerometer, 0 for floats.
-    """
+    """The gate of one IMU: six channels, gyro in rad/s, then accelerometer in m/s^2, in any fixed axes."""
 
     def __init__(self, name: str, profile: NoiseProfile, steps: tuple[float, float] = (0.0, 0.0)) -> None:
         self._name = name
         self._white = np.repeat([profile.gyro.white, profile.accel.white], 3)
         self._steps = np.repeat(np.asarray(steps, dtype=np.float64), 3)
         self._learned: deque[Floats] = deque(maxlen=_LEARN_FROM)
-        self._ordered: list[list[float]] | None = None
-        """The same, channel by channel in ascending order; None: to be made when it is needed."""
         self._noise: Floats | None = None
         self._rest: Floats | None = None
         self._off_level = 0
@@ -172,8 +168,6 @@ class ImuGate:
         """The still stretch has ended: references start again. Noise and rest level stay known."""
         self._recent: deque[Floats] = deque(maxlen=_RECENT)
         self._start: list[Floats] = []
-        self._means: tuple[list[float], list[float]] | None = None
-        """Of both; None: to be worked out when they are needed."""
 
     def forget_level(self) -> None:
         """The readings are not comparable with earlier ones: an offset was written, the owner restarted."""
@@ -184,13 +178,10 @@ class ImuGate:
     def accept(self, batch: Batch, *, settled: bool) -> None:
         """The second counts as still for all sources; `settled` when the stretch is long enough to be believed."""
         self._recent.append(batch.mean[:3])
-        start = None if self._means is None else self._means[1]
         if len(self._start) < _REFERENCE:
             self._start.append(batch.mean[3:])
-            start = None
-        self._means = mean_of(self._recent), start or mean_of(self._start)
         if settled:
-            self._rest = np.array(self._means[0])
+            self._rest = np.mean(self._recent, axis=0)
             self._off_level = 0
 
     def judge(self, batch: Batch) -> Verdict:
@@ -225,53 +216,43 @@ class ImuGate:
             shaking = max(vibration, 1.5 * noise)
             rest = (0.0, shaking**2)
             if sigma2 is not None:
-                known = mean_over(sigma2[triad])
+                known = _mean(sigma2[triad])
                 rest = (known, GLRT_RATIO * known)
             # A known noisy sensor behind a low-pass looks like slow motion, hence the profile's noise here too.
             found, allowed = _motion(variance[triad], white[triad], n, max(motion, noise), rest)
             if found > allowed:
                 return _words(f"{part} {name}", found / unit, allowed / unit, unit_name)
-            found = math.sqrt(mean_over(variance[triad]))
+            found = math.sqrt(_mean(variance[triad]))
             if found > shaking:
                 return _words(f"{part} {name} shakes", found / unit, shaking / unit, unit_name)
-        self._learn(batch.variance)
+        self._learned.append(batch.variance)
         return None if sigma2 is None else self._likelihood(variance, n, sigma2)
-
-    def _learn(self, variance: Floats) -> None:
-        learned = self._learned
-        if self._ordered is not None:
-            if len(learned) == learned.maxlen:
-                for column, value in zip(self._ordered, learned[0].tolist(), strict=True):
-                    del column[bisect_left(column, value)]
-            for column, value in zip(self._ordered, variance.tolist(), strict=True):
-                insort(column, value)
-        learned.append(variance)
 
     def _sigma2(self, floor: list[float], n: int) -> list[float] | None:
         """Variance of one sample at rest, learned; None until there is enough to learn from."""
         if len(self._learned) < _LEARNED_ENOUGH:
             return None
-        if self._ordered is None:
-            rows = [variance.tolist() for variance in self._learned]
-            self._ordered = [sorted(column) for column in zip(*rows, strict=True)]
-        least = _lower_quartile(n - 1)
+        ordered = np.sort(np.array(self._learned), axis=0)
+        below, share = divmod(0.25 * (len(ordered) - 1), 1.0)
+        low, high = ordered[int(below)], ordered[int(below) + 1]
+        quartile = (low + (high - low) * share) / _lower_quartile(n - 1)
         # A truncated reading that toggles between two steps has up to a quarter of a step squared.
         return [
-            max(lower_quartile(ordered) / least, known + step * step / 4.0)
-            for ordered, known, step in zip(self._ordered, floor, self._steps.tolist(), strict=True)
+            max(learned, known + step * step / 4.0)
+            for learned, known, step in zip(quartile.tolist(), floor, self._steps.tolist(), strict=True)
         ]
 
     def _likelihood(self, variance: list[float], n: int, sigma2: list[float]) -> Verdict | None:
         ratio = [found / known for found, known in zip(variance, sigma2, strict=True)]
         allowed = GLRT_RATIO * (1.0 + _CHANCE * math.sqrt(2.0 / (6.0 * n)))
         # T / (6 (W - 1) / W), the variances having n - 1 in their denominators.
-        if mean_over(ratio) <= allowed:
+        if _mean(ratio) <= allowed:
             return None
-        gyro, accel = mean_over(ratio[:3]), mean_over(ratio[3:])
+        gyro, accel = _mean(ratio[:3]), _mean(ratio[3:])
         if gyro >= accel:
-            found = math.sqrt(mean_over(variance[:3])) / DEG
+            found = math.sqrt(_mean(variance[:3])) / DEG
             return _words(f"gyro {self._name}", found, found * math.sqrt(allowed / gyro), "deg/s")
-        found = math.sqrt(mean_over(variance[3:])) / MG
+        found = math.sqrt(_mean(variance[3:])) / MG
         return _words(f"accel {self._name}", found, found * math.sqrt(allowed / accel), "mg")
 
     def _displaced(self, batch: Batch) -> Verdict | None:
@@ -288,15 +269,11 @@ class ImuGate:
         if self._noise is not None:
             noise = list(map(max, noise, self._noise.tolist()))
         chance = [_CHANCE * math.sqrt(each / batch.n) for each in noise]
-        if self._recent and self._means is None:
-            self._means = mean_of(self._recent), mean_of(self._start)
-        if self._means is not None:
-            both = scatter_of_difference(self._recent)
-            found = beyond(rate, self._means[0], [each * both for each in chance[:3]])
+        if self._recent:
+            found = _beyond(rate, self._recent, chance[:3])
             if found > GYRO_STEP_RAD_S:
                 return _words(f"gyro {name} moved by", found / DEG, GYRO_STEP_RAD_S / DEG, "deg/s")
-            both = scatter_of_difference(self._start)
-            found = beyond(force, self._means[1], [each * both for each in chance[3:]])
+            found = _beyond(force, self._start, chance[3:])
             if found > ACCEL_STEP_M_S2:
                 return _words(f"accel {name} tilted by", found / MG, ACCEL_STEP_M_S2 / MG, "mg")
         return self._off_rest(rate)
@@ -304,7 +281,7 @@ class ImuGate:
     def _off_rest(self, rate: list[float]) -> Verdict | None:
         if self._rest is None:
             return None
-        found = farthest(rate, self._rest.tolist())
+        found = max(abs(each - rest) for each, rest in zip(rate, self._rest.tolist(), strict=True))
         if found <= GYRO_REST_RAD_S:
             self._off_level = 0
             return None
@@ -329,14 +306,11 @@ class PoseGate:
     def new_stretch(self) -> None:
         """The still stretch has ended: the reference pose starts again."""
         self._start: list[Floats] = []
-        self._refined: list[float] | None = None
-        """What the others add to the first; None: to be worked out when it is needed."""
 
     def accept(self, batch: Batch) -> None:
         """The second counts as still for all sources."""
         if len(self._start) < _REFERENCE:
             self._start.append(batch.mean)
-            self._refined = None
 
     def judge(self, batch: Batch) -> Verdict:
         """Whether this second was still for this sensor."""
@@ -348,13 +322,12 @@ class PoseGate:
         if self._start:
             # Against the first good second, so that averaging on the circle needs no care; the others refine it.
             first = self._start[0].tolist()
-            if self._refined is None:
-                turns = [self._deviations(each.tolist(), first) for each in self._start]
-                self._refined = [sum(of_one) / len(turns) for of_one in zip(*turns, strict=True)]
+            turns = [self._deviations(each.tolist(), first) for each in self._start]
+            refined = [_mean(of_one) for of_one in zip(*turns, strict=True)]
             turned = self._deviations(batch.mean.tolist(), first)
             off = [
                 abs(turn - refined) - _CHANCE * math.sqrt(white / batch.n)
-                for turn, refined, white in zip(turned, self._refined, batch.white.tolist(), strict=True)
+                for turn, refined, white in zip(turned, refined, batch.white.tolist(), strict=True)
             ]
             if max(off) > self._step_deg:
                 return _words(f"{self._name} moved by", max(off), self._step_deg, "deg")

@@ -22,8 +22,7 @@ from companion.calibration.noise.allan import noise_profile
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.history import Point, PowerUp
 from companion.calibration.solution.joint import Whole, points
-from companion.calibration.solution.pose_effect import pose_effect
-from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, expect, expect_today
+from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, expect, expect_today, pose_effect
 from companion.calibration.solution.record import Record
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 from companion.component.statustext import Severity
