@@ -101,11 +101,7 @@ class Recording:
         return self.items(lambda topic: True)
 
     def items(self, wanted: Callable[[str], bool]) -> Iterator[Item]:
-        """The same, without the messages on topics that are not wanted.
-
-        Args:
-            wanted: is asked of every topic when it is met.
-        """
+        """The same, without the messages on topics that are not wanted."""
         try:
             from mcap.exceptions import EndOfFile
         except ImportError:

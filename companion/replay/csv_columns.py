@@ -92,10 +92,6 @@ def _is_number(text: str) -> bool:
 def read(path: Path, columns: str | None = None) -> Iterator[ImuSample]:
     """The samples of a CSV file; comma, semicolon or tab between fields, "#" begins a remark.
 
-    Args:
-        path: the file.
-        columns: names of the columns, where the file has none of its own.
-
     A last line that does not end is left out: the log may have been cut there.
 
     Raises:

@@ -43,13 +43,7 @@ class Axis(msgspec.Struct, frozen=True):
 
 
 def linear(values: Sequence[float], *, ticks: int = 4, least: float = 0.0) -> Axis:
-    """A linear axis around the values.
-
-    Args:
-        values: what must fit.
-        ticks: about so many.
-        least: the range is at least this wide: a scatter of nothing is not blown up to fill the plot.
-    """
+    """A linear axis around the values, `least` wide at least: a scatter of nothing is not blown up to fill the plot."""
     known = [value for value in values if abs(value) < _MOST] or [0.0]
     low, high = min(known), max(known)
     width = max(high - low, least, 1e-4 * max(abs(low), abs(high)), 1e-9)
@@ -146,15 +140,7 @@ class Plot:
     def points(
         self, points: Sequence[Pair], class_: str, *, spans: Sequence[Pair] = (), size: float = 1.0, shape: str = ""
     ) -> None:
-        """Markers, each with an upright bar where `spans` gives its ends.
-
-        Args:
-            points: where.
-            class_: `sx`, `sy`, `sz` or another of the style sheet.
-            spans: lower and upper end of every point's bar.
-            size: over the usual one.
-            shape: "circle", "square", "triangle"; by the class if left out.
-        """
+        """Markers, each with an upright bar where `spans` gives its ends."""
         if not points:
             return
         shape = shape or {"sx": "circle", "sy": "square", "sz": "triangle"}.get(class_, "circle")

@@ -137,13 +137,7 @@ def unsealed(data: bytes) -> bytes:
 
 
 class StateFile(Generic[T]):
-    """One such file.
-
-    Args:
-        path: where.
-        kind: its type, as msgspec takes it.
-        check: raises msgspec.ValidationError where what was found, or is to be kept, cannot be.
-    """
+    """One such file; `check` raises msgspec.ValidationError where what was found, or is to be kept, cannot be."""
 
     def __init__(
         self, path: Path, kind: Any, check: Callable[[T], None] = lambda _: None, newest: int | None = None

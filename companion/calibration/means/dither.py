@@ -77,13 +77,7 @@ def shifts_lsb(reading_lsb: Floats, *, alternate: bool) -> list[Floats]:
 
 
 def why_void(steps: Sequence[Step], latest: Step, steps_lsb: Floats) -> str | None:
-    """Why the latest step says nothing: the aircraft moved, or the shift was not taken; None when it is sound.
-
-    Args:
-        steps: the sound ones before it.
-        latest: its seconds.
-        steps_lsb: (6,) of the stream, SI units.
-    """
+    """Why the latest step says nothing: the aircraft moved, or the shift was not taken; None when it is sound."""
     if len(latest.batches) < 2:
         return "too few readings"
     corrected, scatter = _corrected(latest, steps_lsb)

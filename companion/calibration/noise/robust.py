@@ -113,15 +113,7 @@ class Line(msgspec.Struct, frozen=True):
 def huber_line(
     times_s: Floats, values: Floats, end_s: float, c: Floats | float = HUBER_C, least: Floats | float = 0.0
 ) -> Line:
-    """Huber's line through every column, evaluated at the window's end and not a second later.
-
-    Args:
-        times_s: (m,) ascending, m >= 3.
-        values: (m, c).
-        end_s: where the line is evaluated.
-        c: as for `huber_mean`.
-        least: as for `huber_mean`.
-    """
+    """Huber's line through every column, evaluated at the window's end and not a second later."""
     count = values.shape[0]
     time = (times_s - times_s.mean())[:, None]
     weight = np.ones_like(values)
@@ -172,13 +164,7 @@ _ONE_IN_10000: Final = 3.8906
 
 
 def is_ramp(line: Line, count: int, wander: Floats) -> NDArray[np.bool_]:
-    """(c,) which columns' slopes are ramps.
-
-    Args:
-        line: through every column.
-        count: of its values.
-        wander: (c,) variance of a slope by the part's own flicker and walk; zero where they are not known.
-    """
+    """(c,) which columns' slopes, of `count` values, are ramps; `wander`: variance of a slope by the part's own."""
     chance = np.abs(line.t_statistic) > slope_limit(count)
     return np.asarray(chance & (np.abs(line.slope) > RAMP_FLOORS * np.sqrt(wander)))
 

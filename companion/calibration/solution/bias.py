@@ -65,13 +65,6 @@ def bias_covariance(
     An attitude error eps makes db_a = eps x f and db_g = eps x w; the cross term is kept, since one tilt error
     makes both. What remains unknown of the Earth's rate (latitude, or a heading never measured) comes in with
     `earth_rate_body.covariance`.
-
-    Args:
-        attitude_covariance_rad2: of eps in body axes, shape (3, 3).
-        up: unit vector of specific force at rest in body axes, shape (3,).
-        gravity_m_s2: its magnitude; `gravity_sigma_m_s2` its one-sigma error.
-        gravity_sigma_m_s2: see there.
-        earth_rate_body: the Earth's rate in body axes, rad/s.
     """
     by_rate = -skew(earth_rate_body.mean)  # eps x w = -[w x] eps
     by_force = -skew(gravity_m_s2 * up)

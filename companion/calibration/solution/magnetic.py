@@ -80,13 +80,7 @@ def assess(
 ) -> Heading:
     """The heading of the vehicle from the compass' window, and everything that bounds its error.
 
-    Args:
-        window: the mean heading.
-        field: the mean field, of a device that gives it.
-        compass: how it is mounted, and how good it claims to be.
-        local: the place.
-        up: unit vector in vehicle axes, shape (3,).
-        up_covariance: of `up`, (3, 3); None: not from a gradienter, no inclination can be told.
+    `up_covariance` None: up is not from a gradienter, and no inclination can be told.
     """
     heading = vehicle_heading_rad(compass, window.heading_deg, up)
     found = _Field(None, None, None) if field is None else _look(field, compass, local, up, up_covariance)
