@@ -63,13 +63,4 @@ class MagSample(msgspec.Struct, frozen=True, gc=False):
     counts: tuple[int, int, int] | None = None
 
 
-class AttitudeSample(msgspec.Struct, frozen=True, gc=False):
-    """What a device itself believes its attitude to be."""
-
-    t_s: float
-    yaw_deg: float
-    pitch_deg: float
-    roll_deg: float
-
-
-Sample = ImuSample | TiltSample | CompassSample | MagSample | AttitudeSample
+Sample = ImuSample | TiltSample | CompassSample | MagSample

@@ -56,7 +56,7 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
 
 
 def _parser() -> Parser:
-    from companion.cli import align, client, ground, install, local, monitor, profile, recordings, report
+    from companion.cli import client, ground, install, local, monitor, profile, recordings, report
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -105,7 +105,7 @@ def _parser() -> Parser:
     calibrate.add_argument(
         "--reboot", action="store_true", help="restart the autopilot afterwards (PX4's attitude needs it)"
     )
-    align.add_command(add)
+    client.add_align(add)
     add("cancel", client.cancel, "cancel a running calibration")
     undo = add("undo", client.undo, "put the autopilot's values from before the last calibration back")
     undo.add_argument(

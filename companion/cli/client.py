@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import asyncio
+import math
 from typing import Any
 
 from companion.cli import show
-from companion.cli.terminal import DONE, FAILED, load_config, print_json, print_lines
+from companion.cli.terminal import DONE, FAILED, AddCommand, load_config, print_json, print_lines, seconds
 from companion.daemon.faces.control import ask
 
 Object = dict[str, Any]
@@ -104,3 +106,102 @@ def setup_lines(answer: Object) -> list[str]:
 
 def _number(value: float | None) -> str:
     return "none" if value is None else f"{value:g}"
+
+
+def add_align(add: AddCommand) -> None:
+    """Add it to the parser of the command line."""
+    parser = add("align", align, "measure the gradienter's zero (turn by 180 degrees), or how it sits (tilts)")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument(
+        "what",
+        nargs="?",
+        choices=("zero", "tilts"),
+        metavar="zero|tilts",
+        help="zero: on one spot; tilts: that, and 4 tilts",
+    )
+    what.add_argument("--show", action="store_true", help="the alignment that is kept")
+    what.add_argument("--forget", action="store_true", help="go back to the configuration's zero and sigma")
+    parser.add_argument(
+        "--headings", type=int, choices=(2, 4), default=2, help="zero: 2: there, turned, back; 4: every 90 deg"
+    )
+    parser.add_argument("--quick", action="store_true", help="zero: leave out the way back, which checks the spot")
+    parser.add_argument("--timeout", type=seconds, metavar="S", help="give up after so long (default 900)")
+
+
+async def align(options: argparse.Namespace) -> int:
+    """`companion align`; Ctrl-C cancels it in the daemon too."""
+    path = load_config(options).control.path
+    action = "show" if options.show else "forget" if options.forget else options.what
+    request = {"command": "align", "action": action, "headings": options.headings, "quick": options.quick}
+    if options.timeout is not None:
+        request["timeout_s"] = options.timeout
+    reply: Object = {}
+    shown, running = "", False
+    try:
+        async for reply in ask(path, request):
+            if reply["kind"] == "progress":
+                running = True
+                if reply["text"] != shown:
+                    shown = reply["text"]
+                    print_lines(f"[{reply['percent']:3d} %] {shown}", error=True)
+    except asyncio.CancelledError:
+        if not running:
+            raise
+        reply = await _cancel(path)
+    return _finish(options, action, reply)
+
+
+async def _cancel(path: Any) -> Object:
+    """Ctrl-C: end what was begun, and say how that went."""
+    replies = [reply async for reply in ask(path, {"command": "cancel"})]
+    return {**replies[-1], "alignment": None}
+
+
+def _finish(options: argparse.Namespace, action: str, reply: Object) -> int:
+    answer = {key: value for key, value in reply.items() if key != "kind"}
+    lines: list[str] = []
+    if reply["kind"] != "error":
+        state = answer["state"].upper()
+        lines = [f"{state}: {answer['reason']}" if answer["reason"] else state]
+        lines += alignment_lines(answer["alignment"]) if answer.get("alignment") else []
+    good = answer.get("state") in ("done", "in force") or (action == "show" and answer.get("state") != "refused")
+    return finish(options, reply, answer, lines, good=good)
+
+
+def alignment_lines(record: Object) -> list[str]:
+    """An alignment as a person reads it: the zero, what it means, then each IMU, then what to copy."""
+    (x, y), sigma = record["offset_deg"], record["sigma_deg"]
+    when, stands, worth_mg = record["measured_at"][:19], len(record["stands"]), 1e3 * math.radians(sigma)
+    lines = [
+        f"measured {when} UTC in {stands} stands; the spot slopes by {record['slope_deg']:.2f} deg",
+        f"gradienter zero: x {x:+.4f} y {y:+.4f} deg, sigma {sigma:.4f} deg, {worth_mg:.2f} mg horizontally",
+    ]
+    for imu in record["imus"]:
+        lines.append(f"{imu['name']}:")
+        lines.append(_axes("bias when level", "mg", imu["level_bias_mg"], imu["level_sigma_mg"], ".3f", 1.0))
+        for words, unit, key, form, scale in (
+            ("accel bias", "mg", "accel_bias_mg", ".3f", 1.0),
+            ("accel scale", "%", "accel_scale", ".4f", 100.0),
+            ("misalignment", "deg", "misalignment_deg", ".3f", 1.0),
+            ("gyro bias", "deg/h", "gyro_bias_deg_h", ".1f", 1.0),
+        ):
+            found = imu[key]
+            if all(found["known"]):
+                lines.append(_axes(words, unit, found["value"], found["sigma"], form, scale))
+    lines += [f"warning: {words}" for words in record["warnings"]]
+    configured = record["gradienter"]["offset_deg"]
+    lines += [
+        "in the configuration the same is said by these lines (then: companion align --forget):",
+        "    [gradienter]",
+        f"    offset_deg = [{configured[0] + x:.4f}, {configured[1] + y:.4f}]",
+        f"    sigma_deg = {sigma:.4f}",
+    ]
+    return lines
+
+
+def _axes(words: str, unit: str, values: list[float], sigmas: list[float], form: str, scale: float) -> str:
+    axes = "  ".join(
+        f"{axis} {value * scale:+{form}} +- {sigma * scale:{form}}"
+        for axis, value, sigma in zip("xyz", values, sigmas, strict=True)
+    )
+    return f"  {words:16} {unit:6} {axes}"

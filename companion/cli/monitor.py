@@ -15,7 +15,7 @@ import shutil
 import sys
 import textwrap
 import time
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from companion.cli import show
 from companion.cli.terminal import DONE, load_config, print_json, print_lines
@@ -35,18 +35,10 @@ _COLOURS: Final = {"good": "1;97;42", "wait": "1;30;103", "busy": "1;97;44", "ba
 _SIGNS: Final = {"good": "OK ", "wait": "...", "busy": ">>>", "bad": "!!!"}
 
 
-class _View(Protocol):
-    def show(self, status: Object) -> None: ...
-
-    def gone(self, why: str) -> None: ...
-
-    def close(self) -> None: ...
-
-
 async def monitor(options: argparse.Namespace) -> int:
     """Watch until Ctrl-C; a daemon that goes away is waited for."""
     path = load_config(options).control.path
-    view: _View
+    view: _Json | _Screen | _Lines
     if getattr(options, "json", False):
         view = _Json()
     else:

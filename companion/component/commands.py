@@ -16,16 +16,17 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion import __version__
 from companion.calibration.request import What
 from companion.component import requests
-from companion.component.identity import autopilot_version
-from companion.component.permission import Permission
+from companion.component.requests import Permission
 from companion.component.service import CalibrationService, Job, Refusal
 from companion.component.statustext import Say, Severity, Weight
 from companion.links.mavlink.link import MavlinkLink
@@ -281,3 +282,30 @@ class CommandServer:
 
 def _doing(request: requests.Calibrate | requests.Undo) -> str:
     return "undoing" if isinstance(request, requests.Undo) else f"calibrating {_WORDS[request.what]}"
+
+
+CAPABILITIES = (
+    mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    # Our parameters are all REAL32, the same in both encodings; the flags tell every client to send the number
+    # itself. PARAM_FLOAT is what Mission Planner decides by, ENCODE_C_CAST what the protocol now asks for.
+    | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
+)
+
+
+def autopilot_version() -> mavlink.MAVLink_autopilot_version_message:
+    """AUTOPILOT_VERSION (148) of this component: its capabilities and the companion's own version."""
+    nothing = (0,) * 8
+    return mavlink.MAVLink_autopilot_version_message(
+        CAPABILITIES, encode_version(__version__), 0, 0, 0, nothing, nothing, nothing, 0, 0, 0
+    )
+
+
+def encode_version(version: str) -> int:
+    """Encode "major.minor.patch" as `flight_sw_version`: a byte each, then the release type (255 official, 0 not)."""
+    match = re.match(r"(\d+)\.(\d+)\.(\d+)", version)
+    major, minor, patch = (min(int(part), 255) for part in match.groups()) if match else (0, 0, 0)
+    official = match is not None and match.end() == len(version)
+    release_type = mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL if official else mavlink.FIRMWARE_VERSION_TYPE_DEV
+    return major << 24 | minor << 16 | patch << 8 | release_type

@@ -9,9 +9,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.arm_authorisation import ArmAuthoriser, ArmingScript
 from companion.component.commands import CommandServer
-from companion.component.identity import heartbeat
 from companion.component.own_parameters import OwnParameters
-from companion.component.permission import Permission
+from companion.component.requests import Permission
 from companion.component.service import ArmGate, CalibrationService, VehicleView
 from companion.component.statustext import Severity, StatusText, Weight
 from companion.config.sections import Senders
@@ -109,3 +108,10 @@ class Component:
     def _on_heartbeat(self, _message: mavlink.MAVLink_heartbeat_message, _t_s: float) -> None:
         if self._vehicle.system_id not in (None, self._known_as):
             self._woken.set()
+
+
+def heartbeat(mav_state: int) -> mavlink.MAVLink_heartbeat_message:
+    """Our heartbeat: an onboard controller that is no autopilot."""
+    return mavlink.MAVLink_heartbeat_message(
+        mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mav_state, 3
+    )

@@ -12,8 +12,7 @@ from typing import Literal
 from companion.calibration.collector.rolling import RollingCollector
 from companion.config.sections import Compass, Config, Gradienter, Imu
 from companion.links.serial.bytestream import PortSettings
-from companion.protocols.registry import PROTOCOLS, Kind, ProtocolInfo
-from companion.protocols.roles import Part, part_for
+from companion.protocols.registry import PROTOCOLS, Kind, ProtocolInfo, part_for
 from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
 
 
@@ -85,14 +84,14 @@ def _device(port: str, used: Sequence[tuple[Role, Imu | Gradienter | Compass]]) 
     )
 
 
-def parts_of(sample: Sample, roles: Sequence[Role]) -> Iterator[tuple[Role, Part]]:
+def parts_of(sample: Sample, roles: Sequence[Role]) -> Iterator[tuple[Role, Sample]]:
     """What each role takes of a sample."""
     for role in roles:
         if (part := part_for(role.kind, sample)) is not None and not role.refuses(sample):
             yield role, part
 
 
-def collect(collector: RollingCollector, role: Role, part: Part) -> TiltSample | CompassSample | None:
+def collect(collector: RollingCollector, role: Role, part: Sample) -> TiltSample | CompassSample | None:
     """Give the collector what a role has taken; the reading of the pose that counts, or came of it, if any."""
     match part:
         case ImuSample():

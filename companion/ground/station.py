@@ -16,19 +16,9 @@ from companion.component.commands import MAV_RESULT_CANCELLED
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity
 from companion.errors import ConfigError, NobodyHeardError
+from companion.ground import heard
 from companion.ground.exchange import Answer, Exchange
-from companion.ground.heard import (
-    AT_ARM,
-    FRESH_S,
-    MEANINGS,
-    RESULTS,
-    Heard,
-    Target,
-    Text,
-    Vehicle,
-    figures,
-    nobody_heard,
-)
+from companion.ground.heard import FRESH_S, Heard, Target, Text, Vehicle
 from companion.ground.link import GroundLink
 
 CALIBRATE, CANCEL, UNDO = mavlink.MAV_CMD_USER_1, mavlink.MAV_CMD_USER_2, mavlink.MAV_CMD_USER_3
@@ -124,7 +114,7 @@ class Station:
             if wanted and (certain or waited_s >= EVERYBODY_WITHIN_S):
                 break
             if loop.time() - begun_s >= within_s and not wanted:
-                raise NobodyHeardError(nobody_heard(self._heard, self._url, system_id, within_s))
+                raise NobodyHeardError(heard.nobody_heard(self._heard, self._url, system_id, within_s))
             await asyncio.sleep(_POLL_S)
         if len(wanted) > 1:
             raise ConfigError(
@@ -152,11 +142,7 @@ class Station:
         return dataclasses.replace(outcome, lines=lines, more={**outcome.more, **more})
 
     async def undo(self) -> Outcome:
-        """Put the old values back.
-
-        Raises:
-            NobodyHeardError: the companion beats, but does not answer.
-        """
+        """Put the old values back; raises as `calibrate`."""
         begun_s = asyncio.get_running_loop().time()
         exchange = self._exchange(UNDO)
         answer = await self._cancellable(exchange, None)
@@ -164,11 +150,7 @@ class Station:
         return dataclasses.replace(outcome, lines=[f"{outcome.state.upper()}: {outcome.reason}", *outcome.lines])
 
     async def cancel(self) -> Outcome:
-        """Cancel what runs, whoever asked for it, and wait until it has ended.
-
-        Raises:
-            NobodyHeardError: the companion beats, but does not answer.
-        """
+        """Cancel what runs, whoever asked for it, and wait until it has ended; raises as `calibrate`."""
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
         answer = await self._exchange(CANCEL).run()
@@ -200,7 +182,7 @@ class Station:
         }.get(beat.system_status, "unknown")  # type: ignore[assignment] # mypy widens the literals
         found = await self._own_parameters()
         vehicle = self.vehicle
-        last = RESULTS.get(found.get("CMP_STATE", -1.0))
+        last = heard.RESULTS.get(found.get("CMP_STATE", -1.0))
         reason = {
             "busy": "calibrating or writing",
             "idle": "ready",
@@ -217,12 +199,12 @@ class Station:
         if not found:
             lines.append("settings: no answer to the question for its parameters (a bad link?)")
         else:
-            known = figures(sigma["gyro_sigma_deg_h"], sigma["accel_sigma_mg"])
+            known = heard.figures(sigma["gyro_sigma_deg_h"], sigma["accel_sigma_mg"])
             lines.append(f"last calibration: {last}{', ' + known if known and last == 'done' else ''}"
                          if last else "last calibration: none since the companion started")  # fmt: skip
             at_arm = found.get("CMP_AT_ARM", -1.0)
             lines.append(
-                f"at arming: {AT_ARM[int(at_arm)] if at_arm in (0.0, 1.0, 2.0) else 'unknown'};"
+                f"at arming: {heard.AT_ARM[int(at_arm)] if at_arm in (0.0, 1.0, 2.0) else 'unknown'};"
                 f" results are {'written to the autopilot' if found.get('CMP_PUSH') else 'NOT written (CMP_PUSH = 0)'}"
             )
         more = {**self._more(0.0), "last": last, **sigma, "parameters": found}
@@ -246,7 +228,7 @@ class Station:
         refusals = [refusal for name, value in wanted.items() if (refusal := await self._set(name, value))]
         if wanted:
             found = await self._own_parameters() or found
-        lines = [f"{name:12} {value:12g}  {MEANINGS.get(name, '')}".rstrip() for name, value in found.items()]
+        lines = [f"{name:12} {value:12g}  {heard.MEANINGS.get(name, '')}".rstrip() for name, value in found.items()]
         reason = "; ".join(refusals) or ("set; holds until the companion restarts" if wanted else "")
         state: State = "refused" if refusals else "done"
         return Outcome(state, reason, good=not refusals, lines=[*lines, *([reason] if reason else [])],
@@ -319,7 +301,7 @@ class Station:
         busy = self._heard.busy(self._target.system_id, asyncio.get_running_loop().time() - FRESH_S)
         if busy is False:
             last = await self._link.get_parameter(self._target, "CMP_STATE")
-            ended = RESULTS.get(-1.0 if last is None else last)
+            ended = heard.RESULTS.get(-1.0 if last is None else last)
             reason = (
                 f"the answer to the request got lost; the companion's last calibration: {ended}"
                 if ended is not None

@@ -1,4 +1,8 @@
-"""Which protocols there are, under the names that the configuration uses, and how their lines are set by default."""
+"""Which protocols there are, under the names that the configuration uses, and how their lines are set by default.
+
+One device on one port may be IMU, gradienter and compass at once. A decoder gives the tilt of one frame once: as a
+`TiltSample`, or as the pitch and roll of its `CompassSample`; `part_for` says what each role takes of it.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +27,7 @@ from companion.protocols.imus.xsens import XsensDecoder, XsensDialogue
 from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder, InclinometerXyDialogue
 from companion.protocols.inclinometers.jewell import JewellDecoder, JewellDialogue
 from companion.protocols.inclinometers.rion import RionDecoder, RionDialogue
+from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
 
 Kind = Literal["imu", "gradienter", "compass"]
 
@@ -111,3 +116,20 @@ def main_kind(name: str) -> Kind:
     raise ConfigError(
         f"found protocol {name!r}; allowed: {', '.join(sorted({n for o in PROTOCOLS.values() for n in o}))}"
     )
+
+
+def part_for(role: Kind, sample: Sample) -> Sample | None:
+    """The sample as this role takes it; None where it has nothing for it."""
+    match sample:
+        case ImuSample():
+            return sample if role == "imu" else None
+        case TiltSample():
+            return sample if role == "gradienter" else None
+        case MagSample():
+            return sample if role == "compass" else None
+        case CompassSample(pitch_deg=pitch_deg, roll_deg=roll_deg):
+            if role == "compass":
+                return sample
+            if role == "gradienter" and pitch_deg is not None and roll_deg is not None:
+                return TiltSample(sample.t_s, roll_deg, pitch_deg)
+    return None

@@ -21,7 +21,7 @@ import msgspec
 
 from companion import __version__
 from companion.errors import CompanionError
-from companion.links.system.backoff import Backoff
+from companion.links.system.connection import Backoff
 from companion.links.system.request import parse_request
 from companion.web.access import (
     TOKEN_HEADER,

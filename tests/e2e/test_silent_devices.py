@@ -11,8 +11,7 @@ import pytest
 from companion.configured.devices import Role, SerialDevice
 from companion.daemon.devices.sensors import SerialSensor
 from companion.protocols.registry import PROTOCOLS, Kind
-from companion.protocols.roles import Part
-from companion.samples import CompassSample, TiltSample
+from companion.samples import CompassSample, Sample, TiltSample
 from sim.aircraft import Pose, VirtualAircraft
 from sim.compasses import NmeaCompass
 from sim.devices import Gradienter
@@ -47,10 +46,10 @@ def test_a_silent_device_is_brought_to_give_readings(
         device, path, info = make(aircraft), tmp_path / "device", PROTOCOLS[kind][protocol]
         async with PtyDevice(device, path):
             stopped(device)
-            taken: list[Part] = []
+            taken: list[Sample] = []
             enough = asyncio.Event()
 
-            def take(role: Role, part: Part) -> None:
+            def take(role: Role, part: Sample) -> None:
                 taken.append(part)
                 if len(taken) >= 10:
                     enough.set()

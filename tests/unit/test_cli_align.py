@@ -14,7 +14,7 @@ import pytest
 
 from companion import cli
 from companion.calibration.alignment.align_record import AlignmentRecord, GradienterSettings
-from companion.cli.align import alignment_lines
+from companion.cli.client import alignment_lines
 from companion.errors import StorageError
 from companion.storage.learned import AlignmentStore
 from companion.storage.state import unsealed

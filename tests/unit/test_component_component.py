@@ -9,8 +9,8 @@ from itertools import pairwise
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.component.commands import encode_version
 from companion.component.component import Component
-from companion.component.identity import encode_version
 from companion.component.statustext import Severity
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.component import CALIBRATE, FakeVehicle, Ground, ScriptedService, bench

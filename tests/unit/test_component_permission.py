@@ -12,7 +12,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.component import Component
-from companion.component.permission import MAX_REMEMBERED, Permission
+from companion.component.requests import MAX_REMEMBERED, Permission
 from companion.config import parse
 from companion.config.sections import Senders
 from companion.daemon.process.run import RELOADABLE

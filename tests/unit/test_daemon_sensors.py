@@ -25,8 +25,7 @@ from companion.daemon.devices.sensors import SerialSensor
 from companion.links.serial.bytestream import ByteLink
 from companion.protocols.decoding.dialogue import Dialogue
 from companion.protocols.registry import PROTOCOLS, ProtocolInfo
-from companion.protocols.roles import Part
-from companion.samples import CompassSample, ImuSample, TiltSample
+from companion.samples import CompassSample, ImuSample, Sample, TiltSample
 from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import HMR3300
 from sim.pty_device import PtyDevice
@@ -97,9 +96,9 @@ def device(
 BOTH = (Role("gradienter", "gradienter"), Role("compass", "compass"))
 
 
-def opened(which: SerialDevice) -> tuple[SerialSensor, OpenPort, list[tuple[str, Part]]]:
+def opened(which: SerialDevice) -> tuple[SerialSensor, OpenPort, list[tuple[str, Sample]]]:
     """A sensor on a port that has just been opened."""
-    taken: list[tuple[str, Part]] = []
+    taken: list[tuple[str, Sample]] = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sensors, "ByteLink", OpenPort)
         sensor = SerialSensor(which, lambda role, part: taken.append((role.name, part)))
@@ -363,7 +362,7 @@ def test_a_stopped_hmr3300_is_polled_unless_it_may_only_be_read(tmp_path: Path, 
                 f'[compass]\nport = "{tmp_path / "compass"}"\nprotocol = "hmr3300"\nread_only = {read_only}\n'.lower()
             )
             (which,) = serial_devices(config(section.replace(str(tmp_path).lower(), str(tmp_path))))
-            taken: list[Part] = []
+            taken: list[Sample] = []
             sensor = SerialSensor(which, lambda role, part: taken.append(part))
             running = asyncio.create_task(sensor.run())
             try:
@@ -408,7 +407,7 @@ def test_every_sample_of_a_read_is_handed_on_once_in_its_order(tmp_path: Path) -
     (device,) = serial_devices(parse(text, "companion.toml"))
 
     async def main() -> None:
-        taken: list[tuple[Role, Part]] = []
+        taken: list[tuple[Role, Sample]] = []
         sensor = SerialSensor(device, lambda role, part: taken.append((role, part)))
         frames = [vectornav_imu(time_ns=n * 1_000_000) for n in range(7)]
         sensor.receive(b"".join(frames[:3]), 1.0)

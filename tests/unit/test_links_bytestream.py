@@ -26,8 +26,8 @@ from companion.links.serial import bytestream
 from companion.links.serial import port as serial_port
 from companion.links.serial.bytestream import OUT_BUFFER_BYTES, QUICK_READS, ByteLink, PortSettings
 from companion.links.serial.port import SerialOpener, open_serial
-from companion.links.system.backoff import Backoff
 from companion.links.system.budget import Budget
+from companion.links.system.connection import Backoff
 from companion.links.system.together import Together
 
 NOBODY = 65534
@@ -596,7 +596,7 @@ def test_an_unexpected_fault_while_opening_is_an_event_and_no_silence(monkeypatc
 
 
 def test_one_warning_a_loss_and_word_when_it_is_back(path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.DEBUG, logger="companion.links.system.backoff")
+    caplog.set_level(logging.DEBUG, logger="companion.links.system.connection")
 
     async def main() -> None:
         with plugged(path) as pty:

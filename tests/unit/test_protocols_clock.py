@@ -14,7 +14,7 @@ from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.protocols.imus.vectornav import VectorNavDecoder
 from companion.protocols.inclinometers.inclinometer_xy import InclinometerXyDecoder
 from companion.protocols.registry import PROTOCOLS
-from companion.samples import AttitudeSample, ImuSample, TiltSample
+from companion.samples import ImuSample, MagSample, TiltSample
 from tests.support.frames import imu_line
 from tests.support.serial_reads import RATE_HZ, Reads, reads
 
@@ -238,7 +238,7 @@ def test_late_samples_are_counted() -> None:
 def test_what_else_a_frame_brings_has_the_same_time() -> None:
     times = SampleTimes()
     times.place([imu(100.0, 5.0)], 100.0)
-    first, second = times.place([imu(101.05, 6.0), AttitudeSample(101.05, 1.0, 2.0, 3.0)], 101.05)
+    first, second = times.place([imu(101.05, 6.0), MagSample(101.05, (1.0, 2.0, 3.0))], 101.05)
     assert first.t_s == second.t_s == pytest.approx(101.0, abs=0.001)
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from companion.protocols.registry import Kind
-from companion.protocols.roles import part_for
-from companion.samples import AttitudeSample, CompassSample, ImuSample, MagSample, Sample, TiltSample
+from companion.protocols.registry import Kind, part_for
+from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
 
 IMU = ImuSample(1.0, (0.1, 0.2, 0.3), (0.0, 0.0, -9.8))
 TILT = TiltSample(1.0, -3.0, 5.0, 20.0)
@@ -30,7 +29,6 @@ WITH_TILT = CompassSample(1.0, 40.0, pitch_deg=5.0, roll_deg=-3.0)
         ("compass", WITH_TILT, WITH_TILT),
         ("imu", MagSample(1.0, counts=(1, 2, 3)), None),
         ("compass", MagSample(1.0, counts=(1, 2, 3)), MagSample(1.0, counts=(1, 2, 3))),
-        ("gradienter", AttitudeSample(1.0, 1.0, 2.0, 3.0), None),
     ],
 )
 def test_a_role_takes_its_part(role: Kind, sample: Sample, part: Sample | None) -> None:

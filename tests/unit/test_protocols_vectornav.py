@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from companion.protocols.imus.vectornav import VectorNavDecoder
-from companion.samples import AttitudeSample, ImuSample, MagSample, Sample
+from companion.samples import ImuSample, MagSample, Sample
 from tests.support.decoders import VECTORNAV_BYTES
 from tests.support.frames import (
     COMMON_SIZES,
@@ -34,11 +34,10 @@ def test_the_test_bench_computes_the_known_crc() -> None:
     assert crc16_xmodem(b"123456789") == 0x31C3
 
 
-def test_ymr_gives_rate_and_force_attitude_and_field() -> None:
+def test_ymr_gives_rate_and_force_and_field() -> None:
     assert feed(YMR) == (
         [
             ImuSample(1.0, (-0.5, 0.25, -0.125), (-1.5, -0.125, -9.75)),
-            AttitudeSample(1.0, 10.0, -7.5, 0.5),
             MagSample(1.0, (-0.5, -0.25, 0.75)),
         ],
         {},
@@ -57,7 +56,7 @@ def test_imu_has_a_temperature() -> None:
 
 def test_a_sentence_may_carry_a_crc_instead() -> None:
     body = YMR[1:].split(b"*")[0]
-    assert len(feed(b"$" + body + b"*%04X\r\n" % crc16_xmodem(body))[0]) == 3
+    assert len(feed(b"$" + body + b"*%04X\r\n" % crc16_xmodem(body))[0]) == 2
     assert feed(b"$" + body + b"*%04X\r\n" % (crc16_xmodem(body) ^ 1)) == ([], {"checksum": 1})
 
 
@@ -76,7 +75,6 @@ def test_a_sentence_may_carry_a_crc_instead() -> None:
         (b"$VN" + b"1" * 400 + b"\r\n", "too long"),
         (sentence("VNYMR,nan,0,0,0,0,0,0,0,-9.8,0,0,0"), "non-finite"),
         (sentence("VNYMR,0,0,0,0,0,0,0,0,-inf,0,0,0"), "non-finite"),
-        (sentence("VNYMR,0,91,0,0,0,0,0,0,-9.8,0,0,0"), "out of range"),
         (sentence("VNYMR,361,0,0,0,0,0,0,0,-9.8,0,0,0"), "out of range"),
         (sentence("VNYMR,0,0,0,0,0,0,0,0,-9999,0,0,0"), "out of range"),
         (sentence("VNYMR,0,0,0,0,0,0,0,0,-9.8,0,0,x"), "not a number"),
@@ -108,10 +106,9 @@ def test_values_come_from_their_own_fields() -> None:
     common |= {0: struct.pack("<Q", 123_456_789_000), 3: floats(11, 12, 13), 5: floats(21, 22, 23)}
     common |= {8: floats(31, 32, 33), 9: floats(41, 42, 43, 51, 52, 53), 10: floats(1, 2, 3, 61, 62)}
     imu = {bit: bytes(size) for bit, size in enumerate(IMU_SIZES)} | {4: floats(71)}
-    attitude, mag = AttitudeSample(1.0, 11, 12, 13), MagSample(1.0, (1, 2, 3))
+    mag = MagSample(1.0, (1, 2, 3))
     assert feed(vectornav_binary({1: common, 3: imu}))[0] == [
         ImuSample(1.0, (21, 22, 23), (31, 32, 33), 71, None, 123.456789),
-        attitude,
         mag,
     ]
     assert feed(vectornav_binary({1: common}))[0][0] == ImuSample(1.0, (21, 22, 23), (31, 32, 33), 61, None, 123.456789)

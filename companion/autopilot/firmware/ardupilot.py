@@ -10,8 +10,7 @@ import dataclasses
 import math
 from typing import Final
 
-from companion.autopilot.firmware.imu_calibration import ACCEL_SCALE_RANGE, ImuCalibration, ImuParameters
-from companion.autopilot.firmware.rivals import read_rivals
+from companion.autopilot.firmware.imu_calibration import ACCEL_SCALE_RANGE, ImuCalibration, ImuParameters, read_rivals
 from companion.autopilot.parameters.client import ParameterClient, read_integer, read_offsets, read_scales
 from companion.errors import AutopilotError, AutopilotRebootedError
 from companion.physics.frames import Matrix, rotation_matrix

@@ -18,9 +18,9 @@ from companion.autopilot.firmware.imu_calibration import (
     MAX_GYRO_RESIDUAL_RAD_S,
     ImuCalibration,
     ImuParameters,
+    rivals_of,
 )
 from companion.autopilot.firmware.px4 import SLOTS, SlotMemory
-from companion.autopilot.firmware.rivals import rivals_of
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Firmware
 from companion.errors import AutopilotError

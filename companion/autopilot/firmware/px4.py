@@ -22,8 +22,14 @@ from typing import Final, Literal
 
 import numpy as np
 
-from companion.autopilot.firmware.imu_calibration import ACCEL_SCALE_RANGE, FarStep, ImuCalibration, ImuParameters
-from companion.autopilot.firmware.rivals import RivalMemory, read_rivals
+from companion.autopilot.firmware.imu_calibration import (
+    ACCEL_SCALE_RANGE,
+    FarStep,
+    ImuCalibration,
+    ImuParameters,
+    RivalMemory,
+    read_rivals,
+)
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.parameters.client import ParameterClient, read_integer, read_offsets, read_scales
 from companion.errors import AutopilotError, AutopilotRebootedError

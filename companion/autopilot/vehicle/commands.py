@@ -26,13 +26,13 @@ MAX_WAITING: Final = 16
 """Commands of one kind that may wait; beyond that the newest is dropped, counted, and answered None at once."""
 
 
+@dataclasses.dataclass(slots=True)
 class _Request:
     """One command: what is sent, how long its answer is awaited, and who waits."""
 
-    def __init__(self, parameters: tuple[float, ...], timeout_s: float, answer: asyncio.Future[int | None]) -> None:
-        self.parameters = parameters
-        self.timeout_s = timeout_s
-        self.answer = answer
+    parameters: tuple[float, ...]
+    timeout_s: float
+    answer: asyncio.Future[int | None]
 
     def settle(self, result: int | None) -> None:
         if not self.answer.done():

@@ -88,28 +88,12 @@ ADOPT_OTHER_COMPONENT_S: Final = 2.0
 """How long an autopilot on another component than 1 must have been heard before it is taken for the one."""
 
 _NOT_AIRCRAFT: Final = frozenset(
-    {
-        mavlink.MAV_TYPE_ANTENNA_TRACKER,
-        mavlink.MAV_TYPE_GCS,
-        mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
-        mavlink.MAV_TYPE_GIMBAL,
-        mavlink.MAV_TYPE_ADSB,
-        mavlink.MAV_TYPE_CAMERA,
-        mavlink.MAV_TYPE_CHARGING_STATION,
-        mavlink.MAV_TYPE_FLARM,
-        mavlink.MAV_TYPE_SERVO,
-        mavlink.MAV_TYPE_ODID,
-        mavlink.MAV_TYPE_BATTERY,
-        mavlink.MAV_TYPE_PARACHUTE,
-        mavlink.MAV_TYPE_LOG,
-        mavlink.MAV_TYPE_OSD,
-        mavlink.MAV_TYPE_IMU,
-        mavlink.MAV_TYPE_GPS,
-        mavlink.MAV_TYPE_WINCH,
-        mavlink.MAV_TYPE_ILLUMINATOR,
-        mavlink.MAV_TYPE_GRIPPER,
-    }
-)
+    getattr(mavlink, f"MAV_TYPE_{name}")
+    for name in (
+        "ANTENNA_TRACKER", "GCS", "ONBOARD_CONTROLLER", "GIMBAL", "ADSB", "CAMERA", "CHARGING_STATION", "FLARM",
+        "SERVO", "ODID", "BATTERY", "PARACHUTE", "LOG", "OSD", "IMU", "GPS", "WINCH", "ILLUMINATOR", "GRIPPER",
+    )
+)  # fmt: skip
 
 
 def is_aircraft(message: mavlink.MAVLink_heartbeat_message) -> bool:

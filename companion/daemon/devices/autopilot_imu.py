@@ -15,9 +15,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from companion.autopilot.firmware.firmwares import read_calibration
-from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, rivals_of
 from companion.autopilot.firmware.px4 import SlotMemory
-from companion.autopilot.firmware.rivals import rivals_of
 from companion.autopilot.telemetry.imu_stream import ImuStream, StreamKind
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
 from companion.config.sections import Imu

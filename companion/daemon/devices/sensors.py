@@ -18,7 +18,6 @@ from companion.links.system.budget import Budget
 from companion.links.system.listeners import Listeners
 from companion.links.system.together import Together
 from companion.protocols.registry import Kind
-from companion.protocols.roles import Part
 from companion.protocols.stream_health import SILENT_AFTER_S
 from companion.samples import CompassSample, Sample
 
@@ -105,7 +104,7 @@ class SerialSensor:
     def __init__(
         self,
         device: SerialDevice,
-        take: Callable[[Role, Part], None],
+        take: Callable[[Role, Sample], None],
         offload: Offload = asyncio.to_thread,
         together: Together | None = None,
     ) -> None:

@@ -17,7 +17,6 @@ from companion.daemon.devices.sensor_health import UNTOUCHED, Corrected, SensorW
 from companion.daemon.devices.sensors import SensorRole, SerialSensor
 from companion.daemon.devices.signing import LinkSigning
 from companion.links.system.request import Object
-from companion.protocols.roles import Part
 from companion.samples import Sample
 
 
@@ -86,7 +85,7 @@ class Devices(Subsystem):
             *([("sensor-watch", self.watch.run)] if ports else []),
         ]
 
-    def _take(self, role: Role, part: Part) -> None:
+    def _take(self, role: Role, part: Sample) -> None:
         reading = collect(self._core.collector, role, part)
         if reading is not None:
             for take in self._pose_watchers:

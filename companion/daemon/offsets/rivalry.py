@@ -9,8 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.autopilot.firmware.rivals import Rival, stop
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, Rival, stop
 from companion.autopilot.parameters.change import Change
 from companion.autopilot.vehicle.vehicle import VehicleEvent
 from companion.component.statustext import Severity, Weight

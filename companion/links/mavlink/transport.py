@@ -17,7 +17,7 @@ from typing import Any
 from companion.errors import LinkError
 from companion.links.mavlink.link import MavlinkLink, Sender
 from companion.links.serial.bytestream import ByteLink, PortSettings
-from companion.links.system.backoff import Backoff, OnState, Reconnection
+from companion.links.system.connection import Backoff, OnState, Reconnection
 
 logger = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from companion.links.mqtt.credentials import is_open_to_all, read_password, tls_
 from companion.links.mqtt.filter import LEAVE_DEADLINE_S, MAX_PACKET_BYTES, MqttFilter
 from companion.links.mqtt.outbox import Outbox
 from companion.links.mqtt.words import explain, is_of_protocol
-from companion.links.system.backoff import Backoff, Reconnection
+from companion.links.system.connection import Backoff, Reconnection
 
 if TYPE_CHECKING:
     import aiomqtt

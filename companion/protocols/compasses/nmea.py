@@ -23,8 +23,7 @@ import math
 from typing import Final, Literal
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import RejectedError, SentenceDecoder
-from companion.protocols.decoding.checks import check_vector
+from companion.protocols.decoding.base import RejectedError, SentenceDecoder, check_vector
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 

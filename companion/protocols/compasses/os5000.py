@@ -15,8 +15,7 @@ import re
 from typing import Final
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import RejectedError, SentenceDecoder
-from companion.protocols.decoding.checks import TEMPERATURE_LIMIT_DEGC
+from companion.protocols.decoding.base import TEMPERATURE_LIMIT_DEGC, RejectedError, SentenceDecoder
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 
 FIELD_LIMIT_GAUSS: Final = 2.0

@@ -13,8 +13,7 @@ from typing import ClassVar, Final
 import msgspec
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import RejectedError, SentenceDecoder
-from companion.protocols.decoding.checks import check_imu
+from companion.protocols.decoding.base import RejectedError, SentenceDecoder, check_imu
 from companion.samples import ImuSample, Sample
 
 _Values = tuple[int, int, float, float, float, float, float, float, float | None]

@@ -17,8 +17,7 @@ from typing import ClassVar, Final
 
 from companion.physics.units import G
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import RejectedError
-from companion.protocols.decoding.checks import check_imu, check_vector
+from companion.protocols.decoding.base import RejectedError, check_imu, check_vector
 from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.protocols.decoding.framing import WAIT, FrameDecoder
 from companion.samples import ImuSample, MagSample, Sample, Vector

@@ -32,8 +32,7 @@ from typing import ClassVar, Final
 
 from companion.physics.units import DEG, G
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import RejectedError
-from companion.protocols.decoding.checks import check_imu
+from companion.protocols.decoding.base import RejectedError, check_imu
 from companion.protocols.decoding.framing import WAIT, FrameDecoder
 from companion.samples import ImuSample, Sample, TiltSample, Vector
 

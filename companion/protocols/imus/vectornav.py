@@ -21,11 +21,17 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import RejectedError, body_of_sentence, xor_checksum
-from companion.protocols.decoding.checks import check_attitude, check_imu, check_vector, numbers
+from companion.protocols.decoding.base import (
+    RejectedError,
+    body_of_sentence,
+    check_imu,
+    check_vector,
+    numbers,
+    xor_checksum,
+)
 from companion.protocols.decoding.dialogue import WakeDialogue
 from companion.protocols.decoding.framing import WAIT, FrameDecoder
-from companion.samples import AttitudeSample, ImuSample, MagSample, Sample, Vector
+from companion.samples import ImuSample, MagSample, Sample, Vector
 
 _Fields = tuple[tuple[str, str], ...]
 
@@ -96,7 +102,6 @@ class Layout:
     time_startup: int | None
     imu: tuple[int, int] | None
     temperature: int | None
-    attitude: int | None
     mag: int | None
 
     def samples(self, frame: bytes, start: int, t_s: float) -> list[Sample]:
@@ -111,10 +116,6 @@ class Layout:
             check_imu(gyro_rad_s, accel_m_s2, temperature_degc)
             t_device_s = None if self.time_startup is None else values[self.time_startup] / 1e9
             samples.append(ImuSample(t_s, gyro_rad_s, accel_m_s2, temperature_degc, None, t_device_s))
-        if self.attitude is not None:
-            yaw_deg, pitch_deg, roll_deg = values[self.attitude : self.attitude + 3]
-            check_attitude(yaw_deg, pitch_deg, roll_deg)
-            samples.append(AttitudeSample(t_s, yaw_deg, pitch_deg, roll_deg))
         if self.mag is not None:
             field_gauss: Vector = values[self.mag : self.mag + 3]
             check_vector(field_gauss)
@@ -149,7 +150,6 @@ def layout_of(header: bytes) -> Layout:
         time_startup=places.get("time_startup_ns"),
         imu=_pair(places),
         temperature=_first(places, _TEMPERATURES),
-        attitude=places.get("yaw_pitch_roll_deg"),
         mag=_first(places, _MAGS),
     )
 
@@ -183,7 +183,7 @@ _REPLIES = frozenset((b"VNRRG", b"VNWRG", b"VNWNV", b"VNRFS", b"VNRST", b"VNTAR"
 
 
 class VectorNavDecoder(FrameDecoder):
-    """VectorNav outputs; gives `ImuSample`, `AttitudeSample` and `MagSample` as far as a frame has them."""
+    """VectorNav outputs; gives `ImuSample` and `MagSample` as far as a frame has them."""
 
     device_clock_wraps_s: ClassVar[float | None] = 2**64 / 1e9
 
@@ -269,15 +269,10 @@ def _decode(sentence: bytes, t_s: float) -> list[Sample]:
 def _decode_ymr(fields: list[bytes], t_s: float) -> list[Sample]:
     if len(fields) != 13:
         raise RejectedError(reasons.FIELD_COUNT)
-    yaw_deg, pitch_deg, roll_deg, mx, my, mz, ax, ay, az, gx, gy, gz = numbers(fields[1:])
-    gyro_rad_s, accel_m_s2, field_gauss = (gx, gy, gz), (ax, ay, az), (mx, my, mz)
-    check_attitude(yaw_deg, pitch_deg, roll_deg)
+    *_, mx, my, mz, ax, ay, az, gx, gy, gz = numbers(fields[1:])
+    gyro_rad_s, accel_m_s2 = (gx, gy, gz), (ax, ay, az)
     check_imu(gyro_rad_s, accel_m_s2, None)
-    return [
-        ImuSample(t_s, gyro_rad_s, accel_m_s2),
-        AttitudeSample(t_s, yaw_deg, pitch_deg, roll_deg),
-        MagSample(t_s, field_gauss),
-    ]
+    return [ImuSample(t_s, gyro_rad_s, accel_m_s2), MagSample(t_s, (mx, my, mz))]
 
 
 def _decode_imu(fields: list[bytes], t_s: float) -> list[Sample]:

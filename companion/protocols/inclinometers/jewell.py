@@ -19,8 +19,7 @@ import re
 from typing import ClassVar, Final
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import LineDecoder, RejectedError, body_of_sentence
-from companion.protocols.decoding.checks import TEMPERATURE_LIMIT_DEGC
+from companion.protocols.decoding.base import TEMPERATURE_LIMIT_DEGC, LineDecoder, RejectedError, body_of_sentence
 from companion.protocols.decoding.dialogue import PollDialogue
 from companion.samples import TiltSample
 
