@@ -105,7 +105,7 @@ def _parser() -> Parser:
     calibrate.add_argument(
         "--reboot", action="store_true", help="restart the autopilot afterwards (PX4's attitude needs it)"
     )
-    client.add_align(add)
+    client.add_command(add)
     add("cancel", client.cancel, "cancel a running calibration")
     undo = add("undo", client.undo, "put the autopilot's values from before the last calibration back")
     undo.add_argument(

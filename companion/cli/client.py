@@ -108,7 +108,7 @@ def _number(value: float | None) -> str:
     return "none" if value is None else f"{value:g}"
 
 
-def add_align(add: AddCommand) -> None:
+def add_command(add: AddCommand) -> None:
     """Add it to the parser of the command line."""
     parser = add("align", align, "measure the gradienter's zero (turn by 180 degrees), or how it sits (tilts)")
     what = parser.add_mutually_exclusive_group(required=True)

@@ -17,11 +17,6 @@ from companion.errors import ConfigError, LinkError, NobodyHeardError
 
 if TYPE_CHECKING:
     from companion.ground.station import Outcome, Station
-from types import TracebackType
-from typing import Any, Self
-
-from companion.ground.link import INSTALL
-from companion.printable import printable
 
 DEFAULT_URL: Final = "udpin:0.0.0.0:14550"
 _SETTING: Final = re.compile(r"([A-Za-z0-9_]{1,16})=(.+)")
@@ -95,7 +90,7 @@ async def _parameters(options: argparse.Namespace) -> int:
 
 async def _on_the_link(options: argparse.Namespace, work: Callable[[Station], Awaitable[Outcome]]) -> int:
     """Find the companion, do the work, print what came of it."""
-    from companion.cli.ground import Display
+    from companion.ground.display import Display
     from companion.ground.heard import Heard
     from companion.ground.link import open_link
     from companion.ground.station import Station
@@ -171,47 +166,3 @@ def _setting(text: str) -> tuple[str, float]:
     if match is None or value != value or abs(value) == float("inf"):
         raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE with a number, such as CMP_PUSH=0")
     return match[1].upper(), value
-
-
-class Display:
-    """A `Watcher`; a context manager, since a bar must be taken off the terminal again."""
-
-    def __init__(self) -> None:
-        try:
-            from rich.console import Console
-            from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
-        except ImportError as error:
-            raise ConfigError(f"companion ground needs rich: {error}; {INSTALL}") from None
-        # What the companion says is no markup: "[x]" stays what it is.
-        self._console = Console(stderr=True, markup=False, highlight=False, soft_wrap=True)
-        self._bar: Any = Progress(
-            BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False),
-            console=self._console, transient=True,
-        )  # fmt: skip
-        self._task: Any = None
-        self._shown = ""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        if self._task is not None:
-            self._bar.stop()
-
-    def progress(self, percent: int, text: str) -> None:
-        """How far it is."""
-        text = printable(text)
-        if self._console.is_terminal:
-            if self._task is None:
-                self._task = self._bar.add_task(text, total=100)
-                self._bar.start()
-            self._bar.update(self._task, completed=percent, description=text)
-        elif text != self._shown:
-            self._shown = text
-            self._console.print(f"[{percent:3d} %] {text}")
-
-    def text(self, text: str, *, urgent: bool) -> None:
-        """What the companion says."""
-        self._console.print(printable(text), style="bold yellow" if urgent else "")

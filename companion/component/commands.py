@@ -1,4 +1,4 @@
-"""The command server of component 191: exactly one final COMMAND_ACK for each request.
+"""The command server of component 191: exactly one final COMMAND_ACK for each request; and who may ask for what.
 
 A request is (sender's system, sender's component, command), because a COMMAND_ACK tells no more apart. Three kinds
 of repeat must be told apart too:
@@ -10,6 +10,9 @@ of repeat must be told apart too:
 - a retransmission (confirmation > 0) of a request that was answered within the last seconds: the final ACK was
   lost or crossed it on the way. It gets the same result again, and may do so until none has come for 3 s; anything
   else would calibrate twice for one press of a button. A request with confirmation 0 is a new press and starts anew.
+
+Who may ask is what `mavlink.allow` says; reading is everybody's. A sender's ids are what it says they are: against
+impostors only signatures help (`links/mavlink/signing.py`).
 """
 
 from __future__ import annotations
@@ -17,18 +20,18 @@ from __future__ import annotations
 import logging
 import math
 import re
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion import __version__
 from companion.calibration.request import What
 from companion.component import requests
-from companion.component.requests import Permission
 from companion.component.service import CalibrationService, Job, Refusal
 from companion.component.statustext import Say, Severity, Weight
+from companion.config.sections import EVERYBODY, Senders
 from companion.links.mavlink.link import MavlinkLink
 
 logger = logging.getLogger(__name__)
@@ -65,6 +68,34 @@ _NAMES: dict[type, str] = {requests.Calibrate: "Calibration", requests.Undo: "Un
 """What not everybody may ask for."""
 # Arm authorisation is a verdict, not a job, and silence is one of its answers.
 _LEFT_TO_OTHERS = frozenset({mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST})
+
+
+MAX_REMEMBERED: Final = 32
+
+
+class Permission:
+    """Judges and counts; says in the log once for each sender what it was refused."""
+
+    def __init__(self, senders: Senders | None = None) -> None:
+        self._senders = senders or Senders(EVERYBODY)
+        self.refused: Counter[tuple[int, int]] = Counter()
+        """By sender: the first 32."""
+
+    def allow(self, senders: Senders) -> None:
+        """From now on these may."""
+        self._senders = senders
+
+    def refuses(self, sender: tuple[int, int], what: str) -> str:
+        """Why a sender (system, component) may not ask for this, in a few words; empty when it may."""
+        if sender in self._senders:
+            return ""
+        system, component = sender
+        if sender not in self.refused and len(self.refused) < MAX_REMEMBERED:
+            logger.warning("mavlink: %s by %d/%d is refused: mavlink.allow does not name it", what, system, component)
+            self.refused[sender] = 0
+        if sender in self.refused:
+            self.refused[sender] += 1
+        return f"{system}/{component} not in mavlink.allow"
 
 
 class _Running(NamedTuple):

@@ -8,9 +8,8 @@ import math
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.arm_authorisation import ArmAuthoriser, ArmingScript
-from companion.component.commands import CommandServer
+from companion.component.commands import CommandServer, Permission
 from companion.component.own_parameters import OwnParameters
-from companion.component.requests import Permission
 from companion.component.service import ArmGate, CalibrationService, VehicleView
 from companion.component.statustext import Severity, StatusText, Weight
 from companion.config.sections import Senders

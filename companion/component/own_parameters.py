@@ -20,7 +20,7 @@ from collections.abc import Callable
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.parameters.wire import float32
-from companion.component.requests import Permission
+from companion.component.commands import Permission
 from companion.component.statustext import Say, Severity, Weight
 from companion.errors import CompanionError
 from companion.links.mavlink.link import MavlinkLink

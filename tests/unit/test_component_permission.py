@@ -11,8 +11,8 @@ from typing import cast
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.component.commands import MAX_REMEMBERED, Permission
 from companion.component.component import Component
-from companion.component.requests import MAX_REMEMBERED, Permission
 from companion.config import parse
 from companion.config.sections import Senders
 from companion.daemon.process.run import RELOADABLE

@@ -22,10 +22,10 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.cli import logs, main, monitor
-from companion.cli.ground import Display
 from companion.cli.logs import JournalFormatter, OneLineFormatter
 from companion.daemon.devices.doctor import Finding
 from companion.errors import LinkError
+from companion.ground.display import Display
 from companion.ground.heard import Heard, Target
 from companion.links.serial.ports import Holder, SerialPort
 from companion.printable import printable
