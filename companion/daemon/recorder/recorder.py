@@ -240,6 +240,9 @@ class Recorder(Subsystem):
                 await self._in_thread(ring.close)
         except StorageError as error:
             self._stop_ring(str(error))
+        except Exception:
+            logger.exception("recordings: internal error")
+            self._stop_ring("internal error; the log has the details")
         else:
             if self.fault is not None:
                 logger.info("recordings: written again")
@@ -273,6 +276,9 @@ class Recorder(Subsystem):
             await self._in_thread(recording.file.write, messages, beginning)
         except StorageError as error:
             await self._end(recording, str(error), state="failed")
+        except Exception:
+            logger.exception("recording: internal error")
+            await self._end(recording, "internal error; the log has the details", state="failed")
         else:
             if recording.until_s is not None and asyncio.get_running_loop().time() >= recording.until_s:
                 await self._end(recording, "recorded as long as was asked for")
