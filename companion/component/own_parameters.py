@@ -115,7 +115,12 @@ class OwnParameters:
         return self._by_name[name].value
 
     def set(self, name: str, value: float) -> None:
-        """Change a value from inside and tell everyone, if it is another; `on_set` is not called."""
+        """Change a value from inside and tell everyone, if it is another; `on_set` is not called.
+
+        Raises:
+            KeyError: there is no such parameter.
+            ValueError: not a number, or out of the limits.
+        """
         parameter = self._by_name[name]
         value = float32(value)
         if not parameter.allows(value):

@@ -142,7 +142,11 @@ class Station:
         return dataclasses.replace(outcome, lines=lines, more={**outcome.more, **more})
 
     async def undo(self) -> Outcome:
-        """Put the old values back; raises as `calibrate`."""
+        """Put the old values back; raises as `calibrate`.
+
+        Raises:
+            NobodyHeardError: the companion beats, but does not answer.
+        """
         begun_s = asyncio.get_running_loop().time()
         exchange = self._exchange(UNDO)
         answer = await self._cancellable(exchange, None)
@@ -150,7 +154,11 @@ class Station:
         return dataclasses.replace(outcome, lines=[f"{outcome.state.upper()}: {outcome.reason}", *outcome.lines])
 
     async def cancel(self) -> Outcome:
-        """Cancel what runs, whoever asked for it, and wait until it has ended; raises as `calibrate`."""
+        """Cancel what runs, whoever asked for it, and wait until it has ended; raises as `calibrate`.
+
+        Raises:
+            NobodyHeardError: the companion beats, but does not answer.
+        """
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
         answer = await self._exchange(CANCEL).run()

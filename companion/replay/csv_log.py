@@ -60,6 +60,12 @@ def estimate(
 ) -> Record:
     """The biases from the longest still stretch of a log.
 
+    Args:
+        samples: in order of time, by any clock in seconds.
+        pose: how it stood.
+        mounting: sensor to vehicle FRD.
+        profile: the sensor's model, or figures learned, for its Allan figures.
+
     Raises:
         StorageError: as `csv_columns.read`, where the samples are its.
     """

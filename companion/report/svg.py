@@ -140,7 +140,15 @@ class Plot:
     def points(
         self, points: Sequence[Pair], class_: str, *, spans: Sequence[Pair] = (), size: float = 1.0, shape: str = ""
     ) -> None:
-        """Markers, each with an upright bar where `spans` gives its ends."""
+        """Markers, each with an upright bar where `spans` gives its ends.
+
+        Args:
+            points: where.
+            class_: `sx`, `sy`, `sz` or another of the style sheet.
+            spans: lower and upper end of every point's bar.
+            size: over the usual one.
+            shape: "circle", "square", "triangle", "cross"; by the class if left out.
+        """
         if not points:
             return
         shape = shape or {"sx": "circle", "sy": "square", "sz": "triangle"}.get(class_, "circle")

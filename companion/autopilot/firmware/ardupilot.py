@@ -35,7 +35,11 @@ class ArduPilotParameters(ImuParameters):
 
 
 def parameters_of(instance: int) -> ArduPilotParameters:
-    """The names of one IMU's parameters, `instance` counting from 1."""
+    """The names of one IMU's parameters, `instance` counting from 1.
+
+    Raises:
+        AutopilotError: no such instance.
+    """
     if instance not in INSTANCES:
         raise AutopilotError(f"IMU {instance} is not known; allowed are {', '.join(map(str, INSTANCES))}")
     if instance > 3:
@@ -140,7 +144,12 @@ _CUSTOM_NAMES: Final = {
 
 
 async def read_board_rotation(parameters: ParameterClient) -> Matrix:
-    """The 3x3 matrix from the board's axes to the vehicle's FRD."""
+    """The 3x3 matrix from the board's axes to the vehicle's FRD.
+
+    Raises:
+        AutopilotError: an orientation that is not known, or a custom one that is not in force; or as
+            `ParameterClient.read`.
+    """
     value = await parameters.read("AHRS_ORIENTATION")
     number = round(value) if math.isfinite(value) else -1
     if 0 <= number < len(ROTATION_NAMES):

@@ -38,6 +38,11 @@ async def read_calibration(
 ) -> ImuCalibration:
     """Read afresh what the autopilot corrects one of its IMUs with.
 
+    Args:
+        parameters: of the autopilot.
+        instance: 1 to 3.
+        memory: what earlier writes have shown about PX4's slots.
+
     Raises:
         AutopilotError: a firmware that is not known, or as the firmware's own `read_calibration`.
     """

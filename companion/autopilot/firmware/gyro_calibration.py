@@ -65,7 +65,11 @@ class GyroCalibration:
 
 
 async def read_gyro_parameters(parameters: ParameterClient) -> GyroParameters:
-    """Read afresh everything that the firmware's gyro calibration writes."""
+    """Read afresh everything that the firmware's gyro calibration writes.
+
+    Raises:
+        AutopilotError: no answer, or it restarted meanwhile.
+    """
     vehicle = parameters.vehicle
     boots = vehicle.boots
     instances = {number: parameters_of(number) for number in INSTANCES}

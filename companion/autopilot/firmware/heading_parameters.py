@@ -60,7 +60,11 @@ RISKS: Final[dict[Firmware, tuple[str, ...]]] = {
 
 
 def wanted_for(firmware: Firmware | None) -> tuple[Wanted, ...]:
-    """The set of a firmware."""
+    """The set of a firmware.
+
+    Raises:
+        AutopilotError: no autopilot yet, or a firmware that is not known.
+    """
     if firmware is None:
         raise AutopilotError("no autopilot has been heard yet")
     found = WANTED.get(firmware)

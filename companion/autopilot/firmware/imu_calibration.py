@@ -106,7 +106,11 @@ class RivalMemory:
 
 
 async def read_rivals(parameters: ParameterClient, memory: RivalMemory | None = None) -> tuple[Rival, ...]:
-    """Those that are switched on, and those that were and act until the next boot."""
+    """Those that are switched on, and those that were and act until the next boot.
+
+    Raises:
+        AutopilotError: as `ParameterClient.read_optional`.
+    """
     found: list[Rival] = []
     for name, kind in _RIVALS.get(parameters.vehicle.firmware or "other", {}).items():
         value = await read_integer(parameters, name)

@@ -99,6 +99,9 @@ class SlotMemory:
             instance: 1 to 3.
             slots: all that hold a device id, in order.
             like: the device id of the IMU's other half; of a chip that is both, it is the same.
+
+        Raises:
+            AutopilotError: there is none.
         """
         prefix, word = PREFIX[sensor], WORDS[sensor]
         self._enabled[sensor] = sum(slot.enabled for slot in slots)
@@ -170,7 +173,11 @@ def parameters_of(gyro_slot: int, accel_slot: int) -> ImuParameters:
 
 
 async def read_slots(parameters: ParameterClient, sensor: Sensor) -> tuple[Slot, ...]:
-    """All slots that hold a device id, in order."""
+    """All slots that hold a device id, in order.
+
+    Raises:
+        AutopilotError: as `ParameterClient.read_optional`.
+    """
     found: list[Slot] = []
     for number in range(SLOTS):
         device_id = await read_integer(parameters, f"{PREFIX[sensor]}{number}_ID")

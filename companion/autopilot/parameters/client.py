@@ -142,7 +142,11 @@ class ParameterClient:
         return None
 
     async def read_many(self, names: Iterable[str], *, optional: bool = False) -> dict[str, float]:
-        """Read several by name, a few requests at a time; where `optional`, what does not exist is left out."""
+        """Read several by name, a few requests at a time; where `optional`, what does not exist is left out.
+
+        Raises:
+            ParameterTimeoutError, ParameterRefusedError, AutopilotRebootedError: as `read` and `read_optional`.
+        """
         wanted = list(names)
         read = self.read_optional if optional else self.read
         found: dict[str, float] = {}
@@ -345,17 +349,29 @@ def _wire_name(name: str) -> bytes:
 
 
 async def read_offsets(parameters: ParameterClient, names: tuple[str, str, str]) -> Vector:
-    """Three offsets; any finite ones will do, for they are only added to."""
+    """Three offsets; any finite ones will do, for they are only added to.
+
+    Raises:
+        AutopilotError: one is not a number; or as `ParameterClient.read`.
+    """
     return await _read_vector(parameters, names, -math.inf, math.inf)
 
 
 async def read_scales(parameters: ParameterClient, names: tuple[str, str, str]) -> Vector:
-    """Three scales, which will be divided by."""
+    """Three scales, which will be divided by.
+
+    Raises:
+        AutopilotError: one is far from 1; or as `ParameterClient.read`.
+    """
     return await _read_vector(parameters, names, 0.5, 2.0)
 
 
 async def read_integer(parameters: ParameterClient, name: str) -> int | None:
-    """A whole number, or None where the firmware has no such parameter."""
+    """A whole number, or None where the firmware has no such parameter.
+
+    Raises:
+        AutopilotError: not a number; or as `ParameterClient.read_optional`.
+    """
     value = await parameters.read_optional(name)
     if value is None:
         return None

@@ -105,6 +105,13 @@ def align(
 ) -> Alignment:
     """Estimate everything from all stands together.
 
+    Args:
+        law: of the gradienter.
+        vehicle_from_sensor: its mounting, 3x3.
+        stands: at least one.
+        ground: gravity and the Earth's rate.
+        priors: what was known before.
+
     Raises:
         CalibrationRefusedError: the equations cannot be solved: readings that cannot belong together.
     """

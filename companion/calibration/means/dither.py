@@ -77,7 +77,13 @@ def shifts_lsb(reading_lsb: Floats, *, alternate: bool) -> list[Floats]:
 
 
 def why_void(steps: Sequence[Step], latest: Step, steps_lsb: Floats) -> str | None:
-    """Why the latest step says nothing: the aircraft moved, or the shift was not taken; None when it is sound."""
+    """Why the latest step says nothing: the aircraft moved, or the shift was not taken; None when it is sound.
+
+    Args:
+        steps: the sound ones before it.
+        latest: its seconds.
+        steps_lsb: (6,) of the stream, SI units.
+    """
     if len(latest.batches) < 2:
         return "too few readings"
     corrected, scatter = _corrected(latest, steps_lsb)
@@ -98,6 +104,12 @@ def why_void(steps: Sequence[Step], latest: Step, steps_lsb: Floats) -> str | No
 
 def combine(steps: Sequence[Step], steps_lsb: Floats, profile: NoiseProfile, horizon_s: float) -> Dithered:
     """The means over all steps, with what averaging left and what the next minutes can expect.
+
+    Args:
+        steps: all of them.
+        steps_lsb: (6,) of the stream, SI units.
+        profile: noise of the IMU.
+        horizon_s: H of V(T, H).
 
     Raises:
         CalibrationRefusedError: a step is missing.

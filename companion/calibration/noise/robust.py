@@ -113,7 +113,15 @@ class Line(msgspec.Struct, frozen=True):
 def huber_line(
     times_s: Floats, values: Floats, end_s: float, c: Floats | float = HUBER_C, least: Floats | float = 0.0
 ) -> Line:
-    """Huber's line through every column, evaluated at the window's end and not a second later."""
+    """Huber's line through every column, evaluated at the window's end and not a second later.
+
+    Args:
+        times_s: (m,) ascending, m >= 3.
+        values: (m, c).
+        end_s: where the line is evaluated.
+        c: as for `huber_mean`.
+        least: as for `huber_mean`.
+    """
     count = values.shape[0]
     time = (times_s - times_s.mean())[:, None]
     weight = np.ones_like(values)

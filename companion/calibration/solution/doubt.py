@@ -98,7 +98,15 @@ _IN_SHORT: Final[dict[Cause, str]] = {
 def doubts(
     triad: Triad, witnesses: Sequence[Witness], up: Array, by_reading: Matrix | None, *, today: bool
 ) -> list[Doubt]:
-    """Everything that contradicts; empty while all is well. `today`: what was known is from this very power-up."""
+    """Everything that contradicts; empty while all is well. `today`: what was known is from this very power-up.
+
+    Args:
+        triad: which half.
+        witnesses: every IMU of which something is known from before.
+        up: unit vector in the vehicle's axes, (3,).
+        by_reading: d (accelerometer bias) / d (gradienter's readings), (3, 2).
+        today: what was known is from this very power-up.
+    """
     against = [witness for witness in witnesses if witness.contradicts]
     if not against:
         return []

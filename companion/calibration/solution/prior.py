@@ -58,7 +58,13 @@ class PoseEffect:
         return mean, np.sqrt(variance)
 
     def effective(self, gravity_m_s2: float, up: Array, sigma_use_m_s2: Array) -> Effective:
-        """What a record says of it, without misalignment, which turns the axes and is none of the sensor's bias."""
+        """What a record says of it, without misalignment, which turns the axes and is none of the sensor's bias.
+
+        Args:
+            gravity_m_s2: local.
+            up: unit vector, the attitude of the calibration, (3,).
+            sigma_use_m_s2: of the bias at this attitude, (3,).
+        """
         # The mean is known but not taken off what is written, so that it counts in full.
         whole = np.sqrt(np.square(self.mean) + np.square(self.sigma))
         to_level = np.square(gravity_m_s2 * (LEVEL - up))

@@ -130,7 +130,18 @@ def judge(
     temperature_degc: float | None,
     present: Present | None,
 ) -> list[Finding]:
-    """Everything that speaks against one triad's calibration now; empty while it is good."""
+    """Everything that speaks against one triad's calibration now; empty while it is good.
+
+    Args:
+        triad: which half of the IMU.
+        name: of the IMU.
+        held: what was found right.
+        model: the noise of this triad.
+        limits: of age and temperature.
+        now_s: the clock of `held`.
+        temperature_degc: of the IMU now, if known.
+        present: from a still window, if there is one.
+    """
     found: list[Finding] = []
     if not held.seen:
         found.append(Finding(Why.UNSEEN, f"{triad} {name}: new offsets not seen to work"))

@@ -59,7 +59,14 @@ def carrying_imu(config: Config) -> Imu:
 
 
 def settings_of(imu: Imu, record: ImuRecord, local: LocalEarth, gyro_step_rad_s: float) -> AttitudeSettings | None:
-    """How the estimator is to take this IMU's samples; None where its gyros were not calibrated."""
+    """How the estimator is to take this IMU's samples; None where its gyros were not calibrated.
+
+    Args:
+        imu: its configuration.
+        record: of the calibration in force.
+        local: the place.
+        gyro_step_rad_s: of a stream of truncated integers, else 0.
+    """
     serial = imu.source == "serial"
     gyro = record.gyro_bias_rad_s if serial else _left(record, record.residual_gyro_rad_s, "GYR")
     accel = record.accel_bias_m_s2 if serial else _left(record, record.residual_accel_m_s2, "ACC")

@@ -64,7 +64,15 @@ def ticks_of(unix_s: float) -> int:
 
 
 def sign(frame: bytes, crc_extra: int, key: bytes, link_id: int, ticks: int) -> bytes:
-    """A MAVLink 2 packet that is not signed yet, signed; the checksum covers the flag that says so."""
+    """A MAVLink 2 packet that is not signed yet, signed; the checksum covers the flag that says so.
+
+    Args:
+        frame: the whole packet.
+        crc_extra: of its kind of message: the checksum covers the flag that says "signed".
+        key: 32 bytes.
+        link_id: 0 to 255.
+        ticks: since 2015, 10 us each.
+    """
     head = bytearray(frame[:-2])
     head[2] |= _SIGNED
     crc = mavlink.x25crc(head[1:])

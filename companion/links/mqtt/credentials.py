@@ -14,7 +14,11 @@ MAX_PASSWORD_BYTES: Final = 4096
 
 
 def read_password(settings: Mqtt) -> str | None:
-    """The password, or None where none is configured."""
+    """The password, or None where none is configured.
+
+    Raises:
+        LinkError: one line that names the file and what is wrong with it.
+    """
     path = settings.password_path
     if path is None:
         return None
@@ -42,7 +46,11 @@ def is_open_to_all(settings: Mqtt) -> bool:
 
 
 def tls_context(settings: Mqtt) -> ssl.SSLContext | None:
-    """What TLS needs, or None without TLS."""
+    """What TLS needs, or None without TLS.
+
+    Raises:
+        LinkError: one line that names the file and what is wrong with it.
+    """
     if not settings.tls:
         return None
     where = Path(settings.ca_file or "")

@@ -86,7 +86,11 @@ _PARTS = {
 
 
 def header_bytes(groups: int) -> int:
-    """The length of a header, from the sync byte to the last mask, that announces these groups."""
+    """The length of a header, from the sync byte to the last mask, that announces these groups.
+
+    Raises:
+        RejectedError: a group that is not known here, or none.
+    """
     if groups == 0 or groups & ~_KNOWN_GROUPS:
         raise RejectedError(reasons.UNKNOWN_GROUP)
     return 2 + 2 * groups.bit_count()
@@ -105,7 +109,11 @@ class Layout:
     mag: int | None
 
     def samples(self, frame: bytes, start: int, t_s: float) -> list[Sample]:
-        """The samples in a frame that begins at `start` and has passed its CRC."""
+        """The samples in a frame that begins at `start` and has passed its CRC.
+
+        Raises:
+            RejectedError: a value is not finite or out of range, or there is nothing of use in it.
+        """
         values = self.payload.unpack_from(frame, start + self.payload_offset)
         samples: list[Sample] = []
         if self.imu is not None:
@@ -126,7 +134,11 @@ class Layout:
 
 
 def layout_of(header: bytes) -> Layout:
-    """Read a whole header."""
+    """Read a whole header.
+
+    Raises:
+        RejectedError: a field that is not known here, or a group without fields.
+    """
     places: dict[str, int] = {}
     code, count = "<", 0
     masks = iter(struct.unpack_from(f"<{len(header) // 2 - 1}H", header, 2))
