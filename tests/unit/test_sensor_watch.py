@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from companion.component.statustext import Severity
-from companion.daemon.devices.sensor_health import UNTOUCHED, Corrected, SensorWatch
+from companion.daemon.devices.sensor_watch import UNTOUCHED, Corrected, SensorWatch
 from companion.protocols.stream_health import Trouble
 from companion.samples import CompassSample, ImuSample, Sample, TiltSample, Vector
 from tests.support.chatter import Listening

@@ -13,7 +13,7 @@ from companion.configured.devices import Role, collect, serial_devices
 from companion.daemon.core import Core, Subsystem, Task
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.devices.reach import Reach
-from companion.daemon.devices.sensor_health import UNTOUCHED, Corrected, SensorWatch
+from companion.daemon.devices.sensor_watch import UNTOUCHED, Corrected, SensorWatch
 from companion.daemon.devices.sensors import SensorRole, SerialSensor
 from companion.daemon.devices.signing import LinkSigning
 from companion.links.system.request import Object

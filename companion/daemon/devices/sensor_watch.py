@@ -1,0 +1,192 @@
+"""What shows only beside the others: a gradienter or compass that hangs while the IMUs see the aircraft move."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+import math
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.seconds.batch import Batch
+from companion.component.statustext import Say, Severity, Weight
+from companion.daemon.devices.sensors import SerialSensor
+from companion.physics.frames import Array, Matrix
+from companion.protocols.stream_health import Trouble
+
+logger = logging.getLogger(__name__)
+
+PERIOD_S: Final = 0.5
+REMEMBERED_S: Final = 300
+TILTED_DEG: Final = 3.0
+"""Far more than the mean of a second in somebody's hands is off, and 300 steps of the coarsest gradienter."""
+TILTED_SECONDS: Final = 3
+BEFORE_S: Final = 3.0
+"""How long before the first of its equal headings a compass may have begun to hang: until then it was near them."""
+QUIET_S: Final = 3.0
+"""An IMU that is so far behind the others is no witness: the autopilot's, while its offsets are being written."""
+LATE_S: Final = 1.0
+"""Nor is one that begins so much later than another: it has not seen how the aircraft stood."""
+TURNED_DEG: Final = 15.0
+TURNING_RAD_S: Final = math.radians(12.0)
+"""Less may be a bias: what is called still may have 10 deg/s."""
+
+
+class Corrected(NamedTuple):
+    """What an owner has made of an IMU's readings."""
+
+    back: Matrix = np.eye(3)
+    """(3, 3), from the axes that it has turned them to into the IMU's own."""
+    accel_m_s2: Array = np.zeros(3)
+    """(3,), what it takes off the accelerometer, in the IMU's own axes."""
+
+
+UNTOUCHED: Final = Corrected()
+
+
+class MotionWitness:
+    """Whether the aircraft has tilted or turned since some instant, as its IMUs saw it.
+
+    In the IMUs' own axes: the angle between two directions of gravity, and the turn about it, need no mounting.
+    """
+
+    def __init__(self) -> None:
+        self._seconds: dict[str, deque[tuple[int, Array, float]]] = {}
+
+    def look(self, latest: Mapping[str, Batch], corrected: Callable[[str], Corrected | None]) -> None:
+        """Take note of the last whole second of each IMU.
+
+        Args:
+            latest: by IMU.
+            corrected: what was done to its readings before they came to us; None while that is not known. It is taken
+                back: new offsets, or another orientation of the board, must not look like a tilt.
+        """
+        for name, batch in latest.items():
+            seconds = self._seconds.setdefault(name, deque(maxlen=REMEMBERED_S))
+            known = corrected(name)
+            if known is None or (seconds and seconds[-1][0] == batch.slot):
+                continue
+            rate, force = known.back @ batch.mean[:3], known.back @ batch.mean[3:] + known.accel_m_s2
+            size = float(np.linalg.norm(force))
+            if size > 0.0:
+                down = force / size
+                about = float(rate @ down)
+                turned_deg = math.degrees(about) if abs(about) > TURNING_RAD_S else 0.0
+                seconds.append((batch.slot, down, turned_deg))
+
+    def tilted_deg(self, near_since_s: float, since_s: float, until_s: float) -> float:
+        """By how much it has tilted and stayed so; the least that any IMU saw.
+
+        Args:
+            near_since_s: since when the sensor shows about what it shows now; the pose then is compared with.
+            since_s: since when it shows exactly that; only what has stayed since then counts.
+            until_s: its latest reading.
+        """
+        return min((self._tilted_deg(each, since_s) for each in self._heard(near_since_s, until_s)), default=0.0)
+
+    @staticmethod
+    def _tilted_deg(seconds: list[tuple[int, Array, float]], since_s: float) -> float:
+        stayed = [down for slot, down, _ in seconds[1:] if slot >= since_s][-TILTED_SECONDS:]
+        if len(stayed) < TILTED_SECONDS:
+            return 0.0
+        cosines = [float(seconds[0][1] @ down) for down in stayed]
+        return math.degrees(math.acos(min(1.0, max(-1.0, *cosines))))
+
+    def turned_deg(self, near_since_s: float, until_s: float) -> float:
+        """By how much it has turned about the vertical; the least that any IMU saw."""
+        turns = [abs(sum(turned_deg for *_, turned_deg in each)) for each in self._heard(near_since_s, until_s)]
+        return min(turns, default=0.0)
+
+    def _heard(self, since_s: float, until_s: float) -> list[list[tuple[int, Array, float]]]:
+        """The whole seconds in between, of each IMU that has seen as much as the others."""
+        # Not as the clock: while a sensor is implausible, nothing is collected of any IMU.
+        newest = max((seconds[-1][0] for seconds in self._seconds.values() if seconds), default=0)
+        found = [
+            [second for second in seconds if since_s <= second[0] <= until_s - 1.0]
+            for seconds in self._seconds.values()
+            if seconds and seconds[-1][0] >= newest - QUIET_S
+        ]
+        first = min((seconds[0][0] for seconds in found if seconds), default=0)
+        return [seconds for seconds in found if seconds and seconds[0][0] <= first + LATE_S]
+
+
+class SensorWatch:
+    """Looks at every sensor twice a second; `run` it beside them."""
+
+    def __init__(
+        self,
+        sensors: Sequence[SerialSensor],
+        collector: RollingCollector,
+        corrected: Callable[[str], Corrected | None] = lambda name: UNTOUCHED,
+        say: Say = lambda *what: None,
+    ) -> None:
+        self._sensors, self._collector = sensors, collector
+        self._corrected = corrected
+        self._witness = MotionWitness()
+        self._has_failed = False
+        self._say = say
+        for sensor in sensors:
+            sensor.health.on_implausible.add(functools.partial(self._tell, sensor))
+
+    def _tell(self, sensor: SerialSensor, trouble: Trouble) -> None:
+        """To the ground stations: no calibration comes to an end with it, and what was written with it may be wrong."""
+        self._say(Severity.WARNING, f"{sensor.name}: {trouble.words.removeprefix(f'{sensor.line}: ')}", Weight.NEWS)
+
+    async def run(self) -> None:
+        """Look until cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                self.look(loop.time())
+            except Exception:
+                # What merely watches must not end what is watched, nor fill the log.
+                if not self._has_failed:
+                    logger.exception("looking after the sensors failed")
+                self._has_failed = True
+            await asyncio.sleep(PERIOD_S)
+
+    def look(self, now_s: float) -> None:
+        """One look at all of them."""
+        self._witness.look(self._collector.imu_seconds(), self._corrected)
+        for sensor in self._sensors:
+            found = sensor.health.look(now_s, None if "imu" in sensor.kinds else self._stuck(sensor))
+            if found is not None and found.implausible:
+                self._collector.reset(f"{sensor.name}: {found.words}", sensor.name if sensor.kinds == {"imu"} else None)
+
+    def _stuck(self, sensor: SerialSensor) -> Trouble | None:
+        """A still gradienter or compass may repeat its digits for minutes; one that is moved may not."""
+        since_s = sensor.health.stream.unchanged_since_s
+        last_s = sensor.health.stream.last_sample_s
+        if since_s is None or last_s is None:
+            return None
+        near_s = sensor.health.stream.near_since_s or since_s
+        tilted_deg = self._witness.tilted_deg(near_s, since_s, last_s)
+        # Turns are summed up, and what is not seen of one adds up likewise.
+        near_s = max(near_s, since_s - BEFORE_S)
+        turned_deg = self._witness.turned_deg(near_s, last_s) if "compass" in sensor.kinds else 0.0
+        if turned_deg > TURNED_DEG:
+            how = f"turned by {turned_deg:.0f} deg"
+        elif tilted_deg > TILTED_DEG and "gradienter" in sensor.kinds:
+            how = f"tilted by {tilted_deg:.0f} deg"
+        else:
+            return None
+        words = f"stuck: the same reading for {last_s - since_s:.0f} s while the aircraft {how}"
+        return Trouble("stuck", f"{words}; switch its power off and on", implausible=True)
+
+    def implausible(self) -> str | None:
+        """A sensor whose readings look good and are not, and why; None where there is none."""
+        now_s = asyncio.get_running_loop().time()
+        found = ((sensor.name, sensor.health.trouble(now_s)) for sensor in self._sensors)
+        return next((f"{name}: {each.words}" for name, each in found if each is not None and each.implausible), None)
+
+    def worst(self) -> str | None:
+        """Of the sensor that troubles most what is wrong, with its name; None while all do well."""
+        now_s = asyncio.get_running_loop().time()
+        found = [(sensor.name, sensor.health.trouble(now_s)) for sensor in self._sensors]
+        troubles = sorted((not each.implausible, f"{name}: {each.words}") for name, each in found if each is not None)
+        return troubles[0][1] if troubles else None
