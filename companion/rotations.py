@@ -7,49 +7,15 @@ FRD axes. Numbers are those of MAV_SENSOR_ORIENTATION, which ArduPilot's AHRS_OR
 from __future__ import annotations
 
 # The two that are not what their name says are spelt out: number 38 is 68.8 and 293.3 degrees in both firmwares.
-_NAMES = [
-    "NONE",
-    "YAW_45",
-    "YAW_90",
-    "YAW_135",
-    "YAW_180",
-    "YAW_225",
-    "YAW_270",
-    "YAW_315",
-    "ROLL_180",
-    "ROLL_180_YAW_45",
-    "ROLL_180_YAW_90",
-    "ROLL_180_YAW_135",
-    "PITCH_180",
-    "ROLL_180_YAW_225",
-    "ROLL_180_YAW_270",
-    "ROLL_180_YAW_315",
-    "ROLL_90",
-    "ROLL_90_YAW_45",
-    "ROLL_90_YAW_90",
-    "ROLL_90_YAW_135",
-    "ROLL_270",
-    "ROLL_270_YAW_45",
-    "ROLL_270_YAW_90",
-    "ROLL_270_YAW_135",
-    "PITCH_90",
-    "PITCH_270",
-    "PITCH_180_YAW_90",
-    "PITCH_180_YAW_270",
-    "ROLL_90_PITCH_90",
-    "ROLL_180_PITCH_90",
-    "ROLL_270_PITCH_90",
-    "ROLL_90_PITCH_180",
-    "ROLL_270_PITCH_180",
-    "ROLL_90_PITCH_270",
-    "ROLL_180_PITCH_270",
-    "ROLL_270_PITCH_270",
-    "ROLL_90_PITCH_180_YAW_90",
-    "ROLL_90_YAW_270",
-    "ROLL_90_PITCH_68_YAW_293",
-    "PITCH_315",
-    "ROLL_90_PITCH_315",
-]
+_NAMES = (
+    "NONE", "YAW_45", "YAW_90", "YAW_135", "YAW_180", "YAW_225", "YAW_270", "YAW_315", "ROLL_180", "ROLL_180_YAW_45",
+    "ROLL_180_YAW_90", "ROLL_180_YAW_135", "PITCH_180", "ROLL_180_YAW_225", "ROLL_180_YAW_270", "ROLL_180_YAW_315",
+    "ROLL_90", "ROLL_90_YAW_45", "ROLL_90_YAW_90", "ROLL_90_YAW_135", "ROLL_270", "ROLL_270_YAW_45",
+    "ROLL_270_YAW_90", "ROLL_270_YAW_135", "PITCH_90", "PITCH_270", "PITCH_180_YAW_90", "PITCH_180_YAW_270",
+    "ROLL_90_PITCH_90", "ROLL_180_PITCH_90", "ROLL_270_PITCH_90", "ROLL_90_PITCH_180", "ROLL_270_PITCH_180",
+    "ROLL_90_PITCH_270", "ROLL_180_PITCH_270", "ROLL_270_PITCH_270", "ROLL_90_PITCH_180_YAW_90", "ROLL_90_YAW_270",
+    "ROLL_90_PITCH_68_YAW_293", "PITCH_315", "ROLL_90_PITCH_315",
+)  # fmt: skip
 _FINE_DEG = {68.0: 68.8, 293.0: 293.3}
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def add_commands(add: AddCommand) -> None:
-    """Add `install-service`, `uninstall-service` and `udev-rule`; `add` makes a parser of name, command and help."""
+    """Add `install-service` and `uninstall-service`; `add` makes a parser of name, command and help."""
     for name, command, words in (
         ("install-service", install, "start the companion at every boot: unit, udev rules, configuration"),
         ("uninstall-service", uninstall, "take that away again; configuration and records stay"),
@@ -28,9 +28,6 @@ def add_commands(add: AddCommand) -> None:
         service.add_argument("--dry-run", action="store_true", help="only tell what would be done")
         if command is install:
             service.add_argument("--executable", metavar="PATH", help="the companion (default: the one that runs this)")
-    udev = add("udev-rule", udev_rule, "print a udev rule that gives a plugged-in device a name of its own")
-    udev.add_argument("--port", required=True, metavar="DEVICE", help="such as /dev/ttyUSB0")
-    udev.add_argument("--name", default="sensor", help="it becomes /dev/companion-NAME (default: sensor)")
 
 
 async def install(options: argparse.Namespace) -> int:
@@ -45,23 +42,6 @@ async def uninstall(options: argparse.Namespace) -> int:
     from companion.installation import install as installing
 
     return _tell(options, installing.uninstall(_target(options, installing.own_executable())))
-
-
-async def udev_rule(options: argparse.Namespace) -> int:
-    """`companion udev-rule`: the rule on stdout, what to do with it on stderr."""
-    from companion.installation import udev
-    from companion.links.serial.ports import list_ports
-
-    rule, words = udev.rule(options.name, options.port, list_ports())
-    if getattr(options, "json", False):
-        print_json({"rule": rule, "recognised_by": words, "file": udev.FILE})
-        return DONE
-    print_lines(rule)
-    print_lines(f"recognised by {words}", error=True)
-    print_lines(f"to use it: add the line to {udev.FILE}, then", error=True)
-    print_lines("  sudo udevadm control --reload && sudo udevadm trigger --subsystem-match=tty", error=True)
-    print_lines(f"and name the port /dev/companion-{options.name} in the configuration", error=True)
-    return DONE
 
 
 def _target(options: argparse.Namespace, executable: str) -> Target:

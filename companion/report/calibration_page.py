@@ -11,7 +11,6 @@ import msgspec
 from companion.calibration.collector.trace import Trace
 from companion.calibration.noise.allan import AllanModel
 from companion.calibration.solution.record import Arming, ImuRecord, Outcome, Record
-from companion.report import svg
 from companion.report.markup import Child, Markup, join, number, tag
 from companion.report.page import (
     AXES,
@@ -188,7 +187,6 @@ def _triad(imu: ImuRecord, triad: Triad, material: Material) -> Markup:
         title,
         held if triad in imu.held_back else None,
         tag("table", tag("tr", *(tag("th", words) for words in heads)), *rows),
-        _sigmas(imu.name, triad, stat, use, model),
         tag("p", _against_the_floor(stat, use, model, unit, unit_name, profile)),
     )
 
@@ -207,27 +205,6 @@ def _against_the_floor(
     if max(use) > 3.0 * max(floor, *stat):
         words += " Most of sigma comes from elsewhere: the pose, the site, or a drift."
     return words
-
-
-def _sigmas(name: str, triad: Triad, stat: Vector, use: Vector, model: AllanModel | None) -> Markup:
-    """A dumbbell an axis: what averaging left, and what the next minutes can expect, against the floor."""
-    unit, unit_name = UNITS[triad]
-    floor = [] if model is None else [model.floor / unit]
-    values = [value / unit for value in (*stat, *use)]
-    across = svg.logarithmic([*values, *floor])
-    rows = svg.Axis(-0.6, 2.6, tuple((2.0 - k, AXES[k]) for k in range(3)))
-    plot = svg.Plot(across, rows, name=f"{name} {triad}: sigmas", height=78.0, x_label=f"sigma, {unit_name}")
-    if floor:
-        plot.line([(floor[0], -0.6), (floor[0], 2.6)], "floor")
-    for k in range(3):
-        ends = [(stat[k] / unit, 2.0 - k), (use[k] / unit, 2.0 - k)]
-        plot.line(ends, "bar use")
-        plot.points(ends[1:], "use", size=1.3, shape="circle")
-        plot.points(ends[:1], "stat", size=1.3, shape="circle")
-    entries = [("use", "σ use"), ("stat", "σ stat")]
-    if floor:
-        entries.append(("floor", "sensor's floor"))
-    return tag("figure", plot.svg(), svg.legend(*entries))
 
 
 # ------------------------------------------------------------------------------------------------- what was written

@@ -6,6 +6,7 @@ import datetime
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -37,50 +38,7 @@ Profiles = Mapping[str, NoiseProfile]
 # No script, nothing fetched, nothing sent: what is not inline does not exist.
 _POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 
-_STYLE: Final = Markup("""
-:root{color-scheme:light dark;--bg:#fff;--fg:#000;--soft:#4a4a4a;--rule:#b0b0b0;--card:#f3f3f0;
---x:#0060a8;--y:#c04a00;--z:#00724f;--bad:#b00020;--good:#00603c;--warn:#7a4b00;--band:#dfe8f2}
-@media(prefers-color-scheme:dark){:root{--bg:#0d0d0d;--fg:#fff;--soft:#c4c4c4;--rule:#5a5a5a;--card:#1d1d1f;
---x:#6cc0ff;--y:#ffab4d;--z:#3fe0ad;--bad:#ff8a8a;--good:#5fe3a1;--warn:#ffcf70;--band:#22303f}}
-*{box-sizing:border-box}html{-webkit-text-size-adjust:100%}
-body{margin:0 auto;padding:12px;max-width:980px;background:var(--bg);color:var(--fg);
-font:16px/1.45 system-ui,sans-serif;overflow-wrap:anywhere}
-h1{font-size:1.45rem;margin:.2em 0}h2{font-size:1.2rem;margin:1.6em 0 .4em;border-bottom:2px solid var(--fg)}
-h3{font-size:1.05rem;margin:1.2em 0 .3em}p{margin:.4em 0}ul{margin:.3em 0;padding-left:1.2em}li{margin:.35em 0}
-.soft,figcaption{color:var(--soft);font-size:.92rem}
-.state{display:inline-block;padding:.1em .6em;border:3px solid;border-radius:6px;font-weight:800;letter-spacing:.04em}
-.done{color:var(--good)}.failed{color:var(--bad)}.cancelled{color:var(--warn)}
-.lead{font-size:1.1rem;font-weight:600}
-.card{background:var(--card);border-left:5px solid var(--rule);padding:.5em .8em;margin:.6em 0}
-.card.alarm{border-color:var(--bad)}.card.caution{border-color:var(--warn)}.card.fine{border-color:var(--good)}
-.pairs h3{margin-top:.7em}.setting{table-layout:fixed}.setting .name td{border:0;text-align:left;padding-top:.6em}
-.setting .values td{padding-top:0;text-align:left}
-small{display:block;color:var(--soft);font-size:.82rem}.setting td{font-size:.97rem}
-.pairs{display:grid;
-grid-template-columns:repeat(auto-fit,minmax(min(100%,400px),1fr));gap:0 28px;align-items:start}
-figure{margin:.5em 0;max-width:560px}svg{display:block;width:100%;height:auto}
-svg.key{display:inline-block;width:24px;height:16px}
-table{border-collapse:collapse;width:100%;max-width:640px;font-variant-numeric:tabular-nums}
-th,td{padding:.32em .3em;border-bottom:1px solid var(--rule);text-align:right;vertical-align:top}
-th{font-size:.88rem;color:var(--soft);font-weight:600}th:first-child,td:first-child{text-align:left}
-.mono{font-family:ui-monospace,monospace;font-size:.92rem}
-.legend span{display:inline-flex;align-items:center;margin-right:1em;font-size:.92rem}
-text{font:13px system-ui,sans-serif;fill:var(--fg)}.mid{text-anchor:middle}.end{text-anchor:end}
-.label{font-weight:600}.halo{paint-order:stroke;stroke:var(--bg);stroke-width:4px}
-.note{font-size:12px;paint-order:stroke;stroke:var(--bg);stroke-width:4px}
-.frame{fill:none;stroke:var(--fg);stroke-width:1.2}.grid{stroke:var(--rule);stroke-width:.6;fill:none}
-.band{fill:var(--band)}.sx{color:var(--x)}.sy{color:var(--y)}.sz{color:var(--z)}
-.dot{fill:none;stroke:currentColor;stroke-width:7.2;stroke-linecap:round}
-.mark{fill:currentColor;stroke:none}.bar{fill:none;stroke:currentColor;stroke-width:1.6}
-
-.bad{color:var(--bad)}.ok{color:var(--good)}.warn{color:var(--warn)}
-.use{color:var(--fg)}.mark.stat{color:var(--fg);fill:var(--bg);stroke:var(--fg);stroke-width:1.8}
-.ring{fill:none;stroke:var(--fg);stroke-width:2}
-.floor{fill:none;stroke:var(--fg);stroke-width:1.8;stroke-dasharray:7 4}
-.still{fill:var(--good)}.moving{fill:var(--bad)}.fault{fill:none;stroke:var(--bad);stroke-width:2}
-.unknown{fill:var(--rule)}.used{fill:var(--fg)}
-@media print{:root{color-scheme:light;--bg:#fff;--fg:#000}body{max-width:none}figure,.card{break-inside:avoid}}
-""")
+_STYLE: Final = Path(__file__).with_name("page.css")
 
 
 def page(title: str, now: datetime.datetime, *body: Child, source: str = "from the records on this computer") -> str:
@@ -97,7 +55,7 @@ def page(title: str, now: datetime.datetime, *body: Child, source: str = "from t
         tag("meta", http_equiv="Content-Security-Policy", content=_POLICY),
         tag("meta", name="color-scheme", content="light dark"),
         tag("title", title),
-        tag("style", _STYLE),
+        tag("style", Markup(_STYLE.read_text(encoding="utf-8"))),
     )
     return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>{join(*body, foot)}</body></html>\n'
 
@@ -202,7 +160,7 @@ def drift(
             x_label=label if axis == 2 else None,
             y_label=f"{AXES[axis]}, {unit_name}",
         )
-        plot.points([(x, point.bias[axis] / unit) for x, point in shown], CLASSES[axis], spans=ends)
+        plot.points([(x, point.bias[axis] / unit) for x, point in shown], CLASSES[axis], ends)
         for x, point in shown:
             if point.number == this:
                 centre = plot.at(x, point.bias[axis] / unit)

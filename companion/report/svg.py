@@ -26,20 +26,15 @@ Pair = tuple[float, float]
 
 
 class Axis(msgspec.Struct, frozen=True):
-    """A range of values, linear or logarithmic, with the places that are written at it."""
+    """A range of values, with the places that are written at it."""
 
     low: float
     high: float
     ticks: tuple[tuple[float, str], ...]
-    log: bool = False
 
     def share(self, value: float) -> float:
         """0 at the low end, 1 at the high end; what lies outside is moved to the end."""
-        if self.log:
-            value, low, high = math.log(max(value, self.low)), math.log(self.low), math.log(self.high)
-        else:
-            low, high = self.low, self.high
-        return min(max((value - low) / (high - low), 0.0), 1.0)
+        return min(max((value - self.low) / (self.high - self.low), 0.0), 1.0)
 
 
 def linear(values: Sequence[float], *, ticks: int = 4, least: float = 0.0) -> Axis:
@@ -54,21 +49,6 @@ def linear(values: Sequence[float], *, ticks: int = 4, least: float = 0.0) -> Ax
     first = math.ceil(low / step - 1e-9)
     places = [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
     return Axis(low, high, tuple((place, f"{place:.{digits}f}") for place in places))
-
-
-def logarithmic(values: Sequence[float]) -> Axis:
-    """A logarithmic axis around the positive values, marked at 1, 2 and 5 where there is room."""
-    known = [value for value in values if 1e-12 < value < _MOST] or [1.0]
-    low, high = min(known) / 1.25, max(known) * 1.25
-    decades = math.log10(high / low)
-    marks = (1.0, 2.0, 5.0) if decades < 2.2 else (1.0, 3.0) if decades < 3.2 else (1.0,)
-    places = [
-        mark * 10.0**k
-        for k in range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-        for mark in marks
-        if low <= mark * 10.0**k <= high
-    ]
-    return Axis(low, high, tuple((place, f"{place:g}") for place in places), log=True)
 
 
 def times(values: Sequence[float]) -> Axis:
@@ -132,38 +112,25 @@ class Plot:
             tag("rect", x=_n(left), y=_n(self._top), width=_n(right - left), height=_n(self._height), class_=class_)
         )
 
-    def line(self, points: Sequence[Pair], class_: str) -> None:
-        """Join points."""
-        if len(points) > 1:
-            self._below.append(_path("M" + "L".join(_xy(*self.at(*point)) for point in points), class_))
-
-    def points(
-        self, points: Sequence[Pair], class_: str, *, spans: Sequence[Pair] = (), size: float = 1.0, shape: str = ""
-    ) -> None:
-        """Markers, each with an upright bar where `spans` gives its ends.
+    def points(self, points: Sequence[Pair], class_: str, spans: Sequence[Pair]) -> None:
+        """Markers, each with an upright bar.
 
         Args:
             points: where.
-            class_: `sx`, `sy`, `sz` or another of the style sheet.
+            class_: `sx` (circles), `sy` (squares) or `sz` (triangles).
             spans: lower and upper end of every point's bar.
-            size: over the usual one.
-            shape: "circle", "square", "triangle", "cross"; by the class if left out.
         """
-        if not points:
-            return
-        shape = shape or {"sx": "circle", "sy": "square", "sz": "triangle"}.get(class_, "circle")
-        if spans:
-            bars: list[str] = []
-            for (x, _), (low, high) in zip(points, spans, strict=True):
-                across, bottom = self.at(x, low)
-                bars.append(f"M{_n(across)} {_n(bottom)}V{_n(self.at(x, high)[1])}")
-            self._parts.append(_path("".join(bars), f"bar {class_}"))
-        if shape == "circle" and size == 1.0:
+        bars: list[str] = []
+        for (x, _), (low, high) in zip(points, spans, strict=True):
+            across, bottom = self.at(x, low)
+            bars.append(f"M{_n(across)} {_n(bottom)}V{_n(self.at(x, high)[1])}")
+        self._parts.append(_path("".join(bars), f"bar {class_}"))
+        if class_ == "sx":
             # A round end of a line without length: a quarter of the characters that a circle takes.
             self._parts.append(_path("".join(f"M{_xy(*self.at(*point))}h.01" for point in points), f"dot {class_}"))
             return
-        marks = "".join(_marker(shape, *self.at(*point), _MARK * size) for point in points)
-        self._parts.append(_path(marks, f"mark {class_}"))
+        marker = _square if class_ == "sy" else _triangle
+        self._parts.append(_path("".join(marker(*self.at(*point)) for point in points), f"mark {class_}"))
 
     def draw(self, *parts: Markup) -> None:
         """Anything else, on top."""
@@ -223,18 +190,10 @@ def strip(left: float, right: float, middle: float, height: float, class_: str) 
 
 
 def legend(*entries: tuple[str, str]) -> Markup:
-    """Markers with words, of (class, words)."""
-    shapes = {"sx": "circle", "sy": "square", "sz": "triangle"}
+    """Blocks with words, of (class, words)."""
     parts = []
     for class_, words in entries:
-        if class_ == "floor":
-            picture = _path("M1 8H23", class_)
-        elif class_ in shapes:
-            picture = _path(_marker(shapes[class_], 12.0, 8.0, 5.0), f"mark {class_}")
-        elif class_ in {"stat", "use"}:
-            picture = _path(_marker("circle", 12.0, 8.0, 5.0), f"mark {class_}")
-        else:
-            picture = strip(2.0, 22.0, 8.0, 4.0 if class_ == "still" else 14.0, class_)
+        picture = strip(2.0, 22.0, 8.0, 4.0 if class_ == "still" else 14.0, class_)
         parts.append(tag("span", tag("svg", picture, viewBox="0 0 24 16", class_="key"), words))
     return tag("p", *parts, class_="legend")
 
@@ -244,13 +203,13 @@ def _path(course: str, class_: str) -> Markup:
     return tag("path", d=Markup(course), class_=class_)
 
 
-def _marker(shape: str, x: float, y: float, r: float) -> str:
-    if shape == "square":
-        side = 1.8 * r
-        return f"M{_xy(x - side / 2, y - side / 2)}h{_n(side)}v{_n(side)}h{_n(-side)}z"
-    if shape == "triangle":
-        return f"M{_xy(x, y - 1.25 * r)}l{_xy(1.15 * r, 2.1 * r)}h{_n(-2.3 * r)}z"
-    return f"M{_xy(x - r, y)}a{_n(r)} {_n(r)} 0 1 0 {_n(2 * r)} 0a{_n(r)} {_n(r)} 0 1 0 {_n(-2 * r)} 0"
+def _square(x: float, y: float) -> str:
+    side = 1.8 * _MARK
+    return f"M{_xy(x - side / 2, y - side / 2)}h{_n(side)}v{_n(side)}h{_n(-side)}z"
+
+
+def _triangle(x: float, y: float) -> str:
+    return f"M{_xy(x, y - 1.25 * _MARK)}l{_xy(1.15 * _MARK, 2.1 * _MARK)}h{_n(-2.3 * _MARK)}z"
 
 
 def _xy(x: float, y: float) -> str:

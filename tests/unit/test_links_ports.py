@@ -119,8 +119,6 @@ def test_everything_about_one_port(machine: Machine) -> None:
         vendor_id=0x0403,
         product_id=0x6001,
         serial_number="A50285BI",
-        usb_interface=None,
-        interface_number=None,
         latency_timer_ms=16,
         holders=(Holder(77, "picocom"),),
         is_console=False,

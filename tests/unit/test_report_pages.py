@@ -142,13 +142,13 @@ def test_how_good_the_compass_heading_can_be_is_one_line(tmp_path: Path) -> None
 
 
 def test_the_points_of_a_plot_lie_where_their_values_are() -> None:
-    across, up = svg.linear([0.0, 10.0]), svg.logarithmic([1.0, 100.0])
+    across, up = svg.linear([0.0, 10.0]), svg.linear([1.0, 100.0])
     plot = svg.Plot(across, up, name="test", height=100.0, x_label="x")
-    plot.points([(0.0, 1.0), (5.0, 10.0), (10.0, 100.0)], "sx", spans=[(1.0, 10.0)] * 3)
+    plot.points([(0.0, 1.0), (5.0, 50.5), (10.0, 100.0)], "sx", spans=[(1.0, 50.5)] * 3)
     drawn = Page(plot.svg())
     marks = next(held["d"] or "" for tag, held in drawn.tags if tag == "path" and held["class"] == "dot sx")
     places = [(float(x), float(y)) for x, y in re.findall(r"M(-?[\d.]+) (-?[\d.]+)", marks)]
-    # Equal steps in value and in decades are equal steps on the page, to a tenth of a unit.
+    # Equal steps in value are equal steps on the page, to a tenth of a unit.
     assert places[1][0] - places[0][0] == pytest.approx(places[2][0] - places[1][0], abs=0.21)
     assert places[1][1] - places[0][1] == pytest.approx(places[2][1] - places[1][1], abs=0.21)
     assert places[0][1] > places[2][1]
@@ -446,7 +446,9 @@ def test_a_browser_shows_it_on_a_phone_without_scrolling_sideways(tmp_path: Path
 
 def test_light_and_dark_text_have_contrast_for_sunlight() -> None:
     """WCAG 2 contrast: 7:1 for text, 4.5:1 for what is drawn, on the page and on its cards."""
-    light, dark = re.findall(r":root\{color-scheme:light dark;([^}]*)\}|:root\{(--bg:#0d[^}]*)\}", str(page._STYLE))
+    light, dark = re.findall(
+        r":root\{color-scheme:light dark;([^}]*)\}|:root\{(--bg:#0d[^}]*)\}", page._STYLE.read_text()
+    )
     for held in (light[0], dark[1]):
         colours = dict(re.findall(r"--(\w+):#([0-9a-f]+)", held.replace("\n", "")))
         for ground in ("bg", "card"):

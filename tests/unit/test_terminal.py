@@ -196,8 +196,8 @@ def test_what_is_on_the_ports(
 
     port = SerialPort(
         device=f"/dev/{EVIL}", stable_name=f"/dev/serial/by-id/{EVIL}", by_id=(), by_path=(), aliases=(EVIL,),
-        description=EVIL, driver=EVIL, vendor_id=None, product_id=None, serial_number=EVIL, usb_interface=EVIL,
-        interface_number=EVIL, latency_timer_ms=None, is_console=False, holders=(Holder(1, EVIL),),
+        description=EVIL, driver=EVIL, vendor_id=None, product_id=None, serial_number=EVIL,
+        latency_timer_ms=None, is_console=False, holders=(Holder(1, EVIL),),
     )  # fmt: skip
     monkeypatch.setattr("companion.links.serial.ports.list_ports", lambda: [port])
     monkeypatch.setattr("companion.links.serial.listening.listen", listen)

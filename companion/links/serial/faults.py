@@ -148,10 +148,9 @@ def _timer(port: SerialPort, *, is_fast: bool) -> Iterator[PortFault]:
 def _name(port: str, found: SerialPort) -> Iterator[PortFault]:
     if not _PASSING.fullmatch(port):
         return
+    remedy = "start udev, which gives a name that stays"
     if found.stable_name is not None:
         remedy = f'set port = "{found.stable_name}"'
-    else:
-        remedy = f"a name that stays: companion udev-rule --port {port} --name NAME"
     yield PortFault(f"the name {port} changes with the order of plugging", remedy, good=True)
 
 

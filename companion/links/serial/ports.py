@@ -15,6 +15,7 @@ from pathlib import Path
 from companion.printable import printable
 
 ROOT = Path("/")
+_BY_ID, _BY_PATH = "/dev/serial/by-id/", "/dev/serial/by-path/"
 _TEXT_LIMIT = 80
 _PASSING_NAME = re.compile(r"/dev/tty(?:USB|ACM)\d+$")
 
@@ -45,10 +46,6 @@ class SerialPort:
     vendor_id: int | None
     product_id: int | None
     serial_number: str | None
-    usb_interface: str | None
-    """The kernel's name of the USB interface, such as 1-1.3:1.0: where it is plugged in."""
-    interface_number: str | None
-    """Of the USB interface, two digits: a bridge with several ports has one each."""
     latency_timer_ms: int | None
     """FTDI only; above 1 ms the samples of a fast sensor arrive in bunches."""
     holders: tuple[Holder, ...]
@@ -84,12 +81,18 @@ def lasting_name(device: str) -> str | None:
         return None
     root = Path(device[: match.start()] or "/")
     links = _links_by_device(root).get(resolve(root, match[0]), [])
-    # Of chips without a serial number only one has the by-id name that all of them claim; a place is one device's.
-    places = [link for link in links if link.startswith("/dev/serial/by-path/")]
-    names = [link for link in links if link.startswith("/dev/serial/by-id/")]
-    serial = _serial_number(root, match[0])
-    best = (names + places) if serial else (places + names)
-    return str(root / best[0].lstrip("/")) if best else None
+    usb = _node_with(root, _hardware(root, match[0]), "idVendor")
+    names = _best_first(_under(_BY_ID, links), _under(_BY_PATH, links), _read(usb / "serial") if usb else None)
+    return str(root / names[0].lstrip("/")) if names else None
+
+
+def _under(folder: str, links: list[str]) -> tuple[str, ...]:
+    return tuple(link for link in links if link.startswith(folder))
+
+
+def _best_first(by_id: tuple[str, ...], by_path: tuple[str, ...], serial_number: str | None) -> tuple[str, ...]:
+    """Chips without a serial number (CH340, PL2303) of one kind all claim the same by-id name; the last one gets it."""
+    return by_id + by_path if serial_number else by_path + by_id
 
 
 def latency_timer_ms(device: str, root: Path = ROOT) -> int | None:
@@ -101,23 +104,14 @@ def _hardware(root: Path, device: str) -> Path:
     return (root / "sys/class/tty" / device.rpartition("/")[2] / "device").resolve()
 
 
-def _serial_number(root: Path, device: str) -> str | None:
-    hardware = _hardware(root, device)
-    usb = _node_with(root, hardware, "idVendor")
-    return _read(usb / "serial") if usb else None
-
-
 def _describe(
     root: Path, entry: Path, links: list[str], holders: tuple[Holder, ...], *, is_console: bool
 ) -> SerialPort:
     hardware = (entry / "device").resolve()
     usb = _node_with(root, hardware, "idVendor")
-    interface = _node_with(root, hardware, "bInterfaceNumber") if usb else None
     serial_number = _read(usb / "serial") if usb else None
-    by_id = tuple(link for link in links if link.startswith("/dev/serial/by-id/"))
-    by_path = tuple(link for link in links if link.startswith("/dev/serial/by-path/"))
-    # Chips without a serial number (CH340, PL2303) of one kind all claim the same by-id name; the last one gets it.
-    names = by_id + by_path if serial_number else by_path + by_id
+    by_id, by_path = _under(_BY_ID, links), _under(_BY_PATH, links)
+    names = _best_first(by_id, by_path, serial_number)
     driver = _driver(hardware)
     return SerialPort(
         device=f"/dev/{entry.name}",
@@ -130,8 +124,6 @@ def _describe(
         vendor_id=_number(usb / "idVendor", 16) if usb else None,
         product_id=_number(usb / "idProduct", 16) if usb else None,
         serial_number=serial_number,
-        usb_interface=interface.name if interface else None,
-        interface_number=_read(interface / "bInterfaceNumber") if interface else None,
         latency_timer_ms=_number(hardware / "latency_timer", 10),
         holders=holders,
         is_console=is_console,
