@@ -112,6 +112,11 @@ class Plot:
             tag("rect", x=_n(left), y=_n(self._top), width=_n(right - left), height=_n(self._height), class_=class_)
         )
 
+    def line(self, points: Sequence[Pair], class_: str) -> None:
+        """Join points."""
+        if len(points) > 1:
+            self._below.append(_path("M" + "L".join(_xy(*self.at(*point)) for point in points), class_))
+
     def points(self, points: Sequence[Pair], class_: str, spans: Sequence[Pair]) -> None:
         """Markers, each with an upright bar.
 

@@ -44,9 +44,8 @@ class MipDecoder(FrameDecoder):
         if len(buffer) < end:
             return WAIT
         if fletcher(buffer[at : end - 2]) != buffer[end - 2 : end]:
-            return self._reject(
-                reasons.CHECKSUM, at + 1
-            )  # not `end`: in what a false start took for its own, a good frame may begin
+            # Not `end`: in what a false start took for its own, a good frame may begin.
+            return self._reject(reasons.CHECKSUM, at + 1)
         return self._accept(samples, _decode, buffer, at, end - 2, self._time_of(origin + end), end=end)
 
 
