@@ -66,8 +66,6 @@ class Strapdown:
         """How E turns against inertial space, in E: the Earth's rotation."""
         self.last_s: float | None = None
         self.last_rate_rad_s: Triple = (0.0, 0.0, 0.0)
-        self.out_of_order = 0
-        """Samples that were not later than the one before: left out."""
         self.lost = False
         """Nothing came for longer than `LOST_S`: `orientation` means nothing until it is set again."""
         self._previous: Triple = (0.0, 0.0, 0.0)
@@ -128,7 +126,6 @@ class Strapdown:
             return None
         dt = sample.t_s - self.last_s
         if not dt > 0.0:
-            self.out_of_order += 1
             return None
         self.last_s = sample.t_s
         if dt > GAP_S:

@@ -109,7 +109,6 @@ def test_random_bytes(name: str) -> None:
         longest = max(longest, held(decoder))
     assert longest <= HELD
     assert decoder.accepted == 0
-    assert decoder.rejected.total() + decoder.skipped > RANDOM // 1000
 
 
 def test_imu_lines_in_noise() -> None:

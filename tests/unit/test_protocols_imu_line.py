@@ -88,13 +88,11 @@ def test_a_line_that_begins_inside_a_rejected_one_is_not_lost(before: bytes) -> 
     assert len(samples) == 1
 
 
-def test_bytes_outside_of_lines_are_counted() -> None:
+def test_a_line_that_another_begins_in_is_counted() -> None:
     decoder = ImuLineDecoder()
     decoder.feed(b"boot\r\n" + LINE + b"???", 1.0)
-    assert decoder.skipped == 7
     decoder.feed(b"$IMU,1$" + b"x" * 161, 1.0)  # a start that is cut short, and one that is two bytes too long
     assert decoder.rejected == {"cut short": 1, "too long": 1}
-    assert decoder.skipped == 7 + 2
 
 
 def test_an_interruption_forgets_the_line_under_way() -> None:

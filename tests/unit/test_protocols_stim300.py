@@ -70,7 +70,7 @@ def test_each_datagram_is_read_to_its_end_and_gives_what_it_holds(identifier: in
 def test_a_cr_lf_after_each_datagram_is_no_loss() -> None:
     decoder = Stim300Decoder()
     assert len(decoder.feed(10 * (DATAGRAM + b"\r\n"), 1.0)) == 20
-    assert (dict(decoder.rejected), decoder.skipped) == ({}, 0)
+    assert not decoder.rejected
 
 
 def test_what_is_sent_at_start_up_is_stepped_over() -> None:
@@ -207,12 +207,11 @@ def test_an_inclination_that_tells_no_tilt_is_counted(inclination: tuple[int, ..
     assert (len(imus(samples)), tilts(samples), rejected) == (1, [], {reason: 1})
 
 
-def test_a_loss_costs_one_count_and_the_bytes_of_the_datagram() -> None:
+def test_a_loss_costs_one_count_and_the_datagram() -> None:
     decoder = Stim300Decoder()
     decoder.feed(DATAGRAM[:17] + DATAGRAM[18:] + 3 * DATAGRAM + bytes(STIM300_BYTES), 1.0)
     assert decoder.accepted == 3
     assert decoder.rejected == {"checksum": 1}
-    assert 0 < decoder.skipped <= len(DATAGRAM) + STIM300_BYTES
 
 
 def test_every_single_damaged_bit_is_seen() -> None:

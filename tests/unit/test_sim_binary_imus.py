@@ -18,11 +18,11 @@ FLU = np.array([1.0, -1.0, -1.0])
 """Device axes of what lies on its base with Z up, as parts of forward, right, down."""
 
 
-def decoded(device: SerialDevice, seconds: float) -> tuple[list[Sample], dict[str, int], int]:
+def decoded(device: SerialDevice, seconds: float) -> tuple[list[Sample], dict[str, int]]:
     decoder = make_decoder("imu", device.protocol)
     data = device.power_on(0.0) + b"".join(frame.data for frame in device.frames_until(seconds))
     samples = decoder.feed(data, 1.0)
-    return samples, dict(decoder.rejected), decoder.skipped
+    return samples, dict(decoder.rejected)
 
 
 @pytest.mark.parametrize(("name", "signs", "replies"), [("mip", np.ones(3), 0), ("xsens", FLU, 1), ("stim300", FLU, 3)])
@@ -31,11 +31,10 @@ def test_the_mean_of_what_is_decoded_is_the_truth_in_the_device_s_axes(
 ) -> None:
     aircraft = VirtualAircraft(POSE)
     device = IMUS[name](ImuModel(aircraft, "adis16470", seed=3))
-    samples, rejected, skipped = decoded(device, 20.0)
+    samples, rejected = decoded(device, 20.0)
     readings = [sample for sample in samples if isinstance(sample, ImuSample)]
     assert len(readings) == 20 * device.rate_hz + 1
     assert rejected == ({"reply": replies} if replies else {})
-    assert skipped == 0
     model = ImuModel(aircraft, "adis16470", seed=3)
     expected = model.read(np.arange(len(readings)) / device.rate_hz, 1 / device.rate_hz).mean(axis=0)
     gyro = np.mean([sample.gyro_rad_s for sample in readings], axis=0)
@@ -49,11 +48,11 @@ def test_the_mean_of_what_is_decoded_is_the_truth_in_the_device_s_axes(
 @pytest.mark.parametrize("crlf", [False, True])
 def test_a_stim300_of_any_range_tells_it_at_power_on(range_g: int, *, crlf: bool) -> None:
     device = Stim300(ImuModel(VirtualAircraft(POSE), "adis16470", seed=3), range_g=range_g, crlf=crlf)
-    samples, rejected, skipped = decoded(device, 1.0)
+    samples, rejected = decoded(device, 1.0)
     forces = [np.linalg.norm(sample.accel_m_s2) for sample in samples if isinstance(sample, ImuSample)]
     assert len(forces) == 251
     assert np.mean(forces) == pytest.approx(9.8, abs=0.1)
-    assert (rejected, skipped) == ({"reply": 3}, 0)
+    assert rejected == {"reply": 3}
 
 
 def test_a_stim300_as_a_gradienter_tells_the_tilt_and_is_older_by_its_latency() -> None:
@@ -67,7 +66,7 @@ def test_a_stim300_as_a_gradienter_tells_the_tilt_and_is_older_by_its_latency() 
 
 
 def test_an_xsens_counts_and_tells_its_own_time() -> None:
-    samples, _, _ = decoded(IMUS["xsens"](ImuModel(VirtualAircraft(POSE), "adis16470", seed=3)), 1.0)
+    samples, _ = decoded(IMUS["xsens"](ImuModel(VirtualAircraft(POSE), "adis16470", seed=3)), 1.0)
     readings = [sample for sample in samples if isinstance(sample, ImuSample)]
     assert [sample.sequence for sample in readings] == list(range(201))
     assert [sample.t_device_s for sample in readings] == pytest.approx([k / 200 for k in range(201)])

@@ -85,7 +85,6 @@ class PniDecoder(FrameDecoder):
             return WAIT
         size = buffer[at + 1]
         if not SHORTEST <= size <= LONGEST or (available >= 3 and buffer[at + 2] not in _KNOWN):
-            self.skipped += 1
             return at + 1
         if available < 3:
             return WAIT

@@ -56,8 +56,6 @@ class Decoder(ABC):
         """Frames, or what began like one, that gave none, by reason."""
         self.warned: Counter[str] = Counter()
         """Frames that gave samples and said something against them, by what they said."""
-        self.skipped = 0
-        """Bytes passed over that did not look like part of any frame; many of them mean a wrong baud or protocol."""
 
     def receive(self, data: bytes, t_s: float) -> list[Sample]:
         """Take the next bytes, read at `t_s` on the host's clock; return the samples that they complete.
@@ -202,24 +200,16 @@ class SentenceDecoder(Decoder):
         """
 
     def _last_sentence(self, text: bytes) -> bytes:
-        """What begins at the last "$" and is not too long yet; everything before it is counted."""
-        start = text.find(b"$")
-        if start < 0:
-            self.skipped += len(text)
+        """What begins at the last "$" and is not too long yet; the sentences cut short before it are counted."""
+        _, *begun = text.split(b"$")
+        if not begun:
             return b""
-        self.skipped += start
-        while (end := text.find(b"$", start + 1)) >= 0:
-            self._too_long_or(reasons.CUT_SHORT, end - start)
-            start = end
-        if len(text) - start > self.LIMIT:
-            self._too_long_or("", len(text) - start)
+        for each in begun[:-1]:
+            self.rejected[reasons.TOO_LONG if len(each) >= self.LIMIT else reasons.CUT_SHORT] += 1
+        if len(begun[-1]) >= self.LIMIT:
+            self.rejected[reasons.TOO_LONG] += 1
             return b""
-        return text[start:]
-
-    def _too_long_or(self, reason: str, length: int) -> None:
-        """Count a sentence that ends without a line end; beyond the limit its bytes belong to no frame."""
-        self.rejected[reasons.TOO_LONG if length > self.LIMIT else reason] += 1
-        self.skipped += max(length - self.LIMIT, 0)
+        return b"$" + begun[-1]
 
 
 _HEXADECIMAL: Final = {

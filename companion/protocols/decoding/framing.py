@@ -69,9 +69,7 @@ class FrameDecoder(Decoder):
     def _skip_to(self, start: bytes, buffer: bytes, at: int) -> int:
         """Pass over what cannot begin a frame."""
         found = buffer.find(start, at)
-        end = len(buffer) if found < 0 else found
-        self.skipped += end - at
-        return end
+        return len(buffer) if found < 0 else found
 
     def _find_mark(self, mark: bytes, buffer: bytes, at: int) -> int:
         """Where to go on when no mark of two bytes stands at `at`: `WAIT` where its second byte has not come yet."""
@@ -79,7 +77,6 @@ class FrameDecoder(Decoder):
             return self._skip_to(mark[:1], buffer, at)
         if len(buffer) == at + 1:
             return WAIT
-        self.skipped += 1
         return at + 1
 
     def _reject(self, reason: str, end: int) -> int:

@@ -149,8 +149,8 @@ _IDENTIFIER = re.compile(b"[" + b"".join(re.escape(bytes((name,))) for name in s
 class Stim300Decoder(FrameDecoder):
     """STIM300 datagrams; gives `ImuSample` where they hold acceleration, `TiltSample` where they hold inclination.
 
-    There is no start mark: after a loss the next datagram is the next one whose CRC is right, and the bytes before it
-    are counted as skipped. A tilt that cannot be used is counted, though the datagram may have given an `ImuSample`.
+    There is no start mark: after a loss the next datagram is the next one whose CRC is right. A tilt that cannot be
+    used is counted, though the datagram may have given an `ImuSample`.
     """
 
     sequence_modulus: ClassVar[int | None] = 256
@@ -180,7 +180,8 @@ class Stim300Decoder(FrameDecoder):
         identifier = buffer[at]
         size = FRAME_BYTES.get(identifier)
         if size is None:
-            return self._out_of_step(buffer, at)
+            match = _IDENTIFIER.search(buffer, at)
+            return match.start() if match else len(buffer)
         end = at + size
         if len(buffer) < end:
             return WAIT
@@ -189,8 +190,6 @@ class Stim300Decoder(FrameDecoder):
             if self._in_step:
                 self.rejected[reasons.CHECKSUM] += 1
                 self._in_step = False
-            else:
-                self.skipped += 1
             return at + 1
         self._in_step = True
         layout = NORMAL_MODE.get(identifier)
@@ -198,13 +197,6 @@ class Stim300Decoder(FrameDecoder):
             self._special(identifier, frame)
             return self._reject(reasons.REPLY, end)
         return self._accept(samples, self._decode, layout, frame, self._time_of(origin + end), end=end)
-
-    def _out_of_step(self, buffer: bytes, at: int) -> int:
-        """Where the next datagram may begin; a CR LF after the last one is no loss."""
-        match = _IDENTIFIER.search(buffer, at)
-        end = match.start() if match else len(buffer)
-        self.skipped += len(buffer[at:end].translate(None, b"\r\n"))
-        return end
 
     def _special(self, identifier: int, frame: bytes) -> None:
         """Learn the ranges and units from a configuration datagram."""

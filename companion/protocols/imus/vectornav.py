@@ -188,8 +188,6 @@ _DOLLAR = ord("$")
 _START = re.compile(rb"[\xfa$]")
 _END_OF_TEXT = re.compile(rb"[^ -#%-~]")
 """The first byte that cannot be inside a sentence: a line end, a "$", or nothing printable."""
-_TEXT = bytes(set(range(0x20, 0x7F)) - {_DOLLAR})
-"""All others."""
 
 _REPLIES = frozenset((b"VNRRG", b"VNWRG", b"VNWNV", b"VNRFS", b"VNRST", b"VNTAR", b"VNASY", b"VNSGB", b"VNCMD"))
 
@@ -211,9 +209,7 @@ class VectorNavDecoder(FrameDecoder):
         if buffer[at] == _DOLLAR:
             return self._sentence(buffer, at, origin, samples)
         match = _START.search(buffer, at)
-        end = match.start() if match else len(buffer)
-        self.skipped += len(buffer[at:end].translate(None, b"\r\n"))
-        return end
+        return match.start() if match else len(buffer)
 
     def _binary(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> int:
         """Where to go on after what begins with a sync byte, or `WAIT` for more bytes."""
@@ -234,9 +230,7 @@ class VectorNavDecoder(FrameDecoder):
             return WAIT
         end = at + layout.frame_bytes
         if binascii.crc_hqx(buffer[at + 1 : end], 0) != 0:
-            return self._reject(
-                reasons.CHECKSUM, at + 1
-            )  # not `end`: in what a false start took for its own, a good frame may begin
+            return self._reject(reasons.CHECKSUM, at + 1)
         if header not in self._layouts:
             if len(self._layouts) >= LAYOUTS_KEPT:
                 self._layouts.clear()
@@ -248,20 +242,14 @@ class VectorNavDecoder(FrameDecoder):
         """Where to go on after what begins with a "$", or `WAIT` for more bytes."""
         begin = buffer[at : at + 3]
         if not b"$VN".startswith(begin):
-            self.skipped += 1
             return at + 1
         limit = at + 1 + SENTENCE_LIMIT
-        end = buffer.find(b"\r", at + 1, limit)
-        # Deleting all that may be in a sentence is quicker than looking for what may not; it is nearly always whole.
-        if end < 0 or buffer[at + 1 : end].translate(None, _TEXT):
-            match = _END_OF_TEXT.search(buffer, at + 1, limit)
-            if match is None:
-                if len(buffer) < limit:
-                    return WAIT
-                return self._reject(reasons.TOO_LONG, at + 1)
-            end = match.start()
-            if buffer[end] not in b"\r\n":
-                return self._reject(reasons.CUT_SHORT, end)
+        match = _END_OF_TEXT.search(buffer, at + 1, limit)
+        if match is None:
+            return WAIT if len(buffer) < limit else self._reject(reasons.TOO_LONG, at + 1)
+        end = match.start()
+        if buffer[end] not in b"\r\n":
+            return self._reject(reasons.CUT_SHORT, end)
         return self._accept(samples, _decode, buffer[at:end], self._time_of(origin + end + 1), end=end)
 
 

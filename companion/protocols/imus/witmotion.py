@@ -72,7 +72,7 @@ class WitMotionDecoder(FrameDecoder):
             if size == WAIT:
                 return WAIT
             if size != FRAME_BYTES:
-                return self._no_frame(size, at)
+                return self._reject(reasons.CHECKSUM, at + 1) if size == _WRONG_SUM else at + 1
             self._good_at = origin + at
         end = at + FRAME_BYTES
         following = _good(buffer, end)
@@ -83,12 +83,6 @@ class WitMotionDecoder(FrameDecoder):
         self._good_at = origin + end
         self._read_frame(buffer, at, origin, samples)
         return end
-
-    def _no_frame(self, size: int, at: int) -> int:
-        if size == _WRONG_SUM:
-            return self._reject(reasons.CHECKSUM, at + 1)
-        self.skipped += 1
-        return at + 1
 
     def _read_frame(self, buffer: bytes, at: int, origin: int, samples: list[Sample]) -> None:
         kind, end = buffer[at + 1], origin + at + FRAME_BYTES

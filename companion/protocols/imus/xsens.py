@@ -74,9 +74,7 @@ class XsensDecoder(FrameDecoder):
         if len(buffer) < end:
             return WAIT
         if sum(buffer[at + 1 : end]) & 0xFF:
-            return self._reject(
-                reasons.CHECKSUM, at + 1
-            )  # not `end`: in what a false start took for its own, a good frame may begin
+            return self._reject(reasons.CHECKSUM, at + 1)
         if buffer[at + 2] != _MT_DATA_2:
             return self._reject(reasons.REPLY, end)
         return self._accept(samples, self._decode, buffer, data, end - 1, self._time_of(origin + end), end=end)

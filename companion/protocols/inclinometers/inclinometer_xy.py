@@ -84,7 +84,6 @@ class InclinometerXyDecoder(LineDecoder):
     def _pass_over(self, before: bytes, *, cut: bool) -> None:
         """What stands in front of the last axis of a line: an echo, or something that has lost its line end."""
         if not cut and _ECHO.fullmatch(before):
-            self.skipped += len(before)
             return
         self.rejected[
             reasons.PARITY if _DAMAGED.search(before) else reasons.TOO_LONG if cut else reasons.CUT_SHORT

@@ -49,7 +49,6 @@ class RionDecoder(FrameDecoder):
             return WAIT
         length = buffer[at + 1]
         if not 4 <= length < LONGEST or (available >= 4 and length not in _LENGTHS.get(buffer[at + 3], ())):
-            self.skipped += 1
             return at + 1
         if available <= length:
             return WAIT
