@@ -20,7 +20,9 @@ from typing import Any, Final
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.calibration.collector.rolling import ImuInput, RollingCollector, Settings
+from companion.calibration.collector.outlook import Settings
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
 from companion.component.arm_authorisation import ArmAuthoriser

@@ -8,11 +8,12 @@ from typing import Final, Literal
 
 from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.calibration.collector.rolling import ImuInput, Settings
+from companion.calibration.collector.outlook import Settings
+from companion.calibration.means.pose import CompassModel, GradienterModel
+from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.solution.record import AlignmentUsed
 from companion.calibration.solution.site import Whereabouts
-from companion.calibration.solution.solve import CompassModel, GradienterModel
 from companion.calibration.stillness.settling import AT_ONCE, Lag
 from companion.config.sections import Compass, Config, Gradienter, GradienterProtocol, Imu, Noise
 from companion.physics.frames import rotation_matrix

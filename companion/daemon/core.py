@@ -9,8 +9,8 @@ from typing import Any, Final
 
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
-from companion.calibration.collector.rolling import Window
 from companion.calibration.machine import Machine
+from companion.calibration.means.windows import Window
 from companion.component.statustext import Severity, StatusText, Weight
 from companion.config.sections import Config
 from companion.configured import models

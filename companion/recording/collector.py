@@ -6,7 +6,8 @@ import asyncio
 from collections import deque
 from typing import Any, Final
 
-from companion.calibration.collector.rolling import ImuInput, RollingCollector, Window
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.means.windows import ImuInput, Window
 from companion.links.system.listeners import Listeners
 from companion.recording.journal import Journal, Means
 from companion.samples import CompassSample, ImuSample, TiltSample

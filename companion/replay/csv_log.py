@@ -14,15 +14,16 @@ import msgspec
 import numpy as np
 
 from companion.calibration.collector.measurement import Measurement
-from companion.calibration.collector.rolling import RollingCollector, Settings, Window
-from companion.calibration.means.pose import HeadingWindow, TiltWindow
-from companion.calibration.means.windows import ImuInput
+from companion.calibration.collector.outlook import Settings
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
+from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.record import Record
 from companion.calibration.solution.site import Remedies, Whereabouts
-from companion.calibration.solution.solve import CompassModel, GradienterModel, solve_at
+from companion.calibration.solution.solve import solve_at
 from companion.config.sections import Mounting, Noise
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import rotation_matrix

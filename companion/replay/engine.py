@@ -84,8 +84,6 @@ class Telemetry:
         return sample, _NOT_THERE
 
 
-__all__ = ["Replay", "Replayed", "Result"]
-
 _UNUSABLE: Final = (
     msgspec.MsgspecError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError,
 )  # fmt: skip

@@ -13,8 +13,7 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from companion.calibration.collector.rolling import Window
-from companion.calibration.means.windows import ImuInput
+from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.noise.allan import noise_profile
 from companion.errors import CalibrationRefusedError
 from sim.accuracy import paper, peers

@@ -16,9 +16,10 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.collector.rolling import RollingCollector, Settings, Window
+from companion.calibration.collector.outlook import Settings
+from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.pose import CompassModel, GradienterModel
-from companion.calibration.means.windows import ImuInput
+from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.request import What
 from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.calibration.solution.solve import ImuSolution, Solution, solve

@@ -8,12 +8,14 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.calibration.collector.rolling import RollingCollector, Settings
+from companion.calibration.collector.outlook import Settings
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
 from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
-from companion.calibration.solution.solve import CompassModel, GradienterModel, ImuSolution, Solution, solve
+from companion.calibration.solution.solve import ImuSolution, Solution, solve
 from companion.physics.gradienter import Law
 from companion.protocols.decoding.base import Decoder
 from companion.protocols.registry import PROTOCOLS, Kind

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.calibration.collector.rolling import RollingCollector, Status
+from companion.calibration.collector.outlook import Status
+from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.noise.robust import huber_line, huber_mean
 from companion.calibration.seconds.batch import BatchSource
 from companion.errors import CalibrationRefusedError

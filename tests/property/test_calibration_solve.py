@@ -12,10 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import Window
 from companion.calibration.request import What
 from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
-from companion.calibration.solution.solve import CompassModel, GradienterModel, ImuSolution, Solution, solve
+from companion.calibration.solution.solve import ImuSolution, Solution, solve
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array
 from companion.physics.units import DEG, DEG_H, MG

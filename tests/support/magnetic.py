@@ -8,10 +8,16 @@ import math
 import msgspec
 import numpy as np
 
-from companion.calibration.means.pose import FieldHeading, FieldUnit, FieldWindow, HeadingWindow
+from companion.calibration.means.pose import (
+    CompassModel,
+    FieldHeading,
+    FieldUnit,
+    FieldWindow,
+    GradienterModel,
+    HeadingWindow,
+)
 from companion.calibration.means.windows import Window
 from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
-from companion.calibration.solution.solve import CompassModel, GradienterModel
 from companion.samples import MagSample, TiltSample
 from tests.support.windows import Array, ideal_window, ned_from_body
 

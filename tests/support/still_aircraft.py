@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.collector.rolling import ImuInput, RollingCollector, Settings
+from companion.calibration.collector.outlook import Settings
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import AllanModel, NoiseProfile, noise_profile
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import CompassSample, ImuSample, TiltSample

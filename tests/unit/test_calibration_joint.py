@@ -12,12 +12,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy import linalg
 
+from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.request import What
 from companion.calibration.solution.history import PowerUp
 from companion.calibration.solution.joint import Weighed, Whole, points, weigh
 from companion.calibration.solution.prior import Expectation, Expected, ExpectedImu
 from companion.calibration.solution.site import Whereabouts, local_earth
-from companion.calibration.solution.solve import CompassModel, GradienterModel, ImuSolution, Shared, Solution, solve
+from companion.calibration.solution.solve import ImuSolution, Shared, Solution, solve
 from tests.prior_study import BY_READING, DEG, DEG_H, LEVEL, MG, G, imu_solution, shared_errors, solution
 from tests.support.windows import about, ideal_window, ned_from_body
 

@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.calibration.collector import measurement
-from companion.calibration.collector.rolling import RollingCollector, Settings
+from companion.calibration.collector.outlook import Settings
+from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.noise.allan import AllanModel, NoiseProfile
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG, DEG_H, MG

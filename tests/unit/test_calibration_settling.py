@@ -10,8 +10,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from companion.calibration.collector.rolling import RollingCollector, Window
-from companion.calibration.means.windows import ImuInput
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.seconds.batch import Batch
 from companion.calibration.stillness.settling import AT_ONCE, UNKNOWN_DEG, Lag, Settling

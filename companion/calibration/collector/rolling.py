@@ -24,28 +24,15 @@ from companion.calibration.collector.outlook import (
     obstacle,
     settling,
 )
-from companion.calibration.collector.sources import Source, SourceStatus
+from companion.calibration.collector.sources import Source
 from companion.calibration.collector.trace import Snapshot, TraceLog
-from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
-from companion.calibration.means.windows import ImuInput, ImuWindow, Window
+from companion.calibration.means.pose import CompassModel, GradienterModel
+from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.seconds.batch import Batch
 from companion.calibration.stillness.gates import ImuGate
 from companion.calibration.stillness.settling import AT_ONCE, HeadingWatch, Lag
 from companion.calibration.stillness.stretch import Stretch
 from companion.errors import CalibrationRefusedError
-
-__all__ = [
-    "Glance",
-    "HeadingWindow",
-    "ImuInput",
-    "ImuWindow",
-    "RollingCollector",
-    "Settings",
-    "SourceStatus",
-    "Status",
-    "TiltWindow",
-    "Window",
-]
 
 MIN_BATCHES: Final = 5
 """Of a window that was asked for with `since_s`: fewer say nothing about their own scatter."""

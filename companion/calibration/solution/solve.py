@@ -16,8 +16,13 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.collector.rolling import ImuWindow, TiltWindow, Window
-from companion.calibration.means.pose import CompassModel, GradienterModel, up_in_vehicle, vehicle_heading_rad
+from companion.calibration.means.pose import (
+    CompassModel,
+    GradienterModel,
+    TiltWindow,
+    up_in_vehicle,
+)
+from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.request import What
 from companion.calibration.solution import magnetic
 from companion.calibration.solution.bias import (
@@ -34,18 +39,6 @@ from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_fr
 from companion.physics.gradienter import up_jacobian
 from companion.physics.units import DEG
 from companion.samples import Triad
-
-__all__ = [
-    "CompassModel",
-    "GradienterModel",
-    "ImuSolution",
-    "Solution",
-    "Truth",
-    "solve",
-    "solve_at",
-    "up_in_vehicle",
-    "vehicle_heading_rad",
-]
 
 # Without a gradienter the accelerometers level the Earth's rate; a 50 mg bias tilts it by 3 degrees (0.8 deg/h).
 LEVEL_BY_ACCELEROMETER_SIGMA_DEG: Final = 3.0

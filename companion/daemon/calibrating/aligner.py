@@ -19,10 +19,10 @@ import numpy as np
 from companion.calibration.alignment.align import Alignment, align, in_words
 from companion.calibration.alignment.align_model import Ground, ImuStand, Stand
 from companion.calibration.alignment.align_record import AlignmentRecord, imu_record, stand_record
-from companion.calibration.collector.rolling import Window
 from companion.calibration.machine import Event
+from companion.calibration.means.pose import GradienterModel, up_in_vehicle, vehicle_heading_rad
+from companion.calibration.means.windows import Window
 from companion.calibration.solution.site import LocalEarth, local_earth
-from companion.calibration.solution.solve import GradienterModel, up_in_vehicle, vehicle_heading_rad
 from companion.component.statustext import Severity
 from companion.configured import models
 from companion.daemon.calibrating import align_steps

@@ -6,8 +6,8 @@ import logging
 from collections.abc import Callable
 
 from companion.calibration.alignment.align_record import AlignmentRecord, GradienterSettings
+from companion.calibration.means.pose import GradienterModel
 from companion.calibration.solution.record import AlignmentUsed
-from companion.calibration.solution.solve import GradienterModel
 from companion.config.sections import Config
 from companion.configured import models
 from companion.daemon.core import Offload

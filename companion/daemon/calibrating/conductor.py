@@ -15,7 +15,7 @@ import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
-from companion.calibration.collector.rolling import Settings
+from companion.calibration.collector.outlook import Settings
 from companion.calibration.machine import Event, State
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words

@@ -16,8 +16,9 @@ import msgspec
 
 from companion.autopilot.parameters.change import WriteFailedError
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.calibration.collector.rolling import Settings, Status, Window
+from companion.calibration.collector.outlook import Settings, Status
 from companion.calibration.machine import Event, State
+from companion.calibration.means.windows import Window
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.history import Point

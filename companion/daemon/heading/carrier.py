@@ -19,11 +19,12 @@ from companion.attitude.estimator import Attitude, AttitudeEstimator, AttitudeSe
 from companion.attitude.quaternion import Quaternion, Triple, conjugate, from_matrix, multiply, rotate
 from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
-from companion.calibration.collector.rolling import Window
+from companion.calibration.means.pose import CompassModel, GradienterModel, vehicle_heading_rad
+from companion.calibration.means.windows import Window
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.solution.record import ImuRecord
 from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
-from companion.calibration.solution.solve import CompassModel, GradienterModel, truth_of, vehicle_heading_rad
+from companion.calibration.solution.solve import truth_of
 from companion.config.sections import Config, Imu
 from companion.configured import models
 from companion.daemon.arming.in_force import InForce

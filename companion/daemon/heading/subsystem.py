@@ -8,8 +8,8 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from companion.autopilot.firmware.heading_parameters import RISKS, changes_for, wanted_for
+from companion.calibration.means.pose import up_in_vehicle, vehicle_heading_rad
 from companion.calibration.solution.site import Whereabouts, local_earth
-from companion.calibration.solution.solve import up_in_vehicle, vehicle_heading_rad
 from companion.configured import models
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.alignment import AlignmentInForce

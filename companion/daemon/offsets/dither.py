@@ -19,11 +19,10 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.pace import has_passed, moment
 from companion.autopilot.parameters.writer import Change, ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.calibration.collector.rolling import Window
 from companion.calibration.collector.sources import integer_batches
 from companion.calibration.machine import Event
 from companion.calibration.means.dither import SECONDS, STEPS, Dithered, Step, combine, shifts_lsb, why_void
-from companion.calibration.means.windows import ImuWindow
+from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.seconds.batch import Batch
 from companion.calibration.solution.draft import Draft

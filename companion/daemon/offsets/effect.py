@@ -22,7 +22,8 @@ from companion.autopilot.parameters.verify import Observation, Verdict, judge
 from companion.autopilot.parameters.writer import Change
 from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.calibration.collector.rolling import MIN_BATCHES, ImuWindow, Window
+from companion.calibration.collector.rolling import MIN_BATCHES
+from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.noise.allan import AllanModel, floor_variance, noise_profile
 from companion.config.sections import Noise
 from companion.daemon.core import Core

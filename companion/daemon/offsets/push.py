@@ -20,8 +20,8 @@ from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.commands import result_name
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
-from companion.calibration.collector.rolling import Window
 from companion.calibration.machine import Event
+from companion.calibration.means.windows import Window
 from companion.calibration.solution.draft import Draft
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core

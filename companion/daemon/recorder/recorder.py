@@ -18,7 +18,7 @@ import msgspec
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.calibration.collector.rolling import Window
+from companion.calibration.means.windows import Window
 from companion.calibration.request import What, is_time_limit
 from companion.calibration.solution.prior import Expectation
 from companion.calibration.solution.site import Whereabouts
