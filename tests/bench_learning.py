@@ -15,9 +15,8 @@ import numpy as np
 
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.profiling.coverage import Kept, coverage
-from companion.calibration.profiling.profile_fit import fit_profile
-from companion.calibration.profiling.rest import Rests, rests
-from companion.replay.csv_columns import read_arrays
+from companion.calibration.profiling.profile_fit import Rests, fit_profile, rests
+from companion.replay.csv_log import read_arrays
 from tests.support.made_noise import DEG_H, adis16405, write_csv
 
 SECONDS: Final = 10080

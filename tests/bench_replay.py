@@ -22,8 +22,7 @@ import numpy as np
 from mcap.reader import make_reader
 
 from companion.recording.walk import Message, Recording
-from companion.replay.csv_columns import read
-from companion.replay.csv_log import PoseGiven, estimate
+from companion.replay.csv_log import PoseGiven, estimate, read
 from companion.replay.engine import Replay
 from tests.support.long_recordings import write_log, write_recording
 from tests.support.rig import Rig

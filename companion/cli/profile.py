@@ -27,8 +27,7 @@ from companion.physics.units import DEG_H, MG
 if TYPE_CHECKING:
     from companion.calibration.noise.allan import AllanModel, NoiseProfile
     from companion.calibration.profiling.coverage import Kept
-    from companion.calibration.profiling.profile_fit import AxisFinding, Finding
-    from companion.calibration.profiling.rest import Rests
+    from companion.calibration.profiling.profile_fit import AxisFinding, Finding, Rests
     from companion.replay.still_log import StillLog
 
 LEAST_SHARE: Final = 0.90
@@ -147,8 +146,7 @@ def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s
     """
     from companion.calibration.noise.allan import noise_profile
     from companion.calibration.profiling.coverage import coverage
-    from companion.calibration.profiling.profile_fit import fit_profile
-    from companion.calibration.profiling.rest import joined, rests
+    from companion.calibration.profiling.profile_fit import fit_profile, joined, rests
 
     whole = [log for log in logs if not log.truncated]
     if not whole:

@@ -167,8 +167,7 @@ def _lines(result: Result) -> list[str]:
 
 
 def _replay_csv(options: argparse.Namespace) -> int:
-    from companion.replay.csv_columns import read
-    from companion.replay.csv_log import PoseGiven, estimate
+    from companion.replay.csv_log import PoseGiven, estimate, read
     from companion.rotations import ROTATIONS_DEG
     from companion.storage.profiles import given_profile
 

@@ -14,7 +14,7 @@ from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.solution.record import AlignmentUsed
 from companion.calibration.solution.site import Whereabouts
-from companion.calibration.stillness.settling import AT_ONCE, Lag
+from companion.calibration.stillness.stretch import AT_ONCE, Lag
 from companion.config.sections import Compass, Config, Gradienter, GradienterProtocol, Imu, Noise
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H, MG

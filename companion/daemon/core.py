@@ -13,10 +13,9 @@ from companion.calibration.machine import Machine
 from companion.calibration.means.windows import Window
 from companion.component.statustext import Severity, StatusText, Weight
 from companion.config.sections import Config
-from companion.configured import models
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.request import Object
-from companion.recording.collector import RecordedCollector
+from companion.recording.journal import RecordedCollector
 
 TICK_S: Final = 0.2
 """How often the seconds that are over end, also of sources that say nothing."""
@@ -49,15 +48,7 @@ class Core:
     def of(cls, config: Config, link: MavlinkLink | None, offload: Offload, only_listening: str | None) -> Core:
         """Make it; a test brings a link that is on a wire of its own."""
         link = link or MavlinkLink(system_id=config.vehicle.system_id or 1, component_id=config.mavlink.component_id)
-        collector = RecordedCollector(
-            models.settings(config),
-            [models.imu_input(imu, None) for imu in config.imu],
-            gradienter=config.gradienter is not None,
-            compass=config.compass is not None,
-            gradienter_lag=models.lag("gradienter", config.gradienter),
-            compass_lag=models.lag("compass", config.compass),
-            field_by=models.field_by(config),
-        )
+        collector = RecordedCollector(config)
 
         def is_carried() -> bool:
             if vehicle.arm_state is ArmState.ARMED:

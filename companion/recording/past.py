@@ -15,6 +15,7 @@ import msgspec
 
 from companion.recording import topics
 from companion.recording.journal import Entry, in_force_key
+from companion.recording.walk import decompressed
 
 LEARNED_S: Final = 65.0
 """Beyond the longest stretch: what the gates on stillness learn from, and the tail of a movement before."""
@@ -111,16 +112,7 @@ def unpacked(packed: bytes) -> list[Message]:
     Raises:
         ValueError: it is nothing that this version could have written.
     """
-    import zstandard
-
-    try:
-        # What a frame says of itself is made room for, whatever the limit is.
-        if zstandard.frame_content_size(packed) > MOST_UNPACKED:
-            raise ValueError(f"a second of more than {MOST_UNPACKED} bytes")
-        data = zstandard.decompress(packed, MOST_UNPACKED)
-    except zstandard.ZstdError as error:
-        raise ValueError(f"a second cannot be unpacked: {error}") from None
-    found = msgspec.msgpack.decode(data, type=list[Message])
+    found = msgspec.msgpack.decode(decompressed(packed, MOST_UNPACKED), type=list[Message])
     if any(topic in _NOT_IN_IT for topic, _, _ in found):
         raise ValueError("a second holds what it may not")
     return found

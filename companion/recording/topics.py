@@ -14,7 +14,7 @@ from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 import msgspec
 
 from companion.calibration.solution.record import Record, to_json
-from companion.samples import CompassSample, ImuSample, TiltSample
+from companion.samples import ImuSample
 
 FORMAT_VERSION: Final = "2"
 METADATA: Final = "companion"
@@ -112,16 +112,6 @@ class ImuEntry(msgspec.Struct, frozen=True, gc=False):
     sequence: int | None = None
     t_device_s: float | None = None
     message: str | None = None
-
-
-def tilt_json(sample: TiltSample) -> bytes:
-    """One reading of the gradienter."""
-    return msgspec.json.encode(TiltEntry(sample.t_s, sample.x_deg, sample.y_deg, sample.temperature_degc))
-
-
-def compass_json(sample: CompassSample) -> bytes:
-    """One heading."""
-    return msgspec.json.encode(CompassEntry(sample.t_s, sample.heading_deg, sample.pitch_deg, sample.roll_deg))
 
 
 def record_json(record: Record, t_s: float) -> bytes:

@@ -103,6 +103,7 @@ class Recording:
     def items(self, wanted: Callable[[str], bool]) -> Iterator[Item]:
         """The same, without the messages on topics that are not wanted."""
         try:
+            import zstandard as _  # noqa: F401 - says here whether it is there
             from mcap.exceptions import EndOfFile
         except ImportError:
             raise StorageError(_NEEDS_MORE) from None
@@ -135,6 +136,8 @@ class Recording:
 
     def _records(self, data: bytes, wanted: Callable[[str], bool]) -> Iterator[Item]:
         """What is in some records."""
+        from mcap import records
+
         at, size, topic_of = 0, len(data), self._topic_of
         while at < size:
             if data[at] == _MESSAGE and size - at >= _WHOLE_HEAD.size:
@@ -150,16 +153,15 @@ class Recording:
             if kind == _MESSAGE:
                 raise _DamagedError("damaged: a message does not end where it should")
             if kind == _CHANNEL:
-                self._channel(data[begin:at], wanted)
+                self._channel(records.Channel.read(_stream(data[begin:at])), wanted)
             elif kind == _METADATA:
-                yield _metadata(data[begin:at])
+                table = records.Metadata.read(_stream(data[begin:at]))
+                yield Metadata(table.name, table.metadata)
             elif kind == _ATTACHMENT:
-                yield _attachment(data[begin:at])
+                file = records.Attachment.read(_stream(data[begin:at]))
+                yield Attachment(file.name, file.data)
 
-    def _channel(self, data: bytes, wanted: Callable[[str], bool]) -> None:
-        from mcap.records import Channel
-
-        channel = Channel.read(_stream(data))
+    def _channel(self, channel: Any, wanted: Callable[[str], bool]) -> None:
         self._topics.add(channel.topic)
         if len(self._topics) > MOST_TOPICS:
             raise _DamagedError(f"damaged: more than {MOST_TOPICS} topics")
@@ -190,20 +192,6 @@ def _stream(data: bytes) -> Any:
     return ReadDataStream(io.BytesIO(data))
 
 
-def _metadata(data: bytes) -> Metadata:
-    from mcap.records import Metadata as Read
-
-    found = Read.read(_stream(data))
-    return Metadata(found.name, found.metadata)
-
-
-def _attachment(data: bytes) -> Attachment:
-    from mcap.records import Attachment as Read
-
-    found = Read.read(_stream(data))
-    return Attachment(found.name, found.data)
-
-
 def _unpacked(data: bytes, at: int) -> bytes:
     """The records in a chunk, checked."""
     from mcap.records import Chunk
@@ -213,7 +201,10 @@ def _unpacked(data: bytes, at: int) -> bytes:
     if size > MOST_BYTES:
         raise _too_large(at, size)
     if chunk.compression == "zstd":
-        packed = _decompressed(packed, size, at)
+        try:
+            packed = decompressed(packed, size)
+        except ValueError:
+            raise _DamagedError(f"damaged at byte {at}") from None
     elif chunk.compression:
         raise _DamagedError(f"compressed by {chunk.compression}, which is not read here")
     if len(packed) != size or (chunk.uncompressed_crc and zlib.crc32(packed) != chunk.uncompressed_crc):
@@ -221,17 +212,18 @@ def _unpacked(data: bytes, at: int) -> bytes:
     return bytes(packed)
 
 
-def _decompressed(packed: bytes, size: int, at: int) -> bytes:
-    """So many bytes at most: what a frame says of itself is not believed."""
-    try:
-        import zstandard
-    except ImportError:
-        raise StorageError(_NEEDS_MORE) from None
+def decompressed(packed: bytes, most: int) -> bytes:
+    """What zstd has packed: what a frame says of itself is not believed.
+
+    Raises:
+        ValueError: it is damaged, or of more than so many bytes.
+    """
+    import zstandard
+
     try:
         # What a frame says is made room for, whatever the limit is.
-        if zstandard.frame_content_size(packed) > size:
-            raise _DamagedError(f"damaged at byte {at}")
-        unpack = zstandard.ZstdDecompressor(max_window_size=MOST_BYTES)
-        return bytes(unpack.decompress(packed, max_output_size=size))
-    except zstandard.ZstdError:
-        raise _DamagedError(f"damaged at byte {at}") from None
+        if zstandard.frame_content_size(packed) > most:
+            raise ValueError(f"unpacks to more than {most} bytes")
+        return bytes(zstandard.ZstdDecompressor(max_window_size=MOST_BYTES).decompress(packed, max_output_size=most))
+    except zstandard.ZstdError as error:
+        raise ValueError(f"cannot be unpacked: {error}") from None

@@ -1,13 +1,17 @@
-"""Somebody's own log of an IMU at rest, as comma separated values, through the estimator.
+"""Somebody's own log of an IMU at rest, as comma separated values: its samples, and what the estimator makes of them.
 
-The mounting turns the sensor's axes into the vehicle's (x forward, y right, z down).
+A column's name says what it holds and its unit: t_s, gx_deg_s, ax_g and so on. Axes are the sensor's own; the mounting
+turns them into the vehicle's (x forward, y right, z down).
 """
 
 from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Iterable
+import re
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -25,9 +29,164 @@ from companion.calibration.solution.record import Record
 from companion.calibration.solution.site import Remedies, Whereabouts
 from companion.calibration.solution.solve import solve_at
 from companion.config.sections import Mounting, Noise
-from companion.errors import CalibrationRefusedError
-from companion.physics.frames import rotation_matrix
+from companion.errors import CalibrationRefusedError, StorageError
+from companion.physics.frames import Floats, rotation_matrix
+from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import ImuSample
+
+_TIMES: Final = {"t_s": 1.0, "t_ms": 1e-3, "t_us": 1e-6, "t_ns": 1e-9}
+_RATES: Final = {"rad_s": 1.0, "deg_s": DEG, "deg_h": DEG_H}
+_FORCES: Final = {"m_s2": 1.0, "g": 1e3 * MG, "mg": MG}
+_TEMPERATURE: Final = "temperature_degc"
+ALLOWED: Final = (
+    "t_s (or _ms, _us, _ns), gx gy gz each with _rad_s, _deg_s or _deg_h, ax ay az each with _m_s2, _g or _mg,"
+    " temperature_degc"
+)
+_LONGEST: Final = 1 << 14
+"""No line has more characters: a hundred columns have a tenth of that."""
+_AROUND: Final = ' "\t\r\n'
+"""What may stand around a number."""
+
+
+class _Columns:
+    """Which column holds what, and the factors to SI units."""
+
+    def __init__(self, names: Sequence[str], where: str) -> None:
+        self.names = [name.strip().strip('"').lower() for name in names]
+        self._wanted = [self._find("t", _TIMES, "", where)]
+        for kind, units in (("g", _RATES), ("a", _FORCES)):
+            self._wanted += [self._find(f"{kind}{axis}", units, "_", where) for axis in "xyz"]
+        self._temperature = self.names.index(_TEMPERATURE) if _TEMPERATURE in self.names else None
+
+    def _find(self, what: str, units: dict[str, float], joint: str, where: str) -> tuple[int, float]:
+        names = {f"{what}{joint}{unit}" if joint else unit: factor for unit, factor in units.items()}
+        found = [(column, names[name]) for column, name in enumerate(self.names) if name in names]
+        if len(found) == 1:
+            return found[0]
+        wrong = f"two columns for {what}" if found else f"no column {' or '.join(names)}"
+        raise StorageError(f"{where}: {wrong} in {', '.join(self.names)}; allowed: {ALLOWED}; or name them: --columns")
+
+    def sample(self, fields: Sequence[str], where: str) -> ImuSample:
+        """One line of the file; the time is its own.
+
+        Raises:
+            StorageError: it is none; says which field of which line.
+        """
+        if len(fields) != len(self.names):
+            raise StorageError(f"{where}: found {len(fields)} fields; allowed: {len(self.names)}, as many as columns")
+        temperature_degc = None
+        try:
+            t_s, gx, gy, gz, ax, ay, az = values = [
+                float(fields[column].strip(_AROUND)) * factor for column, factor in self._wanted
+            ]
+            if self._temperature is not None and (text := fields[self._temperature].strip(_AROUND)):
+                temperature_degc = float(text)
+                values.append(temperature_degc)
+            if all(map(math.isfinite, values)):
+                return ImuSample(t_s, (gx, gy, gz), (ax, ay, az), temperature_degc)
+        except ValueError:
+            pass
+        raise self._no_number(fields, where)
+
+    def _no_number(self, fields: Sequence[str], where: str) -> StorageError:
+        """Which of the fields is none."""
+        columns = [column for column, _ in self._wanted]
+        if self._temperature is not None and fields[self._temperature].strip(_AROUND):
+            columns.append(self._temperature)
+        wrong = next((column for column in columns if not _is_number(fields[column].strip(_AROUND))), columns[0])
+        return StorageError(f"{where}: found {fields[wrong]!r} in column {self.names[wrong]}; allowed: a number")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def read(path: Path, columns: str | None = None) -> Iterator[ImuSample]:
+    """The samples of a CSV file; comma, semicolon or tab between fields, "#" begins a remark.
+
+    A last line that does not end is left out: the log may have been cut there.
+
+    Raises:
+        StorageError: one line with the number of the line, what was found and what is allowed.
+    """
+    log = _Log(path, columns)
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            while line := file.readline(_LONGEST):
+                ended = line.endswith(("\n", "\r"))
+                if not ended and not log.empty and len(line) < _LONGEST:
+                    break  # in the middle of a number, perhaps, which then still looks like one
+                sample = log.sample(line)
+                if sample is not None:
+                    yield sample
+    except (OSError, UnicodeDecodeError) as error:
+        raise StorageError(f"{path}: cannot be read as text: {getattr(error, 'strerror', None) or error}") from None
+    if log.empty:
+        raise StorageError(f"{path}: the file is empty")
+
+
+def read_arrays(path: Path, columns: str | None = None) -> tuple[Floats, Floats, Floats]:
+    """All samples of a CSV file at once.
+
+    Returns:
+        (n,) times in s; (n, 6) gyro in rad/s and accelerometer in m/s^2; (n,) degC, NaN where unknown.
+
+    Raises:
+        StorageError: as `read`.
+    """
+    flat = array("d")
+    for sample in read(path, columns):
+        temperature_degc = math.nan if sample.temperature_degc is None else sample.temperature_degc
+        flat.extend((sample.t_s, *sample.gyro_rad_s, *sample.accel_m_s2, temperature_degc))
+    table = np.frombuffer(flat).reshape(-1, 8)
+    return table[:, 0].copy(), table[:, 1:7].copy(), table[:, 7].copy()
+
+
+class _Log:
+    """One pass over a file: what is known of it from the lines before."""
+
+    def __init__(self, path: Path, names: str | None) -> None:
+        self.empty = True
+        """Whether there was nothing but remarks."""
+        self._path = path
+        self._columns = None if names is None else _Columns(names.split(","), "--columns")
+        self._separator = ","
+        self._lines = 0
+        self._before_s = -math.inf
+
+    def sample(self, line: str) -> ImuSample | None:
+        """What the next line holds; None where that is no sample.
+
+        Raises:
+            StorageError: it cannot be; says where and why.
+        """
+        self._lines += 1
+        where = f"{self._path}, line {self._lines}"
+        if len(line) == _LONGEST:
+            raise StorageError(f"{where}: found no line end within {_LONGEST} characters")
+        text = line.strip()
+        if not text or text.startswith("#"):
+            return None
+        if self.empty:
+            self._separator = max(",;\t", key=text.count)
+            self.empty = False
+            if self._columns is None:
+                if not re.search("[A-Za-z]{2}", text):
+                    raise StorageError(f"{where}: no names of columns; name them: --columns t_s,gx_rad_s,...")
+                self._columns = _Columns(text.split(self._separator), where)
+                return None
+            if re.search("[A-DF-Za-df-z_]{2}", text):
+                return None  # names of its own, which --columns replaces
+        assert self._columns is not None
+        sample = self._columns.sample(text.split(self._separator), where)
+        if sample.t_s <= self._before_s:
+            raise StorageError(f"{where}: time {sample.t_s:.6f} s after {self._before_s:.6f} s; allowed: growing times")
+        self._before_s = sample.t_s
+        return sample
+
 
 MIN_STILL_S: Final = 5.0
 MAX_STILL_S: Final = 3600.0
@@ -68,7 +227,7 @@ def estimate(
         profile: the sensor's model, or figures learned, for its Allan figures.
 
     Raises:
-        StorageError: as `csv_columns.read`, where the samples are its.
+        StorageError: as `read`, where the samples are its.
     """
     settings = Settings(
         min_still_s=MIN_STILL_S, max_s=MAX_STILL_S, target_gyro_sigma_rad_s=0.0, target_accel_sigma_m_s2=0.0

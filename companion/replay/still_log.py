@@ -17,8 +17,7 @@ from companion.errors import StorageError
 from companion.physics.frames import Floats
 from companion.recording import topics
 from companion.recording.walk import Attachment, Message, Metadata, Recording, is_text
-from companion.replay.csv_columns import read_arrays
-from companion.replay.csv_log import NAME
+from companion.replay.csv_log import NAME, read_arrays
 
 TRUNCATED: Final = frozenset(
     message.kind.message

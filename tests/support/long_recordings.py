@@ -25,7 +25,7 @@ from companion.recording import journal, topics
 from companion.recording.files import Beginning, RecordingFile, versions
 from companion.recording.journal import Entry, Journal, Means
 from companion.recording.past import Past
-from companion.samples import CompassSample, ImuSample, TiltSample
+from companion.samples import ImuSample
 
 Floats = NDArray[np.float64]
 
@@ -107,7 +107,7 @@ def _imu(name: str, seconds: float, rate_hz: float, read_s: float, seed: int) ->
         t_s, end = times[start], start + 1
         while end < count and times[end] == t_s:
             end += 1
-        yield topics.SERIAL + name, t_s, journal._raw, (t_s, b"".join(frames[start:end]))
+        yield topics.SERIAL + name, t_s, msgspec.json.encode, (topics.RawBytes(t_s, b"".join(frames[start:end])),)
         for k in range(start, end):
             gx, gy, gz, ax, ay, az = values[k]
             sample = ImuSample(t_s, (gx, gy, gz), (ax, ay, az), 25.0, None, devices[k])
@@ -120,8 +120,13 @@ def _gradienter(seconds: float) -> Iterator[Entry]:
     for k in range(round(seconds * 10.0)):
         t_s = START_S + 0.05 + 0.1 * k
         x, y = -3.0 + rng.normal(0.0, 0.002), 5.0 + rng.normal(0.0, 0.002)
-        yield topics.SERIAL + "gradienter", t_s, journal._raw, (t_s, f"X={x:+07.3f}\r\nY={y:+07.3f}\r\n".encode())
-        yield topics.GRADIENTER, t_s, topics.tilt_json, (TiltSample(t_s, x, y),)
+        yield (
+            topics.SERIAL + "gradienter",
+            t_s,
+            msgspec.json.encode,
+            (topics.RawBytes(t_s, f"X={x:+07.3f}\r\nY={y:+07.3f}\r\n".encode()),),
+        )
+        yield topics.GRADIENTER, t_s, msgspec.json.encode, (topics.TiltEntry(t_s, x, y),)
 
 
 def _compass(seconds: float) -> Iterator[Entry]:
@@ -129,8 +134,13 @@ def _compass(seconds: float) -> Iterator[Entry]:
     for k in range(round(seconds * 8.0)):
         t_s = START_S + 0.07 + 0.125 * k
         heading = 40.0 + rng.normal(0.0, 0.2)
-        yield topics.SERIAL + "compass", t_s, journal._raw, (t_s, f"{heading:.1f}, 5.0, -3.0\r\n".encode())
-        yield topics.COMPASS, t_s, topics.compass_json, (CompassSample(t_s, heading, 5.0, -3.0),)
+        yield (
+            topics.SERIAL + "compass",
+            t_s,
+            msgspec.json.encode,
+            (topics.RawBytes(t_s, f"{heading:.1f}, 5.0, -3.0\r\n".encode()),),
+        )
+        yield topics.COMPASS, t_s, msgspec.json.encode, (topics.CompassEntry(t_s, heading, 5.0, -3.0),)
 
 
 def _ticks(seconds: float) -> Iterator[Entry]:

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 import pytest
 
+from companion.calibration.collector.intake import SourceStatus
 from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.collector.sources import SourceStatus
 from companion.calibration.seconds.batch import Batch
 from companion.errors import CalibrationRefusedError
 from companion.protocols.imus.imu_line import ImuLineDecoder

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from companion.calibration.collector.sources import integer_batches
+from companion.calibration.collector.intake import integer_batches
 from companion.calibration.means.dither import SECONDS, STEPS, Step, combine, shifts_lsb, why_void
 from companion.calibration.seconds.batch import Batch
 from companion.errors import CalibrationRefusedError

@@ -9,7 +9,7 @@ import pytest
 
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.pose import CompassModel, FieldHeading, GradienterModel, vehicle_heading_rad
-from companion.calibration.stillness.settling import HeadingWatch
+from companion.calibration.stillness.stretch import HeadingWatch
 from companion.physics.frames import wrap_deg
 from companion.physics.units import DEG
 from companion.samples import CompassSample, MagSample, TiltSample

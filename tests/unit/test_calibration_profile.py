@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import AllanModel, NoiseProfile, allan_model, noise_profile
 from companion.calibration.profiling.coverage import Kept, coverage, keeps
-from companion.calibration.profiling.profile_fit import Finding, fit_profile
-from companion.calibration.profiling.rest import Rest, Rests, rests, seconds_of
+from companion.calibration.profiling.profile_fit import Finding, Rest, Rests, fit_profile, rests, seconds_of
 from companion.calibration.seconds.batch import BatchSource
 from companion.errors import CalibrationRefusedError
 from tests.support.made_noise import DEG, DEG_H, FLICKER_OF_FLOOR, MG, adis16405, slow

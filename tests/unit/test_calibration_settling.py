@@ -14,7 +14,7 @@ from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.seconds.batch import Batch
-from companion.calibration.stillness.settling import AT_ONCE, UNKNOWN_DEG, Lag, Settling
+from companion.calibration.stillness.stretch import AT_ONCE, UNKNOWN_DEG, Lag, Settling
 from companion.config.sections import Compass
 from companion.config.sections import Gradienter as Section
 from companion.configured.models import lag

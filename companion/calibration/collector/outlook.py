@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.collector.sources import Source, SourceStatus
+from companion.calibration.collector.intake import Source, SourceStatus
 from companion.calibration.means.windows import WHITE_SHARE, Estimate, ImuEstimate
 from companion.calibration.noise.allan import floor_variance
 

@@ -12,7 +12,7 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.collector.intake import Intake
+from companion.calibration.collector.intake import Intake, Source
 from companion.calibration.collector.measurement import Estimates, Found, Measurement, PoseSeconds, Work
 from companion.calibration.collector.outlook import (
     Glance,
@@ -24,14 +24,12 @@ from companion.calibration.collector.outlook import (
     obstacle,
     settling,
 )
-from companion.calibration.collector.sources import Source
 from companion.calibration.collector.trace import Snapshot, TraceLog
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.seconds.batch import Batch
 from companion.calibration.stillness.gates import ImuGate
-from companion.calibration.stillness.settling import AT_ONCE, HeadingWatch, Lag
-from companion.calibration.stillness.stretch import Stretch
+from companion.calibration.stillness.stretch import AT_ONCE, HeadingWatch, Lag, Stretch
 from companion.errors import CalibrationRefusedError
 
 MIN_BATCHES: Final = 5

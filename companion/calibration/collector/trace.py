@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from companion import formats
-from companion.calibration.collector.sources import Kind, Source
+from companion.calibration.collector.intake import Kind, Source
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import AllanModel
 from companion.calibration.seconds.batch import Batch

@@ -15,8 +15,7 @@ import numpy as np
 from companion.calibration.means.windows import ImuInput, estimates
 from companion.calibration.noise.allan import NoiseProfile, allan_variance
 from companion.calibration.noise.robust import median
-from companion.calibration.profiling.profile_fit import LEAST_STILL_S, TRIADS, fit_profile
-from companion.calibration.profiling.rest import CHANNELS, MIN_SECONDS, Rest
+from companion.calibration.profiling.profile_fit import CHANNELS, LEAST_STILL_S, MIN_SECONDS, TRIADS, Rest, fit_profile
 from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
 from companion.samples import Triad

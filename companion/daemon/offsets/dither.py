@@ -19,7 +19,7 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.pace import has_passed, moment
 from companion.autopilot.parameters.writer import Change, ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.calibration.collector.sources import integer_batches
+from companion.calibration.collector.intake import integer_batches
 from companion.calibration.machine import Event
 from companion.calibration.means.dither import SECONDS, STEPS, Dithered, Step, combine, shifts_lsb, why_void
 from companion.calibration.means.windows import ImuWindow, Window

@@ -35,9 +35,8 @@ from companion.links.mavlink.link import Direction
 from companion.links.system.request import Object
 from companion.recording import topics
 from companion.recording.files import FOLDER_MODE, Beginning, RecordingFile, Ring, is_available, versions
-from companion.recording.journal import Journal, Offsets, Solved
+from companion.recording.journal import Journal, KeyFilter, Offsets, Solved
 from companion.recording.past import Message, Past
-from companion.recording.redact import KeyFilter
 
 logger = logging.getLogger(__name__)
 
