@@ -11,7 +11,7 @@ from companion.printable import printable
 
 
 class Display:
-    """A `Watcher`; a context manager, since a bar must be taken off the terminal again."""
+    """A context manager, since a bar must be taken off the terminal again."""
 
     def __init__(self) -> None:
         try:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import difflib
-import re
 from collections.abc import Sequence
-from typing import Any, Final, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -21,11 +20,16 @@ from companion.ground.exchange import Answer, Exchange
 from companion.ground.heard import FRESH_S, Heard, Target, Text, Vehicle
 from companion.ground.link import GroundLink
 
+if TYPE_CHECKING:
+    from companion.ground.display import Display
+
 CALIBRATE, CANCEL, UNDO = mavlink.MAV_CMD_USER_1, mavlink.MAV_CMD_USER_2, mavlink.MAV_CMD_USER_3
 EVERYBODY_WITHIN_S: Final = 1.3
 """Heartbeats come once a second: so long after the first, everybody who can be heard has been."""
 WORDS_WITHIN_S: Final = 3.0
-"""For how long the words that belong to a result may follow it: two lines a second pass, results first."""
+"""For how long the words that belong to an end may follow it."""
+QUIET_S: Final = 1.0
+"""Two lines a second pass: who has been silent for so long has said all."""
 CANCELLED_WITHIN_S: Final = 30.0
 """A cancel waits for a safe point, and old values may have to be put back."""
 SILENCE_WORTH_A_WORD_S: Final = 3.0
@@ -40,17 +44,8 @@ _STATES: Final[dict[int, State]] = {
     mavlink.MAV_RESULT_TEMPORARILY_REJECTED: "refused",
     mavlink.MAV_RESULT_UNSUPPORTED: "refused",
 }
-_RESULT_WORDS: Final = re.compile(r"(?:Auto calibration|Calibration|Undo) (?:(?:done|failed|refused|cancelled): )?")
-
-
-class Watcher(Protocol):
-    """Who shows people what goes on."""
-
-    def progress(self, percent: int, text: str) -> None:
-        """How far it is."""
-
-    def text(self, text: str, *, urgent: bool) -> None:
-        """What the companion says."""
+_SAID_AS: Final = {"failed": Severity.ERROR, "refused": Severity.WARNING}
+"""How the companion says why."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,14 +70,13 @@ class Station:
     Args:
         link: an open link.
         url: its url, for words.
-        watcher: is shown what goes on.
+        display: is shown what goes on.
     """
 
-    def __init__(self, link: GroundLink, url: str, watcher: Watcher) -> None:
-        self._link, self._url, self._watcher = link, url, watcher
+    def __init__(self, link: GroundLink, url: str, display: Display) -> None:
+        self._link, self._url, self._display = link, url, display
         self._heard: Heard = link.heard
         self._target = Target(0, self._heard.component_id)
-        self._waiting_for = ""
         self._interrupted = asyncio.Event()
         self._why_cancelled = ""
         self._heard.on_text = self._on_text
@@ -133,13 +127,16 @@ class Station:
         exchange = self._exchange(CALIBRATE, float(what.value), float(reboot))
         exchange.on_progress = self._show_progress
         answer = await self._cancellable(exchange, timeout_s)
-        outcome = await self._judge(answer, begun_s, "Calibration")
+        outcome = await self._judge(answer, begun_s)
         more: dict[str, Any] = {"duration_s": round(loop.time() - begun_s, 1)}
+        reason = outcome.reason
         if outcome.state == "done":
-            more["gyro_sigma_deg_h"] = await self._sigma("CMP_GYR_SIG") if what.gyros else None
-            more["accel_sigma_mg"] = await self._sigma("CMP_ACC_SIG") if what.accelerometers else None
-        lines = [f"{outcome.state.upper()} after {more['duration_s']:.0f} s: {outcome.reason}", *outcome.lines]
-        return dataclasses.replace(outcome, lines=lines, more={**outcome.more, **more})
+            gyro = await self._sigma("CMP_GYR_SIG") if what.gyros else None
+            accel = await self._sigma("CMP_ACC_SIG") if what.accelerometers else None
+            more |= {"gyro_sigma_deg_h": gyro, "accel_sigma_mg": accel}
+            reason = heard.figures(gyro, accel) or reason
+        lines = [f"{outcome.state.upper()} after {more['duration_s']:.0f} s: {reason}", *outcome.lines[1:]]
+        return dataclasses.replace(outcome, reason=reason, lines=lines, more={**outcome.more, **more})
 
     async def undo(self) -> Outcome:
         """Put the old values back; raises as `calibrate`.
@@ -148,10 +145,7 @@ class Station:
             NobodyHeardError: the companion beats, but does not answer.
         """
         begun_s = asyncio.get_running_loop().time()
-        exchange = self._exchange(UNDO)
-        answer = await self._cancellable(exchange, None)
-        outcome = await self._judge(answer, begun_s, "Undo")
-        return dataclasses.replace(outcome, lines=[f"{outcome.state.upper()}: {outcome.reason}", *outcome.lines])
+        return await self._judge(await self._cancellable(self._exchange(UNDO), None), begun_s)
 
     async def cancel(self) -> Outcome:
         """Cancel what runs, whoever asked for it, and wait until it has ended; raises as `calibrate`.
@@ -161,23 +155,17 @@ class Station:
         """
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
+        was_busy = self._is_busy(begun_s - FRESH_S)
         answer = await self._exchange(CANCEL).run()
         if answer.result != mavlink.MAV_RESULT_ACCEPTED:
-            outcome = await self._judge(answer, begun_s, "Cancel")
-            return dataclasses.replace(outcome, lines=[f"{outcome.state.upper()}: {outcome.reason}", *outcome.lines])
-        said = await self._wait_for_text(re.compile(r"Nothing to cancel|(Auto calibration|Calibration|Undo) [a-z]+"),
-                                         begun_s, CANCELLED_WITHIN_S, give_up_when_idle=True)  # fmt: skip
-        if said is None:
-            reason = "cancelled; the companion has not said what became of it"
-        elif said.words.startswith("Nothing"):
-            reason = "nothing was running"
-        else:
-            reason = said.words
-        state: State = "idle" if said is not None and said.words.startswith("Nothing") else "cancelled"
-        if said is not None and re.match(r"\S+(?: calibration)? (done|failed)", said.words):
-            # Too late for a cancel: what ran had come to its own end.
-            state = "done" if " done" in said.words else "failed"
-        return Outcome(state, reason, good=True, lines=[reason], more=self._more(begun_s))
+            return await self._judge(answer, begun_s)
+        if not was_busy:
+            return self._ended("idle", "nothing was running", begun_s, good=True)
+        while self._is_busy(begun_s) is not False and loop.time() - begun_s < CANCELLED_WITHIN_S:
+            await asyncio.sleep(_POLL_S)
+        last = await self._last_result()
+        reason = f"the companion's last calibration: {last}" if last else "there was no calibration"
+        return self._ended("cancelled", reason, begun_s, good=True)
 
     async def status(self) -> Outcome:
         """What the companion is doing, its settings and its last result."""
@@ -225,6 +213,7 @@ class Station:
             ConfigError: it has no parameter of such a name; nothing was set.
             NobodyHeardError: it does not answer.
         """
+        begun_s = asyncio.get_running_loop().time()
         found = await self._own_parameters()
         if not found:
             raise NobodyHeardError(f"{self._name()} beats, but does not answer for its parameters: a bad link?")
@@ -233,52 +222,51 @@ class Station:
                 near = difflib.get_close_matches(name, found, n=1)
                 hint = f"; nearest: {near[0]}" if near else ""
                 raise ConfigError(f"{name}: the companion has no such parameter (it has {', '.join(found)}{hint})")
-        refusals = [refusal for name, value in wanted.items() if (refusal := await self._set(name, value))]
+        problems = [(name, await self._link.set_parameter(self._target, name, value)) for name, value in wanted.items()]
+        refusals = [f"{name} not set: {problem}" for name, problem in problems if problem is not None]
         if wanted:
             found = await self._own_parameters() or found
         lines = [f"{name:12} {value:12g}  {heard.MEANINGS.get(name, '')}".rstrip() for name, value in found.items()]
         reason = "; ".join(refusals) or ("set; holds until the companion restarts" if wanted else "")
         state: State = "refused" if refusals else "done"
         return Outcome(state, reason, good=not refusals, lines=[*lines, *([reason] if reason else [])],
-                       more={**self._vehicle_and_companion(), "parameters": found})  # fmt: skip
+                       more={**self._more(begun_s), "parameters": found})  # fmt: skip
 
     # --- asking
 
     def _exchange(self, command: int, *parameters: float) -> Exchange:
-        return Exchange(
-            self._link, self._target, command, *parameters,
-            busy=lambda since_s: self._heard.busy(self._target.system_id, since_s),
-        )  # fmt: skip
+        return Exchange(self._link, self._target, command, *parameters, busy=self._is_busy)
 
     async def _cancellable(self, exchange: Exchange, timeout_s: float | None) -> Answer:
         """Run it; Ctrl-C or the end of the time given cancel it, and its end is waited for all the same."""
-        loop = asyncio.get_running_loop()
-        running = loop.create_task(exchange.run())
-        interrupted = loop.create_task(self._interrupted.wait())
+        running = asyncio.create_task(exchange.run())
         try:
-            await asyncio.wait({running, interrupted}, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
-            if not running.done():
+            if not await self._ends(running, timeout_s):
                 self._why_cancelled = self._why_cancelled or f"not finished within {timeout_s:g} s"
-                self._watcher.text(f"{self._why_cancelled}: cancelling (Ctrl-C: do not wait)", urgent=True)
-                interrupted.cancel()
-                self._interrupted.clear()
-                interrupted = loop.create_task(self._interrupted.wait())
-                cancelling = loop.create_task(self._exchange(CANCEL).run())
+                self._display.text(f"{self._why_cancelled}: cancelling (Ctrl-C: do not wait)", urgent=True)
+                cancelling = asyncio.create_task(self._exchange(CANCEL).run())
                 try:
-                    await asyncio.wait(
-                        {running, interrupted}, timeout=CANCELLED_WITHIN_S, return_when=asyncio.FIRST_COMPLETED
-                    )
+                    await self._ends(running, CANCELLED_WITHIN_S)
                 finally:
                     cancelling.cancel()
                     await asyncio.gather(cancelling, return_exceptions=True)
             return running.result() if running.done() else Answer(None, begun=True)
         finally:
             running.cancel()
-            interrupted.cancel()
-            await asyncio.gather(running, interrupted, return_exceptions=True)
+            await asyncio.gather(running, return_exceptions=True)
 
-    async def _judge(self, answer: Answer, begun_s: float, name: str) -> Outcome:
-        """What an answer means, with the words that the companion says to it."""
+    async def _ends(self, running: asyncio.Task[Answer], within_s: float | None) -> bool:
+        """Whether it comes to its end before the time has, or the next Ctrl-C."""
+        interrupted = asyncio.create_task(self._interrupted.wait())
+        try:
+            await asyncio.wait({running, interrupted}, timeout=within_s, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            interrupted.cancel()
+            self._interrupted.clear()
+        return running.done()
+
+    async def _judge(self, answer: Answer, begun_s: float) -> Outcome:
+        """What an answer means, with what the companion says against it."""
         if not answer.begun:
             raise NobodyHeardError(
                 f"{self._name()} beats, but does not answer: nothing that is sent from here arrives"
@@ -288,28 +276,20 @@ class Station:
             return await self._judge_unheard_end(begun_s)
         if answer.result == mavlink.MAV_RESULT_UNSUPPORTED:
             reason = f"{self._name()} does not know this command: is it a companion?"
-            return Outcome("refused", reason, good=False, lines=[], more=self._more(begun_s))
+            return self._ended("refused", reason, begun_s)
         state = _STATES.get(answer.result, "failed")
-        said = await self._wait_for_text(
-            re.compile(rf"(Auto calibration|{name}) {state}|Failed" if state == "failed" else rf"{name} {state}"),
-            begun_s, WORDS_WITHIN_S,
-        )  # fmt: skip
-        if said is not None:
-            reason = _RESULT_WORDS.sub("", said.words, count=1)
-        else:
-            reason = f"{state} (MAV_RESULT {answer.result}); no words came with it"
+        await self._hear_out(begun_s)
+        said = next((text for text in reversed(self._texts(begun_s)) if text.severity == _SAID_AS.get(state)), None)
+        reason = said.words if said is not None else f"{state} (MAV_RESULT {answer.result})"
         if state == "cancelled" and self._why_cancelled:
             reason += f" ({self._why_cancelled})"
-        return Outcome(
-            state, reason, good=state == "done", lines=self._warnings(begun_s, said), more=self._more(begun_s)
-        )
+        return self._ended(state, reason, begun_s, said, good=state == "done")
 
     async def _judge_unheard_end(self, begun_s: float) -> Outcome:
         """The link was gone when it ended, or it was not waited for."""
-        busy = self._heard.busy(self._target.system_id, asyncio.get_running_loop().time() - FRESH_S)
+        busy = self._is_busy(asyncio.get_running_loop().time() - FRESH_S)
         if busy is False:
-            last = await self._link.get_parameter(self._target, "CMP_STATE")
-            ended = heard.RESULTS.get(-1.0 if last is None else last)
+            ended = await self._last_result()
             reason = (
                 f"the answer to the request got lost; the companion's last calibration: {ended}"
                 if ended is not None
@@ -324,31 +304,23 @@ class Station:
             )
         else:
             reason = "nothing is heard of the vehicle any more; it goes on by itself: `companion ground status` later"
-        return Outcome("lost", reason, good=False, lines=self._warnings(begun_s, None), more=self._more(begun_s))
+        return self._ended("lost", reason, begun_s)
 
-    async def _wait_for_text(
-        self, pattern: re.Pattern[str], since_s: float, within_s: float, *, give_up_when_idle: bool = False
-    ) -> Text | None:
+    async def _hear_out(self, since_s: float) -> None:
         loop = asyncio.get_running_loop()
-        begun_s = loop.time()
-        while True:
-            for text in reversed(self._heard.texts_of(self._target.system_id, since_s)):
-                if pattern.match(text.words):
-                    return text
-            waited_s = loop.time() - begun_s
-            idle = give_up_when_idle and self._heard.busy(self._target.system_id, begun_s) is False
-            if waited_s >= within_s or (idle and waited_s >= WORDS_WITHIN_S):
-                return None
+        ended_s = loop.time()
+        while loop.time() - ended_s < WORDS_WITHIN_S:
+            said = self._texts(since_s)
+            if said and loop.time() - max(said[-1].at_s, ended_s) >= QUIET_S:
+                return
             await asyncio.sleep(_POLL_S)
 
-    async def _set(self, name: str, value: float) -> str | None:
-        """Set a parameter; returns why it was not, in the companion's words where it said some."""
-        begun_s = asyncio.get_running_loop().time()
-        problem = await self._link.set_parameter(self._target, name, value)
-        if problem is None:
-            return None
-        said = await self._wait_for_text(re.compile(rf"{name} not set: "), begun_s, WORDS_WITHIN_S)
-        return said.words if said is not None else f"{name} not set: {problem}"
+    def _is_busy(self, since_s: float) -> bool | None:
+        return self._heard.busy(self._target.system_id, since_s)
+
+    async def _last_result(self) -> str | None:
+        last = await self._link.get_parameter(self._target, "CMP_STATE")
+        return heard.RESULTS.get(-1.0 if last is None else last)
 
     async def _own_parameters(self) -> dict[str, float]:
         # MAVSDK's list waits over 10 s for its first answer, and tells nobody; one parameter is given up after 3 s.
@@ -363,38 +335,34 @@ class Station:
     # --- words
 
     def _on_text(self, system_id: int, text: Text) -> None:
-        if system_id != self._target.system_id:
-            return
-        self._waiting_for = text.words.removeprefix("Calibration: ") if text.words.startswith("Calibration: ") else ""
-        self._watcher.text(text.words, urgent=text.severity <= Severity.WARNING)
+        if system_id == self._target.system_id:
+            self._display.text(text.words, urgent=text.severity <= Severity.WARNING)
 
     def _show_progress(self, percent: int, silent_s: float) -> None:
         if silent_s >= SILENCE_WORTH_A_WORD_S:
             stage = f"nothing heard for {max(silent_s // 5 * 5, SILENCE_WORTH_A_WORD_S):.0f} s"
         elif percent < MEASURED_PERCENT:
-            stage = self._waiting_for or "measuring: keep the aircraft still"
+            stage = "measuring: keep the aircraft still"
         elif percent < WRITTEN_PERCENT:
             stage = "writing to the autopilot"
         else:
             stage = "checking that the autopilot uses the new values"
-        self._watcher.progress(percent, stage)
+        self._display.progress(percent, stage)
 
-    def _warnings(self, begun_s: float, result: Text | None) -> list[str]:
-        return [
-            f"warning: {text.words}"
-            for text in self._heard.texts_of(self._target.system_id, begun_s)
-            if text.severity <= Severity.WARNING and text is not result
-        ]
+    def _texts(self, since_s: float) -> list[Text]:
+        return self._heard.texts_of(self._target.system_id, since_s)
+
+    def _ended(
+        self, state: State, reason: str, begun_s: float, said: Text | None = None, *, good: bool = False
+    ) -> Outcome:
+        """How it ended, and what else the companion has warned of meanwhile."""
+        warned = [text for text in self._texts(begun_s) if text.severity <= Severity.WARNING and text is not said]
+        lines = [f"{state.upper()}: {reason}", *(f"warning: {text.words}" for text in warned)]
+        return Outcome(state, reason, good=good, lines=lines, more=self._more(begun_s))
 
     def _more(self, begun_s: float) -> dict[str, Any]:
-        texts = [text.words for text in self._heard.texts_of(self._target.system_id, begun_s)]
-        return {**self._vehicle_and_companion(), "texts": texts}
-
-    def _vehicle_and_companion(self) -> dict[str, Any]:
-        return {
-            "vehicle": self.vehicle._asdict(),
-            "companion": self._target._asdict(),
-        }
+        texts = [text.words for text in self._texts(begun_s)]
+        return {"vehicle": self.vehicle._asdict(), "companion": self._target._asdict(), "texts": texts}
 
     def _name(self) -> str:
         return f"component {self._target.component_id} of system {self._target.system_id}"

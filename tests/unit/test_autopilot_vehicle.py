@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.autopilot.parameters.wire import integers_bytewise
 from companion.autopilot.vehicle.boot_clock import BootClock
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.autopilot.vehicle.whereabouts import Position
@@ -420,7 +421,7 @@ def test_integers_are_bytes_by_the_capability_bits_and_else_on_px4_only(
         vehicle = Vehicle(link)
         heartbeat(link, autopilot=autopilot)
         vehicle.capabilities = capabilities
-        assert vehicle.integers_bytewise == expected
+        assert integers_bytewise(vehicle.capabilities, vehicle.firmware) == expected
         vehicle.close()
 
     run_virtual(main())

@@ -12,6 +12,7 @@ from companion.calibration.request import What
 from companion.component.service import Refusal
 from companion.component.statustext import Severity, Weight
 from companion.errors import ConfigError, NobodyHeardError
+from companion.ground.display import Display
 from companion.ground.heard import Target
 from companion.ground.link import GroundLink
 from companion.ground.station import Station
@@ -21,7 +22,7 @@ from tests.support.virtual_time import run_virtual
 
 
 class Notes:
-    """A watcher that remembers."""
+    """A display that remembers."""
 
     def __init__(self) -> None:
         self.stages: list[str] = []
@@ -37,7 +38,7 @@ class Notes:
 
 def station_on(wire: StationOnTheWire, notes: Notes | None = None) -> Station:
     # As much of a GroundLink as a station uses.
-    return Station(cast("GroundLink", wire), "udpin:0.0.0.0:14550", notes or Notes())
+    return Station(cast("GroundLink", wire), "udpin:0.0.0.0:14550", cast("Display", notes or Notes()))
 
 
 def beat(wire: StationOnTheWire, system_id: int, component_id: int, kind: int, autopilot: int) -> None:
@@ -73,7 +74,7 @@ def test_it_says_what_it_waits_for_and_how_it_ends() -> None:
             assert "warning: Reboot the autopilot before flight" in outcome.lines
             assert outcome.answer["gyro_sigma_deg_h"] == 2.5
             assert outcome.answer["accel_sigma_mg"] is None, "0 is how the companion says that it has none"
-            assert "waiting for still: gyro 0.31 deg/s > 0.10" in notes.stages
+            assert "Calibration: waiting for still: gyro 0.31 deg/s > 0.10" in notes.texts
             assert notes.stages[-2:] == ["writing to the autopilot", "checking that the autopilot uses the new values"]
 
     run_virtual(main())
@@ -87,7 +88,7 @@ def test_without_words_the_result_still_counts() -> None:
             station = station_on(wire)
             await station.find(1, 5.0)
             outcome = await station.undo()
-            assert (outcome.state, outcome.reason) == ("done", "done (MAV_RESULT 0); no words came with it")
+            assert (outcome.state, outcome.reason) == ("done", "done (MAV_RESULT 0)")
 
     run_virtual(main())
 
@@ -105,7 +106,11 @@ def test_a_refusal_of_somebody_elses_request_is_not_taken_for_ours() -> None:
             b.component.say(Severity.ERROR, "Calibration failed: the aircraft moved", Weight.RESULT)
             b.service.jobs[0].finish("failed")
             outcome = await asking
-            assert (outcome.state, outcome.reason, outcome.good) == ("failed", "the aircraft moved", False)
+            assert (outcome.state, outcome.reason, outcome.good) == (
+                "failed",
+                "Calibration failed: the aircraft moved",
+                False,
+            )
 
     run_virtual(main())
 
@@ -181,15 +186,19 @@ def test_the_second_ctrl_c_does_not_wait() -> None:
 def test_a_cancel_that_came_too_late_says_so() -> None:
     async def main() -> None:
         wire = StationOnTheWire()
+        wire.values["CMP_STATE"] = 1.0
         async with bench(ground=wire) as b:
             b.service.cancel = lambda requester: True  # type: ignore[method-assign]
+            b.service.mav_state = mavlink.MAV_STATE_CALIBRATING
             station = station_on(wire)
             await station.find(1, 5.0)
             asking = asyncio.create_task(station.cancel())
             await asyncio.sleep(2.0)
-            b.component.say(Severity.NOTICE, "Calibration done: sigma 2.5 deg/h", Weight.RESULT)
+            assert not asking.done()
+            b.service.mav_state = mavlink.MAV_STATE_STANDBY
             outcome = await asking
-            assert (outcome.state, outcome.reason) == ("done", "Calibration done: sigma 2.5 deg/h")
+            assert (outcome.state, outcome.reason) == ("cancelled", "the companion's last calibration: done")
+            assert (await station.cancel()).reason == "nothing was running"
 
     run_virtual(main())
 

@@ -24,6 +24,7 @@ from companion.autopilot.parameters.wire import (
     decode,
     encode,
     float32,
+    integers_bytewise,
     is_integer,
     same_float32,
 )
@@ -181,7 +182,7 @@ class ParameterClient:
         kind = await self._type_of(name)
         whole = is_integer(kind)
         wanted = value if whole else float32(value)
-        carried = encode(wanted, kind, bytewise=self.vehicle.integers_bytewise)
+        carried = encode(wanted, kind, bytewise=self._bytewise)
         if not math.isfinite(wanted) or carried is None:
             what = "a whole number" if whole else "a number"
             raise ParameterRefusedError(f"{name}: {value} is not {what} that may be written")
@@ -225,6 +226,10 @@ class ParameterClient:
         """Stop listening."""
         for unsubscribe in self._unsubscribe:
             unsubscribe()
+
+    @property
+    def _bytewise(self) -> bool:
+        return integers_bytewise(self.vehicle.capabilities, self.vehicle.firmware)
 
     def _require_disarmed(self, name: str) -> None:
         if (why := self.vehicle.arm_state.why_not_written) is not None:
@@ -292,7 +297,7 @@ class ParameterClient:
 
     async def _type_of(self, name: str) -> int:
         """The type to write a parameter as; only firmware that carries integers byte by byte minds."""
-        if not self.vehicle.integers_bytewise:
+        if not self._bytewise:
             return REAL32
         if name not in self._types:
             await self.read(name)
@@ -312,7 +317,7 @@ class ParameterClient:
     def _on_value(self, message: mavlink.MAVLink_param_value_message, _t_s: float) -> None:
         if not self.vehicle.sent(message):
             return
-        name, value = message.param_id, decode(message, bytewise=self.vehicle.integers_bytewise)
+        name, value = message.param_id, decode(message, bytewise=self._bytewise)
         self._absent.discard(name)
         if len(self._types) < _REMEMBERED_TYPES or name in self._types:
             self._types[name] = message.param_type

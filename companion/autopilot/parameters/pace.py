@@ -29,7 +29,7 @@ class Moment:
 
 def moment(vehicle: Vehicle) -> Moment:
     """Now."""
-    return Moment(asyncio.get_running_loop().time(), vehicle.boot_s, vehicle.boots)
+    return Moment(asyncio.get_running_loop().time(), vehicle.boot.latest_s, vehicle.boots)
 
 
 def has_passed(vehicle: Vehicle, since: Moment, seconds: float) -> bool:
@@ -37,9 +37,10 @@ def has_passed(vehicle: Vehicle, since: Moment, seconds: float) -> bool:
     gone_s = asyncio.get_running_loop().time() - since.t_s
     if gone_s < seconds:
         return False
-    if since.boot_s is None or vehicle.boot_s is None or vehicle.boots != since.boots or not vehicle.alive:
+    boot_s = vehicle.boot.latest_s
+    if since.boot_s is None or boot_s is None or vehicle.boots != since.boots or not vehicle.alive:
         return True
-    return vehicle.boot_s - since.boot_s >= seconds or gone_s >= SLOWEST * seconds
+    return boot_s - since.boot_s >= seconds or gone_s >= SLOWEST * seconds
 
 
 async def let_pass(vehicle: Vehicle, since: Moment, seconds: float) -> None:

@@ -13,6 +13,8 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.autopilot.vehicle.heartbeats import Firmware
+
 
 def float32(value: float) -> float:
     """The nearest 32 bit float; infinite when there is none."""
@@ -47,6 +49,23 @@ _HEADER_BYTES: Final = {0xFE: 6, 0xFD: 10}
 """Length of the header of MAVLink 1 and 2, by the first byte of a packet."""
 
 REAL32: Final[int] = mavlink.MAV_PARAM_TYPE_REAL32
+
+
+def integers_bytewise(capabilities: int | None, firmware: Firmware | None) -> bool:
+    """Whether integer parameters travel as the bytes of an int32 in the float field, not as a number.
+
+    By the capability bit; else by who it is: older PX4 and ArduPilot set neither bit (autopilots 7.5).
+
+    Args:
+        capabilities: MAV_PROTOCOL_CAPABILITY bits; None: not known.
+        firmware: None: not known.
+    """
+    if capabilities is not None:
+        if capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE:
+            return True
+        if capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST:
+            return False
+    return firmware == "px4"
 
 
 def is_integer(kind: int) -> bool:

@@ -20,6 +20,8 @@ _CHANGES: Final = 4
 _CHANGES_WITHIN_S: Final = 5.0
 """Arming and disarming twice within this time is more than pilots and autopilots do."""
 _CONTRADICTION_HOLDS_S: Final = 10.0
+_RESTARTS_S: Final = 1.0
+"""Within this time no autopilot restarts twice; two whose times since boot alternate seem to."""
 _TWO_HOLDS_S: Final = 5.0
 """How long after the last sign of a second autopilot under our vehicle's ids nothing is believed of either."""
 
@@ -44,7 +46,7 @@ class ArmingWatch:
 
     def __init__(self) -> None:
         self._armed: bool | None = None
-        self._armed_s = self._contradiction_s = self._two_s = -math.inf
+        self._armed_s = self._contradiction_s = self._two_s = self._restarted_s = -math.inf
         self._changes_s: deque[float] = deque(maxlen=_CHANGES)
 
     def heard(self, t_s: float, *, armed: bool) -> None:
@@ -57,9 +59,12 @@ class ArmingWatch:
                 self._contradiction_s = t_s
         self._armed = armed
 
-    def restarted(self) -> None:
+    def restarted(self, t_s: float) -> None:
         """What came before says nothing of now; only "armed" still counts, as a restart can be forged too."""
         self._armed = None
+        if t_s - self._restarted_s < _RESTARTS_S:
+            self.two_seen(t_s)
+        self._restarted_s = t_s
 
     def armed(self, t_s: float) -> bool | None:
         """Whether it is armed; None before the first heartbeat."""

@@ -49,8 +49,6 @@ _HEARTBEAT_ID: Final[int] = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 _OVERDUE_S: Final = 1.1
 _TICK_S: Final = 0.5
 _STALL_S: Final = 1.0
-_RESTARTS_S: Final = 1.0
-"""Within this time no autopilot restarts twice; two whose times since boot alternate seem to."""
 
 VehicleEvent = Literal["armed", "disarmed", "lost", "found", "rebooted"]
 """What `Vehicle.watch` tells. "found": latched, or heard again after "lost". "armed" and "disarmed": the heartbeat
@@ -90,6 +88,8 @@ class Vehicle:
         self.place = TimeAndPlace(is_carried)
         """What it says of time and place."""
         self.commands = Commands(link, lambda: None if self.system_id is None else (self.system_id, self.component_id))
+        self.boot = BootWatch(link, self.sent, self._restarted)
+        """Its time since boot."""
         self._link = link
         self._latch = Latch(system_id)
         self._heartbeat_s: float | None = None
@@ -97,10 +97,8 @@ class Vehicle:
         self._arming = ArmingWatch()
         self._armed_told: bool | None = None
         self._conflict_logged = False
-        self._restarted_s = -math.inf
         self._lost = True
         self._trusted_from_s = -math.inf
-        self._boot = BootWatch(link, self.sent, self._on_restart)
         self._listeners: Listeners[[VehicleEvent]] = Listeners()
         self._found = asyncio.Event()
         self._heartbeat_waiters: list[asyncio.Event] = []
@@ -164,19 +162,6 @@ class Vehicle:
         """To be put behind the words that it does not answer although it is heard: what is known of the cause."""
         return "; it signs what it sends: does it refuse what is not signed?" if self.signs else ""
 
-    @property
-    def integers_bytewise(self) -> bool:
-        """Whether integer parameters travel as the bytes of an int32 in the float field, not as a number.
-
-        By the capability bit; else by who it is: older PX4 and ArduPilot set neither bit (autopilots 7.5).
-        """
-        if self.capabilities is not None:
-            if self.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE:
-                return True
-            if self.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST:
-                return False
-        return self.firmware == "px4"
-
     def sent(self, message: Message) -> bool:
         """Whether a message came from the latched autopilot."""
         header = message.get_header()
@@ -186,11 +171,6 @@ class Vehicle:
         """Be told of events, in the order in which they are seen; returns how to stop that."""
         return self._listeners.add(callback)
 
-    @property
-    def boot_s(self) -> float | None:
-        """Its time since boot as it was heard last."""
-        return self._boot.latest_s
-
     async def hear_boot_time(self, timeout_s: float = 1.0) -> bool:
         """Ask for the time since boot and wait for it; afterwards `boots` counts every restart until now.
 
@@ -198,7 +178,7 @@ class Vehicle:
         """
         request = self.commands.request_message(mavlink.MAVLINK_MSG_ID_SYSTEM_TIME)
         try:
-            return await self._boot.wait(timeout_s)
+            return await self.boot.wait(timeout_s)
         finally:
             request.cancel()
 
@@ -236,7 +216,7 @@ class Vehicle:
         self._found.clear()
         for unsubscribe in self._unsubscribe:
             unsubscribe()
-        self._boot.close()
+        self.boot.close()
         for timer in (self._lost_timer, self._tick_timer):
             if timer is not None:
                 timer.cancel()
@@ -296,7 +276,7 @@ class Vehicle:
             return False
         # Another firmware has been flashed while we heard nothing.
         self.firmware = firmware
-        self._boot.begin_anew()
+        self.boot.begin_anew()
         self._restarted()
         return True
 
@@ -344,36 +324,26 @@ class Vehicle:
         self._tick_due_s = now_s + _TICK_S
         self._tick_timer = loop.call_at(self._tick_due_s, self._tick)
         if not self._lost:
-            self._ask_for_missing(now_s)
+            overdue = self._heartbeat_s is not None and now_s - self._heartbeat_s > _OVERDUE_S
+            if overdue and self.firmware == "px4":
+                # Its heartbeat cannot be had faster than once a second, so that after a single one that is lost nobody
+                # would know whether it is armed.
+                self.commands.request_message(_HEARTBEAT_ID)
+            self._wanted.ask_for_missing(now_s)
 
     def _ask_soon(self) -> None:
         # What was streamed before a loss is gone if the autopilot restarted meanwhile.
         self._wanted.forget_asking()
         if self.firmware == "ardupilot":
             self.commands.request_message_interval(_HEARTBEAT_ID, HEARTBEAT_RATE_HZ)
-        self._ask_for_missing(asyncio.get_running_loop().time())
-
-    def _ask_for_missing(self, now_s: float) -> None:
-        overdue = self._heartbeat_s is not None and now_s - self._heartbeat_s > _OVERDUE_S
-        if overdue and self.firmware == "px4":
-            # Its heartbeat cannot be had faster than once a second, so that after a single one that is lost nobody
-            # would know whether it is armed.
-            self.commands.request_message(_HEARTBEAT_ID)
-        self._wanted.ask_for_missing(now_s)
+        self._wanted.ask_for_missing(asyncio.get_running_loop().time())
 
     # --- what the other messages tell
 
-    def _on_restart(self) -> None:
-        now_s = asyncio.get_running_loop().time()
-        if now_s - self._restarted_s < _RESTARTS_S:
-            self._arming.two_seen(now_s)
-            self._log_conflict()
-        self._restarted_s = now_s
-        self._restarted()
-
     def _restarted(self) -> None:
         self.boots += 1
-        self._arming.restarted()
+        self._arming.restarted(asyncio.get_running_loop().time())
+        self._log_conflict()
         self._armed_told = None
         self.place.restarted()
         self.version = self.capabilities = None

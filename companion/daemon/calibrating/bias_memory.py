@@ -218,7 +218,7 @@ class BiasMemory:
 
     def power_up(self, name: str, unix_s: float) -> PowerUp:
         """Since when the sensor of an IMU has been powered, at a wall clock time."""
-        boot_s = self._vehicle.boot_s if name in self._imus else None
+        boot_s = self._vehicle.boot.latest_s if name in self._imus else None
         return PowerUp(host=self._host, since_unix_s=None if boot_s is None else round(unix_s - boot_s, 1))
 
     def _session(self, name: str) -> str:
