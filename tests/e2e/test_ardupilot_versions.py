@@ -99,7 +99,7 @@ def test_preflight_storage_is_never_sent_and_the_firmwares_gyro_calibration_at_m
 
 def test_streams_at_a_quarter_of_their_rate_during_a_parameter_transfer_do_no_harm(tmp_path: Path) -> None:
     async def main() -> None:
-        async with Rig(tmp_path, max_s=20.0).running() as rig:
+        async with Rig(tmp_path, max_s=20.0, imu_rate_hz=100.0).running() as rig:
             await rig.ready()
             job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test"))
             await asyncio.sleep(4.0)

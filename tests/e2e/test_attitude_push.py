@@ -86,7 +86,7 @@ async def flight(
     """A rig whose serial IMU carries the attitude, calibrated, pushing."""
     more = f'[push]\nattitude = "{mode}"\nattitude_rate_hz = {rate_hz}\n'
     parameters = (USES_OURS[firmware] if used else {}) | options.pop("parameters", {})
-    options = {"own_imu": True, "feed_s": 0.005} | options
+    options = {"own_imu": True, "feed_s": 0.01, "imu_rate_hz": 20.0, "imus": 1} | options
     rig = Rig(folder, firmware=firmware, more=more, parameters=parameters, **options)
     witness = Witness(rig)
     async with rig.running():

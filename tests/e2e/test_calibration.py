@@ -119,7 +119,7 @@ def test_after_a_minute_of_rest_the_result_is_there_at_once_and_nothing_is_writt
     tmp_path: Path,
 ) -> None:
     async def main() -> None:
-        async with Rig(tmp_path, more="[push]\nparameters = false\n").running() as rig:
+        async with Rig(tmp_path, imu_rate_hz=100.0, more="[push]\nparameters = false\n").running() as rig:
             await rig.ready()
             await asyncio.sleep(60.0)
             result, record = await calibrated(rig)

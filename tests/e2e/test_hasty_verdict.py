@@ -36,7 +36,7 @@ def test_what_a_second_look_shows_counts(tmp_path: Path, monkeypatch: pytest.Mon
             looks.append(rig.now_s)
             return rig.now_s - looks[0] < 4.0
 
-        rig = Rig(tmp_path, min_still_s=2.0, max_s=4.0)
+        rig = Rig(tmp_path, min_still_s=2.0, max_s=4.0, imu_rate_hz=100.0, feed_s=0.05)
         refused_while(at_first, monkeypatch)
         async with rig.running():
             result, _ = await calibrated(await rig.ready())
@@ -58,7 +58,7 @@ def test_what_ten_seconds_show_is_final(tmp_path: Path, monkeypatch: pytest.Monk
             assert rig.service.calibrating.conductor.state is State.VERIFYING
             return True
 
-        rig = Rig(tmp_path, min_still_s=2.0, max_s=4.0)
+        rig = Rig(tmp_path, min_still_s=2.0, max_s=4.0, imu_rate_hz=100.0, feed_s=0.05)
         refused_while(ever, monkeypatch)
         async with rig.running():
             before = dict(rig.double.parameters.values)
