@@ -7,13 +7,18 @@ import dataclasses
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
 from typing import Any, Final
 
+import msgspec
+
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.calibration.collector.rolling import Settings
 from companion.calibration.machine import Machine
 from companion.calibration.means.windows import Window
 from companion.component.statustext import Severity, StatusText, Weight
-from companion.config.sections import Config
+from companion.config.sections import AtArm, Config
+from companion.configured import models
 from companion.links.mavlink.link import MavlinkLink
+from companion.links.system.listeners import Listeners
 from companion.links.system.request import Object
 from companion.recording.journal import RecordedCollector
 
@@ -25,6 +30,33 @@ Task = tuple[str, Callable[[], Coroutine[Any, Any, None]]]
 """A name, and what runs under it until it is cancelled."""
 Offload = Callable[..., Awaitable[Any]]
 """Runs a blocking call elsewhere: `asyncio.to_thread` in the daemon."""
+
+
+class Wanted:
+    """What the configuration says and a ground station may change, until the next start."""
+
+    def __init__(self, config: Config) -> None:
+        self.at_arm: AtArm = config.calibration.at_arm
+        """What happens at arming."""
+        self.push = config.push.parameters
+        """Whether results are written to the autopilot."""
+        self.settings = models.settings(config)
+        """How good is good enough."""
+        self._listeners: Listeners[Settings] = Listeners()
+
+    def watch(self, retarget: Callable[[Settings], object]) -> None:
+        """Tell when something else is good enough."""
+        self._listeners.add(retarget)
+
+    def switch(self, *, at_arm: AtArm | None = None, push: bool | None = None) -> None:
+        """Change what happens at arming, or whether results are written."""
+        self.at_arm = self.at_arm if at_arm is None else at_arm
+        self.push = self.push if push is None else push
+
+    def retarget(self, **targets: float) -> None:
+        """Change how good is good enough: `target_...` as in `Settings`."""
+        self.settings = msgspec.structs.replace(self.settings, **targets)
+        self._listeners.tell(self.settings)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +73,7 @@ class Core:
     texts: StatusText
     machine: Machine
     """Where the calibration stands."""
+    wanted: Wanted
     only_listening: str | None
     """Why nothing may be started although requests arrive: a check listens and must change nothing."""
 
@@ -57,7 +90,18 @@ class Core:
 
         vehicle = Vehicle(link, system_id=config.vehicle.system_id, is_carried=is_carried)
         parameters = ParameterClient(link, vehicle)
-        return cls(config, offload, link, vehicle, parameters, collector, StatusText(link), Machine(), only_listening)
+        return cls(
+            config,
+            offload,
+            link,
+            vehicle,
+            parameters,
+            collector,
+            StatusText(link),
+            Machine(),
+            Wanted(config),
+            only_listening,
+        )
 
     async def keep_ticking(self) -> None:
         """Tell the collector the time until cancelled: the only one in the daemon who does."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from typing import Final
 
 from companion.calibration.alignment.align_record import AlignmentRecord
@@ -15,6 +16,8 @@ from companion.samples import Triad
 
 ALIGNMENT: Final = "gradienter alignment"
 """The kind of job that calibrates nothing."""
+
+Product = Record | AlignmentRecord | dict[str, WrittenParameter]
 
 
 class JobCancelledError(Exception):
@@ -39,15 +42,14 @@ class Job:
         """Whether the autopilot is to be restarted once the result is stored."""
         self.automatic = automatic
         """Whether nobody asked for it."""
-        self.armed = False
+        self.was_armed = False
         """Whether the aircraft was armed since, be it for a moment."""
         self.deadline_s = deadline_s
         """Loop time until which measuring may take; None: no limit."""
         self.finished: asyncio.Future[JobResult] = asyncio.get_running_loop().create_future()
-        self.record: Record | None = None
-        self.alignment: AlignmentRecord | None = None
-        self.written: dict[str, WrittenParameter] = {}
-        self.held_back: dict[tuple[str, Triad], Doubt] = {}
+        self.product: Product | None = None
+        """The record of a calibration or an alignment, the parameters that an undo has written."""
+        self.held_back: Mapping[tuple[str, Triad], Doubt] = {}
         """By IMU and triad, what is measured but not written, and why: only of what nobody asked for."""
         self.words = ""
         """What is going on now, for people."""
@@ -57,6 +59,23 @@ class Job:
         self._until_s = 0.0
         self._cancelled_by: str | None = None
         self._nudge = asyncio.Event()
+
+    @property
+    def record(self) -> Record | None:
+        """What came of a calibration."""
+        return self.product if isinstance(self.product, Record) else None
+
+    def deliver(self, product: Product) -> None:
+        """This is what came of it."""
+        self.product = product
+
+    def note_armed(self) -> None:
+        """The aircraft is armed."""
+        self.was_armed = True
+
+    def hold_back(self, doubts: Mapping[tuple[str, Triad], Doubt]) -> None:
+        """This is measured and not written."""
+        self.held_back = doubts
 
     @property
     def is_running(self) -> bool:

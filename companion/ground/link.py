@@ -48,8 +48,8 @@ class SignedLink:
         self._from_sdk = mavlink.MAVLink(None)
         self._from_sdk.robust_parsing = True
         self.link = MavlinkLink(system_id=own[0], component_id=own[1])
-        self.signing = self.link.signing = Signing(required=True)
-        self.signing.key = key
+        self.signing = Signing(required=True, key=key)
+        self.link.sign_with(self.signing)
         for kind in mavlink.mavlink_map.values():
             self.link.subscribe(kind, self._hand_over)
         sdk.subscribe_raw_bytes_to_be_sent(self._in_a_thread)

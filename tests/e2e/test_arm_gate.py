@@ -282,7 +282,7 @@ def test_ardupilots_script_hears_the_verdict_only_while_it_gates(tmp_path: Path,
             await asyncio.sleep(4.0)
             assert tunnelled(rig, rig.now_s - 0.6)[-1].startswith(b"CMPA\x01\x00hold still")
             # A pilot who switches the gate off at the flight line is let go.
-            rig.service.calibrating.conductor.switch(at_arm="warn")
+            rig.service.core.wanted.switch(at_arm="warn")
             await asyncio.sleep(1.0)
             assert tunnelled(rig, rig.now_s - 0.6)[-1][5] == 3
 

@@ -98,7 +98,7 @@ def test_truncated_integers_with_noise_enough_are_within_15_deg_h_and_150_ug_aft
     async def main() -> None:
         async with second_imu_only(tmp_path, DITHERED).running() as rig:
             await rig.until(lambda: rig.service.core.vehicle.system_id == 1, 10.0)
-            rig.service.calibrating.conductor.retarget(gyro_sigma_rad_s=0.1 * DEG_H, accel_sigma_m_s2=0.001 * MG)
+            rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=0.1 * DEG_H, target_accel_sigma_m_s2=0.001 * MG)
             result, record, naive = await once(rig)
             assert result.outcome == "done", result
             assert naive > 60.0

@@ -18,6 +18,7 @@ from companion.configured.models import doubtful
 from companion.daemon.devices import signing as daemon_signing
 from companion.daemon.devices.signing import AHEAD_S, LinkSigning
 from companion.errors import StorageError
+from companion.links.mavlink import signing as link_signing
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.signing import EPOCH_S, TICKS_PER_S, SigningClock
 from companion.storage import signing_time
@@ -41,7 +42,7 @@ class Board:
         monkeypatch.setattr(daemon_signing, "uptime_s", self.uptime_s)
         monkeypatch.setattr(daemon_signing, "this_boot", lambda: f"boot {self.boots}")
         monkeypatch.setattr(
-            daemon_signing, "SigningClock", lambda start: SigningClock(start, wall_s=self.wall_s, uptime=self.uptime_s)
+            link_signing, "SigningClock", lambda: SigningClock(wall_s=self.wall_s, uptime=self.uptime_s)
         )
         (folder / "k").write_text(KEY.hex())
         (folder / "k").chmod(0o600)

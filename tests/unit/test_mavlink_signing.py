@@ -46,9 +46,7 @@ class Clocks:
 
 
 def signing(*, required: bool = True, key: bytes | None = KEY, clocks: Clocks | None = None) -> Signing:
-    found = Signing(required=required, clock=(clocks or Clocks()).clock())
-    found.key = key
-    return found
+    return Signing(required=required, key=key, clock=(clocks or Clocks()).clock())
 
 
 def peer(
@@ -255,8 +253,7 @@ def test_time_never_goes_back_with_the_clock() -> None:
 
 def test_a_clock_of_1970_goes_on_from_what_was_kept_and_learns_from_who_has_the_key() -> None:
     clocks = Clocks(wall_s=100.0)
-    judge = Signing(required=True, clock=clocks.clock(start=NOW - 5))
-    judge.key = KEY
+    judge = Signing(required=True, key=KEY, clock=clocks.clock(start=NOW - 5))
     assert judge.clock.next() == NOW - 5
     later = NOW + 1000 * TICKS_PER_S
     assert judge.admits(MESSAGE.pack(peer(KEY, later)))

@@ -23,7 +23,9 @@ from companion.autopilot.firmware.imu_calibration import (
 from companion.autopilot.firmware.px4 import SLOTS, SlotMemory
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Firmware
+from companion.calibration.solution.record import Outcome, WrittenParameter
 from companion.errors import AutopilotError
+from companion.samples import Triad
 
 _SETTLE_S: Final[dict[Firmware, float]] = {
     # The telemetry shows a new offset within 60 ms (its 20 Hz filter); a second covers slower links.
@@ -115,3 +117,10 @@ CALIBRATION: Final[Mapping[Firmware, Ranges]] = {
     "px4": {**_px4(), **dict.fromkeys(rivals_of("px4"), _SWITCH)},
 }
 """By a calibration and its undo."""
+
+
+def outcomes_of(triad: Triad, written: Mapping[str, WrittenParameter]) -> set[Outcome]:
+    """What became of the offsets of one half of an IMU, among everything that was written for it."""
+    offset = GYRO_OFFSET if triad == "gyro" else ACCEL_OFFSET
+    offsets = {name for each in CALIBRATION.values() for name, one in each.items() if one is offset}
+    return {one.outcome for name, one in written.items() if name in offsets}

@@ -64,6 +64,7 @@ class Automatic:
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], conductor: Conductor, in_force: InForce) -> None:
         self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
+        self._wanted, self._only_listening = core.wanted, core.only_listening is not None
         self._imus, self._in_force, self._say, self._offload = imus, in_force, core.say, core.offload
         self._file = BoundedList(core.config.storage.path / "automatic.json", AutomaticWrite, PER_DAY + 8)
         self._writes: list[AutomaticWrite] = []
@@ -83,8 +84,7 @@ class Automatic:
     @property
     def wanted(self) -> bool:
         """Whether the configuration, or what was set since, asks for it."""
-        conductor = self._conductor
-        return conductor.at_arm != "off" and conductor.push_parameters and conductor.only_listening is None
+        return self._wanted.at_arm != "off" and self._wanted.push and not self._only_listening
 
     def why_not(self) -> str | None:
         """Why none will start by itself, as what to do about it; None when one will as soon as it is needed."""

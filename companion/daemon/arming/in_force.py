@@ -14,6 +14,7 @@ from typing import Final
 
 import msgspec
 
+from companion.autopilot.firmware.firmwares import outcomes_of
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
 from companion.calibration.solution.doubt import Doubt
@@ -215,15 +216,14 @@ class InForce:
     def _take(self, imu: ImuRecord, now_s: float, held_back: Mapping[Key, Doubt]) -> None:
         """Hold what a calibration has found in one IMU, save what it has not written for doubt."""
         corrected = imu.name in self._imus
-        halves: tuple[tuple[Triad, str, Vector | None, Vector | None, Vector | None], ...] = (
-            ("gyro", "GYR", imu.gyro_sigma_use_rad_s, imu.gyro_bias_rad_s, imu.residual_gyro_rad_s),
-            ("accel", "ACC", imu.accel_sigma_use_m_s2, imu.accel_bias_m_s2, imu.residual_accel_m_s2),
+        halves: tuple[tuple[Triad, Vector | None, Vector | None, Vector | None], ...] = (
+            ("gyro", imu.gyro_sigma_use_rad_s, imu.gyro_bias_rad_s, imu.residual_gyro_rad_s),
+            ("accel", imu.accel_sigma_use_m_s2, imu.accel_bias_m_s2, imu.residual_accel_m_s2),
         )
-        for triad, mark, sigma, bias, residual in halves:
+        for triad, sigma, bias, residual in halves:
             key = (imu.name, triad)
             if key not in self._held or sigma is None or bias is None:
                 continue
-            outcomes = {one.outcome for name, one in imu.written.items() if mark in name}
             found = Held(
                 calibrated_s=now_s,
                 confirmed_s=now_s,
@@ -231,7 +231,7 @@ class InForce:
                 sigma_use=sigma,
                 expected=_ZERO if corrected else bias,
                 # Of an IMU that is not in the autopilot's telemetry "stored" is all that can ever be known.
-                seen=outcomes <= {"verified"} or not corrected,
+                seen=outcomes_of(triad, imu.written) <= {"verified"} or not corrected,
                 averaged_s=self._config.calibration.min_still_s,
             )
             doubt = held_back.get(key)

@@ -12,8 +12,6 @@ import math
 from typing import Final, Literal
 
 from companion.autopilot.firmware.firmwares import settle_s
-from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.machine import State
 from companion.calibration.solution.validity import Why
 from companion.component.service import ArmAnswer
@@ -66,8 +64,9 @@ _VERB: Final = {
 class Forecast:
     """Of the write that the conductor does."""
 
-    def __init__(self, vehicle: Vehicle, collector: RollingCollector, conductor: Conductor) -> None:
-        self._vehicle, self._collector, self._conductor = vehicle, collector, conductor
+    def __init__(self, core: Core, conductor: Conductor) -> None:
+        self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
+        self._min_still_s = core.config.calibration.min_still_s
         self._promised: tuple[object, float] | None = None
         """The state, and the time at which its end was promised."""
 
@@ -78,7 +77,7 @@ class Forecast:
 
     @property
     def _check_s(self) -> float:
-        return settle_s(self._vehicle.firmware) + min(self._conductor.settings.min_still_s, LOOK_S) + LATE_S
+        return settle_s(self._vehicle.firmware) + min(self._min_still_s, LOOK_S) + LATE_S
 
     @property
     def _job_s(self) -> float:
@@ -125,8 +124,9 @@ class Readiness:
         self, core: Core, conclusion: Conclusion, conductor: Conductor, in_force: InForce, automatic: Automatic
     ) -> None:
         self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
+        self._wanted = core.wanted
         self.in_force, self._automatic, self._conclusion = in_force, automatic, conclusion
-        self._forecast = Forecast(core.vehicle, core.collector, conductor)
+        self._forecast = Forecast(core, conductor)
         self._answer = ArmAnswer("wait", "companion is starting")
         self._answered_s = -math.inf
         self._has_gated = False
@@ -137,7 +137,7 @@ class Readiness:
     @property
     def at_arm(self) -> AtArm:
         """What is to happen at arming; may change at the flight line."""
-        return self._conductor.at_arm
+        return self._wanted.at_arm
 
     @property
     def asks_script(self) -> bool:
@@ -190,7 +190,7 @@ class Readiness:
         if (obstacle := self._conductor.why_not(_CLOSED)) is not None:
             wait = _WAITS.get(obstacle.rung)
             return ArmAnswer("refuse", obstacle.words) if wait is None else ArmAnswer("wait", wait)
-        if not self._conductor.push_parameters:
+        if not self._wanted.push:
             return ArmAnswer("refuse", "writing is off (CMP_PUSH): no gate")
         glance = self._collector.glance(now_s)
         if self._conductor.state.is_writing:
@@ -201,7 +201,7 @@ class Readiness:
             return ArmAnswer("wait", f"reading {reading}")
         findings = self.in_force.findings(now_s)
         if all(finding.why is Why.REBOOTED for finding in findings) and findings and not self.in_force.measured:
-            left_s = self._conductor.settings.min_still_s + 1.0 - glance.still_s
+            left_s = self._wanted.settings.min_still_s + 1.0 - glance.still_s
             return ArmAnswer.hold_still(left_s, "checking after restart")
         if findings:
             why_not = self._automatic.why_not()
@@ -220,7 +220,7 @@ class Readiness:
         if status.enough:
             return math.ceil(self._forecast.whole_s)
         # Before anything is known of the noise this is the longest there is: waiting may only get shorter.
-        whole_s = status.still_s / status.progress if status.progress > 0.0 else self._conductor.settings.max_s
+        whole_s = status.still_s / status.progress if status.progress > 0.0 else self._wanted.settings.max_s
         return max(1.0, math.ceil(whole_s - status.still_s)) + math.ceil(self._forecast.whole_s)
 
     # --- in words, for arming, status and history

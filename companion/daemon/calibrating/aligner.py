@@ -114,7 +114,8 @@ class Aligner:
                 self._machine.on(Event.MOVED)
         assert result is not None
         assert local is not None
-        job.alignment = record = self._record(plan, result, taken, local)
+        record = self._record(plan, result, taken, local)
+        job.deliver(record)
         await self._alignment.keep(record)
         self._machine.on(Event.NOTHING_TO_WRITE)
         x_deg, y_deg = record.offset_deg

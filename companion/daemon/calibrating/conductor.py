@@ -11,7 +11,6 @@ import datetime
 import logging
 from collections.abc import Awaitable, Callable, Collection, Coroutine
 
-import msgspec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
@@ -22,11 +21,10 @@ from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
-from companion.config.sections import AtArm
 from companion.daemon.calibrating.align_steps import Plan
 from companion.daemon.calibrating.aligner import Aligner
 from companion.daemon.calibrating.bias_memory import Results, has_written
-from companion.daemon.calibrating.course import Course, Measuring
+from companion.daemon.calibrating.course import Course
 from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
 from companion.daemon.core import Core
 from companion.daemon.job import ALIGNMENT, Job, JobCancelledError
@@ -45,13 +43,12 @@ class Conductor:
     def __init__(
         self,
         core: Core,
-        measuring: Measuring,
         course: Course,
         aligner: Aligner,
         recovery: Recovery,
         results: Results,
     ) -> None:
-        self._machine, self._measuring = core.machine, measuring
+        self._machine, self._wanted, self._only_listening = core.machine, core.wanted, core.only_listening
         self._vehicle, self._collector, self._say = core.vehicle, core.collector, core.say
         self._course, self._aligner, self._recovery, self._results = course, aligner, recovery, results
         self._has_gradienter = core.config.gradienter is not None
@@ -60,11 +57,9 @@ class Conductor:
         self.job: Job | None = None
         self.reason = "ready"
         """What the present state means, in words."""
-        self.at_arm: AtArm = core.config.calibration.at_arm
-        self.only_listening = core.only_listening
-        """Why nothing may be started although requests arrive: a check listens and must change nothing."""
         self._listeners: Listeners[Job, JobResult] = Listeners()
         self._unsubscribe = core.vehicle.watch(self._on_event)
+        core.wanted.watch(self._retarget)
         recovery.watch(self._recovered)
 
     def watch(self, on_ended: OnEnded) -> None:
@@ -84,11 +79,6 @@ class Conductor:
     def state(self) -> State:
         """Where the calibration stands."""
         return self._machine.state
-
-    @property
-    def settings(self) -> Settings:
-        """How good is good enough."""
-        return self._measuring.settings
 
     @property
     def running(self) -> Job | None:
@@ -170,28 +160,6 @@ class Conductor:
         self.running.cancel(requester)
         return True
 
-    def retarget(self, *, gyro_sigma_rad_s: float | None = None, accel_sigma_m_s2: float | None = None) -> None:
-        """Change how good is good enough, from the next look on."""
-        changes = {"target_gyro_sigma_rad_s": gyro_sigma_rad_s, "target_accel_sigma_m_s2": accel_sigma_m_s2}
-        self._measuring.retarget(
-            msgspec.structs.replace(
-                self.settings, **{key: value for key, value in changes.items() if value is not None}
-            )
-        )
-        if self.running is None:
-            self._collector.retarget(self.settings)
-
-    @property
-    def push_parameters(self) -> bool:
-        """Whether results are written to the autopilot."""
-        return self._course.push
-
-    def switch(self, *, at_arm: AtArm | None = None, push: bool | None = None) -> None:
-        """Change what happens at arming, or whether results are written, as at the flight line."""
-        self.at_arm = self.at_arm if at_arm is None else at_arm
-        if push is not None:
-            self._course.switch(push=push)
-
     async def close(self) -> None:
         """Stop: cancel what runs and wait until it has left the autopilot in order."""
         self._unsubscribe()
@@ -202,8 +170,8 @@ class Conductor:
     # --- starting and ending
 
     def _refusal(self, requester: str, no_gradienter: str | None = None, nothing: str | None = None) -> Refusal | None:
-        if self.only_listening is not None:
-            return Refusal("other", self.only_listening)
+        if self._only_listening is not None:
+            return Refusal("other", self._only_listening)
         if (found := self.why_not()) is not None:
             return found.refusal
         if no_gradienter is not None and not self._has_gradienter:
@@ -242,10 +210,14 @@ class Conductor:
     def _on_event(self, event: VehicleEvent) -> None:
         if event == "armed":
             if self.job is not None:
-                self.job.armed = True
+                self.job.note_armed()
             self._collector.reset("armed")
         elif event == "disarmed":
             self._collector.reset("just disarmed")
+
+    def _retarget(self, settings: Settings) -> None:
+        if self.running is None:
+            self._collector.retarget(settings)
 
     def _recovered(self, words: str) -> None:
         """What was put in order is what `status` says last."""
@@ -261,9 +233,10 @@ class Conductor:
             return "; ".join([in_words(draft.solution), *draft.notes])
 
         result = await _result(job, run())
-        job.record = draft.record(result.outcome, result.reason, loop.time() - started_s)
-        await self._results.keep(job.record, started_s, draft.measured_s)
-        self._collector.retarget(self.settings)
+        record = draft.record(result.outcome, result.reason, loop.time() - started_s)
+        job.deliver(record)
+        await self._results.keep(record, started_s, draft.measured_s)
+        self._collector.retarget(self._wanted.settings)
         self._end(job, result)
 
     async def _align(self, job: Job, plan: Plan) -> None:
@@ -284,11 +257,12 @@ class Conductor:
 
     async def _undo(self, job: Job, *, force: bool) -> None:
         async def run() -> str:
-            job.written = await self._recovery.undo(force=force)
+            written = await self._recovery.undo(force=force)
+            job.deliver(written)
             if self._vehicle.system_id is not None:
                 await self._results.undone(self._vehicle.system_id)
             self._machine.on(Event.CONCLUDED)
-            return f"{len(job.written)} old values back"
+            return f"{len(written)} old values back"
 
         self._end(job, await _result(job, run()))
 

@@ -71,14 +71,8 @@ class Measuring:
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
         self._core, self._machine, self._imus = core, core.machine, imus
-        self.settings = models.settings(core.config)
-        """How good is good enough."""
         self._upsets: dict[str, int] = {}
         """By IMU, how many there had been before this calibration."""
-
-    def retarget(self, settings: Settings) -> None:
-        """Change how good is good enough."""
-        self.settings = settings
 
     def begin(self) -> None:
         """A calibration begins, which may measure more than once."""
@@ -90,7 +84,7 @@ class Measuring:
         Raises:
             CalibrationRefusedError: armed since the job began (in those words), or out of time.
         """
-        if job.armed or self._core.vehicle.arm_state is ArmState.ARMED:
+        if job.was_armed or self._core.vehicle.arm_state is ArmState.ARMED:
             raise CalibrationRefusedError(if_armed)
         job.check_time()
         await self._core.catch_up()
@@ -154,10 +148,11 @@ class Measuring:
 
     def _wanted(self, what: What) -> Settings:
         """The targets of what was asked for; the rest may be as bad as it likes."""
+        settings = self._core.wanted.settings
         return msgspec.structs.replace(
-            self.settings,
-            target_gyro_sigma_rad_s=self.settings.target_gyro_sigma_rad_s if what.gyros else math.inf,
-            target_accel_sigma_m_s2=self.settings.target_accel_sigma_m_s2 if what.accelerometers else math.inf,
+            settings,
+            target_gyro_sigma_rad_s=settings.target_gyro_sigma_rad_s if what.gyros else math.inf,
+            target_accel_sigma_m_s2=settings.target_accel_sigma_m_s2 if what.accelerometers else math.inf,
         )
 
 
@@ -174,7 +169,7 @@ class Solving:
         """Tell of every solution: the window measured and used, the place, what was asked for, what was known."""
         self._listeners.add(tell)
 
-    async def solve(self, measured: Window, window: Window, job: Job, draft: Draft, *, push: bool) -> Solution:
+    async def solve(self, measured: Window, window: Window, job: Job, draft: Draft) -> Solution:
         """The biases; fills the draft, and says what contradicts earlier ones.
 
         What contradicts is written where somebody has asked for it. Of a calibration by itself it is held back: what
@@ -198,9 +193,10 @@ class Solving:
         weighed: Weighed = await offload(weigh, solution, whole, expectation)
         started_at = draft.started_at.isoformat(timespec="milliseconds")
         # From here on nobody can make this job theirs, so that a request is never answered with half of it.
-        writes = job.automatic and push
-        job.held_back = {key: doubt for key, doubt in weighed.doubted.items() if writes and key[0] in self._written}
-        draft.solution, draft.held_back = weighed.solution, dict(job.held_back)
+        writes = job.automatic and self._core.wanted.push
+        held = {key: doubt for key, doubt in weighed.doubted.items() if writes and key[0] in self._written}
+        job.hold_back(held)
+        draft.solution, draft.held_back = weighed.solution, dict(held)
         draft.points = _less(memory.measured(solution, whole, weighed.doubts, started_at, unix_s), draft.held_back)
         for doubt in weighed.doubts:
             self._core.say(Severity.WARNING, doubt.words)
@@ -209,10 +205,10 @@ class Solving:
             self._core.say(Severity.WARNING, f"Held back: {what}; calibrate on request to write it all the same")
         return weighed.solution
 
-    async def remember(self, job: Job, draft: Draft, *, push: bool) -> None:
+    async def remember(self, job: Job, draft: Draft) -> None:
         """The calibration has come to a good end."""
         points = draft.points
-        if push and not job.automatic:
+        if self._core.wanted.push and not job.automatic:
             # Who has asked was told of every contradiction, and has what was measured in force: that is true now.
             points = {name: point.as_chosen() for name, point in points.items()}
         await self._memory.keep(points)
@@ -249,12 +245,6 @@ class Course:
         self._core, self._machine = core, core.machine
         self._measuring, self._solving, self._ditherer = measuring, solving, ditherer
         self._planner, self._pusher, self._conclusion = planner, pusher, conclusion
-        self.push = core.config.push.parameters
-        """Whether results are written to the autopilot."""
-
-    def switch(self, *, push: bool) -> None:
-        """Change whether results are written."""
-        self.push = push
 
     async def run(self, job: Job, draft: Draft) -> None:
         """Measure, work out, write, verify and settle, filling the draft on the way.
@@ -284,12 +274,12 @@ class Course:
                 break
         else:
             await self._measure_and_push(job, draft)
-        await self._solving.remember(job, draft, push=self.push)
+        await self._solving.remember(job, draft)
 
     async def _measure_and_push(self, job: Job, draft: Draft) -> None:
         measured, window = await self._measure(job, draft)
-        solution = await self._solving.solve(measured, window, job, draft, push=self.push)
-        plan = await self._planner.plan(solution, draft, push=self.push)
+        solution = await self._solving.solve(measured, window, job, draft)
+        plan = await self._planner.plan(solution, draft)
         job.check_cancelled()
         if not plan.changes:
             self._machine.on(Event.NOTHING_TO_WRITE)
@@ -300,7 +290,7 @@ class Course:
         def go_on(words: str) -> None:
             job.check_cancelled()
             still_s = self._core.collector.status(asyncio.get_running_loop().time()).still_s
-            share = min(still_s / self._measuring.settings.min_still_s, 1.0)
+            share = min(still_s / self._core.wanted.settings.min_still_s, 1.0)
             job.progress(WRITTEN_PERCENT + (100.0 - WRITTEN_PERCENT) * share, words or _WATCHING)
 
         async with self._pusher.written(plan, draft, lambda words: job.progress(MEASURED_PERCENT, words)) as plan:
@@ -314,10 +304,9 @@ class Course:
         """A window of telemetry under the offsets in force; and the same, its means bettered where that is allowed."""
         while True:
             measured = window = await self._measuring.measure(job)
-            if await self._pusher.offsets_still_hold(push=self.push):
-                if self.push:
-                    window = await self._ditherer.refine(measured, job, draft)
-                if window is measured or await self._pusher.offsets_still_hold(push=self.push):
+            if await self._pusher.offsets_still_hold():
+                window = await self._ditherer.refine(measured, job, draft)
+                if window is measured or await self._pusher.offsets_still_hold():
                     return measured, window
             # The window holds telemetry under other offsets than those now in force.
             self._machine.on(Event.MOVED)

@@ -84,7 +84,7 @@ class Commands:
     async def _undo(self, request: Object, face: str) -> AsyncIterator[Object]:
         job = _accepted(self._conductor.start_undo(f"{face} undo", force=request.get("force") is True))
         result = await asyncio.shield(job.finished)
-        written = msgspec.to_builtins(job.written)
+        written = msgspec.to_builtins(job.product or {})
         yield {"kind": "result", "state": result.outcome, "reason": result.reason, "written": written}
 
     async def _align(self, request: Object, face: str) -> AsyncIterator[Object]:
@@ -107,7 +107,7 @@ class Commands:
                 "kind": "result",
                 "state": result.outcome,
                 "reason": result.reason,
-                "alignment": msgspec.to_builtins(job.alignment),
+                "alignment": msgspec.to_builtins(job.product),
             }
 
     def _shown(self) -> Object:
@@ -162,7 +162,7 @@ class Calibrating(Subsystem):
         course = Course(core, measuring, self.solving, ditherer, offsets.planner, offsets.pusher, self.conclusion)
         aligner = Aligner(core, imus, measuring, self.alignment)
         self._results = Results(core, self.store, self.memory)
-        self.conductor = Conductor(core, measuring, course, aligner, offsets.recovery, self._results)
+        self.conductor = Conductor(core, course, aligner, offsets.recovery, self._results)
 
     def load(self) -> None:  # noqa: D102 - as in the base class
         self.alignment.load()

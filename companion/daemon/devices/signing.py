@@ -20,7 +20,7 @@ from companion.config.sections import Config
 from companion.daemon.core import Offload
 from companion.errors import LinkError, StorageError
 from companion.links.mavlink.link import MavlinkLink
-from companion.links.mavlink.signing import TICKS_PER_S, Reason, Signing, SigningClock, read_key, uptime_s
+from companion.links.mavlink.signing import TICKS_PER_S, Reason, Signing, read_key, uptime_s
 from companion.storage import signing_time
 from companion.storage.signing_time import SigningTime, this_boot
 
@@ -191,7 +191,8 @@ class LinkSigning:
         self._told: set[tuple[Reason, int, int]] = set()
         if self.mode != "off":
             # From the first byte on: what comes before the key is read is not believed either.
-            self.signing = link.signing = Signing(required=self.mode == "require")
+            self.signing = Signing(required=self.mode == "require")
+            link.sign_with(self.signing)
         self._watch = _SignatureWatch(link, vehicle, self.signing, say)
         link.subscribe(mavlink.MAVLink_setup_signing_message, self._on_setup)
 
@@ -199,7 +200,7 @@ class LinkSigning:
         """Read time and key, before anything is sent; a key that cannot be read is tried again in `run`."""
         if self.signing is not None:
             kept = signing_time.load(self._config.storage.path)
-            self.signing.clock = SigningClock(_go_on_from(kept, uptime_s(), this_boot()))
+            self.signing.clock.heard(_go_on_from(kept, uptime_s(), this_boot()))
             self._take_key(self.signing)
 
     async def run(self) -> None:
@@ -227,15 +228,13 @@ class LinkSigning:
         path = self._config.mavlink.signing_key_path
         assert path is not None  # the configuration's rules
         try:
-            signing.key = read_key(path)
+            signing.take_key(read_key(path))
         except LinkError as error:
             if str(error) != self.trouble:
                 logger.warning("mavlink: no signing: %s", error)
             self.trouble = str(error)
             return
         self.trouble = ""
-        signing.doubted.clear()
-        signing.strangers.clear()
         logger.info("mavlink: what is sent is signed, what comes unsigned is %s", self._fate)
 
     @property

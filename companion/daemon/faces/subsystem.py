@@ -11,11 +11,11 @@ from companion.calibration.solution.record import ImuRecord
 from companion.component.component import Component
 from companion.component.own_parameters import OwnParameters
 from companion.component.service import JobResult
-from companion.config.sections import AtArm, Config, Senders
+from companion.config.sections import AtArm, Senders
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.subsystem import Calibrating
-from companion.daemon.core import Core, Subsystem, Task
+from companion.daemon.core import Core, Subsystem, Task, Wanted
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.faces.answers import Answers
 from companion.daemon.faces.headline import Headlines
@@ -59,7 +59,7 @@ class Faces(Subsystem):
             texts=core.texts,
             senders=Senders(core.config.mavlink.allow),
         )
-        define_parameters(self.component.parameters, core.config, calibrating.conductor)
+        define_parameters(self.component.parameters, core.wanted, calibrating.conductor)
         self._headlines = Headlines(core, devices, calibrating.conductor, arming, heading.attitude)
         self.answers = Answers([self, devices, offsets, calibrating, arming, heading, recorder], heading.pose)
         self.mqtt = _mqtt(core, self.answers, calibrating, heading)
@@ -120,29 +120,29 @@ def _page(core: Core, answers: Answers) -> Page | None:
     return Page(core.config.web.bind, core.config.storage.path, answers.answer, answers.look, core.offload)
 
 
-def define_parameters(parameters: OwnParameters, config: Config, conductor: Conductor) -> None:
+def define_parameters(parameters: OwnParameters, wanted: Wanted, conductor: Conductor) -> None:
     """Define CMP_*: targets, at_arm and push may be set; the last result is shown.
 
     What a ground station sets holds until the daemon restarts: the configuration file is the aircraft owner's.
     """
     assert set(AT_ARM) == set(get_args(AtArm))
-    wanted = config.calibration
+    gyro, accel = wanted.settings.target_gyro_sigma_rad_s / DEG_H, wanted.settings.target_accel_sigma_m_s2 / MG
 
     def set_gyro_target(deg_h: float) -> None:
-        conductor.retarget(gyro_sigma_rad_s=deg_h * DEG_H)
+        wanted.retarget(target_gyro_sigma_rad_s=deg_h * DEG_H)
 
     def set_accel_target(mg: float) -> None:
-        conductor.retarget(accel_sigma_m_s2=mg * MG)
+        wanted.retarget(target_accel_sigma_m_s2=mg * MG)
 
     def set_push(value: float) -> None:
-        conductor.switch(push=bool(_whole("CMP_PUSH", value)))
+        wanted.switch(push=bool(_whole("CMP_PUSH", value)))
 
     def set_at_arm(value: float) -> None:
-        conductor.switch(at_arm=AT_ARM[_whole("CMP_AT_ARM", value)])
+        wanted.switch(at_arm=AT_ARM[_whole("CMP_AT_ARM", value)])
 
-    parameters.define("CMP_GYR_TGT", wanted.target_gyro_sigma_deg_h, 0.01, LARGEST, set_gyro_target)
-    parameters.define("CMP_ACC_TGT", wanted.target_accel_sigma_mg, 0.0001, LARGEST, set_accel_target)
-    parameters.define("CMP_PUSH", float(config.push.parameters), 0.0, 1.0, set_push)
+    parameters.define("CMP_GYR_TGT", gyro, 0.01, LARGEST, set_gyro_target)
+    parameters.define("CMP_ACC_TGT", accel, 0.0001, LARGEST, set_accel_target)
+    parameters.define("CMP_PUSH", float(wanted.push), 0.0, 1.0, set_push)
     parameters.define("CMP_AT_ARM", float(AT_ARM.index(wanted.at_arm)), 0.0, 2.0, set_at_arm)
     parameters.define("CMP_STATE", 0.0, 0.0, 3.0, read_only=True)
     parameters.define("CMP_GYR_SIG", 0.0, 0.0, LARGEST, read_only=True)

@@ -18,6 +18,7 @@ import numpy as np
 from companion.attitude.estimator import Attitude, AttitudeEstimator, AttitudeSettings, Phase
 from companion.attitude.quaternion import Quaternion, Triple, conjugate, from_matrix, multiply, rotate
 from companion.attitude.uncertainty import HEADING_UNKNOWN_RAD
+from companion.autopilot.firmware.firmwares import outcomes_of
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
 from companion.calibration.means.pose import CompassModel, GradienterModel, vehicle_heading_rad
 from companion.calibration.means.windows import Window
@@ -33,7 +34,7 @@ from companion.daemon.core import Core
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Matrix, rotation_matrix
 from companion.physics.units import DEG, MG
-from companion.samples import CompassSample, ImuSample, Sample, Vector
+from companion.samples import CompassSample, ImuSample, Sample, Triad, Vector
 
 logger = logging.getLogger(__name__)
 
@@ -69,8 +70,8 @@ def settings_of(imu: Imu, record: ImuRecord, local: LocalEarth, gyro_step_rad_s:
         gyro_step_rad_s: of a stream of truncated integers, else 0.
     """
     serial = imu.source == "serial"
-    gyro = record.gyro_bias_rad_s if serial else _left(record, record.residual_gyro_rad_s, "GYR")
-    accel = record.accel_bias_m_s2 if serial else _left(record, record.residual_accel_m_s2, "ACC")
+    gyro = record.gyro_bias_rad_s if serial else _left(record, record.residual_gyro_rad_s, "gyro")
+    accel = record.accel_bias_m_s2 if serial else _left(record, record.residual_accel_m_s2, "accel")
     if gyro is None or record.gyro_sigma_use_rad_s is None:
         return None
     covariance = np.diag(np.square(record.gyro_sigma_use_rad_s))
@@ -98,9 +99,9 @@ def _level_sigma(record: ImuRecord) -> Vector | None:
     return record.accel_sigma_use_m_s2 if record.effective is None else record.effective.level_sigma_m_s2
 
 
-def _left(record: ImuRecord, residual: Vector | None, mark: str) -> Vector | None:
+def _left(record: ImuRecord, residual: Vector | None, triad: Triad) -> Vector | None:
     """What an autopilot's stream still has in it: nothing, if it was written; else what was found there."""
-    outcomes = {one.outcome for name, one in record.written.items() if mark in name}
+    outcomes = outcomes_of(triad, record.written)
     return _ZERO if outcomes and outcomes <= {"verified", "stored"} else residual
 
 

@@ -71,7 +71,7 @@ class Ditherer:
     """Replaces the means of IMUs whose integers do not tell, where the user has allowed it."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], writer: ParameterWriter, ledger: Ledger) -> None:
-        self.enabled = core.config.push.dither and core.config.push.parameters
+        self._allowed, self._wanted = core.config.push.dither, core.wanted
         self._vehicle, self._parameters, self._collector = core.vehicle, core.parameters, core.collector
         self._machine, self._imus, self._writer, self._ledger = core.machine, imus, writer, ledger
         self._profiles = {imu.name: noise_profile(imu.profile) for imu in core.config.imu}
@@ -86,7 +86,7 @@ class Ditherer:
             JobCancelledError: cancelled; likewise.
             StorageError: the old values could not be kept; nothing was written.
         """
-        if not self.enabled:
+        if not (self._allowed and self._wanted.push):
             return window
         found: list[ImuWindow] = []
         for each in window.imus:
@@ -181,6 +181,8 @@ class Ditherer:
         job.check_cancelled()
         if self._vehicle.arm_state is ArmState.ARMED:
             raise CalibrationRefusedError("armed while the offsets dithered")
+        if self._vehicle.arm_state is ArmState.UNKNOWN:
+            raise AutopilotError("no heartbeat while the offsets dithered")
         if self._vehicle.boots != work.boots:
             raise AutopilotError("the autopilot rebooted while the offsets dithered")
         job.check_time()
@@ -206,8 +208,6 @@ class Ditherer:
             while len(source.batches) < SECONDS and loop.time() < deadline_s:
                 await job.pause(POLL_S)
                 self._check(job, work)
-                if self._vehicle.arm_state is ArmState.UNKNOWN:
-                    raise AutopilotError("no heartbeat while the offsets dithered")
                 source.close_before(loop.time() - 0.5)
                 moved = moved or self._moving(work.name)
         finally:

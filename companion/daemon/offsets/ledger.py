@@ -231,9 +231,8 @@ class Recovery:
             with self._changing():
                 await self._writer.restore(ours)
         if self._ledger.undoable.get(open_set.system_id) == open_set:
-            await self._ledger.forget_undo(
-                open_set.system_id
-            )  # it was an undo that was interrupted, and now it is done
+            # It was an undo that was interrupted, and now it is done.
+            await self._ledger.forget_undo(open_set.system_id)
         await self._ledger.undone()
         words = f"Interrupted write: {f'{len(ours)} old values put back' if ours else 'nothing of ours was in force'}"
         if foreign:

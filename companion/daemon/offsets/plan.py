@@ -93,10 +93,10 @@ class Planner:
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], memory: SlotMemory, rivalry: Rivalry) -> None:
         self._vehicle, self._parameters, self._imus = core.vehicle, core.parameters, imus
-        self._memory, self._rivalry = memory, rivalry
+        self._memory, self._rivalry, self._wanted = memory, rivalry, core.wanted
         self._sources = {imu.name: imu for imu in core.config.imu}
 
-    async def plan(self, solution: Solution, draft: Draft, *, push: bool) -> Plan:
+    async def plan(self, solution: Solution, draft: Draft) -> Plan:
         """Work out which parameter gets which value; fills the draft's whole biases and warnings.
 
         Raises:
@@ -121,7 +121,7 @@ class Planner:
             changes = changes_for(
                 calibration, None if gyro is None else vector(gyro), None if accel is None else vector(accel)
             )
-            if push:
+            if self._wanted.push:
                 coarse_mg = float(found.accel_sigma_use_m_s2.max()) / MG if accel is not None else 0.0
                 if coarse_mg > COARSE_ACCEL_MG:
                     draft.warn(

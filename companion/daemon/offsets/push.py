@@ -72,10 +72,10 @@ class Pusher:
         effect: EffectWatch,
     ) -> None:
         self._vehicle, self._parameters, self._imus = core.vehicle, core.parameters, imus
-        self._writer, self._ledger = writer, ledger
+        self._writer, self._ledger, self._wanted = writer, ledger, core.wanted
         self._px4, self._firmware, self._effect = px4, firmware, effect
 
-    async def offsets_still_hold(self, *, push: bool) -> bool:
+    async def offsets_still_hold(self) -> bool:
         """Read the offsets afresh; False when they were not, or not surely, those under which was measured.
 
         Raises:
@@ -85,7 +85,7 @@ class Pusher:
         held = True
         for imu in self._imus.values():
             held &= await imu.refresh()
-        return held and not (push and await self._px4.make_sure(list(self._imus.values())))
+        return held and not (self._wanted.push and await self._px4.make_sure(list(self._imus.values())))
 
     @contextlib.asynccontextmanager
     async def written(self, plan: Plan, draft: Draft, go_on: Callable[[str], None]) -> AsyncIterator[Plan]:

@@ -16,6 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.links.mavlink.frames import Codec, goes_ahead, kind_at, may_wait, read
 from companion.links.mavlink.signing import NEVER_SIGNED, Signing
+from companion.links.system.listeners import Listeners
 from companion.links.system.together import Take, Together
 
 logger = logging.getLogger(__name__)
@@ -48,8 +49,6 @@ class MavlinkLink:
         self.sent = 0
         self.dropped = 0
         """Messages that could not be sent: no transport was attached, or its buffer was full."""
-        self.tap: Callable[[Direction, bytes | None, float | None], object] | None = None
-        """Called with (direction, bytes, time of arrival); without bytes: some are missing here."""
         self.signing: Signing | None = None
         """Signs what is sent and judges what comes; None: nobody does."""
         self.together = Together()
@@ -61,6 +60,15 @@ class MavlinkLink:
         self._transmit: Callable[[bytes], object] | None = None
         self._attached = 0
         self._handlers: dict[str, list[Handler[mavlink.MAVLink_message]]] = {}
+        self._bytes: Listeners[Direction, bytes | None, float | None] = Listeners()
+
+    def watch_bytes(self, tell: Callable[[Direction, bytes | None, float | None], object]) -> None:
+        """Tell of everything that passes: direction, bytes, time of arrival; without bytes: some are missing here."""
+        self._bytes.add(tell)
+
+    def sign_with(self, signing: Signing) -> None:
+        """Sign what is sent, and believe what comes as far as this allows, from now on."""
+        self.signing = signing
 
     @property
     def system_id(self) -> int:
@@ -99,8 +107,7 @@ class MavlinkLink:
         self._transmit = transmit
         self._attached += 1
         self._forget_received()
-        if self.tap is not None:
-            self.tap("in", None, None)
+        self._bytes.tell("in", None, None)
 
     def send(self, message: mavlink.MAVLink_message) -> bool:
         """Send a message now; False (and counted) when no transport is attached or its buffer is full."""
@@ -111,8 +118,8 @@ class MavlinkLink:
         if self.signing is not None:
             data = self.signing.sign(data, message.crc_extra)
         self._codec.seq = (self._codec.seq + 1) % 256
-        if self.tap is not None:
-            self.tap("out", data, None)
+        if self._bytes:
+            self._bytes.tell("out", data, None)
         if self._transmit(data) is False:
             self.dropped += 1
             return False
@@ -145,8 +152,8 @@ class MavlinkLink:
 
     def receive(self, data: bytes, t_s: float) -> None:
         """Take bytes of a stream that arrived at `t_s` (monotonic); never raises, whatever they are."""
-        if self.tap is not None:
-            self.tap("in", data, t_s)
+        if self._bytes:
+            self._bytes.tell("in", data, t_s)
         attached = self._attached
         for name, _, message in self._frames(data):
             self._dispatch(name, message, t_s)
@@ -164,13 +171,12 @@ class MavlinkLink:
         `admit` is told who sent each message that may have an effect, before it has any; not of a radio's own, which
         anybody may send without a signature.
         """
-        if self.tap is not None:
-            self.tap("in", datagram, t_s)
+        if self._bytes:
+            self._bytes.tell("in", datagram, t_s)
         frames = list(self._frames(datagram))
         if self.half_received:
             self.received["bad"] += 1
-            if self.tap is not None:
-                self.tap("in", None, None)
+            self._bytes.tell("in", None, None)
         self._forget_received()
         for name, sender, message in frames:
             if name not in _ANYBODYS:

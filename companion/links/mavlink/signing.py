@@ -131,15 +131,16 @@ class Signing:
 
     Args:
         required: whether what is not signed with the key is dropped; else it is only counted.
+        key: 32 bytes; without it nothing can be signed or believed.
         clock: of all links that have the key.
         link_id: of this link.
     """
 
-    def __init__(self, *, required: bool, clock: SigningClock | None = None, link_id: int = 0) -> None:
-        self.required, self.link_id = required, link_id
+    def __init__(
+        self, *, required: bool, key: bytes | None = None, clock: SigningClock | None = None, link_id: int = 0
+    ) -> None:
+        self.required, self.key, self.link_id = required, key, link_id
         self.clock = clock or SigningClock()
-        self.key: bytes | None = None
-        """32 bytes; without it nothing can be signed or believed."""
         self.verified = 0
         """Messages that were signed with our key."""
         self.doubted: Counter[Reason] = Counter()
@@ -150,6 +151,12 @@ class Signing:
         """What was signed with our key, by system and component."""
         self._streams: dict[tuple[int, int, int], int] = {}
         self._newest: dict[tuple[int, int], int] = {}
+
+    def take_key(self, key: bytes) -> None:
+        """Sign and judge with this key from now on; what was doubted before is forgotten."""
+        self.key = key
+        self.doubted.clear()
+        self.strangers.clear()
 
     def __repr__(self) -> str:
         """Without the key."""
