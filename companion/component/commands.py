@@ -31,7 +31,7 @@ from companion.calibration.request import What
 from companion.component import requests
 from companion.component.service import CalibrationService, Job, Refusal
 from companion.component.statustext import Say, Severity, Weight
-from companion.config.sections import EVERYBODY, Senders
+from companion.config.sections import Senders
 from companion.links.mavlink.link import MavlinkLink
 
 logger = logging.getLogger(__name__)
@@ -76,8 +76,8 @@ MAX_REMEMBERED: Final = 32
 class Permission:
     """Judges and counts; says in the log once for each sender what it was refused."""
 
-    def __init__(self, senders: Senders | None = None) -> None:
-        self._senders = senders or Senders(EVERYBODY)
+    def __init__(self, senders: Senders) -> None:
+        self._senders = senders
         self.refused: Counter[tuple[int, int]] = Counter()
         """By sender: the first 32."""
 
@@ -123,10 +123,10 @@ class CommandServer:
         service: CalibrationService,
         say: Say,
         wake: Callable[[], None],
-        permission: Permission | None = None,
+        permission: Permission,
     ) -> None:
         self._link, self._service, self._say, self._wake = link, service, say, wake
-        self._permission = permission or Permission()
+        self._permission = permission
         self._running: _Running | None = None
         self._next_ack_s = 0.0
         self._finals: OrderedDict[requests.Key, _Final] = OrderedDict()

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Sequence
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.arm_authorisation import ArmAuthoriser, ArmingScript
 from companion.component.commands import CommandServer, Permission
-from companion.component.own_parameters import OwnParameters
+from companion.component.own_parameters import OwnParameters, Parameter
 from companion.component.service import ArmGate, CalibrationService, VehicleView
-from companion.component.statustext import Severity, StatusText, Weight
+from companion.component.statustext import StatusText
 from companion.config.sections import Senders
 from companion.links.mavlink.link import MavlinkLink
 
@@ -22,8 +23,7 @@ _RETRY_S = 0.05
 class Component:
     """The companion on the MAVLink network.
 
-    Everything is sent from `run`: when that loop stalls, so does the heartbeat, and the network can see it. Define
-    `parameters` before `run` starts. Without a `gate` questions about arming are left unanswered.
+    Everything is sent from `run`: when that loop stalls, so does the heartbeat, and the network can see it.
     """
 
     def __init__(
@@ -31,29 +31,24 @@ class Component:
         link: MavlinkLink,
         vehicle: VehicleView,
         service: CalibrationService,
-        gate: ArmGate | None = None,
-        *,
-        texts: StatusText | None = None,
-        senders: Senders | None = None,
+        gate: ArmGate,
+        texts: StatusText,
+        parameters: Sequence[Parameter],
+        senders: Senders,
     ) -> None:
-        self._link, self._vehicle, self._service = link, vehicle, service
-        self.texts = texts or StatusText(link)
-        self._woken = self.texts.woken
+        self._link, self._vehicle, self._service, self._texts = link, vehicle, service, texts
+        self._woken = texts.woken
         self._known_as = link.system_id
         """The system id under which we were heard last."""
         self._next_heartbeat_s = -math.inf
         self.turns = 0
         """Turns of the working loop, so that it is seen to go on."""
         self.permission = Permission(senders)
-        self.parameters = OwnParameters(link, self.texts.say, self._woken.set, self.permission)
-        self._commands = CommandServer(link, service, self.texts.say, self._woken.set, self.permission)
-        self._authoriser = ArmAuthoriser(link, vehicle, gate, self.texts.say) if gate is not None else None
-        self._script = ArmingScript(link, vehicle, gate) if gate is not None else None
+        self.parameters = OwnParameters(link, parameters, texts.say, self._woken.set, self.permission)
+        self._commands = CommandServer(link, service, texts.say, self._woken.set, self.permission)
+        self._authoriser = ArmAuthoriser(link, vehicle, gate, texts.say)
+        self._script = ArmingScript(link, vehicle, gate)
         self._unsubscribe = link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
-
-    def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
-        """Say something to the people at the ground stations; False when it is a repeat or the queue is full."""
-        return self.texts.say(severity, text, weight)
 
     async def run(self) -> None:
         """Be the component until cancelled."""
@@ -70,11 +65,10 @@ class Component:
                     timer.cancel()
         finally:
             self._unsubscribe()
-            if self._authoriser is not None:
-                self._authoriser.close()
+            self._authoriser.close()
             self.parameters.close()
             self._commands.close(loop.time())
-            self.texts.step(loop.time())
+            self._texts.step(loop.time())
 
     def _step(self, now_s: float) -> float:
         """Do what is due; returns when something is due next."""
@@ -91,10 +85,10 @@ class Component:
                 self._next_heartbeat_s = now_s + _RETRY_S
         return min(
             self._next_heartbeat_s,
-            self._script.step(now_s) if self._script is not None else math.inf,
+            self._script.step(now_s),
             self._commands.step(now_s),
             self.parameters.step(now_s),
-            self.texts.step(now_s),
+            self._texts.step(now_s),
         )
 
     def _follow_vehicle(self) -> None:

@@ -14,8 +14,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -28,91 +27,55 @@ from companion.links.mavlink.link import MavlinkLink
 logger = logging.getLogger(__name__)
 
 VALUES_PER_S = 40.0
-_NAME = re.compile(r"CMP_[A-Z0-9_]{1,12}")
 _REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
 
 
-@dataclasses.dataclass(slots=True, kw_only=True)
-class _Parameter:
+@dataclasses.dataclass(frozen=True, slots=True)
+class Parameter:
+    """One of ours; like every value its limits are rounded to float32."""
+
     name: str
-    index: int
+    """CMP_ and at most 12 more of A-Z, 0-9 and _ (16 in all, the protocol's limit)."""
     value: float
+    """At the start."""
     minimum: float
     maximum: float
-    on_set: Callable[[float], None] | None
-    read_only: bool
+    on_set: Callable[[float], None] | None = None
+    """Told of a value that a ground station sets, before it is in force; raises a CompanionError to refuse it. None:
+    ground stations may not set it (results)."""
 
     def allows(self, value: float) -> bool:
-        """Whether the value is a number within the limits (all are float32; NaN compares false)."""
-        return self.minimum <= value <= self.maximum
+        """Whether a float32 is a number within the limits (NaN compares false)."""
+        return float32(self.minimum) <= value <= float32(self.maximum)
 
 
 class OwnParameters:
-    """The parameters of component 191. Define all before the first `step`: their count never changes after that."""
+    """The parameters of component 191."""
 
     def __init__(
         self,
         link: MavlinkLink,
-        say: Say = lambda severity, text, weight: None,
-        wake: Callable[[], None] = lambda: None,
-        permission: Permission | None = None,
+        parameters: Sequence[Parameter],
+        say: Say,
+        wake: Callable[[], None],
+        permission: Permission,
     ) -> None:
-        self._link, self._say, self._wake = link, say, wake
-        self._permission = permission or Permission()
-        self._all: list[_Parameter] = []
-        self._by_name: dict[str, _Parameter] = {}
-        self._pending: dict[int, None] = {}
+        self._link, self._say, self._wake, self._permission = link, say, wake, permission
+        self._by_name = {parameter.name: parameter for parameter in parameters}
+        self._values = {parameter.name: float32(parameter.value) for parameter in parameters}
+        self._names = list(self._by_name)
+        """By index."""
+        self._pending: dict[str, None] = {}
         self._next_s = -math.inf
-        self._fixed = False
         self._subscriptions = (
             link.subscribe(mavlink.MAVLink_param_request_list_message, self._on_request_list),
             link.subscribe(mavlink.MAVLink_param_request_read_message, self._on_request_read),
             link.subscribe(mavlink.MAVLink_param_set_message, self._on_set),
         )
 
-    def define(
-        self,
-        name: str,
-        value: float,
-        minimum: float,
-        maximum: float,
-        on_set: Callable[[float], None] | None = None,
-        *,
-        read_only: bool = False,
-    ) -> None:
-        """Add a parameter.
-
-        Args:
-            name: CMP_ and at most 12 more of A-Z, 0-9 and _ (16 in all, the protocol's limit).
-            value: its first value; like every value it is rounded to float32.
-            minimum: least allowed value.
-            maximum: greatest allowed value.
-            on_set: called with a new value that a ground station sets, before it is stored; raises a CompanionError
-                to refuse it.
-            read_only: ground stations may not set it (results).
-
-        Raises:
-            ValueError: the name or the limits are not allowed, or the name is taken.
-            RuntimeError: the component runs already.
-        """
-        if self._fixed:
-            raise RuntimeError(f"{name}: parameters cannot be added once the component runs")
-        if not _NAME.fullmatch(name) or name in self._by_name:
-            raise ValueError(f"{name!r} is not a free name of the form CMP_..., at most 16 characters")
-        parameter = _Parameter(
-            name=name, index=len(self._all), value=float32(value), minimum=float32(minimum), maximum=float32(maximum),
-            on_set=on_set, read_only=read_only,
-        )  # fmt: skip
-        if not (
-            math.isfinite(parameter.minimum) and math.isfinite(parameter.maximum) and parameter.allows(parameter.value)
-        ):
-            raise ValueError(f"{name}: {value:g} is not within finite limits {minimum:g} .. {maximum:g}")
-        self._all.append(parameter)
-        self._by_name[name] = parameter
-
     def get(self, name: str) -> float:
         """The value in force; KeyError when there is no such parameter."""
-        return self._by_name[name].value
+        return self._values[name]
 
     def set(self, name: str, value: float) -> None:
         """Change a value from inside and tell everyone, if it is another; `on_set` is not called.
@@ -125,9 +88,9 @@ class OwnParameters:
         value = float32(value)
         if not parameter.allows(value):
             raise ValueError(f"{name}: {value:g} is not within {parameter.minimum:g} .. {parameter.maximum:g}")
-        if value != parameter.value:
-            parameter.value = value
-            self._request(parameter)
+        if value != self._values[name]:
+            self._values[name] = value
+            self._request(name)
 
     def change(self, name: str, value: float) -> None:
         """Change what a ground station may change, from inside: `on_set` is called, whatever the limits are.
@@ -142,14 +105,13 @@ class OwnParameters:
 
     def step(self, now_s: float) -> float:
         """Send the values that are due; return when the next one is (infinity: none waits)."""
-        self._fixed = True
         if not self._pending or not self._link.connected:
             # Without a transport nobody is there who asked; what changed meanwhile is told once one is back.
             return math.inf
         if now_s >= self._next_s:
-            index = next(iter(self._pending))
-            if self._send(self._all[index]):
-                del self._pending[index]
+            name = next(iter(self._pending))
+            if self._send(name):
+                del self._pending[name]
             self._next_s = now_s + 1.0 / VALUES_PER_S
         return self._next_s if self._pending else math.inf
 
@@ -158,15 +120,14 @@ class OwnParameters:
         for unsubscribe in self._subscriptions:
             unsubscribe()
 
-    def _request(self, parameter: _Parameter) -> None:
-        self._pending.setdefault(parameter.index)
+    def _request(self, name: str) -> None:
+        self._pending.setdefault(name)
         self._wake()
 
-    def _send(self, parameter: _Parameter) -> bool:
+    def _send(self, name: str) -> bool:
+        count, index = len(self._names), self._names.index(name)
         return self._link.send(
-            mavlink.MAVLink_param_value_message(
-                parameter.name.encode("ascii"), parameter.value, _REAL32, len(self._all), parameter.index
-            )
+            mavlink.MAVLink_param_value_message(name.encode("ascii"), self._values[name], _REAL32, count, index)
         )
 
     def _addressed(self, target_system: int, target_component: int) -> bool:
@@ -174,18 +135,16 @@ class OwnParameters:
 
     def _on_request_list(self, message: mavlink.MAVLink_param_request_list_message, _t_s: float) -> None:
         if self._addressed(message.target_system, message.target_component):
-            for parameter in self._all:
-                self._request(parameter)
+            for name in self._names:
+                self._request(name)
 
     def _on_request_read(self, message: mavlink.MAVLink_param_request_read_message, _t_s: float) -> None:
         if not self._addressed(message.target_system, message.target_component):
             return
-        if message.param_index < 0:
-            parameter = self._by_name.get(message.param_id)
-        else:
-            parameter = self._all[message.param_index] if message.param_index < len(self._all) else None
-        if parameter is not None:
-            self._request(parameter)
+        index = message.param_index
+        name = message.param_id if index < 0 else next(iter(self._names[index : index + 1]), "")
+        if name in self._by_name:
+            self._request(name)
         elif message.target_component == self._link.component_id:
             self._send_unknown(message, message.param_id, message.param_index)
 
@@ -204,32 +163,31 @@ class OwnParameters:
         refusal = self._permission.refuses(sender, f"setting {parameter.name}") or self._apply(parameter, message)
         if refusal:
             self._say(Severity.WARNING, f"{parameter.name} not set: {refusal}", Weight.REFUSAL)
-        if self._send(parameter):
-            self._pending.pop(parameter.index, None)
+        if self._send(parameter.name):
+            self._pending.pop(parameter.name, None)
         else:
-            self._request(parameter)
+            self._request(parameter.name)
 
-    def _apply(self, parameter: _Parameter, message: mavlink.MAVLink_param_set_message) -> str:
+    def _apply(self, parameter: Parameter, message: mavlink.MAVLink_param_set_message) -> str:
         """Take over the new value; returns why not, or nothing."""
         value = float32(message.param_value)
-        if parameter.read_only:
+        if parameter.on_set is None:
             return "it is read only"
         if message.param_type != _REAL32:
             # The bytes could be a number or an integer's bits; which one depends on the sender's habits.
             return f"its type is REAL32 (9), not {message.param_type}"
         if not parameter.allows(value):
             return f"{value:g} is not in {parameter.minimum:g} .. {parameter.maximum:g}"
-        if value == parameter.value:
+        if value == self._values[parameter.name]:
             return ""
-        if parameter.on_set is not None:
-            try:
-                parameter.on_set(value)
-            except CompanionError as error:
-                return str(error)
-            except Exception:
-                logger.exception("setting %s failed", parameter.name)
-                return "an internal error, see the log"
-        parameter.value = value
+        try:
+            parameter.on_set(value)
+        except CompanionError as error:
+            return str(error)
+        except Exception:
+            logger.exception("setting %s failed", parameter.name)
+            return "an internal error, see the log"
+        self._values[parameter.name] = value
         return ""
 
     def _send_unknown(self, message: mavlink.MAVLink_message, name: str, index: int) -> None:

@@ -17,7 +17,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.daemon.devices import signing as daemon_signing
+from companion.links.mavlink import signing as link_signing
 from companion.links.mavlink.signing import SigningClock, ticks_of
 from tests.support.component import ACCEPTED, CALIBRATE, CANCEL, DENIED, Ground, command_message
 from tests.support.rig import Rig
@@ -41,13 +41,13 @@ def now() -> int:
     return ticks_of(time.time())
 
 
-def virtual_clock(start: int) -> SigningClock:
+def virtual_clock() -> SigningClock:
     """The daemon's clock for signatures, going with the loop's."""
 
     def seconds() -> float:
         return asyncio.get_running_loop().time()
 
-    return SigningClock(start, wall_s=lambda: START_S + seconds(), uptime=seconds)
+    return SigningClock(wall_s=lambda: START_S + seconds(), uptime=seconds)
 
 
 def words_of(rig: Rig) -> str:
@@ -384,7 +384,7 @@ def test_heartbeats_held_back_on_another_link_do_not_disarm(
     tmp_path: Path, mode: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The autopilot signs each of its links apart; those of the telemetry radio are played on ours 75 s later."""
-    monkeypatch.setattr(daemon_signing, "SigningClock", virtual_clock)
+    monkeypatch.setattr(link_signing, "SigningClock", virtual_clock)
 
     async def main() -> None:
         rig = signed_rig(tmp_path, mode=mode, imu_rate_hz=10.0)

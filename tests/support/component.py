@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
 from typing import Literal, NamedTuple
 
@@ -11,7 +11,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.calibration.request import What
 from companion.component.component import Component
+from companion.component.own_parameters import Parameter
 from companion.component.service import ArmAnswer, Job, JobResult, Refusal
+from companion.component.statustext import StatusText
+from companion.config.sections import EVERYBODY, Senders
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.wire import Wire
 
@@ -186,6 +189,7 @@ class Bench(NamedTuple):
     wire: Wire
     task: asyncio.Task[None]
     gate: ScriptedGate
+    texts: StatusText
 
 
 @asynccontextmanager
@@ -196,18 +200,18 @@ async def bench(
     duplicate: float = 0.0,
     system_id: int | None = None,
     ground: Ground | None = None,
-    prepare: Callable[[Component], None] | None = None,
+    parameters: Sequence[Parameter] = (),
+    allow: Sequence[str] = EVERYBODY,
 ) -> AsyncIterator[Bench]:
     """The component running at one end of a wire."""
     link, ground = MavlinkLink(), ground or Ground()
     service, vehicle, gate = ScriptedService(), FakeVehicle(system_id), ScriptedGate()
-    component = Component(link, vehicle, service, gate)
-    if prepare is not None:
-        prepare(component)
+    texts = StatusText(link)
+    component = Component(link, vehicle, service, gate, texts, parameters, Senders(tuple(allow)))
     wire = Wire(link, ground, seed=seed, loss=loss, duplicate=duplicate)
     task = asyncio.create_task(component.run())
     try:
-        yield Bench(link, component, service, vehicle, ground, wire, task, gate)
+        yield Bench(link, component, service, vehicle, ground, wire, task, gate, texts)
     finally:
         task.cancel()
         with suppress(asyncio.CancelledError):

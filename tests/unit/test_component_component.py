@@ -11,9 +11,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.commands import encode_version
 from companion.component.component import Component
-from companion.component.statustext import Severity
+from companion.component.statustext import Severity, StatusText
+from companion.config.sections import EVERYBODY, Senders
 from companion.links.mavlink.link import MavlinkLink
-from tests.support.component import CALIBRATE, FakeVehicle, Ground, ScriptedService, bench
+from tests.support.component import CALIBRATE, FakeVehicle, Ground, ScriptedGate, ScriptedService, bench
 from tests.support.virtual_time import run_virtual
 from tests.support.wire import Wire
 
@@ -47,7 +48,7 @@ def test_the_bytes_on_the_wire() -> None:
             # COMMAND_ACK: command u16, result, progress, result_param2 i32, target 255/190
             assert b.ground.raw[1] == frame(1, 77, struct.pack("<HBBiBB", 31010, 5, 0, 0, 255, 190), 143)
             assert b.ground.raw[2] == frame(2, 77, struct.pack("<HBBiBB", 31010, 0, 0, 0, 255, 190), 143)
-            b.component.say(Severity.NOTICE, "done")
+            b.texts.say(Severity.NOTICE, "done")
             await asyncio.sleep(0.05)
             assert b.ground.raw[3] == frame(3, 253, struct.pack("<B50sHB", 5, b"done", 0, 0), 83)
 
@@ -149,8 +150,10 @@ def test_a_vehicle_found_without_a_heartbeat_to_wake_us_is_followed_within_a_sec
 def test_the_first_heartbeat_on_a_late_link_comes_at_once() -> None:
     async def main() -> None:
         link, ground = MavlinkLink(), Ground()
-        component = Component(link, FakeVehicle(), ScriptedService())
-        component.say(Severity.INFO, "waited for the link")
+        texts = StatusText(link)
+        senders = Senders(EVERYBODY)
+        component = Component(link, FakeVehicle(), ScriptedService(), ScriptedGate(), texts, (), senders)
+        texts.say(Severity.INFO, "waited for the link")
         async with asyncio.TaskGroup() as group:
             task = group.create_task(component.run())
             await asyncio.sleep(7.37)

@@ -10,22 +10,22 @@ from collections.abc import Callable
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.component.component import Component
-from companion.component.own_parameters import OwnParameters
+from companion.component.own_parameters import Parameter
 from companion.errors import CalibrationRefusedError
-from companion.links.mavlink.link import MavlinkLink
 from tests.support.component import Ground, bench
 from tests.support.virtual_time import run_virtual
 
 taken: list[float] = []
 
 
-def prepare(component: Component) -> None:
+def served() -> list[Parameter]:
     taken.clear()
-    component.parameters.define("CMP_TGT_GYRO", 5.0, 0.1, 100.0, taken.append)
-    component.parameters.define("CMP_AT_ARM", 1, 0, 2, taken.append)
-    component.parameters.define("CMP_RESULT", 0.0, -1e6, 1e6, read_only=True)
-    component.parameters.define("CMP_SIXTEEN_LONG", 0.1, 0.1, 0.1)
+    return [
+        Parameter("CMP_TGT_GYRO", 5.0, 0.1, 100.0, taken.append),
+        Parameter("CMP_AT_ARM", 1, 0, 2, taken.append),
+        Parameter("CMP_RESULT", 0.0, -1e6, 1e6),
+        Parameter("CMP_SIXTEEN_LONG", 0.1, 0.1, 0.1, taken.append),
+    ]
 
 
 NAMES = ["CMP_TGT_GYRO", "CMP_AT_ARM", "CMP_RESULT", "CMP_SIXTEEN_LONG"]
@@ -65,7 +65,7 @@ def float32(value: float) -> float:
 @pytest.mark.parametrize("target", [(1, 191), (1, 0), (0, 0)])
 def test_the_list_is_complete_and_paced(target: tuple[int, int]) -> None:
     async def main() -> None:
-        async with bench(prepare=prepare) as b:
+        async with bench(parameters=served()) as b:
             b.ground.send(mavlink.MAVLink_param_request_list_message(*target))
             await asyncio.sleep(2)
             found = values(b.ground)
@@ -81,7 +81,7 @@ def test_the_list_is_complete_and_paced(target: tuple[int, int]) -> None:
 @pytest.mark.parametrize("target", [(1, 1), (2, 191), (1, 190), (2, 0)])
 def test_what_is_addressed_to_others_is_ignored(target: tuple[int, int]) -> None:
     async def main() -> None:
-        async with bench(prepare=prepare) as b:
+        async with bench(parameters=served()) as b:
             b.ground.send(mavlink.MAVLink_param_request_list_message(*target))
             b.ground.send(read_message("CMP_AT_ARM", target=target))
             b.ground.send(read_message("", 0, target=target))
@@ -96,7 +96,7 @@ def test_what_is_addressed_to_others_is_ignored(target: tuple[int, int]) -> None
 @pytest.mark.parametrize(("name", "index"), [("CMP_AT_ARM", -1), ("", 1), ("CMP_RESULT", 1)])
 def test_one_is_read_by_name_or_by_index(name: str, index: int, target: tuple[int, int]) -> None:
     async def main() -> None:
-        async with bench(prepare=prepare) as b:
+        async with bench(parameters=served()) as b:
             b.ground.send(read_message(name, index, target=target))
             await asyncio.sleep(1)
             assert values(b.ground) == [("CMP_AT_ARM", 1.0, 9, 4, 1)]
@@ -106,7 +106,7 @@ def test_one_is_read_by_name_or_by_index(name: str, index: int, target: tuple[in
 
 def test_a_name_of_full_length_survives_the_wire() -> None:
     async def main() -> None:
-        async with bench(prepare=prepare) as b:
+        async with bench(parameters=served()) as b:
             b.ground.send(read_message("CMP_SIXTEEN_LONG"))
             await asyncio.sleep(1)
             assert values(b.ground)[0][0] == "CMP_SIXTEEN_LONG"
@@ -128,7 +128,7 @@ def test_a_name_of_full_length_survives_the_wire() -> None:
 )
 def test_what_does_not_exist_is_said_not_to_exist(message: mavlink.MAVLink_message) -> None:
     async def main() -> None:
-        async with bench(prepare=prepare) as b:
+        async with bench(parameters=served()) as b:
             b.ground.send(message)
             await asyncio.sleep(1)
             (error,) = errors(b.ground)
@@ -149,7 +149,7 @@ def test_what_does_not_exist_is_said_not_to_exist(message: mavlink.MAVLink_messa
 )
 def test_what_everyone_is_asked_for_may_be_another_components(message: mavlink.MAVLink_message) -> None:
     async def main() -> None:
-        async with bench(prepare=prepare) as b:
+        async with bench(parameters=served()) as b:
             b.ground.send(message)
             await asyncio.sleep(1)
             assert (values(b.ground), errors(b.ground)) == ([], [])
@@ -159,7 +159,7 @@ def test_what_everyone_is_asked_for_may_be_another_components(message: mavlink.M
 
 def test_set_is_answered_at_once_with_the_new_value() -> None:
     async def main() -> None:
-        async with bench(prepare=prepare) as b:
+        async with bench(parameters=served()) as b:
             asked_s = asyncio.get_running_loop().time()
             b.ground.send(set_message("CMP_TGT_GYRO", 7.3))
             await asyncio.sleep(1)
@@ -193,7 +193,7 @@ def test_a_value_that_is_not_allowed_is_answered_with_the_old_one(
     name: str, value: float, kind: int, unchanged: float
 ) -> None:
     async def main() -> None:
-        async with bench(prepare=prepare) as b:
+        async with bench(parameters=served()) as b:
             b.ground.send(set_message(name, value, kind=kind))
             await asyncio.sleep(1)
             assert [found[:2] for found in values(b.ground)] == [(name, unchanged)]
@@ -209,10 +209,7 @@ def test_limits_are_allowed_values_in_float32(limit: str) -> None:
     """0.1 is not a float32: a limit must not refuse its own nearest float32."""
 
     async def main() -> None:
-        def define(component: Component) -> None:
-            component.parameters.define("CMP_X", 0.5, 0.1, 0.7)
-
-        async with bench(prepare=define) as b:
+        async with bench(parameters=[Parameter("CMP_X", 0.5, 0.1, 0.7, taken.append)]) as b:
             value = 0.1 if limit == "minimum" else 0.7
             b.ground.send(set_message("CMP_X", value))
             await asyncio.sleep(1)
@@ -232,7 +229,7 @@ def breaks(_value: float) -> None:
 @pytest.mark.parametrize(("on_set", "reason"), [(refuse, "not while calibrating"), (breaks, "an internal error")])
 def test_who_takes_the_value_may_refuse_it(on_set: Callable[[float], None], reason: str) -> None:
     async def main() -> None:
-        async with bench(prepare=lambda component: component.parameters.define("CMP_X", 1, 0, 2, on_set)) as b:
+        async with bench(parameters=[Parameter("CMP_X", 1, 0, 2, on_set)]) as b:
             b.ground.send(set_message("CMP_X", 2))
             await asyncio.sleep(1)
             assert values(b.ground) == [("CMP_X", 1.0, 9, 1, 0)]
@@ -243,7 +240,7 @@ def test_who_takes_the_value_may_refuse_it(on_set: Callable[[float], None], reas
 
 def test_a_change_from_inside_is_told_once() -> None:
     async def main() -> None:
-        async with bench(prepare=prepare) as b:
+        async with bench(parameters=served()) as b:
             b.component.parameters.set("CMP_RESULT", 12.5)
             b.component.parameters.set("CMP_RESULT", 13.5)
             b.component.parameters.set("CMP_RESULT", 13.5)
@@ -259,45 +256,9 @@ def test_a_change_from_inside_is_told_once() -> None:
     run_virtual(main())
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "minimum", "maximum"),
-    [
-        ("INS_GYROFFS_X", 0, 0, 1),
-        ("CMP_", 0, 0, 1),
-        ("CMP_SEVENTEEN_LON", 0, 0, 1),
-        ("CMP_lower", 0, 0, 1),
-        ("CMP_TWICE", 0, 0, 1),
-        ("CMP_X", 2, 0, 1),
-        ("CMP_X", math.nan, 0, 1),
-        ("CMP_X", 0, -math.inf, 1),
-        ("CMP_X", 0, 0, math.nan),
-        ("CMP_X", 0, 0, 1e300),
-    ],
-)
-def test_definitions_that_cannot_be_served_are_refused(name: str, value: float, minimum: float, maximum: float) -> None:
-    parameters = OwnParameters(MavlinkLink())
-    parameters.define("CMP_TWICE", 0, 0, 1)
-    with pytest.raises(ValueError, match=r"CMP_|INS_"):
-        parameters.define(name, value, minimum, maximum)
-
-
-def test_the_count_is_fixed_once_the_component_runs() -> None:
-    async def main() -> None:
-        async with bench(prepare=prepare) as b:
-            await asyncio.sleep(0.1)
-            with pytest.raises(RuntimeError, match="CMP_LATE"):
-                b.component.parameters.define("CMP_LATE", 0, 0, 1)
-
-    run_virtual(main())
-
-
 def test_a_flood_of_list_requests_costs_neither_memory_nor_bandwidth() -> None:
-    def define(component: Component) -> None:
-        for i in range(30):
-            component.parameters.define(f"CMP_P{i}", i, 0, 100)
-
     async def main() -> None:
-        async with bench(prepare=define) as b:
+        async with bench(parameters=[Parameter(f"CMP_P{i}", i, 0, 100) for i in range(30)]) as b:
             request = mavlink.MAVLink_param_request_list_message(1, 191)
             for _ in range(2000):
                 b.ground.send(request)

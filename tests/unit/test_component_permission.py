@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
 from types import SimpleNamespace
 from typing import cast
 
@@ -12,9 +12,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.commands import MAX_REMEMBERED, Permission
-from companion.component.component import Component
+from companion.component.own_parameters import Parameter
 from companion.config import parse
-from companion.config.sections import Senders
+from companion.config.sections import EVERYBODY, Senders
 from companion.daemon.process.run import RELOADABLE
 from companion.daemon.process.service import Service
 from companion.errors import ConfigError
@@ -34,12 +34,8 @@ from tests.support.virtual_time import run_virtual
 from tests.unit.test_config import GOOD
 
 
-def allowing(*entries: str) -> Callable[[Component], None]:
-    def prepare(component: Component) -> None:
-        component.permission.allow(Senders(entries))
-        component.parameters.define("CMP_PUSH", 1.0, 0.0, 1.0)
-
-    return prepare
+def allowing(*entries: str) -> AbstractAsyncContextManager[Bench]:
+    return bench(allow=entries, parameters=[Parameter("CMP_PUSH", 1.0, 0.0, 1.0, lambda _value: None)])
 
 
 @pytest.mark.parametrize(
@@ -79,7 +75,7 @@ def test_what_is_no_list_of_texts(value: str) -> None:
 def test_everybody_may_unless_the_configuration_says_otherwise() -> None:
     """QGroundControl, Mission Planner, MAVProxy and MAVSDK have ids of their users' choice: 255, 254, 250, 245 ..."""
     assert parse(GOOD, "x.toml").mavlink.allow == ("*",)
-    assert Permission().refuses((252, 190), "calibration") == ""
+    assert Permission(Senders(EVERYBODY)).refuses((252, 190), "calibration") == ""
 
 
 @pytest.mark.parametrize("int_", [False, True], ids=["LONG", "INT"])
@@ -91,7 +87,7 @@ def test_who_is_not_named_is_denied_with_the_reason(
     command: int, params: tuple[float, ...], name: str, int_: bool
 ) -> None:
     async def main() -> None:
-        async with bench(prepare=allowing("254", "255:1-189")) as b:
+        async with allowing("254", "255:1-189") as b:
             b.ground.command(command, *params, int_=int_)
             await asyncio.sleep(1)
             assert b.ground.acks() == [DENIED]
@@ -104,7 +100,7 @@ def test_who_is_not_named_is_denied_with_the_reason(
 
 def test_who_is_named_may() -> None:
     async def main() -> None:
-        async with bench(prepare=allowing("255:190")) as b:
+        async with allowing("255:190") as b:
             b.ground.command(CALIBRATE, 0)
             await asyncio.sleep(0.5)
             assert len(b.service.started) == 1
@@ -117,7 +113,7 @@ def test_who_is_named_may() -> None:
 
 def test_a_stranger_cannot_cancel_what_another_has_started() -> None:
     async def main() -> None:
-        async with bench(prepare=allowing("255")) as b:
+        async with allowing("255") as b:
             b.ground.command(CALIBRATE, 0)
             await asyncio.sleep(0.5)
             stranger = Ground(77, 190)
@@ -139,7 +135,7 @@ def set_push(ground: Ground, value: float) -> bytes:
 
 def test_a_parameter_is_answered_with_the_value_that_stays() -> None:
     async def main() -> None:
-        async with bench(prepare=allowing("254")) as b:
+        async with allowing("254") as b:
             b.ground.send_raw(set_push(b.ground, 0.0))
             await asyncio.sleep(1)
             assert push(b) == 1.0
@@ -152,7 +148,7 @@ def test_a_parameter_is_answered_with_the_value_that_stays() -> None:
 
 def test_reading_is_everybodys() -> None:
     async def main() -> None:
-        async with bench(prepare=allowing()) as b:
+        async with allowing() as b:
             b.ground.send(mavlink.MAVLink_param_request_read_message(1, 191, b"CMP_PUSH", -1))
             b.ground.command(512, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
             await asyncio.sleep(1)
@@ -166,7 +162,7 @@ def test_reading_is_everybodys() -> None:
 
 def test_nobody_sets_a_parameter_under_our_own_ids() -> None:
     async def main() -> None:
-        async with bench(prepare=allowing("*")) as b:
+        async with allowing("*") as b:
             b.link.receive(set_push(Ground(1, 191), 0.0), asyncio.get_running_loop().time())
             await asyncio.sleep(1)
             assert push(b) == 1.0
@@ -214,7 +210,7 @@ def test_a_key_file_alone_means_that_signatures_are_required(monkeypatch: pytest
 
 
 def test_a_reload_changes_who_may() -> None:
-    faces = SimpleNamespace(component=SimpleNamespace(permission=Permission()))
+    faces = SimpleNamespace(component=SimpleNamespace(permission=Permission(Senders(EVERYBODY))))
     RELOADABLE["mavlink.allow"](cast("Service", SimpleNamespace(faces=faces)), ("254",))
     assert faces.component.permission.refuses((255, 190), "undo") != ""
     assert faces.component.permission.refuses((254, 190), "undo") == ""

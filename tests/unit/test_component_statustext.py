@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.component.component import Component
+from companion.component.own_parameters import Parameter
 from companion.component.statustext import Severity, StatusText, Weight, split_chunks, to_ascii
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.component import Ground, bench
@@ -53,7 +53,7 @@ def test_texts_of_every_length_arrive_whole(length: int) -> None:
 
     async def main() -> None:
         async with bench() as b:
-            b.component.say(Severity.INFO, text)
+            b.texts.say(Severity.INFO, text)
             await asyncio.sleep(3)
             lines = statustexts(b.ground)
             assert put_together(lines) == [text]
@@ -65,7 +65,7 @@ def test_texts_of_every_length_arrive_whole(length: int) -> None:
 def test_a_text_too_long_loses_its_tail_and_says_so() -> None:
     async def main() -> None:
         async with bench() as b:
-            b.component.say(Severity.INFO, "x" * 5000)
+            b.texts.say(Severity.INFO, "x" * 5000)
             await asyncio.sleep(3)
             (text,) = put_together(statustexts(b.ground))
             assert text == "x" * 196 + "..."
@@ -102,7 +102,7 @@ def test_severity_is_kept_and_ids_differ() -> None:
     async def main() -> None:
         async with bench() as b:
             for severity in Severity:
-                b.component.say(severity, "a" * 60 + severity.name)
+                b.texts.say(severity, "a" * 60 + severity.name)
                 await asyncio.sleep(5)
             messages = [m for _, m in b.ground.received if isinstance(m, mavlink.MAVLink_statustext_message)]
             assert [m.severity for m in messages] == [s for severity in Severity for s in (severity, severity)]
@@ -118,7 +118,7 @@ def test_a_request_cancelled_and_made_again_at_once_is_heard_to_start_again() ->
             story = ["Calibration started", "Calibration cancelled", "Calibration started", "Calibration cancelled"]
             for text in story:
                 weight = Weight.RESULT if text.endswith("cancelled") else Weight.NEWS
-                assert b.component.texts.say(Severity.NOTICE, text, weight)
+                assert b.texts.say(Severity.NOTICE, text, weight)
                 await asyncio.sleep(0.3)
             await asyncio.sleep(1.0)
             assert put_together(statustexts(b.ground)) == story
@@ -131,11 +131,11 @@ def test_repeats_within_seconds_are_said_once() -> None:
         async with bench() as b:
             said = []
             for _ in range(9):
-                said.append(b.component.say(Severity.INFO, "again"))
+                said.append(b.texts.say(Severity.INFO, "again"))
                 await asyncio.sleep(1)
             assert said == [True, False, False] * 3
             assert b.ground.texts() == ["again"] * 3
-            assert b.component.say(Severity.WARNING, "again"), "another severity is another text"
+            assert b.texts.say(Severity.WARNING, "again"), "another severity is another text"
 
     run_virtual(main())
 
@@ -144,7 +144,7 @@ def test_lines_per_second_are_bounded_and_nothing_within_the_bounds_is_lost() ->
     async def main() -> None:
         async with bench() as b:
             for i in range(16):
-                b.component.say(Severity.INFO, f"text {i}")
+                b.texts.say(Severity.INFO, f"text {i}")
             await asyncio.sleep(10)
             assert b.ground.texts() == [f"text {i}" for i in range(16)]
             times = b.ground.times("STATUSTEXT")
@@ -160,17 +160,17 @@ def test_a_flood_of_news_and_refusals_cannot_push_out_a_result() -> None:
     async def main() -> None:
         async with bench() as b:
             for i in range(1000):
-                b.component.say(Severity.INFO, f"news {i}")
-            b.component.say(Severity.NOTICE, "the result", Weight.RESULT)
+                b.texts.say(Severity.INFO, f"news {i}")
+            b.texts.say(Severity.NOTICE, "the result", Weight.RESULT)
             for i in range(1000):
-                b.component.say(Severity.WARNING, f"refused {i}", Weight.REFUSAL)
-            waiting = b.component.texts._waiting.values()
+                b.texts.say(Severity.WARNING, f"refused {i}", Weight.REFUSAL)
+            waiting = b.texts._waiting.values()
             assert sum(len(texts) for texts in waiting) == 16
             await asyncio.sleep(30)
             texts = b.ground.texts()
             assert texts[0] == "the result"
             assert texts[1:] == [f"refused {i}" for i in range(985, 1000)]
-            assert len(b.component.texts._said_s) <= 32
+            assert len(b.texts._said_s) <= 32
 
     run_virtual(main())
 
@@ -179,11 +179,11 @@ def test_news_do_not_push_out_refusals() -> None:
     async def main() -> None:
         async with bench() as b:
             for i in range(16):
-                assert b.component.say(Severity.WARNING, f"refused {i}", Weight.REFUSAL)
-            assert not b.component.say(Severity.INFO, "news")
+                assert b.texts.say(Severity.WARNING, f"refused {i}", Weight.REFUSAL)
+            assert not b.texts.say(Severity.INFO, "news")
             await asyncio.sleep(30)
             assert b.ground.texts() == [f"refused {i}" for i in range(16)]
-            assert b.component.texts.dropped == 1
+            assert b.texts.dropped == 1
 
     run_virtual(main())
 
@@ -208,7 +208,7 @@ def test_what_waited_for_a_link_until_it_was_stale_is_not_said_but_results_are()
 def test_nothing_to_say_is_not_said() -> None:
     async def main() -> None:
         async with bench() as b:
-            assert not b.component.say(Severity.INFO, " \n ")
+            assert not b.texts.say(Severity.INFO, " \n ")
             await asyncio.sleep(1)
             assert b.ground.texts() == []
 
@@ -216,16 +216,13 @@ def test_nothing_to_say_is_not_said() -> None:
 
 
 def test_a_full_transport_delays_texts_and_values_but_loses_none() -> None:
-    def define(component: Component) -> None:
-        for name in ("CMP_A", "CMP_B", "CMP_C"):
-            component.parameters.define(name, 0, 0, 9)
-
     async def main() -> None:
-        async with bench(prepare=define) as b:
+        parameters = [Parameter(name, 0, 0, 9) for name in ("CMP_A", "CMP_B", "CMP_C")]
+        async with bench(parameters=parameters) as b:
             await asyncio.sleep(0.1)
             transmit = b.link._transmit
             b.link.attach(lambda data: False)
-            b.component.say(Severity.NOTICE, "x" * 120, Weight.RESULT)
+            b.texts.say(Severity.NOTICE, "x" * 120, Weight.RESULT)
             for name in ("CMP_A", "CMP_B", "CMP_C"):
                 b.component.parameters.set(name, 5)
             await asyncio.sleep(5)

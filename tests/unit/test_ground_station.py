@@ -60,13 +60,13 @@ def test_it_says_what_it_waits_for_and_how_it_ends() -> None:
             await station.find(None, 5.0)
             asking = asyncio.create_task(station.calibrate(What.BOTH, None, reboot=False))
             await until_started(b)
-            b.component.say(Severity.INFO, "Calibration: waiting for still: gyro 0.31 deg/s > 0.10")
+            b.texts.say(Severity.INFO, "Calibration: waiting for still: gyro 0.31 deg/s > 0.10")
             await asyncio.sleep(1.0)
             for percent in (75, 85):
                 b.service.jobs[0].progress_percent = percent
                 await asyncio.sleep(1.0)
-            b.component.say(Severity.WARNING, "Reboot the autopilot before flight", Weight.RESULT)
-            b.component.say(Severity.NOTICE, "Calibration done: sigma 2.5 deg/h", Weight.RESULT)
+            b.texts.say(Severity.WARNING, "Reboot the autopilot before flight", Weight.RESULT)
+            b.texts.say(Severity.NOTICE, "Calibration done: sigma 2.5 deg/h", Weight.RESULT)
             b.service.jobs[0].finish("done")
             outcome = await asking
             assert (outcome.state, outcome.reason, outcome.good) == ("done", "sigma 2.5 deg/h", True)
@@ -101,9 +101,9 @@ def test_a_refusal_of_somebody_elses_request_is_not_taken_for_ours() -> None:
             await station.find(1, 5.0)
             asking = asyncio.create_task(station.calibrate(What.GYROS, None, reboot=False))
             await until_started(b)
-            b.component.say(Severity.WARNING, "Calibration refused: a calibration is running", Weight.REFUSAL)
+            b.texts.say(Severity.WARNING, "Calibration refused: a calibration is running", Weight.REFUSAL)
             await asyncio.sleep(1.0)
-            b.component.say(Severity.ERROR, "Calibration failed: the aircraft moved", Weight.RESULT)
+            b.texts.say(Severity.ERROR, "Calibration failed: the aircraft moved", Weight.RESULT)
             b.service.jobs[0].finish("failed")
             outcome = await asking
             assert (outcome.state, outcome.reason, outcome.good) == (

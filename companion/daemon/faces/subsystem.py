@@ -9,11 +9,10 @@ import msgspec
 
 from companion.calibration.solution.record import ImuRecord
 from companion.component.component import Component
-from companion.component.own_parameters import OwnParameters
+from companion.component.own_parameters import Parameter
 from companion.component.service import JobResult
 from companion.config.sections import AtArm, Senders
 from companion.daemon.arming.subsystem import Arming
-from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Subsystem, Task, Wanted
 from companion.daemon.devices.subsystem import Devices
@@ -56,14 +55,22 @@ class Faces(Subsystem):
             core.vehicle,
             calibrating.conductor,
             arming.readiness,
-            texts=core.texts,
-            senders=Senders(core.config.mavlink.allow),
+            core.texts,
+            own_parameters(core.wanted),
+            Senders(core.config.mavlink.allow),
         )
-        define_parameters(self.component.parameters, core.wanted, calibrating.conductor)
+        calibrating.conductor.watch(self._show_result)
         self._headlines = Headlines(core, devices, calibrating.conductor, arming, heading.attitude)
         self.answers = Answers([self, devices, offsets, calibrating, arming, heading, recorder], heading.pose)
         self.mqtt = _mqtt(core, self.answers, calibrating, heading)
         self.page = _page(core, self.answers)
+
+    def _show_result(self, job: Job, _result: JobResult) -> None:
+        if (record := job.record) is not None:
+            parameters = self.component.parameters
+            parameters.set("CMP_STATE", STATE_NUMBER[record.state])
+            parameters.set("CMP_GYR_SIG", _worst(record.imus, "gyro_sigma_use_rad_s", DEG_H))
+            parameters.set("CMP_ACC_SIG", _worst(record.imus, "accel_sigma_use_m_s2", MG))
 
     def status(self) -> Object:  # noqa: D102 - as in the base class
         return {
@@ -120,8 +127,8 @@ def _page(core: Core, answers: Answers) -> Page | None:
     return Page(core.config.web.bind, core.config.storage.path, answers.answer, answers.look, core.offload)
 
 
-def define_parameters(parameters: OwnParameters, wanted: Wanted, conductor: Conductor) -> None:
-    """Define CMP_*: targets, at_arm and push may be set; the last result is shown.
+def own_parameters(wanted: Wanted) -> list[Parameter]:
+    """CMP_*: targets, at_arm and push may be set; the last result is shown.
 
     What a ground station sets holds until the daemon restarts: the configuration file is the aircraft owner's.
     """
@@ -140,23 +147,15 @@ def define_parameters(parameters: OwnParameters, wanted: Wanted, conductor: Cond
     def set_at_arm(value: float) -> None:
         wanted.switch(at_arm=AT_ARM[_whole("CMP_AT_ARM", value)])
 
-    parameters.define("CMP_GYR_TGT", gyro, 0.01, LARGEST, set_gyro_target)
-    parameters.define("CMP_ACC_TGT", accel, 0.0001, LARGEST, set_accel_target)
-    parameters.define("CMP_PUSH", float(wanted.push), 0.0, 1.0, set_push)
-    parameters.define("CMP_AT_ARM", float(AT_ARM.index(wanted.at_arm)), 0.0, 2.0, set_at_arm)
-    parameters.define("CMP_STATE", 0.0, 0.0, 3.0, read_only=True)
-    parameters.define("CMP_GYR_SIG", 0.0, 0.0, LARGEST, read_only=True)
-    parameters.define("CMP_ACC_SIG", 0.0, 0.0, LARGEST, read_only=True)
-
-    def show(job: Job, result: JobResult) -> None:
-        del result
-        if (record := job.record) is None:
-            return
-        parameters.set("CMP_STATE", STATE_NUMBER[record.state])
-        parameters.set("CMP_GYR_SIG", _worst(record.imus, "gyro_sigma_use_rad_s", DEG_H))
-        parameters.set("CMP_ACC_SIG", _worst(record.imus, "accel_sigma_use_m_s2", MG))
-
-    conductor.watch(show)
+    return [
+        Parameter("CMP_GYR_TGT", gyro, 0.01, LARGEST, set_gyro_target),
+        Parameter("CMP_ACC_TGT", accel, 0.0001, LARGEST, set_accel_target),
+        Parameter("CMP_PUSH", wanted.push, 0.0, 1.0, set_push),
+        Parameter("CMP_AT_ARM", AT_ARM.index(wanted.at_arm), 0.0, 2.0, set_at_arm),
+        Parameter("CMP_STATE", 0.0, 0.0, 3.0),
+        Parameter("CMP_GYR_SIG", 0.0, 0.0, LARGEST),
+        Parameter("CMP_ACC_SIG", 0.0, 0.0, LARGEST),
+    ]
 
 
 def _whole(name: str, value: float) -> int:
