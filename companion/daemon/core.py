@@ -11,7 +11,7 @@ import msgspec
 
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
-from companion.calibration.collector.rolling import Settings
+from companion.calibration.collector.outlook import Settings
 from companion.calibration.machine import Machine
 from companion.calibration.means.windows import Window
 from companion.component.statustext import Severity, StatusText, Weight
