@@ -32,6 +32,7 @@ from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
 LIMIT_MS: Final = 50.0
+_SOLVE: Final = "Solving.solve.<locals>.<lambda>"
 SETTINGS: Final = """
 [push]
 parameters = false
@@ -143,7 +144,7 @@ async def _processor_s(folder: Path) -> dict[str, float]:
             assert not isinstance(job, Refusal)
             await rig.until(lambda job=job: job.words == "working out the biases" or job.finished.done(), 100.0)  # type: ignore[misc]
             await job.finished
-            for name in ("solve_at", "Conductor._keep"):
+            for name in (_SOLVE, "Conductor._keep"):
                 least[name] = min(least.get(name, float("inf")), spent.pop(name))
     return least
 
@@ -165,7 +166,7 @@ def table(calibrations: int) -> None:
                            ("the same and an autopilot's IMU, whose offsets are read again", both_ms)):  # fmt: skip
         print(f"{words:60} {took_ms[0]:6.1f} {statistics.median(took_ms):7.1f} {took_ms[-1]:6.1f}")
     print(f"{'floor: the disk alone, for a record and its trace':60} {'':6} {disk_ms:7.1f}")
-    print(f"{'processor time of it: biases':60} {1e3 * processor['solve_at']:6.1f}")
+    print(f"{'processor time of it: biases':60} {1e3 * processor[_SOLVE]:6.1f}")
     print(f"{'processor time of it: record, trace and files':60} {1e3 * processor['Conductor._keep']:6.1f}")
     median_ms = statistics.median(own_ms)
     print(f"limit {LIMIT_MS:g} ms: median {median_ms:.1f} ms, {'held' if median_ms <= LIMIT_MS else 'NOT HELD'}; "

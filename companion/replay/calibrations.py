@@ -19,8 +19,8 @@ from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.joint import weigh
 from companion.calibration.solution.record import AlignmentUsed, ImuRecord, Record
-from companion.calibration.solution.site import Whereabouts
-from companion.calibration.solution.solve import ImuSolution, Solution, solve_at
+from companion.calibration.solution.site import Whereabouts, local_earth
+from companion.calibration.solution.solve import ImuSolution, Solution, solve
 from companion.config.sections import Config
 from companion.configured import models
 from companion.configured.models import aligned
@@ -189,7 +189,7 @@ class Calibrations:
         assert config is not None
         gradienter = aligned(models.gradienter_model(config.gradienter), self._alignment)
         compass = models.compass_model(config.compass)
-        return solve_at(window, self.where, gradienter, compass, what)
+        return solve(window, local_earth(self.where), gradienter, compass, what)
 
     def _whole(self, found: ImuSolution) -> tuple[Array | None, Array | None]:
         calibration = self._solved_with.get(found.name)

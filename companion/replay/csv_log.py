@@ -26,8 +26,8 @@ from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.record import Record
-from companion.calibration.solution.site import Remedies, Whereabouts
-from companion.calibration.solution.solve import solve_at
+from companion.calibration.solution.site import Remedies, Whereabouts, local_earth
+from companion.calibration.solution.solve import solve
 from companion.config.sections import Mounting, Noise
 from companion.errors import CalibrationRefusedError, StorageError
 from companion.physics.frames import Floats, rotation_matrix
@@ -265,7 +265,9 @@ def estimate(
     if not tilt_known:
         draft.warnings.append("no accelerometer biases without --pitch-deg and --roll-deg")
     try:
-        draft.solution = solve_at(*_posed(best, pose), What.BOTH if tilt_known else What.GYROS, _REMEDIES)
+        window, where, gradienter, compass = _posed(best, pose)
+        what = What.BOTH if tilt_known else What.GYROS
+        draft.solution = solve(window, local_earth(where, _REMEDIES), gradienter, compass, what)
     except CalibrationRefusedError as error:
         return draft.record("failed", str(error), seconds)
     return draft.record("done", in_words(draft.solution), seconds)

@@ -394,7 +394,6 @@ def test_the_gradienters_share_is_how_its_readings_move_the_bias(law: Literal["a
     compass = CompassModel(False, np.eye(3), 0.0, 1.0)
     found = solve(both, local, gradienter, compass, What.BOTH)
     shared = found.shared
-    assert shared is not None
     assert shared.by_reading is not None
     step = 1e-5
     assert both.tilt is not None

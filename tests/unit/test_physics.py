@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from companion.calibration.solution.bias import accelerometer_bias, gyro_bias
+from companion.calibration.solution.solve import accelerometer_bias, gyro_bias
 from companion.physics import earth
 from companion.physics.frames import body_from_ned, roll_pitch_from_up, rotation_matrix, skew
 from companion.physics.gradienter import Law, attitude_from_readings, readings_from_up, up_in_sensor, up_jacobian

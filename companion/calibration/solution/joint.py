@@ -64,56 +64,48 @@ class _Known:
     imu: int
     triad: Triad
     expected: Expected
-    difference: Array
-    """Measured less expected."""
+    measured: Array
+    witness: Witness
 
     @property
     def rows(self) -> slice:
-        start = 6 * self.imu + (0 if self.triad == "gyro" else 3)
+        start = 6 * self.imu + _part(self.triad).start
         return slice(start, start + 3)
 
 
 def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed:
     """Take in what was known from before: guard against it, and let it take part where it may."""
-    shared = solution.shared
-    if shared is None:
-        return Weighed(solution, ())
     expected = {each.name: each for each in expectation.imus}
     solution = dataclasses.replace(
-        solution, imus=tuple(_with_effect(imu, expected.get(imu.name), shared) for imu in solution.imus)
+        solution, imus=tuple(_with_effect(imu, expected.get(imu.name), solution.shared) for imu in solution.imus)
     )
-    found = _doubts(solution, whole, expected, shared)
+    found = Weighed(solution, tuple(_doubts(solution, whole, expected)))
     known = [one for triad in _TRIADS for one in _known(solution, whole, expected, triad, today=False)]
-    doubted = {(doubt.triad, name) for doubt in found for name in doubt.names}
-    # A tilt, a gravity or a turn that nobody expected is in all of them, whether or not each shows it.
-    shaken = {doubt.triad for doubt in found if doubt.of_all}
-
-    def may_weigh(one: _Known) -> bool:
-        is_doubted = one.triad in shaken or (one.triad, solution.imus[one.imu].name) in doubted
-        return one.expected.weighs and not is_doubted and _agrees(_witness(solution, shared, one))
-
-    used = list(filter(may_weigh, known))
-    weighed = _estimate(solution, shared, used, zero_is_known=expectation.zero_is_known) if used else solution
+    used = [
+        one
+        for one in known
+        if one.expected.weighs and (one.witness.name, one.triad) not in found.doubted and _agrees(one.witness)
+    ]
+    weighed = _estimate(solution, used, zero_is_known=expectation.zero_is_known) if used else solution
     imus = []
     for k, imu in enumerate(weighed.imus):
-        prior = _prior([one for one in known if one.imu == k], used, solution, shared, whole)
-        own = [doubt.words for doubt in found if not doubt.of_all and imu.name in doubt.names]
+        own = [doubt.words for doubt in found.doubts if not doubt.of_all and imu.name in doubt.names]
+        prior = _prior([one for one in known if one.imu == k], used)
         imus.append(dataclasses.replace(imu, prior=prior, warnings=(*imu.warnings, *own)))
-    common = [doubt.words for doubt in found if doubt.of_all]
+    common = [doubt.words for doubt in found.doubts if doubt.of_all]
     weighed = dataclasses.replace(weighed, imus=tuple(imus), warnings=(*solution.warnings, *common))
-    return Weighed(weighed, tuple(found))
+    return Weighed(weighed, found.doubts)
 
 
-def _doubts(solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu], shared: Shared) -> list[Doubt]:
+def _doubts(solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu]) -> list[Doubt]:
     """What contradicts what was known."""
     found: list[Doubt] = []
     for triad in _TRIADS:
         # What was measured in this power-up says most; where it is content, nothing older has to be asked.
         for today in (True, False):
-            known = _known(solution, whole, expected, triad, today=today)
-            witnesses = [_witness(solution, shared, one) for one in known]
-            said = doubts(triad, witnesses, shared.up, shared.by_reading, today=today)
-            if said or (today and len(known) == len(solution.imus)):
+            witnesses = [one.witness for one in _known(solution, whole, expected, triad, today=today)]
+            said = doubts(triad, witnesses, solution.shared.up, solution.shared.by_reading, today=today)
+            if said or (today and len(witnesses) == len(solution.imus)):
                 found += said
                 break
     return found
@@ -131,10 +123,8 @@ def points(
 ) -> dict[str, Point]:
     """By IMU, what later calibrations may know of this one."""
     shared = solution.shared
-    if shared is None:
-        return {}
     doubted = {(doubt.triad, name) for doubt in found for name in doubt.names}
-    by_zero = _by_zero(shared)
+    by_zero = _by_reading(shared) * shared.zero_sigma_rad
     common = np.diag(shared.covariance).copy()
     common[3:] = np.maximum(common[3:] - np.diag(by_zero @ by_zero.T), 0.0)
 
@@ -194,7 +184,8 @@ def _known(
         measured = whole[imu.name][_TRIADS.index(triad)] if imu.name in whole else None
         known = expected[imu.name].of(triad, today=today) if imu.name in expected else None
         if measured is not None and known is not None:
-            found.append(_Known(k, triad, known, measured - np.array(known.value)))
+            witness = _witness(imu, solution.shared, triad, known, measured)
+            found.append(_Known(k, triad, known, measured, witness))
     return found
 
 
@@ -208,30 +199,20 @@ def _own_variance(imu: ImuSolution, shared: Shared) -> Array:
     return np.maximum(np.diag(imu.covariance) - np.diag(shared.covariance), 0.0)
 
 
-def _by_zero(shared: Shared) -> Matrix:
-    """Accelerometer bias by the gradienter's zero, in sigmas of that, (3, 2)."""
-    return _by_reading(shared) * shared.zero_sigma_rad
-
-
-def _other_zero(shared: Shared, expected: Expected) -> Matrix:
-    """What is expected by the error of earlier zeros, (3, 2)."""
-    return _by_reading(shared) * expected.other_zero_rad
-
-
 def _by_reading(shared: Shared) -> Matrix:
     return np.zeros((3, 2)) if shared.by_reading is None else shared.by_reading
 
 
-def _witness(solution: Solution, shared: Shared, known: _Known) -> Witness:
-    part = _part(known.triad)
-    imu, expected = solution.imus[known.imu], known.expected
+def _witness(imu: ImuSolution, shared: Shared, triad: Triad, expected: Expected, measured: Array) -> Witness:
+    part = _part(triad)
     common = shared.covariance[part, part]
-    if known.triad == "accel":
-        zero, other = _by_zero(shared), _other_zero(shared, expected)
+    if triad == "accel":
+        by_reading = _by_reading(shared)
+        zero, other = by_reading * shared.zero_sigma_rad, by_reading * expected.other_zero_rad
         common = common + (np.square(1.0 - expected.same_zero) - 1.0) * (zero @ zero.T) + other @ other.T
     return Witness(
         name=imu.name,
-        difference=known.difference,
+        difference=measured - np.array(expected.value),
         own_variance=_own_variance(imu, shared)[part] + np.array(expected.variance),
         common=common,
         limit=expected.limit,
@@ -242,40 +223,24 @@ def _witness(solution: Solution, shared: Shared, known: _Known) -> Witness:
 
 def _whole_covariance(solution: Solution) -> Matrix:
     """Of all biases of all IMUs, (6 n, 6 n)."""
-    count = len(solution.imus)
-    matrix = np.zeros((6 * count, 6 * count))
-    for i, j in itertools.product(range(count), repeat=2):
-        one, other = solution.imus[i], solution.imus[j]
-        if i == j:
-            block = one.covariance
-        elif i < j:
-            block = solution.cross[one.name, other.name]
-        else:
-            block = solution.cross[other.name, one.name].T
-        matrix[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] = block
-    return matrix
+    blocks = {(imu.name, imu.name): imu.covariance for imu in solution.imus} | dict(solution.cross)
+    blocks |= {(other, one): matrix.T for (one, other), matrix in solution.cross.items()}
+    return np.block([[blocks[one.name, other.name] for other in solution.imus] for one in solution.imus])
 
 
-def _estimate(solution: Solution, shared: Shared, used: Sequence[_Known], *, zero_is_known: bool) -> Solution:
+def _estimate(solution: Solution, used: Sequence[_Known], *, zero_is_known: bool) -> Solution:
     """The solution with what may take part; see the equations at the top."""
-    count = len(solution.imus)
+    shared, count = solution.shared, len(solution.imus)
     index = np.concatenate([np.arange(one.rows.start, one.rows.stop) for one in used])
-    innovation = -np.concatenate([one.difference for one in used])
+    innovation = -np.concatenate([one.witness.difference for one in used])
     s_d = _whole_covariance(solution)
-    zero = _by_zero(shared)
-    noise = _by_reading(shared) * np.array(shared.reading_sigma_rad)
+    by_reading, none = _by_reading(shared), np.zeros((3, 2))
+    zero = by_reading * shared.zero_sigma_rad
     # Every accelerometer's share of the zero's error: in d it is whole, in p as far as that was measured with it.
-    zero_in_d = np.zeros((6 * count, 2))
-    noise_in_d = np.zeros((6 * count, 2))
-    for k in range(count):
-        zero_in_d[6 * k + 3 : 6 * k + 6] = zero
-        noise_in_d[6 * k + 3 : 6 * k + 6] = noise
-    zero_in_p = np.zeros((len(index), 2))
-    other_in_p = np.zeros((len(index), 2))
-    for k, one in enumerate(used):
-        if one.triad == "accel":
-            zero_in_p[3 * k : 3 * k + 3] = zero * one.expected.same_zero
-            other_in_p[3 * k : 3 * k + 3] = _other_zero(shared, one.expected)
+    zero_in_d = np.tile(np.vstack([none, zero]), (count, 1))
+    noise_in_d = np.tile(np.vstack([none, by_reading * np.array(shared.reading_sigma_rad)]), (count, 1))
+    zero_in_p = np.vstack([zero * one.expected.same_zero if one.triad == "accel" else none for one in used])
+    other_in_p = np.vstack([by_reading * one.expected.other_zero_rad if one.triad == "accel" else none for one in used])
     s_p = np.diag(np.concatenate([one.expected.variance for one in used]))
     s_p = s_p + zero_in_p @ zero_in_p.T + other_in_p @ other_in_p.T
     both = zero_in_d @ zero_in_p.T
@@ -321,23 +286,18 @@ def _shifted(imu: ImuSolution, shift: Array, covariance: Matrix, stat: Array) ->
     )
 
 
-def _prior(
-    known: Sequence[_Known], used: Sequence[_Known], solution: Solution, shared: Shared, whole: Whole
-) -> Prior | None:
+def _prior(known: Sequence[_Known], used: Sequence[_Known]) -> Prior | None:
     """What the record says of what was known of one IMU."""
     found: dict[Triad, GyroPrior | AccelPrior] = {}
     for one in known:
-        witness, expected = _witness(solution, shared, one), one.expected
-        measured = whole[witness.name][_TRIADS.index(one.triad)]
-        assert measured is not None  # of nothing else something is known
-        unit = "rad_s" if one.triad == "gyro" else "m_s2"
+        witness, expected = one.witness, one.expected
+        kind, unit = (GyroPrior, "rad_s") if one.triad == "gyro" else (AccelPrior, "m_s2")
         figures: dict[str, Any] = {
             f"expected_{unit}": expected.value,
             f"sigma_{unit}": vector(np.sqrt(np.array(expected.variance))),
-            f"measured_{unit}": vector(measured),
+            f"measured_{unit}": vector(one.measured),
             "shift_sigma": vector(witness.difference / witness.sigma),
         }
-        kind = GyroPrior if one.triad == "gyro" else AccelPrior
         found[one.triad] = kind(
             used=one in used,
             power_ups=expected.power_ups,

@@ -12,7 +12,6 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.solution.bias import Uncertain
 from companion.calibration.solution.record import Site
 from companion.physics import earth
 from companion.physics.frames import Array, Matrix
@@ -30,6 +29,14 @@ _VARIANCE_COS: Final = 2 / 3 - math.pi**2 / 16
 _VARIANCE_SIN: Final = 1 / 3
 _MEAN_GRAVITY_M_S2: Final = 9.7976
 _GRAVITY_SIGMA_M_S2: Final = 0.0155
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Uncertain:
+    """A vector that is known up to a covariance: `mean` shape (3,), `covariance` shape (3, 3)."""
+
+    mean: Array
+    covariance: Matrix
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -4,6 +4,19 @@ The gradienter gives the direction of up, the compass the heading, the site grav
 sensor should have read follows, and the rest is its bias. "Bias" is the effective one at this pose: a scale error
 times 1 g on the vertical axis cannot be told from a bias in one pose (method section 2.3) and is what the
 autopilot's offset has to carry here; it is not part of sigma.
+
+The bias equations of the paper in their corrected form:
+
+| paper | printed                                           | here                                                |
+|-------|---------------------------------------------------|-----------------------------------------------------|
+| (2)   | gravity in body axes                              | specific force: minus gravity, at rest g * up       |
+| (3)   | accelerometer = gravity + bias                    | accelerometer = specific force + bias               |
+| (4)   | dN = -mean + g sin, dE with cos cos, dU + g cos   | bias = mean - g * up, one vector equation           |
+| (5)   | T11, T12 with wrong signs; latitude in row 2      | physics.frames.body_from_ned (orthogonal)           |
+| (6)   | -mean - T Omega                                   | bias = mean - C_n^b w_ie^n                          |
+
+Coded as printed, (4) returns the negative of the north bias and (6) minus the bias less twice the Earth's rate
+(method section 1.3). Everything is FRD and NED; `up` is the unit vector of specific force at rest.
 """
 
 from __future__ import annotations
@@ -25,17 +38,10 @@ from companion.calibration.means.pose import (
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.request import What
 from companion.calibration.solution import magnetic
-from companion.calibration.solution.bias import (
-    Uncertain,
-    accelerometer_bias,
-    attitude_error_jacobian,
-    bias_covariance,
-    gyro_bias,
-)
 from companion.calibration.solution.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site
-from companion.calibration.solution.site import IN_CONFIGURATION, LocalEarth, Remedies, Whereabouts, local_earth
+from companion.calibration.solution.site import LocalEarth, Uncertain
 from companion.errors import CalibrationRefusedError
-from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
+from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, skew
 from companion.physics.gradienter import up_jacobian
 from companion.physics.units import DEG
 from companion.samples import Triad
@@ -84,19 +90,17 @@ class Truth:
     """What the sensors should have read, from everything but the sensors themselves."""
 
     up: Array
+    up_covariance: Matrix
     attitude_covariance_rad2: Matrix
     """(3, 3) in vehicle FRD."""
-    heading_rad: float | None
-    heading_sigma_rad: float | None
-    from_gradienter: bool
-    tilt_sigma_rad: tuple[float, float]
-    """Of theta and gamma."""
+    up_by_reading: Matrix | None
+    """d up / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
+    reading_sigma_rad: tuple[float, float]
+    """Of the gradienter's two means, without its zero."""
+    heading_rad: float | None = None
+    heading_sigma_rad: float | None = None
     magnetic: Magnetic | None = None
     """What the compass' field and steadiness say of the heading; None without a compass."""
-    up_by_reading: Matrix | None = None
-    """d up / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
-    reading_sigma_rad: tuple[float, float] = (0.0, 0.0)
-    """Of the gradienter's two means, without its zero."""
 
     @property
     def body_from_ned(self) -> Matrix:
@@ -132,14 +136,36 @@ class Solution:
     site: Site
     imus: tuple[ImuSolution, ...]
     warnings: tuple[str, ...]
+    shared: Shared
     unknown: tuple[tuple[str, Triad], ...] = ()
     """IMUs and triads that were asked for and whose readings do not tell; the IMU's warnings say why."""
     magnetic: Magnetic | None = None
     """How good the heading can be; None without a compass."""
-    shared: Shared | None = None
-    """None only where somebody has made a solution by hand."""
     cross: Mapping[tuple[str, str], Matrix] = dataclasses.field(default_factory=dict)
     """Cross-covariance (6x6) of every two IMUs, in their order."""
+
+
+def accelerometer_bias(mean_m_s2: Array, up: Array, gravity_m_s2: float) -> Array:
+    """Equation (4), corrected: mean reading minus the specific force at rest; shape (3,), FRD, m/s^2."""
+    return mean_m_s2 - gravity_m_s2 * up
+
+
+def gyro_bias(mean_rad_s: Array, earth_rate_body_rad_s: Array) -> Array:
+    """Equation (6), corrected: mean reading minus the Earth's rotation in body axes; shape (3,), FRD, rad/s."""
+    return mean_rad_s - earth_rate_body_rad_s
+
+
+def attitude_error_jacobian(up: Array) -> Matrix:
+    """How a change of `up` turns the attitude, at a fixed heading angle: eps = jacobian @ d up, shape (3, 3).
+
+    C_hat = (I - [eps x]) C. Roll turns about the body's x axis, pitch about the horizontal axis
+    (0, cos gamma, -sin gamma); with gamma = atan2(-u_y, -u_z) and sin theta = u_x.
+    """
+    gamma, theta = roll_pitch_from_up(up)
+    horizontal = np.hypot(up[1], up[2])
+    by_gamma = np.array([0.0, up[2], -up[1]]) / horizontal**2
+    by_theta = np.array([1.0 / np.cos(theta), 0.0, 0.0])
+    return np.outer([1.0, 0.0, 0.0], by_gamma) + np.outer([0.0, np.cos(gamma), -np.sin(gamma)], by_theta)
 
 
 def solve(
@@ -190,22 +216,6 @@ def solve(
     )
 
 
-def solve_at(
-    window: Window,
-    where: Whereabouts,
-    gradienter: GradienterModel | None,
-    compass: CompassModel | None,
-    what: What,
-    remedies: Remedies = IN_CONFIGURATION,
-) -> Solution:
-    """`solve`, with all that the place is needed for (the magnetic model takes the longest), in one call for a thread.
-
-    Raises:
-        CalibrationRefusedError: as `solve`.
-    """
-    return solve(window, local_earth(where, remedies), gradienter, compass, what)
-
-
 def truth_of(
     window: Window,
     gradienter: GradienterModel | None,
@@ -230,32 +240,11 @@ def truth_of(
     if math.hypot(up[1], up[2]) < 0.1:
         raise CalibrationRefusedError("the aircraft stands on its nose or tail (pitch beyond 84 deg): lay it down")
     jacobian = attitude_error_jacobian(up)
-    covariance = jacobian @ up_covariance @ jacobian.T
-    gamma_variance = np.array([0.0, up[2], -up[1]]) / (up[1] ** 2 + up[2] ** 2)
-    tilt_sigma = (
-        math.sqrt(up_covariance[0, 0] / (1.0 - up[0] ** 2)),
-        math.sqrt(gamma_variance @ up_covariance @ gamma_variance),
-    )
-    without = Truth(
-        up,
-        covariance,
-        None,
-        None,
-        gradienter is not None,
-        tilt_sigma,
-        up_by_reading=by_reading,
-        reading_sigma_rad=reading_sigma,
-    )
+    without = Truth(up, up_covariance, jacobian @ up_covariance @ jacobian.T, by_reading, reading_sigma)
     if compass is None or window.heading is None:
         return without
-    found = magnetic.assess(
-        window.heading,
-        window.field,
-        compass,
-        local,
-        up,
-        up_covariance if gradienter is not None else None,
-    )
+    tilt_covariance = None if by_reading is None else up_covariance
+    found = magnetic.assess(window.heading, window.field, compass, local, up, tilt_covariance)
     warnings += found.warnings
     if not found.is_usable:
         return dataclasses.replace(without, magnetic=found.magnetic)
@@ -263,13 +252,11 @@ def truth_of(
         warnings.append("declination unknown (no position or date): magnetic heading used, sigma widened")
     # A heading from the field takes part in the tilt's errors: one wrong tilt turns all three angles.
     turned = jacobian - np.outer(up, found.heading_by_up)
-    covariance = turned @ up_covariance @ turned.T + np.outer(up, up) * found.sigma_rad**2
-    sigma = math.sqrt(found.sigma_rad**2 + found.heading_by_up @ up_covariance @ found.heading_by_up)
     return dataclasses.replace(
         without,
-        attitude_covariance_rad2=covariance,
+        attitude_covariance_rad2=turned @ up_covariance @ turned.T + np.outer(up, up) * found.sigma_rad**2,
         heading_rad=found.heading_rad,
-        heading_sigma_rad=sigma,
+        heading_sigma_rad=math.sqrt(found.sigma_rad**2 + found.heading_by_up @ up_covariance @ found.heading_by_up),
         magnetic=found.magnetic,
     )
 
@@ -288,32 +275,38 @@ def _up(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix, Matrix
 
 def _pose(truth: Truth) -> Pose:
     gamma, theta = roll_pitch_from_up(truth.up)
-    known, heading = truth.from_gradienter, truth.heading_rad
+    up, covariance, heading = truth.up, truth.up_covariance, truth.heading_rad
+    by_gamma = np.array([0.0, up[2], -up[1]]) / (up[1] ** 2 + up[2] ** 2)
+    known = truth.up_by_reading is not None
     return Pose(
         theta_deg=theta / DEG if known else None,
         gamma_deg=gamma / DEG if known else None,
         psi_deg=(heading / DEG) % 360.0 if heading is not None else None,
         sigma_deg=PoseSigma(
-            theta=truth.tilt_sigma_rad[0] / DEG if known else None,
-            gamma=truth.tilt_sigma_rad[1] / DEG if known else None,
+            theta=math.sqrt(covariance[0, 0] / (1.0 - up[0] ** 2)) / DEG if known else None,
+            gamma=math.sqrt(by_gamma @ covariance @ by_gamma) / DEG if known else None,
             psi=truth.heading_sigma_rad / DEG if truth.heading_sigma_rad is not None else None,
         ),
     )
 
 
 def _shared(truth: Truth, local: LocalEarth, zero_sigma_rad: float) -> Shared:
-    by_up = truth.up_by_reading
+    """What one attitude, gravity and Earth's rate add to the errors of all; method section 2.1.
+
+    An attitude error eps makes db_a = eps x f and db_g = eps x w = -[w x] eps; the cross term is kept, since one tilt
+    error makes both. What remains unknown of the Earth's rate (latitude, or a heading never measured) comes in with
+    its own covariance.
+    """
+    rate, up = truth.earth_rate(local), truth.up
+    jacobian = np.vstack([-skew(rate.mean), -skew(local.gravity_m_s2 * up)])
+    covariance = jacobian @ truth.attitude_covariance_rad2 @ jacobian.T
+    covariance[:3, :3] += rate.covariance
+    covariance[3:, 3:] += np.outer(up, up) * local.gravity_sigma_m_s2**2
     return Shared(
-        up=truth.up,
+        up=up,
         gravity_m_s2=local.gravity_m_s2,
-        covariance=bias_covariance(
-            attitude_covariance_rad2=truth.attitude_covariance_rad2,
-            up=truth.up,
-            gravity_m_s2=local.gravity_m_s2,
-            gravity_sigma_m_s2=local.gravity_sigma_m_s2,
-            earth_rate_body=truth.earth_rate(local),
-        ),
-        by_reading=None if by_up is None else -local.gravity_m_s2 * by_up,
+        covariance=covariance,
+        by_reading=None if truth.up_by_reading is None else -local.gravity_m_s2 * truth.up_by_reading,
         reading_sigma_rad=truth.reading_sigma_rad,
         zero_sigma_rad=zero_sigma_rad,
     )

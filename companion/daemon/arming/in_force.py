@@ -19,7 +19,8 @@ from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.record import ImuRecord, Record
-from companion.calibration.solution.solve import Solution, solve_at
+from companion.calibration.solution.site import local_earth
+from companion.calibration.solution.solve import Solution, solve
 from companion.calibration.solution.validity import (
     Finding,
     Held,
@@ -286,14 +287,9 @@ class InForce:
         self._measured_s = window.end_s
         known = self._offsets.known()
         try:
-            solution: Solution = await self._offload(
-                solve_at,
-                window,
-                models.whereabouts(self._config, self._vehicle),
-                self._alignment.model(),
-                models.compass_model(self._config.compass),
-                self.what,
-            )
+            where = models.whereabouts(self._config, self._vehicle)
+            poses = self._alignment.model(), models.compass_model(self._config.compass)
+            solution: Solution = await self._offload(lambda: solve(window, local_earth(where), *poses, self.what))
         except CalibrationRefusedError:
             self._forget()
             return True

@@ -117,12 +117,9 @@ class BiasMemory:
 
     def expectation(self, solution: Solution, unix_s: float) -> Expectation:
         """What earlier calibrations say of these IMUs today."""
-        shared = solution.shared
-        if shared is None:
-            return Expectation()
         wanted = self._config.calibration.prior
         return Expectation(
-            imus=tuple(self._expected(imu, shared, unix_s, wanted=wanted) for imu in solution.imus),
+            imus=tuple(self._expected(imu, solution.shared, unix_s, wanted=wanted) for imu in solution.imus),
             zero_is_known=self._alignment.used is not None
             or (self._config.gradienter is not None and self._config.gradienter.sigma_deg is not None),
         )

@@ -24,8 +24,8 @@ from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.history import Point
 from companion.calibration.solution.joint import Weighed, weigh
 from companion.calibration.solution.prior import Expectation
-from companion.calibration.solution.site import Whereabouts
-from companion.calibration.solution.solve import Solution, solve_at
+from companion.calibration.solution.site import Whereabouts, local_earth
+from companion.calibration.solution.solve import Solution, solve
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity
 from companion.configured import models
@@ -180,8 +180,8 @@ class Solving:
         """
         config, offload, memory = self._core.config, self._core.offload, self._memory
         where = models.whereabouts(config, self._core.vehicle)
-        compass = models.compass_model(config.compass)
-        solution: Solution = await offload(solve_at, window, where, self._alignment.model(), compass, job.what)
+        poses = self._alignment.model(), models.compass_model(config.compass)
+        solution: Solution = await offload(lambda: solve(window, local_earth(where), *poses, job.what))
         draft.alignment, draft.solution = self._alignment.used, solution
         draft.measured_s = (measured.start_s, measured.end_s)
         unix_s = draft.started_at.timestamp()
