@@ -22,7 +22,7 @@ from tests.support.extent import LONG
 # everybody: a suite is green or red, and no matter of dice. Those of `make long` are new every time.
 hypothesis.settings.register_profile(
     "anywhere",
-    max_examples=80,
+    max_examples=40,
     deadline=None,
     derandomize=True,
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
@@ -39,9 +39,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 TESTS: Final = Path(__file__).parent
 DURATIONS: Final = TESTS / "durations.json"
-"""Processor time of every test that takes more than a second, by its name, in seconds."""
-WORTH_NOTING_S: Final = 1.0
-QUICK_S: Final = 2.0
+"""Processor time of every test that takes more than half a second, by its name, in seconds."""
+WORTH_NOTING_S: Final = 0.5
+QUICK_S: Final = 0.5
 """The most processor time of a test that `make quick` runs."""
 QUICK_ROOMS: Final = ("unit", "property")
 WAITS: Final = re.compile(

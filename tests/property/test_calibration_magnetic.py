@@ -18,6 +18,7 @@ from companion.physics.frames import wrap_deg
 from companion.physics.units import DEG
 from sim.aircraft import Iron
 from tests.support import magnetic as at
+from tests.support.extent import extent
 from tests.support.windows import Array, about, ned_from_body
 
 TILT_SIGMA_DEG = 0.05
@@ -82,7 +83,10 @@ def _ground_magnet(*, where_f: float, random: np.random.Generator, share: float)
 
 
 @pytest.mark.parametrize("ground", [False, True], ids=["hard iron", "magnet on the ground"])
-@pytest.mark.parametrize("place", ["Beijing", "Perth", "Hobart", "Quito", "Bangkok", "Tromso"])
+@pytest.mark.parametrize(
+    "place",
+    extent(whole=["Beijing", "Perth", "Hobart", "Quito", "Bangkok", "Tromso"], a_slice=["Beijing", "Hobart", "Tromso"]),
+)
 def test_the_bound_covers_the_true_error_of_19_in_20_disturbances(place: str, ground: bool) -> None:
     random = np.random.default_rng([7, len(place), ground])
     mounting = about(2, 0.7) @ about(1, 0.1)

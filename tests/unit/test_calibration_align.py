@@ -18,6 +18,7 @@ from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import Gradienter
 from sim.earth import angles_of, axis_rotation, body_from_ned
 from sim.scenario import site_at
+from tests.support.extent import extent
 
 Floats = NDArray[np.float64]
 
@@ -263,7 +264,7 @@ def test_the_stated_sigma_covers_the_error() -> None:
 def test_the_turn_brings_horizontal_accelerometers_from_1_75_mg_to_0_25() -> None:
     """A zero of 0.1 deg (one sigma), a fairly level spot, a compass good to 1 deg, marks met again to 0.02 deg."""
     before_mg, after_mg, sigmas = [], [], []
-    for seed in range(200):
+    for seed in range(extent(whole=200, a_slice=100)):
         rng = np.random.default_rng([seed, 2])
         world = World(LAWS[seed % 3])
         world.rng, world.heading_deg, world.zero_deg = rng, 1.0, rng.normal(0.0, 0.1, 2)

@@ -60,7 +60,7 @@ def fly(motions: list[Motion], *, device_lag_s: float, known: Lag, until_s: floa
     aircraft = VirtualAircraft(Pose(1.0, -0.5, 40.0), site_at(40.0, 116.0, 50.0), motions=motions)
     model = ImuModel(aircraft, "icm42688p", seed=1)
     devices = {
-        "imu": (VectorNavBinary(model), make_decoder("imu", "vectornav")),
+        "imu": (VectorNavBinary(model, rate_hz=50.0), make_decoder("imu", "vectornav")),
         "gradienter": (
             Gradienter(aircraft, seed=1, law="slope", lag_s=device_lag_s),
             make_decoder("gradienter", "inclinometer_xy"),

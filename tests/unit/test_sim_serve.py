@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -55,9 +56,10 @@ def test_the_printed_configuration_is_one_the_companion_takes(tmp_path: Path) ->
     assert autopilot.gradienter is None
 
 
-@pytest.mark.parametrize("gradienter", GRADIENTERS)
-@pytest.mark.parametrize("compass", COMPASSES)
-@pytest.mark.parametrize("imu", IMUS)
+@pytest.mark.parametrize(
+    ("imu", "gradienter", "compass"),
+    [*product(list(IMUS)[:1], GRADIENTERS, COMPASSES), *product(IMUS, list(GRADIENTERS)[:1], list(COMPASSES)[:1])],
+)
 def test_the_printed_configuration_fits_every_family(tmp_path: Path, imu: str, gradienter: str, compass: str) -> None:
     scenario = demo(devices=(imu, gradienter, compass))
     printed = config.parse(configuration(scenario, directory=tmp_path, udp=None), "devices")
