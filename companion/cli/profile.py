@@ -182,7 +182,7 @@ def _notes(
         )
     if finding.still_s < SHORT_S:
         notes.append("less than 20 min at rest: an hour tells N and B, a night K too")
-    if not any(axis.per_kelvin or axis.drift_per_s for axis in finding.axes) and unseen:
+    if unseen and not any(axis.drift_per_s for axis in finding.axes):
         walking = [name for name, axis, *_ in _named(finding) if axis.fit.known[2]]
         if walking:
             notes.append(f"K of {', '.join(walking)}: may be warm-up, or the room's temperature, which is not recorded")
@@ -194,10 +194,6 @@ def _notes(
             drift = axis.drift_per_s * 3600.0 / unit
             notes.append(
                 f"{name} drifts by {drift:.3g} {unit_name} in an hour: K allows for it; --skip leaves warm-up out"
-            )
-        if axis.per_kelvin is not None:
-            notes.append(
-                f"{name} follows the temperature, {axis.per_kelvin / unit:.3g} {unit_name} per K: this is in B and K"
             )
         if axis.fit.excess is not None:
             span, ratio = axis.fit.excess

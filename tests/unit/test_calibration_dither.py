@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from companion.calibration.collector.intake import integer_batches
+from companion.calibration.collector.intake import LIMITS_IMU
 from companion.calibration.means.dither import SECONDS, STEPS, Step, combine, shifts_lsb, why_void
-from companion.calibration.seconds.batch import Batch
+from companion.calibration.seconds.batch import Batch, BatchSource
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG_H, MG
 from tests.support.still_aircraft import QUIET, imu
@@ -27,7 +27,7 @@ MEAN = np.array([0.532, -0.324, 0.779, 88.1, 51.4, -994.3])
 
 def seconds_of(rng: np.random.Generator, output_lsb: Floats, sigma: float) -> list[Batch]:
     """Six whole seconds at 50 Hz, cut toward zero."""
-    source = integer_batches(STEPS_SI, 20)
+    source = BatchSource(LIMITS_IMU, 20, steps=STEPS_SI)
     exact = output_lsb + sigma * rng.standard_normal(((SECONDS + 1) * 50, 6))
     cut = np.where(exact < 0.0, -np.floor(-exact), np.floor(exact)) * STEPS_SI
     for index, row in enumerate(cut.tolist()):

@@ -142,16 +142,6 @@ def test_a_drift_is_no_random_walk() -> None:
     assert more >= (ramp * 120.0) ** 2
 
 
-def test_what_follows_the_temperature_is_named() -> None:
-    degc = 25.0 + np.sin(2.0 * np.pi * np.arange(3600) / 1500.0)
-    still = rest_of(3600, (GYRO, ACCEL), 9, degc)
-    warm = still.means.copy()
-    warm[:, 1] += 18.0 * DEG_H * (degc - 25.0)
-    axes = fitted(Rest(still.slots, warm, degc, ())).axes
-    assert axes[1].per_kelvin == pytest.approx(18.0 * DEG_H, rel=0.3)
-    assert axes[0].per_kelvin is None
-
-
 def test_what_tells_nothing_is_refused() -> None:
     with pytest.raises(CalibrationRefusedError, match="only 30 s at rest; a profile needs 60 s"):
         fitted(rest_of(30, (GYRO, ACCEL), 10))

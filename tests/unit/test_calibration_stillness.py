@@ -13,9 +13,8 @@ from companion.calibration.seconds.batch import Batch, BatchSource
 from companion.calibration.stillness.gates import (
     GLRT_RATIO,
     ImuGate,
+    PoseGate,
     Verdict,
-    compass_gate,
-    gradienter_gate,
 )
 from companion.calibration.stillness.stretch import Stretch
 from companion.physics.units import DEG, MG
@@ -208,7 +207,7 @@ def test_a_quantised_constant_stream_is_not_stuck() -> None:
 
 def test_gradienter_gate() -> None:
     rng = np.random.default_rng(9)
-    gate = gradienter_gate()
+    gate = PoseGate("gradienter")
     for _ in range(30):
         batch = batch_of(np.round(np.array([1.0, -2.0]) + rng.normal(0.0, 0.01, (10, 2)), 2))
         assert gate.judge(batch).still
@@ -222,7 +221,7 @@ def test_gradienter_gate() -> None:
 
 
 def test_compass_gate_works_across_north() -> None:
-    gate = compass_gate()
+    gate = PoseGate("compass")
     for heading in (359.8, 0.3, 359.9):
         batch = batch_of(np.mod(np.array([[-0.2], [0.2], [0.0], [0.1]]) + heading, 360.0), circle=True)
         assert gate.judge(batch).still

@@ -8,13 +8,11 @@ from collections.abc import Sequence
 from typing import Final, Literal
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from companion.calibration.means.pose import CompassModel, FieldHeading, GradienterModel
 from companion.calibration.means.windows import ImuInput, integer_steps
 from companion.calibration.seconds.batch import Batch, BatchSource
-from companion.calibration.stillness.gates import ImuGate, PoseGate, Verdict, compass_gate, gradienter_gate
+from companion.calibration.stillness.gates import ImuGate, PoseGate, Verdict
 from companion.calibration.stillness.stretch import Lag, Settling
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 
@@ -23,7 +21,7 @@ Kind = Literal["imu", "gradienter", "compass"]
 _SILENT_S: Final = 2.5
 _CARRY: Final = 2
 """Seconds for which a slow gradienter's or compass' last reading stands."""
-_LIMITS_IMU: Final = (1e3,) * 3 + (1e4,) * 3
+LIMITS_IMU: Final = (1e3,) * 3 + (1e4,) * 3
 _LIMITS_TILT: Final = (180.0,) * 2
 _LIMITS_HEADING: Final = (1e3,)
 
@@ -134,28 +132,11 @@ class Source:
         )
 
 
-def imu_source(name: str, gate: ImuGate, keep: int) -> Source:
-    """A source of six channels: gyro in rad/s, accelerometer in m/s^2."""
-    return Source("imu", name, BatchSource(_LIMITS_IMU, keep), gate)
-
-
-def integer_batches(steps: NDArray[np.float64], keep: int) -> BatchSource:
-    """Seconds of an IMU's stream of truncated integers, (6,) steps in SI units, outside of a collector."""
-    batches = BatchSource(_LIMITS_IMU, keep)
-    batches.steps = steps
-    return batches
-
-
-def gradienter_source(keep: int, lag: Lag) -> Source:
-    """A source of two channels in degrees."""
-    batches = BatchSource(_LIMITS_TILT, keep)
-    return Source("gradienter", "gradienter", batches, gradienter_gate(), Settling(lag), keep)
-
-
-def compass_source(keep: int, lag: Lag) -> Source:
-    """A source of one heading in degrees."""
-    batches = BatchSource(_LIMITS_HEADING, keep, circle=True)
-    return Source("compass", "compass", batches, compass_gate(), Settling(lag, circle=True), keep)
+def _pose_source(name: Literal["gradienter", "compass"], keep: int, lag: Lag) -> Source:
+    """A gradienter's two channels, or a compass' heading, in degrees."""
+    circle = name == "compass"
+    batches = BatchSource(_LIMITS_HEADING if circle else _LIMITS_TILT, keep, circle=circle)
+    return Source(name, name, batches, PoseGate(name), Settling(lag, circle=circle), keep)
 
 
 class Intake(ABC):
@@ -174,8 +155,8 @@ class Intake(ABC):
         self._inputs: dict[str, ImuInput] = {}
         self._imus: dict[str, Source] = {}
         self._lags = lags
-        self._tilt = gradienter_source(keep, lags[0]) if gradienter else None
-        self._heading = compass_source(keep, lags[1]) if compass else None
+        self._tilt = _pose_source("gradienter", keep, lags[0]) if gradienter else None
+        self._heading = _pose_source("compass", keep, lags[1]) if compass else None
         self._breaks: dict[str, int] = {}
         self._field = None if field_by is None else FieldHeading(*field_by, keep)
 
@@ -242,8 +223,8 @@ class Intake(ABC):
         gate = ImuGate(imu.name, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2))
         known = self._imus.get(imu.name)
         if known is None:
-            known = self._imus[imu.name] = imu_source(imu.name, gate, self._keep)
-            known.batches.steps = integer_steps(imu)
+            batches = BatchSource(LIMITS_IMU, self._keep, steps=integer_steps(imu))
+            self._imus[imu.name] = Source("imu", imu.name, batches, gate)
             # It has no share in the seconds so far.
             self._break()
         else:
@@ -255,9 +236,9 @@ class Intake(ABC):
         """Change which pose sensors are waited for, for example when one is found dead; the IMUs' history stays."""
         added = (gradienter and self._tilt is None) or (compass and self._heading is None)
         if gradienter != (self._tilt is not None):
-            self._tilt = gradienter_source(self._keep, self._lags[0]) if gradienter else None
+            self._tilt = _pose_source("gradienter", self._keep, self._lags[0]) if gradienter else None
         if compass != (self._heading is not None):
-            self._heading = compass_source(self._keep, self._lags[1]) if compass else None
+            self._heading = _pose_source("compass", self._keep, self._lags[1]) if compass else None
         if added:
             self._break()
 

@@ -5,11 +5,11 @@ Estimates are kept while they are of use, and packed up so that they can be work
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import msgspec
 
-from companion.calibration.means.pose import FieldWindow, HeadingWindow, TiltWindow, heading_window, tilt_window
+from companion.calibration.means.pose import FieldWindow, heading_window, tilt_window
 from companion.calibration.means.windows import ImuEstimate, ImuInput, Window, imu_estimates
 from companion.calibration.seconds.batch import Batch
 from companion.errors import CalibrationRefusedError
@@ -17,15 +17,26 @@ from companion.errors import CalibrationRefusedError
 Found = list[ImuEstimate] | CalibrationRefusedError
 
 
-class Work(msgspec.Struct, frozen=True):
+class Work(msgspec.Struct, frozen=True, kw_only=True):
     """An estimate that is due; `run` touches nothing that changes, and may be called in another thread."""
 
-    run: Callable[[], Found]
+    imus: list[ImuInput]
+    batches: list[list[Batch]]
+    slots: list[int]
+    """The good seconds, the same of every IMU."""
+    horizon_s: float
     since_s: float | None
     """The window's own beginning, where it is not the whole stretch."""
-    last: int
-    """Its last second."""
     generation: int
+
+    def run(self) -> Found:
+        """Work it out."""
+        first, last = self.slots[0], self.slots[-1]
+        rejected = last - first + 1 - len(self.slots)
+        try:
+            return imu_estimates(self.imus, self.batches, end_s=last + 1.0, horizon_s=self.horizon_s, rejected=rejected)
+        except CalibrationRefusedError as error:
+            return error
 
 
 class Estimates:
@@ -33,45 +44,25 @@ class Estimates:
 
     def __init__(self) -> None:
         self._kept: dict[float | None, tuple[int, Found]] = {}
-        self._generation = 0
+        self.generation = 0
+        """Of the stretch that is under way."""
 
     def clear(self) -> None:
         """The stretch is over: what was worked out over it, or still is, is of no use."""
         self._kept.clear()
-        self._generation += 1
+        self.generation += 1
 
     def known(self, last: int, since_s: float | None) -> Found | None:
         """The estimate of a window that ends with that second or a later one; None where there is none yet."""
         kept = self._kept.get(since_s)
         return kept[1] if kept is not None and kept[0] >= last else None
 
-    def work(
-        self,
-        imus: Sequence[ImuInput],
-        batches: Sequence[Sequence[Batch]],
-        slots: Sequence[int],
-        *,
-        horizon_s: float,
-        since_s: float | None,
-    ) -> Work:
-        """Pack up the estimate of these good seconds (`slots`), the same of every IMU."""
-        last = slots[-1]
-        rejected = last - slots[0] + 1 - len(slots)
-
-        def run() -> Found:
-            try:
-                return imu_estimates(imus, batches, end_s=last + 1.0, horizon_s=horizon_s, rejected=rejected)
-            except CalibrationRefusedError as error:
-                return error
-
-        return Work(run, since_s, last, self._generation)
-
     def keep(self, work: Work, found: Found) -> None:
         """Remember what it has found, unless it comes too late."""
-        if work.generation != self._generation:
+        if work.generation != self.generation:
             return
         self._kept = {key: one for key, one in self._kept.items() if key is None or key == work.since_s}
-        self._kept[work.since_s] = (work.last, found)
+        self._kept[work.since_s] = (work.slots[-1], found)
 
 
 class PoseSeconds(msgspec.Struct, frozen=True):
@@ -118,12 +109,15 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
             raise estimates
         if self.settling is not None:
             raise CalibrationRefusedError(self.settling)
+        tilt, heading = self.tilt, self.heading
         return Window(
             start_s=float(self.slots[0]),
             end_s=self.slots[-1] + 1.0,
             imus=tuple(item.window for item in estimates),
-            tilt=self._tilt(),
-            heading=self._heading(),
+            tilt=None if tilt is None else tilt_window(tilt.some()),
+            heading=None
+            if heading is None
+            else heading_window(heading.some(), from_field=heading.from_field, wander_deg=heading.wander_deg),
             field=self.field,
         )
 
@@ -132,12 +126,3 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
         if self.heading is None:
             return self
         return msgspec.structs.replace(self, heading=msgspec.structs.replace(self.heading, wander_deg=wander_deg))
-
-    def _tilt(self) -> TiltWindow | None:
-        return None if self.tilt is None else tilt_window(self.tilt.some())
-
-    def _heading(self) -> HeadingWindow | None:
-        seconds = self.heading
-        if seconds is None:
-            return None
-        return heading_window(seconds.some(), from_field=seconds.from_field, wander_deg=seconds.wander_deg)

@@ -149,7 +149,7 @@ class RollingCollector(Intake):
         enough = False
         progress = 0.0
         if self._stretch.begun and waiting is None:
-            estimates = self._estimate(self._slots(None), late=1)
+            estimates = self._estimate_later(self._slots(None), None, late=1)()
             if isinstance(estimates, CalibrationRefusedError):
                 waiting = Obstacle(str(estimates))
             else:
@@ -321,27 +321,19 @@ class RollingCollector(Intake):
         # A stretch that has begun may have had up to a fifth rejected since.
         return len(slots) >= self._min_good or (self._stretch.begun and bool(slots))
 
-    def _estimate(self, slots: list[int], since_s: float | None = None, late: int = 0) -> Found:
-        """Computed once a second, however often it is asked for."""
-        found = self._estimates.known(slots[-1] - late, since_s)
-        if found is None:
-            work = self._work(slots, since_s)
-            found = work.run()
-            self._estimates.keep(work, found)
-        return found
-
     def _work(self, slots: list[int], since_s: float | None) -> Work:
-        return self._estimates.work(
-            [self._inputs[name] for name in self._imus],
-            [[source.batches.batches[slot] for slot in slots] for source in self._imus.values()],
-            slots,
+        return Work(
+            imus=[self._inputs[name] for name in self._imus],
+            batches=[[source.batches.batches[slot] for slot in slots] for source in self._imus.values()],
+            slots=slots,
             horizon_s=self._settings.horizon_s,
             since_s=since_s,
+            generation=self._estimates.generation,
         )
 
-    def _estimate_later(self, slots: list[int], since_s: float | None) -> Callable[[], Found]:
-        """`_estimate`, worked out when it is asked for, of what is known now."""
-        found = self._estimates.known(slots[-1], since_s)
+    def _estimate_later(self, slots: list[int], since_s: float | None, late: int = 0) -> Callable[[], Found]:
+        """Worked out when it is asked for, of what is known now; once a second, however often that is."""
+        found = self._estimates.known(slots[-1] - late, since_s)
         if found is not None:
             return lambda: found
         work = self._work(slots, since_s)

@@ -167,15 +167,16 @@ class Snapshot(msgspec.Struct, frozen=True):
 class TraceLog:
     """The latest seconds as they were judged, whatever became of them."""
 
-    def __init__(self, keep: int = MAX_SECONDS) -> None:
-        self._seconds: deque[tuple[int, bool, tuple[_Seen, ...]]] = deque(maxlen=keep)
+    def __init__(self) -> None:
+        self._seconds: deque[tuple[int, bool, tuple[_Seen, ...]]] = deque(maxlen=MAX_SECONDS)
 
     def add(self, slot: int, sources: Sequence[Source], *, good: bool) -> None:
         """Take one second that has just been judged."""
         if self._seconds and slot <= self._seconds[-1][0]:
             # The clock went back: what was before cannot be set against what comes.
             self._seconds.clear()
-        self._seconds.append((slot, good, tuple(_seen(source, slot) for source in sources)))
+        seen = (_Seen(each.kind, each.name, each.verdict, each.batches.batches.get(slot)) for each in sources)
+        self._seconds.append((slot, good, tuple(seen)))
 
     def snapshot(
         self, inputs: Mapping[str, ImuInput], started_s: float, measured_s: tuple[float, float] | None
@@ -187,10 +188,6 @@ class TraceLog:
         cut = full and self._seconds[0][0] > first
         kept = tuple(second for second in self._seconds if second[0] >= first)
         return Snapshot(kept, dict(inputs), started_s, measured_s, cut)
-
-
-def _seen(source: Source, slot: int) -> _Seen:
-    return _Seen(source.kind, source.name, source.verdict, source.batches.batches.get(slot))
 
 
 def _words(seen: _Seen | None) -> str | None:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.means.integers import integer_columns
+from companion.calibration.means.integers import IntegerColumns, integer_columns
 from companion.calibration.means.pose import FieldWindow, HeadingWindow, TiltWindow
 from companion.calibration.means.quantised import EDGE_RMS
 from companion.calibration.noise.allan import (
@@ -171,32 +171,22 @@ def estimates(
         end_s: end of the window; a ramp is evaluated here and never later.
         horizon_s: H of V(T, H).
     """
-    gyros, accels = [imu.profile.gyro for imu in imus], [imu.profile.accel for imu in imus]
+    models = [model for imu in imus for model in (imu.profile.gyro, imu.profile.accel)]
     slots = np.array([batch.slot for batch in batches[0]], dtype=np.int64)
     values = _columns([[batch.mean for batch in item] for item in batches])
     seconds = float(len(slots))
-    steps = _per_axis([imu.gyro_step_rad_s for imu in imus], [imu.accel_step_m_s2 for imu in imus])
+    steps = np.repeat([step for imu in imus for step in (imu.gyro_step_rad_s, imu.accel_step_m_s2)], 3)
     edges = np.repeat([_edges(imu) for imu in imus], 3)
     whole = integer_columns(batches, steps, np.repeat([imu.truncates for imu in imus], 6), edges)
     values = np.where(whole.of, whole.values, values)
-    flicker = _per_axis([m.flicker for m in gyros], [m.flicker for m in accels])
-    walk = _per_axis([m.walk for m in gyros], [m.walk for m in accels])
-    mean = robust_mean(values, whole.huber_c, whole.least)
-    leverage = np.full(values.shape[1], 1.0 / seconds)
-    slope = np.zeros(values.shape[1])
-    level: Floats = values
-    if len(values) >= RAMP_BATCHES:
-        times = slots.astype(np.float64) + 0.5
-        line = huber_line(times, values, end_s, whole.huber_c, whole.least)
-        # The profile of an unknown part has the floor of the worst, behind which every warm-up would hide.
-        named = np.repeat([imu.profile != PROFILES["unknown"] for imu in imus], 6)
-        ramps = is_ramp(line, len(values), np.where(named, slope_variance(flicker, walk, end_s - slots[0]), 0.0))
-        mean = np.where(ramps, line.end, mean)
-        leverage = np.where(ramps, line.end_leverage, leverage)
-        slope = np.where(ramps, line.slope, 0.0)
-        level = values - slope * (times - times.mean())[:, None]
+    flicker = np.repeat([model.flicker for model in models], 3)
+    walk = np.repeat([model.walk for model in models], 3)
+    # The profile of an unknown part has the floor of the worst, behind which every warm-up would hide.
+    named = np.repeat([imu.profile != PROFILES["unknown"] for imu in imus], 6)
+    wander = np.where(named, slope_variance(flicker, walk, end_s - slots[0]), 0.0)
+    mean, leverage, slope, level = _levelled(slots, values, end_s, whole, wander)
     measured = np.maximum(white_noise(slots, level), whole.least)
-    white = np.maximum(measured, _per_axis([m.white for m in gyros], [m.white for m in accels]))
+    white = np.maximum(measured, np.repeat([model.white for model in models], 3))
     flicker = _flicker(slots, level, measured, flicker)
     quantum, half_step = _quantisation(batches, steps)
     quantum, half_step = np.where(whole.of, whole.hidden, quantum), np.where(whole.of, whole.unknown, half_step)
@@ -207,34 +197,47 @@ def estimates(
     white_part = np.square(white) * leverage
     use = white_part + floor_variance(flicker, walk, seconds, horizon_s) + np.square(quantum) + going_on
 
-    def triad(part: slice) -> Estimate:
-        return Estimate(
-            mean=mean[part],
-            stat_variance=stat[part],
-            use_variance=use[part],
-            white_variance=white_part[part],
-            white=white[part],
-            flicker=flicker[part],
-            walk=walk[part],
-            ramp_per_s=slope[part],
-            half_step=half_step[part],
-            undecided=whole.unknown[part],
-            useless=whole.useless[part],
-            edge_rms=whole.edge_rms[part],
-        )
+    columns: dict[str, Any] = {
+        "mean": mean,
+        "stat_variance": stat,
+        "use_variance": use,
+        "white_variance": white_part,
+        "white": white,
+        "flicker": flicker,
+        "walk": walk,
+        "ramp_per_s": slope,
+        "half_step": half_step,
+        "undecided": whole.unknown,
+        "useless": whole.useless,
+        "edge_rms": whole.edge_rms,
+    }
+    triads = [
+        Estimate(**{name: figures[at : at + 3] for name, figures in columns.items()})
+        for at in range(0, 6 * len(imus), 3)
+    ]
+    return list(zip(triads[::2], triads[1::2], strict=True))
 
-    return [(triad(slice(at, at + 3)), triad(slice(at + 3, at + 6))) for at in range(0, 6 * len(imus), 6)]
+
+def _levelled(
+    slots: NDArray[np.int64], values: Floats, end_s: float, whole: IntegerColumns, wander: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Means, or the ends of ramps; their leverages; slopes, zero but of ramps; and the values without those."""
+    mean = robust_mean(values, whole.huber_c, whole.least)
+    leverage = np.full(values.shape[1], 1.0 / len(values))
+    if len(values) < RAMP_BATCHES:
+        return mean, leverage, np.zeros(values.shape[1]), values
+    times = slots.astype(np.float64) + 0.5
+    line = huber_line(times, values, end_s, whole.huber_c, whole.least)
+    ramps = is_ramp(line, len(values), wander)
+    slope = np.where(ramps, line.slope, 0.0)
+    level = values - slope * (times - times.mean())[:, None]
+    return np.where(ramps, line.end, mean), np.where(ramps, line.end_leverage, leverage), slope, level
 
 
 def _columns(values: list[list[Floats]]) -> Floats:
     """(imus, seconds, 6) as (seconds, 6 * imus)."""
     stacked = np.array(values)
     return np.asarray(stacked.transpose(1, 0, 2).reshape(stacked.shape[1], -1))
-
-
-def _per_axis(gyro: Sequence[float], accel: Sequence[float]) -> Floats:
-    """One figure a triad and IMU as one a column."""
-    return np.repeat(np.array([gyro, accel], dtype=np.float64).T.ravel(), 3)
 
 
 def _flicker(slots: NDArray[np.int64], values: Floats, white: Floats, profile: Floats) -> Floats:

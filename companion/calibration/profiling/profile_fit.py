@@ -150,10 +150,6 @@ MEAN_S: Final = 60.0
 HORIZON_S: Final = 180.0
 """The minutes for which a drift must be allowed for: a calibration's mean, and what it is used for."""
 _BLOCKS: Final = 64
-_TEMPERATURE_BLOCK_S: Final = 60
-_TEMPERATURE_LEAST_K: Final = 0.5
-_TEMPERATURE_BLOCKS: Final = 10
-_EXPLAINED: Final = 0.5
 _AXES: Final = "xyz"
 _NAMES: Final = ("N", "B", "K")
 
@@ -165,8 +161,6 @@ class AxisFinding(msgspec.Struct, frozen=True, kw_only=True):
     """Of the noise without the drift, where there is one."""
     drift_per_s: float = 0.0
     """Of the steepest stretch; zero where none is significant."""
-    per_kelvin: float | None = None
-    """How the slow part follows the temperature, where it does."""
 
 
 class Finding(msgspec.Struct, frozen=True, kw_only=True):
@@ -213,8 +207,7 @@ def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Fin
             slope = float(slopes[column])
             if abs(slope) > DRIFT_T * _slope_sigma(rest, without.figures) and abs(slope) > abs(drift):
                 drift = slope
-        kelvin = _per_kelvin(rests, column)
-        axes.append(AxisFinding(fit=without if drift else fit, drift_per_s=drift, per_kelvin=kelvin))
+        axes.append(AxisFinding(fit=without if drift else fit, drift_per_s=drift))
     models, kept = [], []
     for triad, part in TRIADS:
         model, unknown = _triad(axes[part], fallback.gyro if triad == "gyro" else fallback.accel)
@@ -283,21 +276,3 @@ def _slope_sigma(rest: Rest, figures: tuple[float, float, float]) -> float:
     covariance[np.diag_indices(_BLOCKS)] += white**2 / block
     variance = float(weights @ covariance @ weights)
     return math.sqrt(max(variance, white**2 * 12.0 / span_s**3))
-
-
-def _per_kelvin(rests: Sequence[Rest], column: int) -> float | None:
-    """Slope against temperature where it explains most of the slow part of the longest stretch; else None."""
-    rest = max(rests, key=lambda each: len(each.slots))
-    known = np.isfinite(rest.temperature_degc)
-    blocks = len(rest.slots) // _TEMPERATURE_BLOCK_S
-    if blocks < _TEMPERATURE_BLOCKS or not known.all():
-        return None
-    shape = (blocks, _TEMPERATURE_BLOCK_S)
-    kelvin = rest.temperature_degc[: blocks * _TEMPERATURE_BLOCK_S].reshape(shape).mean(axis=1)
-    values = rest.means[: blocks * _TEMPERATURE_BLOCK_S, column].reshape(shape).mean(axis=1)
-    if float(np.ptp(kelvin)) < _TEMPERATURE_LEAST_K:
-        return None
-    kelvin, values = kelvin - kelvin.mean(), values - values.mean()
-    slope = float((kelvin * values).sum() / np.square(kelvin).sum())
-    left = float(np.square(values - slope * kelvin).sum() / np.square(values).sum())
-    return slope if 1.0 - left > _EXPLAINED else None

@@ -189,12 +189,12 @@ class BatchSource:
         limits: (c,) largest believable absolute value of every channel; a sample beyond is dropped.
         keep: how many batches are kept; the oldest go first.
         circle: the single channel is an angle in degrees on [0, 360); means are taken on the circle.
+        steps: (c,) of a stream of integers, of which every second keeps how often each one came; None for floats.
     """
 
-    steps: NDArray[np.float64] | None = None
-    """(c,) of a stream of integers, of which every second keeps how often each one came; None for floats."""
-
-    def __init__(self, limits: tuple[float, ...], keep: int, *, circle: bool = False) -> None:
+    def __init__(
+        self, limits: tuple[float, ...], keep: int, *, circle: bool = False, steps: Floats | None = None
+    ) -> None:
         self.dropped: Counter[str] = Counter()
         self.batches: dict[int, Batch] = {}
         self.closed_through: int | None = None
@@ -207,6 +207,7 @@ class BatchSource:
         self._limits = np.asarray(limits)
         self._keep = keep
         self._circle = circle
+        self.steps = steps
         self._restart()
 
     def _restart(self) -> None:

@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, Literal
 
 import msgspec
 import numpy as np
@@ -296,11 +296,11 @@ class ImuGate:
 class PoseGate:
     """The gate of the gradienter (two channels, deg) or of the compass (one channel on the circle, deg)."""
 
-    def __init__(self, name: str, motion_deg: float, step_deg: float, *, circle: bool = False) -> None:
+    def __init__(self, name: Literal["gradienter", "compass"]) -> None:
         self._name = name
-        self._motion_deg = motion_deg
-        self._step_deg = step_deg
-        self._circle = circle
+        self._circle = name == "compass"
+        self._motion_deg = HEADING_MOTION_DEG if self._circle else TILT_MOTION_DEG
+        self._step_deg = HEADING_STEP_DEG if self._circle else TILT_STEP_DEG
         self.new_stretch()
 
     def new_stretch(self) -> None:
@@ -336,13 +336,3 @@ class PoseGate:
     def _deviations(self, values: list[float], first: list[float]) -> list[float]:
         differences = [value - begin for value, begin in zip(values, first, strict=True)]
         return [(each + 180.0) % 360.0 - 180.0 for each in differences] if self._circle else differences
-
-
-def gradienter_gate() -> PoseGate:
-    """The gate of the gradienter."""
-    return PoseGate("gradienter", TILT_MOTION_DEG, TILT_STEP_DEG)
-
-
-def compass_gate() -> PoseGate:
-    """The gate of the compass."""
-    return PoseGate("compass", HEADING_MOTION_DEG, HEADING_STEP_DEG, circle=True)

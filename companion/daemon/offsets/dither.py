@@ -19,12 +19,12 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.parameters.pace import has_passed, moment
 from companion.autopilot.parameters.writer import Change, ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.calibration.collector.intake import integer_batches
+from companion.calibration.collector.intake import LIMITS_IMU
 from companion.calibration.machine import Event
 from companion.calibration.means.dither import SECONDS, STEPS, Dithered, Step, combine, shifts_lsb, why_void
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.noise.allan import noise_profile
-from companion.calibration.seconds.batch import Batch
+from companion.calibration.seconds.batch import Batch, BatchSource
 from companion.calibration.solution.draft import Draft
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -195,7 +195,7 @@ class Ditherer:
             await job.pause(POLL_S)
             self._check(job, work)
         settled_s = loop.time()
-        source = integer_batches(work.steps_si, SECONDS + 2)
+        source = BatchSource(LIMITS_IMU, SECONDS + 2, steps=work.steps_si)
         deadline_s = settled_s + SECONDS + 1.0 + SLACK_S
         moved: str | None = None
 
