@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 # Tests run in two processes: the boards and machines this is made for have at least two cores. Those of the real clock
 # wait more than they work: several at once.
 JOBS ?= 2
-WAITING ?= 4
+WAITING ?= 8
 # Where it is set, every process of every test compiles the whole program anew.
 unexport PYTHONDONTWRITEBYTECODE
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -102,14 +103,17 @@ def shared_runs() -> list[Run]:
     return with_imu + [Run((next(iter(IMUS)),), name, name, shared=True) for name in GRADIENTERS if name in COMPASSES]
 
 
-PLAIN, SHARED = plain_runs(), shared_runs()
-CASES = [
-    *(("imu", name, next(run for run in PLAIN if name in run.imus)) for name in IMUS),
-    *(("gradienter", name, next(run for run in PLAIN if name == run.gradienter)) for name in GRADIENTERS),
-    *(("compass", name, next(run for run in PLAIN if name == run.compass)) for name in COMPASSES),
-    *(("imu and gradienter" if run.gradienter in run.imus else "compass and gradienter", run.gradienter, run)
-      for run in SHARED),
-]  # fmt: skip
+RUNS = [*plain_runs(), *shared_runs()]
+
+
+def cases(run: Run) -> Iterator[tuple[str, str]]:
+    """The roles, in words, and the families that a run tries."""
+    if run.shared:
+        yield "imu and gradienter" if run.gradienter in run.imus else "compass and gradienter", run.gradienter
+        return
+    yield from (("imu", name) for name in run.imus)
+    yield "gradienter", run.gradienter
+    yield "compass", run.compass
 
 
 def section(role: str, device: SerialDevice, path: Path, *more: str) -> str:
@@ -192,55 +196,41 @@ async def _calibrated(service: Service, tasks: list[asyncio.Task[None]]) -> Reco
     return job.record
 
 
-@pytest.fixture(scope="module")
-def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[Run, Outcome | BaseException]:
-    """All runs, a few at a time."""
-
-    async def main() -> dict[Run, Outcome | BaseException]:
-        gate = asyncio.Semaphore(AT_ONCE)
-
-        async def one(number: int, run: Run) -> Outcome:
-            async with gate:
-                return await carry_out(run, tmp_path_factory.mktemp("family"), number)
-
-        runs = [*PLAIN, *SHARED]
-        found = await asyncio.gather(*(one(n, run) for n, run in enumerate(runs)), return_exceptions=True)
-        return dict(zip(runs, found, strict=True))
-
-    return asyncio.run(main())
-
-
 def within(found: Any, truth: Any, sigma: Any, times: float = 4.0) -> None:
     off = np.abs(np.subtract(found, truth)) / np.asarray(sigma)
     assert off.max() < times, f"off by {off} sigma"
 
 
-@pytest.mark.parametrize(
-    ("roles", "name", "run"), CASES, ids=[f"{roles} {name}".replace(" ", "-") for roles, name, _ in CASES]
-)
-def test_a_family_on_a_pty_calibrates_right(
-    outcomes: dict[Run, Outcome | BaseException], roles: str, name: str, run: Run
-) -> None:
-    outcome = outcomes[run]
-    if isinstance(outcome, BaseException):
-        raise outcome
-    pose, devices = outcome.record.pose, outcome.devices
+@pytest.mark.parametrize("first", range(0, len(RUNS), AT_ONCE))
+def test_families_on_ptys_calibrate_right(tmp_path_factory: pytest.TempPathFactory, first: int) -> None:
+    async def main(runs: list[Run]) -> list[Outcome]:
+        folders = [tmp_path_factory.mktemp("family") for _ in runs]
+        return await asyncio.gather(*map(carry_out, runs, folders, range(first, first + AT_ONCE)))
+
+    runs = RUNS[first : first + AT_ONCE]
+    for run, outcome in zip(runs, asyncio.run(main(runs)), strict=True):
+        for roles, name in cases(run):
+            for role in roles.split(" and "):
+                check(outcome, role, name, shared=run.shared)
+
+
+def check(outcome: Outcome, role: str, name: str, *, shared: bool) -> None:
+    pose = outcome.record.pose
     assert pose is not None
-    for role in roles.split(" and "):
-        device = devices[name if role == "imu" else role]
-        assert device["good"], device
-        assert bool(device["shared_with"]) == run.shared
-        if role == "imu":
-            (imu,) = (imu for imu in outcome.record.imus if imu.name == name)
-            check_imu(imu, outcome)
-        elif role == "gradienter":
-            assert None not in (pose.theta_deg, pose.gamma_deg)
-            within((pose.theta_deg, pose.gamma_deg), (5.0, -3.0), (pose.sigma_deg.theta, pose.sigma_deg.gamma))
-            for imu in outcome.record.imus:
-                within(imu.accel_bias_m_s2, outcome.truth[imu.name].accel_m_s2, imu.accel_sigma_use_m_s2)
-        else:
-            assert pose.psi_deg is not None
-            within((pose.psi_deg - outcome.heading_deg + 180.0) % 360.0 - 180.0, 0.0, pose.sigma_deg.psi)
+    device = outcome.devices[name if role == "imu" else role]
+    assert device["good"], device
+    assert bool(device["shared_with"]) == shared
+    if role == "imu":
+        (imu,) = (imu for imu in outcome.record.imus if imu.name == name)
+        check_imu(imu, outcome)
+    elif role == "gradienter":
+        assert None not in (pose.theta_deg, pose.gamma_deg)
+        within((pose.theta_deg, pose.gamma_deg), (5.0, -3.0), (pose.sigma_deg.theta, pose.sigma_deg.gamma))
+        for imu in outcome.record.imus:
+            within(imu.accel_bias_m_s2, outcome.truth[imu.name].accel_m_s2, imu.accel_sigma_use_m_s2)
+    else:
+        assert pose.psi_deg is not None
+        within((pose.psi_deg - outcome.heading_deg + 180.0) % 360.0 - 180.0, 0.0, pose.sigma_deg.psi)
 
 
 def check_imu(imu: ImuRecord, outcome: Outcome) -> None:
@@ -256,7 +246,9 @@ def check_imu(imu: ImuRecord, outcome: Outcome) -> None:
     assert max(imu.accel_sigma_use_m_s2) < 1.5 * tilt + 1.5 * MG
 
 
-def test_every_protocol_can_be_simulated() -> None:
+def test_every_protocol_can_be_simulated_and_is_tried_in_every_role() -> None:
+    tried = {(role, name) for run in RUNS for roles, name in cases(run) for role in roles.split(" and ")}
+    assert tried == {(kind, name) for kind, names in PROTOCOLS.items() for name in names}
     assert {kind: set(names) for kind, names in PROTOCOLS.items()} == {
         "imu": set(IMUS),
         "gradienter": set(GRADIENTERS),

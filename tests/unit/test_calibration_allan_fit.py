@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import allantools
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -22,6 +21,8 @@ def curve_of(values: Floats) -> Curve:
 
 
 def test_the_deviations_are_those_of_allantools() -> None:
+    import allantools  # most of a second, as scipy.stats: not at every collection
+
     values = slow(np.random.default_rng(1), 3000, 2.0, 0.05, 9.0)
     found = curve_of(values)
     taus, deviations, _, _ = allantools.oadev(values, rate=1.0, data_type="freq", taus=list(found.spans))

@@ -9,7 +9,6 @@ import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import stats
 
 from companion.calibration.alignment.align_record import Determined, ImuAlignmentRecord
 from companion.calibration.noise.allan import noise_profile
@@ -157,6 +156,8 @@ def test_two_power_ups_say_nothing_three_guard_five_weigh() -> None:
 
 
 def test_mean_and_sigma_are_those_of_one_more_power_up() -> None:
+    from scipy import stats
+
     biases = some(12, seed=3)
     expected = found([point(bias, str(k)) for k, bias in enumerate(biases)])
     np.testing.assert_allclose(expected.value, biases.mean(axis=0), rtol=1e-9)
@@ -169,6 +170,8 @@ def test_mean_and_sigma_are_those_of_one_more_power_up() -> None:
 
 @pytest.mark.parametrize("freedom", [6, 9, 12, 27, 60, 1000])
 def test_the_gate_is_as_improbable_for_few_points_as_four_sigma_for_many(freedom: int) -> None:
+    from scipy import stats
+
     exact = stats.t.isf(stats.norm.sf(4.0), freedom)
     assert 0.9 * exact < student_limit(freedom) < 1.01 * exact
 
@@ -177,6 +180,8 @@ def test_the_gate_is_as_improbable_for_few_points_as_four_sigma_for_many(freedom
 
 
 def test_a_line_over_temperature_is_that_of_a_least_squares_fit() -> None:
+    from scipy import stats
+
     temperatures = np.array([5.0, 11.0, 14.0, 22.0, 25.0, 31.0])
     slope = np.array([18.0, -30.0, 5.0]) * DEG_H
     biases = some(6, scale=2.0 * DEG_H) + np.outer(temperatures, slope)

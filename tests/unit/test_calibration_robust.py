@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scipy import stats
 
 from companion.calibration.noise.robust import HUBER_C, huber_line, huber_mean, median, robust_mean, slope_limit
 from companion.physics.frames import Floats
@@ -112,6 +111,8 @@ def test_the_robust_mean_of_equal_values_is_their_value_and_moves_with_them() ->
 
 @pytest.mark.parametrize("count", [8, 10, 15])
 def test_the_limit_of_a_slope_in_a_short_window_is_students(count: int) -> None:
+    from scipy import stats
+
     assert slope_limit(count) == pytest.approx(stats.t.isf(0.5e-4, count - 2), rel=0.03)
     assert slope_limit(60) == 5.0
 

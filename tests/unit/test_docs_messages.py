@@ -58,7 +58,12 @@ def rows(path: Path) -> list[tuple[list[str], str]]:
 
 
 SHOWN = [shown for path in (GUIDE, TROUBLE, ALSO) for messages, _ in rows(path) for shown in messages]
-MESSAGES = all_messages()
+
+
+@pytest.fixture(scope="module")
+def said() -> list[Message]:
+    """All that the code can say."""
+    return all_messages()
 
 
 def undocumented(messages: list[Message]) -> dict[str, str]:
@@ -67,14 +72,14 @@ def undocumented(messages: list[Message]) -> dict[str, str]:
     return {shown: message.where for shown, message in wanted.items() if not any(message.is_in(line) for line in SHOWN)}
 
 
-def test_every_message_of_the_code_is_explained() -> None:
-    missing = undocumented(MESSAGES)
+def test_every_message_of_the_code_is_explained(said: list[Message]) -> None:
+    missing = undocumented(said)
     assert not missing, "explain these in docs/messages.md:\n" + "\n".join(f"{w}: {s}" for s, w in missing.items())
 
 
-def test_every_message_that_is_explained_can_be_said() -> None:
+def test_every_message_that_is_explained_can_be_said(said: list[Message]) -> None:
     lines = {line for path in (GUIDE, TROUBLE) for messages, _ in rows(path) for line in messages}
-    stale = {line for line in lines if not any(message.is_in(line) for message in MESSAGES)}
+    stale = {line for line in lines if not any(message.is_in(line) for message in said)}
     assert stale == PUT_TOGETHER
 
 
@@ -84,8 +89,8 @@ def test_every_row_says_what_to_do() -> None:
     assert len(rows(GUIDE)) > 100
 
 
-def test_what_is_left_out_is_still_said_somewhere() -> None:
-    assert {message.shown() for message in MESSAGES} >= NOT_MESSAGES
+def test_what_is_left_out_is_still_said_somewhere(said: list[Message]) -> None:
+    assert {message.shown() for message in said} >= NOT_MESSAGES
 
 
 @pytest.mark.parametrize(
