@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from companion.config.rules import is_address
 from companion.errors import StorageError
 from companion.storage.state import read_regular, write_atomically
 
@@ -133,7 +134,7 @@ class Access:
         match = re.fullmatch(r"(\[[0-9a-f:.]+\]|[^:\[\]/@\s]+)(?::\d{1,5})?", host.lower())
         if match is not None:
             bare = match[1].strip("[]").removesuffix(".")
-            if bare in self._names or _is_address(bare):
+            if bare in self._names or is_address(bare):
                 return None
         return f"not known here as {host[:80]!r}: use the board's address in numbers, or its own name"
 
@@ -156,11 +157,3 @@ class Access:
                 return "the companion was restarted: try again"
             return "wrong token: companion web-token, on the board, shows the right one"
         return None
-
-
-def _is_address(host: str) -> bool:
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        return False
-    return True
