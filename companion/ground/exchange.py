@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.commands import REMEMBER_FINAL_S
-from companion.ground.heard import Target
+from companion.ground.heard import Ack, Target
+
+if TYPE_CHECKING:
+    from companion.ground.link import GroundLink
 
 ANSWER_WITHIN_S: Final = (0.6, 0.6, 0.6, 0.6, 1.6)
 """Of each attempt. The companion answers within 0.3 s, the rest is for the radio; all attempts are made while it would
@@ -28,25 +31,6 @@ ENDED_AFTER_S: Final = 5.0
 """So long without an answer while the heartbeat shows no work: the end came and was not heard."""
 LOST_AFTER_S: Final = 20.0
 _TICK_S: Final = 0.25
-
-
-class Ack(NamedTuple):
-    """A COMMAND_ACK that is addressed to us."""
-
-    source: Target
-    command: int
-    result: int
-    progress: int
-
-
-class Wire(Protocol):
-    """What an exchange needs of the link."""
-
-    def send_command(self, target: Target, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
-        """Send COMMAND_LONG; a packet that cannot be sent is a lost packet."""
-
-    def watch_acks(self, handler: Callable[[Ack], None]) -> Callable[[], None]:
-        """Call the handler with every ACK to us; returns how to stop that."""
 
 
 class Answer(NamedTuple):
@@ -62,29 +46,35 @@ class Exchange:
     """A request under way; `run` it once.
 
     Args:
-        wire: the link.
+        link: an open one.
         target: the companion.
         command: MAV_CMD_*.
         parameters: its first parameters; the rest are 0.
         busy: whether the companion is at work, by a heartbeat later than a time; None: there was none.
+        on_progress: told how far it is and for how long nothing has come, several times a second.
     """
 
     def __init__(
-        self, wire: Wire, target: Target, command: int, *parameters: float, busy: Callable[[float], bool | None]
+        self,
+        link: GroundLink,
+        target: Target,
+        command: int,
+        *parameters: float,
+        busy: Callable[[float], bool | None],
+        on_progress: Callable[[int, float], None] = lambda percent, silent_s: None,
     ) -> None:
-        self._wire, self._target, self._command, self._busy = wire, target, command, busy
+        self._link, self._target, self._command = link, target, command
+        self._busy, self._on_progress = busy, on_progress
         self._parameters = (*parameters, *(0.0,) * (7 - len(parameters)))
         self._result: int | None = None
         self._answered = asyncio.Event()
         self._heard_s = 0.0
         self._confirmation = 0
-        self.on_progress: Callable[[int, float], None] = lambda percent, silent_s: None
-        """Told how far it is and for how long nothing has come, several times a second."""
         self.percent = 0
 
     async def run(self) -> Answer:
         """Ask and wait for the end; without an answer or a heartbeat at most 20 s."""
-        stop_watching = self._wire.watch_acks(self._take)
+        stop_watching = self._link.watch_acks(self._take)
         try:
             if not await self._begin():
                 return Answer(None, begun=False)
@@ -107,18 +97,18 @@ class Exchange:
         repeats = list(REPEAT_AFTER_S)
         while not await self._hears(_TICK_S):
             silent_s = loop.time() - self._heard_s
-            self.on_progress(self.percent, silent_s)
+            self._on_progress(self.percent, silent_s)
             if repeats and silent_s >= repeats[0]:
                 del repeats[0]
                 self._send()
             busy = self._busy(max(self._heard_s + ENDED_AFTER_S / 2, loop.time() - LOST_AFTER_S))
             if (busy is False and silent_s >= ENDED_AFTER_S) or (busy is None and silent_s >= LOST_AFTER_S):
                 return False
-        self.on_progress(self.percent, 0.0)
+        self._on_progress(self.percent, 0.0)
         return True
 
     def _send(self) -> None:
-        self._wire.send_command(self._target, self._command, self._parameters, min(self._confirmation, 255))
+        self._link.send_command(self._target, self._command, self._parameters, min(self._confirmation, 255))
         self._confirmation += 1
 
     async def _hears(self, within_s: float) -> bool:

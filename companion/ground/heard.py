@@ -8,6 +8,7 @@ from typing import Final, Literal, NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.statustext import CHUNK_BYTES, to_ascii
+from companion.links.system.listeners import Listeners, Unsubscribe
 
 FIRMWARES: Final = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot", mavlink.MAV_AUTOPILOT_PX4: "PX4"}
 _NO_VEHICLES: Final = frozenset({mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ONBOARD_CONTROLLER})
@@ -46,6 +47,15 @@ class Text(NamedTuple):
     at_s: float
 
 
+class Ack(NamedTuple):
+    """A COMMAND_ACK that is addressed to us."""
+
+    source: Target
+    command: int
+    result: int
+    progress: int
+
+
 class Vehicle(NamedTuple):
     """The autopilot as its heartbeat shows it."""
 
@@ -68,7 +78,7 @@ class Heard:
         self.heartbeats: dict[Target, Heartbeat] = {}
         self.texts: list[tuple[int, Text]] = []
         """By the companions of all vehicles, with their system ids, oldest first; the oldest beyond 200 are gone."""
-        self.on_text: Callable[[int, Text], None] = lambda system_id, text: None
+        self._listeners: Listeners[[int, Text]] = Listeners()
         self._unfinished: dict[tuple[int, int], dict[int, str]] = {}
 
     def take(self, name: str, source: Target, fields: Fields, now_s: float) -> None:
@@ -77,6 +87,10 @@ class Heard:
             self._heartbeat(source, fields, now_s)
         elif name == "STATUSTEXT" and source.component_id == self.component_id:
             self._chunk(source.system_id, fields, now_s)
+
+    def watch(self, callback: Callable[[int, Text], None]) -> Unsubscribe:
+        """Be told of every text, with its system id; returns how to stop that."""
+        return self._listeners.add(callback)
 
     def companions(self) -> list[int]:
         """The system ids of the vehicles whose companion was heard."""
@@ -143,7 +157,7 @@ class Heard:
         text = Text(_whole(fields, "severity"), to_ascii(words), now_s)
         self.texts.append((system_id, text))
         del self.texts[:-MAX_TEXTS]
-        self.on_text(system_id, text)
+        self._listeners.tell(system_id, text)
 
 
 def _is_station(beat: Heartbeat) -> bool:

@@ -24,11 +24,11 @@ from typing import Any, ClassVar, Final
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.errors import AutopilotError, ConfigError, LinkError
-from companion.ground.exchange import Ack
-from companion.ground.heard import Heard, Target
+from companion.ground.heard import Ack, Heard, Target
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.links.mavlink.signing import Signing
 from companion.links.mavlink.transport import parse_url, run_transport
+from companion.links.system.listeners import Listeners, Unsubscribe
 
 logger = logging.getLogger(__name__)
 
@@ -98,14 +98,22 @@ _HEARD: Final = ("HEARTBEAT", "STATUSTEXT", "COMMAND_ACK")
 
 
 class GroundLink:
-    """A ground station on an open link; made by `open_link`."""
+    """A ground station on an open link; made by `open_link`.
 
-    def __init__(self, sdk: Any, direct: Any, own: Target, heard: Heard) -> None:
-        self.own, self.heard = own, heard
+    Args:
+        sdk: a `mavsdk.Mavsdk`.
+        direct: its `MavlinkDirectServer`.
+        own: system and component that MAVSDK sends as.
+        heard: learns what comes.
+        unbelieved: what was dropped because of its signature, in words; empty: nothing.
+    """
+
+    def __init__(
+        self, sdk: Any, direct: Any, own: Target, heard: Heard, unbelieved: Callable[[], str] = lambda: ""
+    ) -> None:
+        self.own, self.heard, self.unbelieved = own, heard, unbelieved
         self._sdk, self._direct = sdk, direct
-        self._ack_handlers: list[Callable[[Ack], None]] = []
-        self.unbelieved: Callable[[], str] = lambda: ""
-        """What was dropped because of its signature, in words; empty: nothing."""
+        self._ack_handlers: Listeners[[Ack]] = Listeners()
         self._loop = asyncio.get_running_loop()
         for name in _HEARD:
             direct.subscribe_message(name, self._in_a_thread)
@@ -128,10 +136,9 @@ class GroundLink:
         except MavlinkDirectServerError as error:
             logger.debug("not sent: %s", error)
 
-    def watch_acks(self, handler: Callable[[Ack], None]) -> Callable[[], None]:
+    def watch_acks(self, handler: Callable[[Ack], None]) -> Unsubscribe:
         """Call the handler with every COMMAND_ACK to us; returns how to stop that."""
-        self._ack_handlers.append(handler)
-        return lambda: self._ack_handlers.remove(handler)
+        return self._ack_handlers.add(handler)
 
     async def parameters(self, target: Target) -> dict[str, float]:
         """All parameters of a component; empty when it does not answer."""
@@ -190,9 +197,9 @@ class GroundLink:
             0,
             self.own.component_id,
         ):
-            ack = Ack(source, fields.get("command", 0), fields.get("result", 0), fields.get("progress", 0))
-            for handler in [*self._ack_handlers]:
-                handler(ack)
+            self._ack_handlers.tell(
+                Ack(source, fields.get("command", 0), fields.get("result", 0), fields.get("progress", 0))
+            )
 
 
 class _Log:
@@ -242,15 +249,13 @@ async def open_link(url: str, heard: Heard, key: bytes | None = None) -> AsyncIt
     own = Target(configuration.system_id, configuration.component_id)
     with mavsdk.Mavsdk(configuration) as sdk:
         direct = MavlinkDirectServer(sdk.server_component_by_id(own.component_id))
-        link = GroundLink(sdk, direct, own, heard)
         if key is not None:
             async with open_signed(sdk, own, url, key) as signed:
-                link.unbelieved = signed.words
-                yield link
+                yield GroundLink(sdk, direct, own, heard, signed.words)
             return
         try:
             await asyncio.to_thread(sdk.add_any_connection_with_handle, f"{_SCHEMES[kind]}://{where}:{number}")
         except mavsdk.MavsdkError as error:
             hint = "; another ground station has it: docs/ground_stations.md" if "in use" in log.last_error else ""
             raise LinkError(f"{url} cannot be opened: {log.last_error or error}{hint}") from None
-        yield link
+        yield GroundLink(sdk, direct, own, heard)

@@ -79,7 +79,7 @@ class Station:
         self._target = Target(0, self._heard.component_id)
         self._interrupted = asyncio.Event()
         self._why_cancelled = ""
-        self._heard.on_text = self._on_text
+        self._heard.watch(self._on_text)
 
     @property
     def vehicle(self) -> Vehicle:
@@ -124,8 +124,10 @@ class Station:
         """
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
-        exchange = self._exchange(CALIBRATE, float(what.value), float(reboot))
-        exchange.on_progress = self._show_progress
+        exchange = Exchange(
+            self._link, self._target, CALIBRATE, float(what.value), float(reboot),
+            busy=self._is_busy, on_progress=self._show_progress,
+        )  # fmt: skip
         answer = await self._cancellable(exchange, timeout_s)
         outcome = await self._judge(answer, begun_s)
         more: dict[str, Any] = {"duration_s": round(loop.time() - begun_s, 1)}
@@ -234,8 +236,8 @@ class Station:
 
     # --- asking
 
-    def _exchange(self, command: int, *parameters: float) -> Exchange:
-        return Exchange(self._link, self._target, command, *parameters, busy=self._is_busy)
+    def _exchange(self, command: int) -> Exchange:
+        return Exchange(self._link, self._target, command, busy=self._is_busy)
 
     async def _cancellable(self, exchange: Exchange, timeout_s: float | None) -> Answer:
         """Run it; Ctrl-C or the end of the time given cancel it, and its end is waited for all the same."""

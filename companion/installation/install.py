@@ -6,7 +6,6 @@ can be done again and again.
 
 from __future__ import annotations
 
-import enum
 import hashlib
 import os
 import re
@@ -15,7 +14,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import companion
 from companion.errors import CompanionError
@@ -30,31 +29,22 @@ _STAMP: Final = "# Put here by `companion install-service`; sha256 of what follo
 _STAMPED: Final = re.compile(re.escape(_STAMP).encode() + rb"([0-9a-f]{64})\n")
 
 
-class Place(enum.Enum):
-    """Below which folder a file goes."""
-
-    LIBRARY = "lib"
-    """`lib` of a prefix: the installation's own. What the owner changes goes to /etc (`systemctl edit`)."""
-    CONFIGURATION = "etc"
-    """/etc/companion: the owner's own."""
-
-
-@dataclass(frozen=True, slots=True)
-class Shipped:
+class Shipped(NamedTuple):
     """One file: its name in `systemd/`, and where it goes."""
 
     source: str
-    place: Place
     target: str
+    """Below /etc/companion, the owner's own folder; or, where it begins with lib/, below a prefix: the installation's
+    own, of which the owner changes what he wants in /etc (`systemctl edit`)."""
 
 
-SERVICE: Final = Shipped("companion.service", Place.LIBRARY, "systemd/system/companion.service")
-RULES: Final = Shipped("rules.d/70-companion.rules", Place.LIBRARY, "udev/rules.d/70-companion.rules")
-MODULES: Final = Shipped("modules-load.d/companion.conf", Place.LIBRARY, "modules-load.d/companion.conf")
-SAMPLE: Final = Shipped("companion.toml", Place.CONFIGURATION, "companion.toml.sample")
+SERVICE: Final = Shipped("companion.service", "lib/systemd/system/companion.service")
+RULES: Final = Shipped("rules.d/70-companion.rules", "lib/udev/rules.d/70-companion.rules")
+MODULES: Final = Shipped("modules-load.d/companion.conf", "lib/modules-load.d/companion.conf")
+SAMPLE: Final = Shipped("companion.toml", "companion.toml.sample")
 OURS: Final = (SERVICE, RULES, MODULES, SAMPLE)
 """What is replaced by a new version."""
-CONFIGURATION: Final = Shipped("companion.toml", Place.CONFIGURATION, "companion.toml")
+CONFIGURATION: Final = Shipped("companion.toml", "companion.toml")
 """What is put there once and then belongs to the aircraft's owner."""
 
 
@@ -153,7 +143,7 @@ class Target:
 
     def path(self, shipped: Shipped) -> Path:
         """Where a file goes."""
-        base = "etc/companion" if shipped.place is Place.CONFIGURATION else f"{str(self.prefix).lstrip('/')}/lib"
+        base = str(self.prefix).lstrip("/") if shipped.target.startswith("lib/") else "etc/companion"
         return self.root / base / shipped.target
 
     def serial_group(self) -> str:

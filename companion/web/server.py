@@ -15,13 +15,13 @@ import re
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 import msgspec
 
 from companion import __version__
 from companion.errors import CompanionError
-from companion.links.system.connection import Backoff
+from companion.links.system.connection import Backoff, Reconnection
 from companion.links.system.request import parse_request
 from companion.web.access import (
     TOKEN_HEADER,
@@ -56,6 +56,8 @@ KERNEL_BYTES: Final = 64 * 1024
 UNHEARD_MS: Final = 10_000
 """So long the kernel waits for a viewer who acknowledges nothing: gone out of range, or asleep."""
 ACTION_WITHIN_S: Final = 10.0
+WORTH_S: Final = 10.0
+"""A page that was there for so long is tried again at once."""
 RECORDS: Final = 10
 FACE: Final = "the page's"
 """As in "cancelled by the page's cancel"."""
@@ -90,43 +92,40 @@ class Page:
         self._viewers: set[Exchange] = set()
         self._guesses, self._waiting = Guesses(), 0
         self._wake = asyncio.Event()
+        self._reconnection = Reconnection(
+            "page", Backoff(first_s=1.0, cap_s=30.0), worth_s=WORTH_S, on_state=self._on_state
+        )
 
     # --- open, and open again
 
     async def run(self) -> None:
         """Serve until cancelled; an address that is not there yet is waited for."""
-        backoff = Backoff(first_s=1.0, cap_s=30.0)
-        while True:
-            try:
-                if not self.local:
-                    self.access = Access(await self._offload(kept_token, self._directory), handed_out=False)
-                await self._serve(backoff)
-            except (OSError, CompanionError) as error:
-                words = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
-                self._failed(f"{self._host}:{self._port}: {words}")
-            except Exception:
-                logger.exception("the page met a fault of the program")
-                self._failed("internal error; the log has the details")
-            await asyncio.sleep(backoff.next_s())
+        await self._reconnection.keep(self._serve)
 
-    def _failed(self, words: str) -> None:
-        if words != self.problem:
-            logger.warning("no page: %s; trying again", words)
-        self.problem = words
-
-    async def _serve(self, backoff: Backoff) -> None:
-        server = await asyncio.start_server(self._accept, self._host, self._port, limit=KERNEL_BYTES)
+    async def _serve(self) -> str:
+        server: asyncio.Server | None = None
         try:
+            if not self.local:
+                self.access = Access(await self._offload(kept_token, self._directory), handed_out=False)
+            server = await asyncio.start_server(self._accept, self._host, self._port, limit=KERNEL_BYTES)
             self._port = server.sockets[0].getsockname()[1]
-            self.problem = None
-            backoff.reset()
-            logger.info("page: %s", self.url)
+            self._reconnection.up(self.url)
             await self._broadcast()
+        except (OSError, CompanionError) as error:
+            words = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
+            return f"{self._host}:{self._port}: {words}"
+        except Exception:
+            logger.exception("the page met a fault of the program")
+            return "internal error; the log has the details"
         finally:
-            server.close()
+            if server is not None:
+                server.close()
             for client in list(self._clients):
                 client.cancel()
             await asyncio.gather(*self._clients, return_exceptions=True)
+
+    def _on_state(self, there: bool, words: str) -> None:  # noqa: FBT001 - Reconnection's own signature
+        self.problem = None if there else words
 
     @property
     def url(self) -> str:
@@ -294,7 +293,7 @@ class Page:
         finally:
             self._viewers.discard(exchange)
 
-    async def _broadcast(self) -> None:
+    async def _broadcast(self) -> NoReturn:
         while True:
             if not self._viewers:
                 await self._wake.wait()

@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.ground.exchange import Ack
-from companion.ground.heard import Heard, Target
+from companion.ground.heard import Ack, Heard, Target
 from tests.support.component import Ground, command_message
 
 COMPANION = Target(1, 191)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
+from typing import cast
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.service import Refusal
-from companion.ground.exchange import Ack, Answer, Exchange
+from companion.ground.exchange import Answer, Exchange
+from companion.ground.heard import Ack
+from companion.ground.link import GroundLink
 from tests.support.component import (
     ACCEPTED,
     CALIBRATE,
@@ -23,17 +27,30 @@ from tests.support.ground_wire import COMPANION, StationOnTheWire, is_final
 from tests.support.virtual_time import run_virtual
 
 
-def exchange(station: StationOnTheWire, command: int = CALIBRATE, *parameters: float) -> Exchange:
-    return Exchange(station, COMPANION, command, *parameters, busy=lambda since_s: station.heard.busy(1, since_s))
+def exchange(
+    station: StationOnTheWire,
+    command: int = CALIBRATE,
+    *parameters: float,
+    on_progress: Callable[[int, float], None] = lambda percent, silent_s: None,
+) -> Exchange:
+    # As much of a GroundLink as an exchange uses.
+    link = cast("GroundLink", station)
+    return Exchange(
+        link,
+        COMPANION,
+        command,
+        *parameters,
+        busy=lambda since_s: station.heard.busy(1, since_s),
+        on_progress=on_progress,
+    )
 
 
 def test_progress_is_shown_and_the_end_is_the_companions() -> None:
     async def main() -> None:
         station = StationOnTheWire()
         async with bench(ground=station) as b:
-            one = exchange(station, CALIBRATE, 1.0)
             shown: list[int] = []
-            one.on_progress = lambda percent, silent_s: shown.append(percent)
+            one = exchange(station, CALIBRATE, 1.0, on_progress=lambda percent, silent_s: shown.append(percent))
             asking = asyncio.create_task(one.run())
             for percent in (10, 40, 95):
                 await asyncio.sleep(1.0)
@@ -153,9 +170,8 @@ def test_a_link_that_stays_away_is_given_up() -> None:
         station = StationOnTheWire()
         async with bench(ground=station) as b:
             b.service.mav_state = mavlink.MAV_STATE_CALIBRATING
-            one = exchange(station)
             silence: list[float] = []
-            one.on_progress = lambda percent, silent_s: silence.append(silent_s)
+            one = exchange(station, on_progress=lambda percent, silent_s: silence.append(silent_s))
             asking = asyncio.create_task(one.run())
             await asyncio.sleep(2.0)
             b.wire.cut = True

@@ -42,29 +42,18 @@ def parameters_of(instance: int) -> ArduPilotParameters:
     """
     if instance not in INSTANCES:
         raise AutopilotError(f"IMU {instance} is not known; allowed are {', '.join(map(str, INSTANCES))}")
-    if instance > 3:
-        return ArduPilotParameters(
-            gyro_offset=_xyz(f"INS{instance}_GYROFFS_{{}}"),
-            accel_offset=_xyz(f"INS{instance}_ACCOFFS_{{}}"),
-            accel_scale=_xyz(f"INS{instance}_ACCSCAL_{{}}"),
-            gyro_id=f"INS{instance}_GYR_ID",
-            accel_id=f"INS{instance}_ACC_ID",
-            gyro_caltemp=f"INS{instance}_GYR_CALTEMP",
-            tcal_enable=f"INS{instance}_TCAL_ENABLE",
-            use=f"INS{instance}_USE",
-        )
-    n = "" if instance == 1 else str(instance)
-    # The offsets of the first are INS_GYROFFS and INS_ACCOFFS, those of the others INS_GYR2OFFS and INS_ACC2OFFS.
-    gyro = "INS_GYRO" if instance == 1 else f"INS_GYR{n}O"
+    # INS_GYROFFS, INS_GYR2OFFS, INS4_GYROFFS; but INS_GYR1_CALTEMP, INS_TCAL1_ENABLE.
+    ins, number = (f"INS{instance}_", "") if instance > 3 else ("INS_", str(instance))
+    n = "" if instance == 1 else number
     return ArduPilotParameters(
-        gyro_offset=_xyz(f"{gyro}FFS_{{}}"),
-        accel_offset=_xyz(f"INS_ACC{n}OFFS_{{}}"),
-        accel_scale=_xyz(f"INS_ACC{n}SCAL_{{}}"),
-        gyro_id=f"INS_GYR{n}_ID",
-        accel_id=f"INS_ACC{n}_ID",
-        gyro_caltemp=f"INS_GYR{instance}_CALTEMP",
-        tcal_enable=f"INS_TCAL{instance}_ENABLE",
-        use=f"INS_USE{n}",
+        gyro_offset=_xyz(f"{ins}GYR{n}OFFS_{{}}"),
+        accel_offset=_xyz(f"{ins}ACC{n}OFFS_{{}}"),
+        accel_scale=_xyz(f"{ins}ACC{n}SCAL_{{}}"),
+        gyro_id=f"{ins}GYR{n}_ID",
+        accel_id=f"{ins}ACC{n}_ID",
+        gyro_caltemp=f"{ins}GYR{number}_CALTEMP",
+        tcal_enable=f"{ins}TCAL{number}_ENABLE",
+        use=f"{ins}USE{n}",
     )
 
 
