@@ -27,7 +27,7 @@ from companion.attitude.quaternion import (
 )
 
 FORCE_SMOOTHED_S: Final = 1.0
-"""Over so long the force's length is looked at: vibration and gusts are shorter."""
+"""The time over which the length of specific force is judged: vibration and gusts are shorter."""
 DOUBTED_SHARE: Final = 0.03
 """At so much of g off, half is believed: three times what an uncalibrated accelerometer's scale may be off by, and
 the 15 degrees of bank from which on a turn tilts more than a calibrated gyro drifts in its time."""

@@ -40,15 +40,15 @@ Phase = Literal["ground", "flight"]
 
 LEVEL_TAU_S: Final[dict[Phase, float]] = {"ground": 3.0, "flight": 30.0}
 STEADY_SHARE: Final = 0.03
-"""A compass that levels itself is read only while the force's length is within so much of g ..."""
+"""How far the length of specific force may be from g, as a share, for a compass that levels itself to be read."""
 STEADY_RAD_S: Final = math.radians(20.0)
-"""... and nothing turns faster."""
+"""How fast it may turn then."""
 COVARIANCE_STEP_S: Final = 0.2
 REST_S: Final = 1.0
 REST_SIGMAS: Final = 5.0
 """A second of rest that tells more than this of bias was none: nobody knows at once that a movement has begun."""
 KEPT_S: Final = 2.0
-"""Orientations are remembered for so long, for compass readings that come late."""
+"""How long orientations are remembered, for compass readings that come late."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

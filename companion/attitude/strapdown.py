@@ -22,7 +22,7 @@ from companion.attitude.quaternion import (
 from companion.samples import ImuSample
 
 STEP_S: Final = 0.02
-"""Length of the stretches over which specific force is averaged for the leveller."""
+"""Length of the stretches over which specific force is averaged for levelling."""
 TURN_S: Final = 0.004
 """Specific force is turned into E after so long at the latest: at 1000 deg/s that is 4 degrees, of which the mean
 direction keeps half, for as long as the turn lasts."""
@@ -31,7 +31,7 @@ GAP_S: Final = 0.1
 _ROUNDING_S: Final = 1e-6
 _ANGLE_SQUARE: Final = 1e6
 _FORCE_SQUARE: Final = 1e8
-"""Of one sample; ten times what decoders let through, so that nothing overflows here whoever calls."""
+"""Limits of one sample, squared: ten times what decoders let through, so that nothing overflows here."""
 LOST_S: Final = 1.0
 """After a longer one the attitude is not known any more."""
 

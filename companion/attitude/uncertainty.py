@@ -24,7 +24,7 @@ MANOEUVRE_M_S2: Final = {"ground": 0.05, "flight": 0.6}
 """What of the horizontal acceleration is left after averaging where it is not seen by the length of the force."""
 MANOEUVRE_LASTS_S: Final = 2.0
 HEADING_UNKNOWN_RAD: Final = math.pi / math.sqrt(3.0)
-"""One sigma of a heading that may be any."""
+"""One sigma of an unknown heading."""
 _BIAS_WANDERS_S: Final = 300.0
 """In so long a bias moves by the floor of its Allan deviation, the middle of the flat part of consumer gyros."""
 

@@ -23,9 +23,9 @@ _PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, log
 
 LINES_PER_S: Final = 0.1
 BURST: Final = 10.0
-"""Of each place in the program: more than a day at the flight line makes at once."""
+"""The most lines of each place in the program: more than a day at the flight line makes at once."""
 SAID_AFTER_S: Final = 60.0
-"""So long after the last line that was not shown the count is said with the next line of whatever place."""
+"""How long after the last suppressed line their count is added to the next line of any place."""
 
 
 @dataclasses.dataclass(slots=True)

@@ -30,7 +30,7 @@ SILENT_S: Final = 5.0
 AGAIN_S: Final = 1.0
 
 _SAID_ABOVE: Final = ("state:", "in force:", "at arming")
-"""Lines of the status that the big word and its reason have said already."""
+"""Lines of the status that repeat the headline."""
 _COLOURS: Final = {"good": "1;97;42", "wait": "1;30;103", "busy": "1;97;44", "bad": "1;97;41"}
 _SIGNS: Final = {"good": "OK ", "wait": "...", "busy": ">>>", "bad": "!!!"}
 

@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from companion.replay.still_log import StillLog
 
 LEAST_SHARE: Final = 0.90
-"""Of the minutes within 2 sigma below which a profile is not saved."""
+"""The least share of minutes within 2 sigma for a profile to be saved."""
 LEAST_MINUTES: Final = 20.0
-"""Side by side: fewer say nothing about a share of 90 %."""
+"""The least number of windows side by side: fewer say nothing about a share of 90 %."""
 SHORT_S: Final = 1200
 _UNITS: Final = {"gyro": (DEG_H, "deg/h", 1), "accel": (1e-3 * MG, "ug", 0)}
 _AXES: Final = "xyz"

@@ -99,7 +99,7 @@ class ArmAuthoriser:
 
 PERIOD_S: Final = 0.5
 PAYLOAD_TYPE: Final = 33191
-"""One of the numbers that MAVLink leaves to local use (above 32767); the payload's own mark tells it apart."""
+"""Payload type from the range that MAVLink leaves to local use (above 32767); a mark in the payload tells it apart."""
 MARK: Final = b"CMPA\x01"
 REASON_BYTES: Final = 41
 """What ArduPilot shows of an auxiliary authorisation's reason (autopilots 5.3)."""

@@ -20,9 +20,9 @@ from companion.errors import ConfigError
 
 DEFAULT_PATH = Path("/etc/companion/companion.toml")
 MOST_BYTES: Final = 64 * 1024
-"""Of the file; the sample, which says every key, has a ninth of that."""
+"""The longest configuration file; the sample, which has every key, is a ninth of that."""
 MOST_LINE: Final = 4096
-"""Characters of one line: what TOML takes to read a key grows with the square of its dots."""
+"""The most characters of a line: the time that TOML takes for a key grows with the square of its dots."""
 
 
 def load(path: Path, saved: Saved | None = None) -> Config:

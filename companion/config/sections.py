@@ -197,9 +197,9 @@ class Calibration(Section, frozen=True):
     target_accel_sigma_mg: PositiveFloat = 0.2
     at_arm: AtArm = "warn"
     max_age_min: PositiveFloat = 30.0
-    """So long after it was last seen to be right a calibration counts as fresh (method section 3, item 8)."""
+    """How long a calibration counts as fresh after it was last seen to be right (method section 3, item 8)."""
     max_temperature_change_degc: PositiveFloat = 3.0
-    """So far from the temperature at which it was seen to be right (the same)."""
+    """How far the temperature may be from the one at which it was seen to be right (the same)."""
     prior: bool = True
     """Whether earlier calibrations guard new ones, and weigh in where that betters them (docs/calibration.md)."""
 

@@ -22,24 +22,24 @@ from companion.protocols.registry import PROTOCOLS
 from companion.storage.profiles import ProfileStore
 
 IMU_RATE_HZ: Final = 100.0
-"""Asked of the autopilot for each IMU where the connection does not limit it; its own filters pass 20 Hz."""
+"""Rate asked of the autopilot for each IMU where the connection does not limit it; its own filters pass 20 Hz."""
 LEAST_IMU_RATE_HZ: Final = 10.0
 LINE_SHARE: Final = 0.5
 BITS_PER_BYTE: Final = 10.0
-"""8N1: a start bit, eight bits of data, a stop bit."""
+"""Bits on the wire for one byte (8N1): a start bit, eight bits of data, a stop bit."""
 HIGHRES_BYTES: Final = 75.0
-"""HIGHRES_IMU in MAVLink 2: 63 bytes and 12 around them."""
+"""Length of HIGHRES_IMU in MAVLink 2: 63 bytes and 12 around them."""
 VISION_BYTES: Final = 129.0
-"""VISION_POSITION_ESTIMATE likewise: 117 and 12."""
+"""Length of VISION_POSITION_ESTIMATE: 117 bytes and 12."""
 SCALED_BYTES: Final = 36.0
-"""SCALED_IMU2 or 3 likewise: 24 and 12."""
+"""Length of SCALED_IMU2 and SCALED_IMU3: 24 bytes and 12."""
 
 TILT_SIGMA_DEG: Final = 0.05
-"""Of a gradienter whose protocol names no device that is known to be worse: cell and mounting."""
+"""Sigma of a gradienter whose protocol names no device that is known to be worse: cell and mounting."""
 TILT_BY_THE_WAY_SIGMA_DEG: Final = 0.65
-"""Of the tilt that a compass or an IMU tells as well, where no document gives a figure: the HMR3300's."""
+"""Sigma of the tilt that a compass or an IMU gives as well, where no document has a figure: the HMR3300's."""
 HEADING_SIGMA_DEG: Final = 3.0
-"""Of a compass likewise: the aircraft's own iron and currents."""
+"""Sigma of a compass where no document has a figure: the aircraft's own iron and currents."""
 
 
 def settings(config: Config) -> Settings:

@@ -28,7 +28,7 @@ REPEAT_AFTER_S: Final = (1.2, 1.5, 1.8, 2.1, 2.4)
 leaves the radio the rest of the time for which the companion remembers its final answer."""
 assert max(REPEAT_AFTER_S[-1], sum(ANSWER_WITHIN_S[:-1])) < REMEMBER_FINAL_S - 0.5
 ENDED_AFTER_S: Final = 5.0
-"""So long without an answer while the heartbeat shows no work: the end came and was not heard."""
+"""How long without an answer, while the heartbeat shows no work, until the end counts as missed."""
 LOST_AFTER_S: Final = 20.0
 _TICK_S: Final = 0.25
 

@@ -15,7 +15,7 @@ _NO_VEHICLES: Final = frozenset({mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ONBOARD_
 FRESH_S: Final = 3.0
 """A heartbeat older than this says nothing about now: they come once a second, and two may be lost in a row."""
 MAX_PEERS: Final = 64
-"""Newcomers beyond these are not remembered."""
+"""The most senders that are remembered; newcomers beyond are not."""
 MAX_TEXTS: Final = 200
 _MAX_UNFINISHED: Final = 8
 

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 
 CALIBRATE, CANCEL, UNDO = mavlink.MAV_CMD_USER_1, mavlink.MAV_CMD_USER_2, mavlink.MAV_CMD_USER_3
 EVERYBODY_WITHIN_S: Final = 1.3
-"""Heartbeats come once a second: so long after the first, everybody who can be heard has been."""
+"""How long after the first heartbeat everybody in reach has been heard: heartbeats come once a second."""
 WORDS_WITHIN_S: Final = 3.0
 """For how long the words that belong to an end may follow it."""
 QUIET_S: Final = 1.0
-"""Two lines a second pass: who has been silent for so long has said all."""
+"""Silence after which a sender has said everything: two lines a second pass."""
 CANCELLED_WITHIN_S: Final = 30.0
 """A cancel waits for a safe point, and old values may have to be put back."""
 SILENCE_WORTH_A_WORD_S: Final = 3.0

@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 CHUNK_BYTES: Final = 256 * 1024
 """A second of a busy aircraft has less."""
 RESERVE_BYTES: Final = 32 * 1024 * 1024
-"""Left free on the disk: the values for undo and the records are worth more than any recording."""
+"""Bytes left free on the disk: the values for undo and the records are worth more than any recording."""
 PARTS: Final = 8
 """A ring's files are at most this part of it, so that the oldest can go without taking much along."""
 

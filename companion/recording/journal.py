@@ -33,7 +33,7 @@ from companion.recording.topics import JournalEvent
 from companion.samples import CompassSample, ImuSample, TiltSample
 
 MOST_DETAIL_BYTES: Final = 1024 * 1024
-"""Of one detail; ours have some thousand."""
+"""The most bytes of one detail; ours have some thousand."""
 
 Offsets = dict[str, ImuCalibration | None]
 
@@ -102,9 +102,9 @@ def decode(event: JournalEvent, data: bytes | None) -> Any:
 
 
 MOST_ENTRIES: Final = 12_000
-"""Some 15 s of a 200 Hz IMU beside 100 Hz telemetry: longer than a memory card stalls."""
+"""The most entries that wait: some 15 s of a 200 Hz IMU beside 100 Hz telemetry, longer than a memory card stalls."""
 MOST_BYTES: Final = 4 * 1024 * 1024
-"""Of raw bytes among them."""
+"""The most raw bytes among them."""
 
 Entry = tuple[str, float, Callable[..., bytes], tuple[Any, ...]]
 
@@ -203,7 +203,7 @@ def _event(t_s: float, event: topics.JournalEvent, detail: Any) -> bytes:
 
 
 _ID: Final = (256).to_bytes(3, "little")
-"""SETUP_SIGNING, as it stands in a MAVLink 2 header; MAVLink 1 has no such id."""
+"""Message id of SETUP_SIGNING in a MAVLink 2 header; MAVLink 1 has no such id."""
 _ID_AT: Final = 7
 _HEADER: Final = 10
 _MARKER: Final = 0xFD

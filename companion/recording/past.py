@@ -18,14 +18,14 @@ from companion.recording.journal import Entry, in_force_key
 from companion.recording.walk import decompressed
 
 LEARNED_S: Final = 65.0
-"""Beyond the longest stretch: what the gates on stillness learn from, and the tail of a movement before."""
+"""Seconds kept beyond the longest stretch: what the gates on stillness learn from, and the tail of a movement."""
 MOST_BYTES: Final = 8 * 1024 * 1024
-"""Packed. 125 s of an IMU at 1 kHz are 5 MB."""
+"""The most bytes kept, packed: 125 s of an IMU at 1 kHz are 5 MB."""
 IN_FORCE: Final = frozenset({"imu", "expect", "place", "offsets"})
 BREATH: Final = 64
-"""So many messages are made before the event loop gets a chance, should it wait for the interpreter's lock."""
+"""Messages made between two rests, in which an event loop that waits for the interpreter's lock gets it."""
 BREATH_S: Final = 2e-4
-"""Not zero: who lets go of the lock for no time at all gets it back before anybody else wakes up."""
+"""Length of a rest; with zero the lock would come back before anybody else wakes up."""
 
 Message = tuple[str, float, bytes]
 """Topic, time, JSON."""
@@ -40,7 +40,7 @@ def breathing(items: Iterable[Any]) -> Iterator[Any]:
 
 
 MOST_UNPACKED: Final = 8 * 1024 * 1024
-"""Of one second: more than may wait in the journal."""
+"""The most bytes of one second, unpacked: more than may wait in the journal."""
 _NOT_IN_IT: Final = frozenset({topics.PAST, topics.START, topics.RECORD})
 
 

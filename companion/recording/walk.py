@@ -23,11 +23,11 @@ MAGIC: Final = b"\x89MCAP0\r\n"
 _CHANNEL, _MESSAGE, _CHUNK, _ATTACHMENT, _METADATA, _DATA_END = 0x04, 0x05, 0x06, 0x09, 0x0C, 0x0F
 _HEAD: Final = struct.Struct("<BQ")
 _WHOLE_HEAD: Final = struct.Struct("<BQHIQQ")
-"""Of a message: its record's, and its own."""
+"""Bytes before a message's data: the record's header and its own."""
 MOST_BYTES: Final = 16 * 1024 * 1024
-"""Of a record in the file, and of a chunk unpacked; ours have less than one."""
+"""The most bytes of a record, and of a chunk unpacked; ours have less than one MiB."""
 MOST_TIMES: Final = 100
-"""All chunks together unpack to so many times the file at most, and one chunk's worth; ours to four times."""
+"""The most that all chunks together may unpack to, in sizes of the file, beside one chunk; ours reach four."""
 MOST_TOPICS: Final = 1024
 _NEEDS_MORE: Final = "a recording needs more than is installed: pip install 'companion[recording]'"
 

@@ -121,7 +121,7 @@ def _imu_again(imu: ImuRecord, recorded: ImuRecord | None) -> ImuRecord:
 
 
 WINDOWS_KEPT: Final = 4000
-"""Means that were taken, for a calibration that may come of them."""
+"""The most means kept for a calibration that may be made of them."""
 
 
 class Replayed(msgspec.Struct, frozen=True):

@@ -43,7 +43,7 @@ ALLOWED: Final = (
     " temperature_degc"
 )
 _LONGEST: Final = 1 << 14
-"""No line has more characters: a hundred columns have a tenth of that."""
+"""The most characters of a line: a hundred columns have a tenth of that."""
 _AROUND: Final = ' "\t\r\n'
 """What may stand around a number."""
 

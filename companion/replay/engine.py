@@ -34,7 +34,7 @@ from companion.replay.calibrations import Calibrations, Replayed
 from companion.samples import ImuSample
 
 PENDING: Final = 4000
-"""Telemetry that nobody has counted yet is remembered so long."""
+"""The most telemetry messages remembered that nobody has counted yet."""
 
 _NOT_THE_SAME: Final = "a sample does not decode as it did"
 _NOT_THERE: Final = "a sample is not in the MAVLink bytes"

@@ -28,7 +28,7 @@ TRUNCATED: Final = frozenset(
 )
 """Messages of whole mrad/s and mg: their steps hide what a profile is about."""
 BREAKING: Final = frozenset({"reset", "imu"})
-"""Events of the journal after which readings are not comparable with those before."""
+"""Events of the journal after which readings cannot be compared with those before."""
 CONTINUED_S: Final = 60.0
 """A recording that begins within so much of another's end, on the same clock, goes on with it."""
 

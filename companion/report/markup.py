@@ -11,7 +11,7 @@ import re
 from typing import Final
 
 MAX_TEXT: Final = 600
-"""Characters of one piece of text: a page stays bounded whatever a file holds."""
+"""The most characters of one piece of text: a page stays bounded whatever a file holds."""
 
 # Controls (but line breaks and tabs), direction marks and overrides, zero-width characters, lone surrogates.
 _INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")

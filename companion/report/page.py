@@ -25,12 +25,12 @@ TRIADS: Final[tuple[Triad, ...]] = ("gyro", "accel")
 AXES: Final = ("x", "y", "z")
 CLASSES: Final = ("sx", "sy", "sz")
 _MOST: Final = 1e4
-"""SI units: beyond is a damaged file, which must not squash the rest of a plot."""
+"""The largest value in a plot (SI units): what is beyond comes from a damaged file and must not squash the rest."""
 _LATEST_S: Final = 230 * 365.25 * 86400
 """The year 2200."""
 MAX_WARNINGS: Final = 40
 MAX_IMUS: Final = 4
-"""Three of an autopilot and our own; more are said, not shown: a page stays below half a megabyte."""
+"""The most IMUs shown: three of an autopilot and our own. More are mentioned: a page stays below half a megabyte."""
 
 Profiles = Mapping[str, NoiseProfile]
 """By the name of the IMU."""

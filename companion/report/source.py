@@ -13,7 +13,7 @@ from companion.storage.records import Entry, RecordStore
 from companion.storage.state import BoundedList
 
 MAX_EARLIER: Final = 60
-"""Calibrations in the drift plots of the page of one."""
+"""The most calibrations in the drift plots of a page."""
 
 
 class Storage:

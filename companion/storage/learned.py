@@ -23,7 +23,7 @@ class AlignmentStore(StateFile[align_record.AlignmentRecord]):
 
 FORMAT_VERSION: Final = 1
 KEEP_POINTS: Final = 40
-"""Of each IMU: some 30 kB."""
+"""The most points kept of each IMU: some 30 kB."""
 KEEP_IMUS: Final = 8
 
 

@@ -16,7 +16,7 @@ from companion.storage.state import read_regular
 logger = logging.getLogger(__name__)
 
 PID_FILE: Final = "daemon.pid"
-"""Only for words: what counts is the lock."""
+"""File with the holder's process id, for messages only: what counts is the lock."""
 
 
 @contextlib.contextmanager

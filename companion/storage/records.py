@@ -26,7 +26,7 @@ KEEP = 1000
 KEEP_TRACES = 200
 
 MAX_TRACE_BYTES: Final = 4_000_000
-"""Unpacked: more is none of ours."""
+"""The most bytes of a trace, unpacked; a larger one is not ours."""
 
 _NAME = re.compile(r"(\d{6,})\.json")
 _TRACE = re.compile(r"(\d{6,})\.trace\.json\.gz")

@@ -77,11 +77,11 @@ def _sync_folder(folder: Path) -> None:
 logger = logging.getLogger(__name__)
 
 MOST_BYTES: Final = 1_000_000
-"""More is none of ours: the largest, with the earlier biases, has some 240 kB."""
+"""The most bytes of a state file; the largest of ours, with the earlier biases, has some 240 kB."""
 
 ASIDE: Final = ".unusable"
 MOST_ASIDE: Final = 3
-"""Of each name; the last one makes room."""
+"""The most set-aside files of each name; the last one makes room."""
 
 UNREADABLE: Final = (ValueError, RecursionError, OverflowError, msgspec.MsgspecError)
 """What reading any bytes as JSON of a type may raise."""

@@ -29,13 +29,13 @@ TOKEN_FILE: Final = "web-token"  # noqa: S105 - a name
 _ALPHABET: Final = "23456789abcdefghjkmnpqrstuvwxyz"
 _GROUPS, _GROUP = 3, 4
 _LEAST_TOKEN: Final = _GROUPS * _GROUP
-"""Of a token that somebody chose; gaps and dashes do not count."""
+"""The least length of a token that somebody chose, without gaps and dashes."""
 FIRST_DELAY_S: Final = 0.25
 MOST_DELAY_S: Final = 5.0
 MOST_PEERS: Final = 256
 _MOST_TOKEN_BYTES: Final = 200
 _OWN_ENDINGS: Final = ("", ".local", ".lan", ".home.arpa", ".internal")
-"""Of names that nobody can register: what a hotspot or a router makes of the board's name."""
+"""Endings of names that nobody can register: what a hotspot or a router makes of the board's name."""
 
 
 def split_address(bind: str) -> tuple[str, int]:

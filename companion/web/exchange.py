@@ -13,7 +13,7 @@ from typing import Final
 import h11
 
 REQUEST_WITHIN_S: Final = 5.0
-"""Whole, head and body: whoever sends byte by byte is not waited for."""
+"""Deadline of a whole request, head and body: whoever sends byte by byte is not waited for."""
 SENT_WITHIN_S: Final = 20.0
 MAX_HEAD: Final = 8192
 MAX_BODY: Final = 4096

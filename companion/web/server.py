@@ -49,18 +49,18 @@ LEAST_S: Final = 0.1
 MAX_CONNECTIONS: Final = 48
 MAX_VIEWERS: Final = 16
 MAX_WAITING: Final = 16
-"""Answers to wrong tokens that are held back at a time."""
+"""The most answers to wrong tokens that are held back at a time."""
 MAX_WAITING_BYTES: Final = 128 * 1024
 """For one viewer, beyond what the kernel holds: ten seconds of events. Who is further behind begins anew."""
 KERNEL_BYTES: Final = 64 * 1024
 UNHEARD_MS: Final = 10_000
-"""So long the kernel waits for a viewer who acknowledges nothing: gone out of range, or asleep."""
+"""How long the kernel waits for a viewer who acknowledges nothing: gone out of range, or asleep."""
 ACTION_WITHIN_S: Final = 10.0
 WORTH_S: Final = 10.0
 """A page that was there for so long is tried again at once."""
 RECORDS: Final = 10
 FACE: Final = "the page's"
-"""As in "cancelled by the page's cancel"."""
+"""How the page is named as a sender, as in "cancelled by the page's cancel"."""
 
 
 class Page:

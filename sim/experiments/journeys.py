@@ -23,7 +23,7 @@ PAPER_DEG: Final = {"pitch": 2.0, "roll": 1.5, "heading": 5.0}
 """Section 5.2: "about 2, 1.5 and 5 degrees in 180 second"; one run."""
 AXES: Final = (("pitch", 1), ("roll", 0), ("heading", 2))
 PHONE_PLOTS: Final = 40
-"""So many seeds are drawn."""
+"""Number of seeds drawn."""
 
 
 def main(argv: Sequence[str]) -> int:

@@ -36,7 +36,7 @@ MIN_BATCHES: Final = 5
 """Of a window that was asked for with `since_s`: fewer say nothing about their own scatter."""
 
 _GRACE_S: Final = 1.0
-"""So long after its end a second waits for a source that has said nothing: the latency of a busy telemetry link."""
+"""How long after its end a second waits for a silent source: the latency of a busy telemetry link."""
 _CLOSE_S: Final = 0.25
 _MARGIN: Final = 8
 

@@ -35,7 +35,7 @@ class Kept(msgspec.Struct, frozen=True, kw_only=True):
     mean_s: int
     windows: int
     minutes: float
-    """So many windows beside one another there is room for: what the share is worth."""
+    """How many windows fit beside one another: what the share is worth."""
     rms: float
     """Of the misses, rad/s or m/s^2."""
     sigma_use: float

@@ -178,7 +178,7 @@ MAX_SAMPLES: Final = 4096
 
 _MAX_TIME_S: Final = 1e12
 _BACKWARD_SAMPLES: Final = 20
-"""So many samples in a row from the past mean that the clock went back, not that some were late."""
+"""Samples in a row from the past that mean that the clock went back, not that some were late."""
 _BACKWARD_S: Final = 2.0
 
 

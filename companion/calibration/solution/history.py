@@ -18,7 +18,7 @@ MOST_RAD_S: Final = 10.0
 MOST_M_S2: Final = 100.0
 """Of a whole bias and of its sigmas: beyond what the worst IMU could have, one with a wrong scale included."""
 NEW_AFTER: Final = 3
-"""So many power-ups in a row that contradict what was before are no outliers: the sensor is another one now."""
+"""Power-ups in a row that contradict earlier ones and are no outliers any more: the sensor is another one now."""
 SAME_START_S: Final = 60.0
 """Two power-ups whose beginnings differ by less are one: the wall clock is set in between, by a little."""
 

@@ -122,7 +122,7 @@ WEIGHS_FROM: Final = 5
 LINE_FROM: Final = 5
 LINE_OVER_K: Final = 5.0
 VALID_K: Final = 3.0
-"""So far beyond the temperatures seen the model holds (method section 3)."""
+"""How far beyond the temperatures seen the model holds (method section 3)."""
 GATE_SIGMAS: Final = 4.0
 TEMPERATURE_SIGMA_K: Final = 10.0
 """Between two calibrations of one power-up, where no temperature is told."""
@@ -131,7 +131,7 @@ CATALOGUE_SCATTER: Final[dict[Triad, float]] = {"gyro": 70.0 * DEG_H, "accel": 2
 CATALOGUE_PER_K: Final[dict[Triad, float]] = {"gyro": 54.0 * DEG_H, "accel": 0.2 * MG}
 """BMI088, the worse one of method section 2.1."""
 _AT_LEAST: Final = 0.5
-"""So much of what the points show counts as the sensor's scatter."""
+"""The least share of what the points show that counts as the sensor's scatter."""
 _IN_RUN_MEAN_S: Final = 30.0
 _SHORTEST_GAP_S: Final = 180.0
 

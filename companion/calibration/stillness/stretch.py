@@ -167,7 +167,7 @@ class Settling:
 SMOOTHED_OVER: Final = 5
 """Seconds of headings behind a value, so that noise does not look like wandering."""
 BLIND_S: Final = 5
-"""So long may others say nothing (offsets are written, and readings forgotten) before it begins anew."""
+"""How long others may say nothing (offsets are written, readings forgotten) before it begins anew."""
 
 
 class HeadingWatch:

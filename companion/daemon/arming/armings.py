@@ -22,7 +22,7 @@ from companion.storage.state import BoundedList
 logger = logging.getLogger(__name__)
 
 KEEP: Final = 200
-"""Some 400 bytes each: below 100 kB, a season of flying."""
+"""The most armings kept: a season of flying, below 100 kB at some 400 bytes each."""
 QUEUE: Final = 16
 
 

@@ -41,7 +41,7 @@ POLL_S: Final = 1.0
 SPACING_S: Final = 300.0
 """Between two automatic writes; the horizon of sigma_use is 180 s, so that nothing is lost by waiting."""
 WORTH_FOR_S: Final = 30.0
-"""So long better offsets must seem to be had before good ones are replaced."""
+"""How long better offsets must seem available before good ones are replaced."""
 PER_BOOT: Final = 12
 PER_DAY: Final = 24
 """A dozen parameters each: some 300 of the 10 000 rewrites that a page of flash is good for, spread over its log."""

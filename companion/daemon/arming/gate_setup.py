@@ -18,7 +18,7 @@ logger = logging.getLogger(__name__)
 POLL_S: Final = 1.0
 RETRY_S: Final = 30.0
 SCRIPT_STARTS_S: Final = 10.0
-"""Scripting starts some seconds after the first heartbeat."""
+"""How long the script is given to answer: scripting starts some seconds after the first heartbeat."""
 SHORTEST_TIMEOUT_S: Final = 0.5
 _PX4: Final = ("COM_ARM_AUTH_REQ", "COM_ARM_AUTH_ID", "COM_ARM_AUTH_MET", "COM_ARM_AUTH_TO")
 _SCRIPT: Final = "CMPG_ENABLE"

@@ -54,7 +54,7 @@ _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 # what a boot replaced is pushed again.
 _SETTLED_BY_MEASURING: Final = frozenset({Why.NEVER, Why.REBOOTED, Why.FAILED, Why.ALIGNED})
 SETTLED_EVERY_S: Final = 5
-"""So often the output is looked at while nothing speaks against what is in force; else every second."""
+"""How often the output is checked while nothing speaks against what is in force; otherwise every second."""
 
 
 class InForce:

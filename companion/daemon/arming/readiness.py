@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 
 POLL_S: Final = 0.25
 STEADY_S: Final = 2.0
-"""So long it must have been still when somebody arms: whoever arms has just let go of it."""
+"""How long it must have been still when somebody arms: whoever arms has just let go of it."""
 OLDEST_ANSWER_S: Final = 1.5
 """An answer that was not renewed for so long (the loop stood still) is none."""
 _IN_THE_MIDDLE: Final[dict[State, str]] = {

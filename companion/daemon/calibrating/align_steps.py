@@ -21,7 +21,7 @@ QUARTER_DEG: Final = 90.0
 LEAST_TILT_DEG: Final = 15.0
 """A tilt tells scale and misalignment from bias by what a cosine loses: little, below this."""
 APART_DEG: Final = 45.0
-"""Two tilts to sides less apart than this tell the same."""
+"""The least angle between two tilts to different sides."""
 TILTS: Final = 4
 HEADINGS: Final = 4
 

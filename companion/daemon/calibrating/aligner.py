@@ -40,12 +40,12 @@ logger = logging.getLogger(__name__)
 
 
 STAND_S: Final = 12.0
-"""Of stillness a stand: averaging beyond 10 s buys an accelerometer nothing (method section 2.3)."""
+"""Seconds of stillness for each stand: averaging beyond 10 s buys an accelerometer nothing (method section 2.3)."""
 SETTLE_S: Final = 1.0
 READING_SIGMA_DEG: Final = 0.005
 """What one mean of a gradienter is good for besides its zero (the gradienter noise of method section 3's table)."""
 GYRO_TURN_SIGMA_DEG: Final = 3.0
-"""Of a half turn by the gyros alone: scale errors of 1 %, and a turn about no vertical axis."""
+"""Sigma of a half turn by the gyros alone: scale errors of 1 %, and an axis that is not vertical."""
 SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
 

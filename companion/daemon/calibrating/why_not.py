@@ -18,10 +18,10 @@ from companion.daemon.offsets.ledger import Recovery
 from companion.links.system.budget import Budget
 
 STARTS_PER_S: Final = 1.0
-"""Nobody presses faster for long."""
+"""Requests a second that one sender may make for long: nobody presses faster."""
 BURST: Final = 10.0
 MOST_REQUESTERS: Final = 16
-"""More than an aircraft has faces and ground stations; newcomers beyond share one budget, as ids can be made up."""
+"""Senders with a budget of their own, more than an aircraft has; newcomers beyond share one, as ids can be made up."""
 
 
 class Rung(enum.Enum):

@@ -18,12 +18,12 @@ ABSENT: Final = "absent"
 FLOOD: Final = "flood"
 FLOOD_S: Final = 1.0
 RENEW_AFTER_S: Final = 2.5
-"""A sensor that streams says something every second; so soon a connection over which nothing comes is made anew."""
+"""How long a connection may be silent before it is made anew: a sensor that streams says something every second."""
 RENEW_POLLED_AFTER_S: Final = 6.0
-"""One that must be asked is given time to be asked, and to answer."""
+"""The same for a sensor that must be asked: time to be asked, and to answer."""
 GOOD_AFTER_S: Final = 1.0
 AGAIN_S: Final = 60.0
-"""How soon after its last line the same trouble is said in the detailed log only: a loose wire must not fill it."""
+"""How soon after its last line the same trouble goes to the detailed log only: a loose wire must not fill the other."""
 
 
 class SensorHealth:

@@ -24,17 +24,17 @@ logger = logging.getLogger(__name__)
 PERIOD_S: Final = 0.5
 REMEMBERED_S: Final = 300
 TILTED_DEG: Final = 3.0
-"""Far more than the mean of a second in somebody's hands is off, and 300 steps of the coarsest gradienter."""
+"""The least tilt that shows a hanging sensor: 300 steps of the coarsest gradienter, far beyond the error of a mean."""
 TILTED_SECONDS: Final = 3
 BEFORE_S: Final = 3.0
 """How long before the first of its equal headings a compass may have begun to hang: until then it was near them."""
 QUIET_S: Final = 3.0
-"""An IMU that is so far behind the others is no witness: the autopilot's, while its offsets are being written."""
+"""How far an IMU may be behind the others to be a witness; the autopilot's is while its offsets are being written."""
 LATE_S: Final = 1.0
-"""Nor is one that begins so much later than another: it has not seen how the aircraft stood."""
+"""How much later than the others an IMU may begin to be a witness: it has not seen how the aircraft stood before."""
 TURNED_DEG: Final = 15.0
 TURNING_RAD_S: Final = math.radians(12.0)
-"""Less may be a bias: what is called still may have 10 deg/s."""
+"""The least rate that counts as turning; less may be a bias, of up to 10 deg/s."""
 
 
 class Corrected(NamedTuple):

@@ -34,7 +34,7 @@ LOOK_AGAIN_S: Final = 60.0
 """How long a port-holder check stays valid."""
 HELD_AGAIN_S: Final = 5.0
 MOST_WORDS: Final = 20
-"""Different things said to one device that are told in the log."""
+"""The most different messages to one device that are logged."""
 
 _WANTED: Final[dict[Kind, str]] = {"imu": "rates", "gradienter": "tilt", "compass": "heading"}
 

@@ -43,11 +43,11 @@ _WHY: Final[dict[Reason, str]] = {
 AFTER_S: Final = 3.0
 """How long nothing of it is right before that is said: somebody else's packet is not it, nor a key being changed."""
 UNANSWERED: Final = 3
-"""Questions in a row, one a second."""
+"""Unanswered questions in a row, one a second, after which the autopilot is taken to want signatures."""
 ASK_AGAIN_S: Final = 30.0
-"""Pause before one that has answered is asked again."""
+"""Pause before an autopilot that has answered is asked again."""
 AGAIN_S: Final = 60.0
-"""Least time between two words about what changes to and fro."""
+"""The least time between two messages about what changes to and fro."""
 
 _Doubt = Literal["other key", "unsigned", "old"]
 _Kind = Literal["wants ours", "other key", "unsigned", "old"]

@@ -37,12 +37,12 @@ REQUEST_LIMIT: Final = 64 * 1024
 ANSWER_LIMIT: Final = 32 * 1024 * 1024
 REQUEST_TIMEOUT_S: Final = 5.0
 ANSWER_TIMEOUT_S: Final = 10.0
-"""So long a client may take to read before it is given up."""
+"""How long a client may take to read an answer before it is given up."""
 KERNEL_BYTES: Final = 16 * 1024
 MAX_CLIENTS: Final = 16
-"""Of each kind: those that have not asked yet, those with urgent commands, and all others."""
+"""The most connections of each kind: not asked yet, urgent commands, all others."""
 URGENT: Final = ("cancel", "status")
-"""Commands that no crowd of others keeps out."""
+"""Commands that are served however many others are connected."""
 
 
 class ControlServer:

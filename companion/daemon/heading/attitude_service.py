@@ -37,14 +37,14 @@ logger = logging.getLogger(__name__)
 TICK_S: Final = 0.1
 LOOK_S: Final = 0.5
 ATTITUDE_RATE_HZ: Final = 10.0
-"""Asked of the autopilot, for comparison."""
+"""Rate of ATTITUDE asked of the autopilot, for comparison."""
 VFR_HUD_RATE_HZ: Final = 5.0
 AIRSPEED_OLD_S: Final = 1.0
 INTERNAL: Final = "internal error; the log has the details"
 SAID_AGAIN_S: Final = 30.0
 """The same stop is not told more often."""
 SHORTEST_S: Final = 0.02
-"""ArduPilot drops what comes sooner after the one before (autopilots section 6)."""
+"""The least time between two messages: ArduPilot drops what comes sooner (autopilots section 6)."""
 SHOWN_EVERY_S: Final = 0.2
 """For people: autopilots forward these to radios that carry little."""
 RATE_SPAN_S: Final = 2.0

@@ -43,7 +43,7 @@ KEPT_S: Final = 5.0
 STOOD_S: Final = 7.0
 """How far back the seconds of an alignment may lie; five good ones are enough."""
 CHECK_EVERY_S: Final = 10.0
-"""So often what is carried is compared with how the aircraft stands."""
+"""How often the carried attitude is compared with how the aircraft stands."""
 TILT_FLOOR_RAD: Final = 0.5 * DEG
 HEADING_FLOOR_RAD: Final = 3.0 * DEG
 DISAGREES_SIGMAS: Final = 3.0

@@ -31,9 +31,9 @@ TILT_SIGMA_DEG: Final = 15.0
 DIFFERS_SIGMAS: Final = 3.0
 DIFFERS_S: Final = 5.0
 THEIR_TILT_DEG: Final = 2.0
-"""One sigma of what the autopilot's own tilt is off by; trim (AHRS_TRIM) and mounting errors are in it."""
+"""One sigma of the error of the autopilot's own tilt, with trim (AHRS_TRIM) and mounting errors."""
 THEIR_HEADING_DEG: Final = 5.0
-"""Likewise of its heading, where a compass or we give it."""
+"""One sigma of the error of its heading, where a compass or the companion gives it."""
 GOOD_S: Final = 3.0
 """After a stop everything has to be well for so long before the push begins again."""
 TOLD_TILT_DEG: Final = 4.0
@@ -42,9 +42,9 @@ TOLD_HEADING_DEG: Final = 8.0
 SMOOTHED_S: Final = 3.0
 """The two differ for moments by their filters' delays; over so long what lasts is left."""
 OLD_S: Final = 2.0
-"""Without the autopilot's attitude for so long there is no difference to speak of."""
+"""How old the autopilot's attitude may be to be compared with."""
 STEEP_RAD: Final = math.radians(60.0)
-"""Beyond it a heading tells roll and heading apart badly."""
+"""Pitch beyond which roll and heading can hardly be told apart."""
 FORGETS_PER_S: Final = 1e-4
 """The shortest delay that was seen is forgotten as two clocks may run apart."""
 _DOWN: Final[Triple] = (0.0, 0.0, 1.0)

@@ -44,7 +44,7 @@ POLL_S: Final = 0.2
 SLACK_S: Final = 6.0
 """Beyond its seconds a step may take so much longer when readings are lost."""
 MOST_VOID: Final = 6
-"""Steps that may be void in one dither before it is given up."""
+"""The most void steps in one dither before it is given up."""
 BACK_WITHIN_S: Final = 20.0
 """How long the recovery is waited for before the job ends without it."""
 

@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 SENSORS: Final[tuple[Sensor, Sensor]] = ("accel", "gyro")
 RATE_HZ: Final = 50.0
-"""Asked of the IMUs that nobody listens to otherwise."""
+"""Rate asked of IMUs that nobody listens to otherwise."""
 HEAR_S: Final = 0.4
 BEFORE_S: Final = 1.0
 SETTLE_S: Final = 1.3

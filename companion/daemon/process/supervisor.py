@@ -24,12 +24,12 @@ FEEDS_PER_LIMIT: Final = 4.0
 """A manager that gives less time than the usual is fed so often within it: one feed may be late."""
 MARGIN_S: Final = 2.0
 COMPONENT_S: Final = 5.0
-"""Its heartbeat is due every second."""
+"""Deadline of the component, whose heartbeat is due every second."""
 ESTIMATOR_S: Final = 10.0
 """A look is due every quarter of a second; a small board that solves a full window may take two."""
 
 AUTOMATIC_S: Final = 180.0
-"""It may have to read a dozen parameters over a bad radio link, each with all its retries."""
+"""Deadline of what may have to read a dozen parameters over a bad radio link, each with all its retries."""
 
 
 class Turning(Protocol):

@@ -45,11 +45,11 @@ FLUSH_S: Final = 1.0
 """What a power cut costs."""
 RETRY_S: Final = 60.0
 DEFAULT_MB: Final = 64
-"""Some 35 minutes of a 200 Hz IMU beside 100 Hz telemetry."""
+"""Default size of the ring: some 35 minutes of a 200 Hz IMU beside 100 Hz telemetry."""
 MOST_FILE_BYTES: Final = 4 << 30
 PROGRESS_S: Final = 0.5
 HANGS_S: Final = 5.0
-"""So long at most the daemon's end waits for the disk."""
+"""How long the daemon's end waits for the disk at most."""
 HOW_TO_INSTALL: Final = "recording needs more than is installed: pip install 'companion[recording]'"
 
 

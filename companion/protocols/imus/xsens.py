@@ -139,7 +139,7 @@ def _unsigned(data: bytes, size: int) -> int:
 
 
 def _numbers(data: bytes, number_format: int, count: int) -> list[float]:
-    """So many numbers in one of the four formats."""
+    """`count` numbers in one of the four formats."""
     if number_format == 2:
         if len(data) != 6 * count:
             raise RejectedError(reasons.FIELD_COUNT)

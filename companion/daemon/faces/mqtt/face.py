@@ -29,7 +29,7 @@ LOOK_S: Final = 0.2
 """The attitude goes out at every look: at most 5 a second."""
 PROGRESS_S: Final = 0.5
 FOUND_WITHIN_S: Final = 3.0
-"""So long the autopilot's system id is waited for; without it the vehicle is number 1, as on MAVLink."""
+"""How long the autopilot's system id is waited for; without it the vehicle is number 1, as on MAVLink."""
 AFTER_FAULT_S: Final = 30.0
 STATE_S: Final = 0.5
 ANSWER_AT_END_S: Final = 0.5

@@ -17,7 +17,7 @@ Transaction = str | int | None
 MAX_PAYLOAD_BYTES: Final = 4096
 MAX_TRANSACTION: Final = 128
 MAX_NUMBER: Final = 2**53
-"""Beyond it JSON numbers are not the same everywhere."""
+"""The largest integer that every reader of JSON keeps exactly."""
 MAX_SHOWN: Final = 60
 
 

@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 
 
 MAX_PENDING: Final = 8
-"""Requests that wait for their end, such as cancels of a calibration in the middle of a write."""
+"""The most requests that wait for their end, such as cancels in the middle of a write."""
 REMEMBERED: Final = 32
 REMEMBER_S: Final = 600.0
 _COMMAND = re.compile(r"[A-Za-z0-9_-]{1,32}")
