@@ -47,12 +47,6 @@ class Leveller:
         self._slope: Triple = (0.0, 0.0, 0.0)
         self._length = gravity_m_s2
 
-    def restart(self) -> None:
-        """E is NED now, and upright is as it says."""
-        self.ned_from_e = IDENTITY
-        self._force, self._slope = (0.0, 0.0, -self.gravity_m_s2), (0.0, 0.0, 0.0)
-        self._length, self.doubt = self.gravity_m_s2, 0.0
-
     def update(self, force_m_s2: Triple, span_s: float, tau_s: float) -> float:
         """Take the mean specific force (3,) in E over `span_s`; return the share of it that was believed.
 
@@ -107,10 +101,6 @@ class HeadingAid:
     def __init__(self) -> None:
         self._last_s: float | None = None
         self._refused_since_s: float | None = None
-
-    def restart(self) -> None:
-        """After an alignment."""
-        self._last_s = self._refused_since_s = None
 
     def gain(self, t_s: float, innovation_rad: float, sigma_rad: float, compass_sigma_rad: float) -> float:
         """The share of the innovation to turn by, `sigma_rad` being that of our heading; 0: it is refused.

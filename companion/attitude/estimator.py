@@ -139,8 +139,7 @@ class AttitudeEstimator:
         """
         ned_from_body = from_matrix(np.asarray(body_from_ned).T)
         self._strapdown.restart(multiply(ned_from_body, conjugate(self._sensor_from_vehicle)), t_s)
-        self._leveller.restart()
-        self._heading.restart()
+        self._leveller, self._heading = Leveller(self._settings.gravity_m_s2), HeadingAid()
         self._uncertainty.restart(np.asarray(covariance))
         self._history.clear()
         self._forget_rest()

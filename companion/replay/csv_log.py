@@ -74,34 +74,22 @@ class _Columns:
         """
         if len(fields) != len(self.names):
             raise StorageError(f"{where}: found {len(fields)} fields; allowed: {len(self.names)}, as many as columns")
-        temperature_degc = None
-        try:
-            t_s, gx, gy, gz, ax, ay, az = values = [
-                float(fields[column].strip(_AROUND)) * factor for column, factor in self._wanted
-            ]
-            if self._temperature is not None and (text := fields[self._temperature].strip(_AROUND)):
-                temperature_degc = float(text)
-                values.append(temperature_degc)
-            if all(map(math.isfinite, values)):
-                return ImuSample(t_s, (gx, gy, gz), (ax, ay, az), temperature_degc)
-        except ValueError:
-            pass
-        raise self._no_number(fields, where)
-
-    def _no_number(self, fields: Sequence[str], where: str) -> StorageError:
-        """Which of the fields is none."""
-        columns = [column for column, _ in self._wanted]
+        wanted = self._wanted
         if self._temperature is not None and fields[self._temperature].strip(_AROUND):
-            columns.append(self._temperature)
-        wrong = next((column for column in columns if not _is_number(fields[column].strip(_AROUND))), columns[0])
-        return StorageError(f"{where}: found {fields[wrong]!r} in column {self.names[wrong]}; allowed: a number")
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
+            wanted = [*wanted, (self._temperature, 1.0)]
+        values = []
+        for column, factor in wanted:
+            try:
+                value = float(fields[column].strip(_AROUND))
+            except ValueError:
+                value = math.nan
+            if not math.isfinite(value):
+                raise StorageError(
+                    f"{where}: found {fields[column]!r} in column {self.names[column]}; allowed: a number"
+                )
+            values.append(value * factor)
+        t_s, gx, gy, gz, ax, ay, az, *temperature = values
+        return ImuSample(t_s, (gx, gy, gz), (ax, ay, az), temperature[0] if temperature else None)
 
 
 def read(path: Path, columns: str | None = None) -> Iterator[ImuSample]:
@@ -112,19 +100,38 @@ def read(path: Path, columns: str | None = None) -> Iterator[ImuSample]:
     Raises:
         StorageError: one line with the number of the line, what was found and what is allowed.
     """
-    log = _Log(path, columns)
+    table = None if columns is None else _Columns(columns.split(","), "--columns")
+    separator, before_s = "", -math.inf
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            while line := file.readline(_LONGEST):
-                ended = line.endswith(("\n", "\r"))
-                if not ended and not log.empty and len(line) < _LONGEST:
+            for number, line in enumerate(iter(lambda: file.readline(_LONGEST), ""), 1):
+                where, text = f"{path}, line {number}", line.strip()
+                if len(line) == _LONGEST:
+                    raise StorageError(f"{where}: found no line end within {_LONGEST} characters")
+                if separator and not line.endswith(("\n", "\r")):
                     break  # in the middle of a number, perhaps, which then still looks like one
-                sample = log.sample(line)
-                if sample is not None:
-                    yield sample
+                if not text or text.startswith("#"):
+                    continue
+                if not separator:
+                    separator = max(",;\t", key=text.count)
+                    if table is None:
+                        if not re.search("[A-Za-z]{2}", text):
+                            raise StorageError(f"{where}: no names of columns; name them: --columns t_s,gx_rad_s,...")
+                        table = _Columns(text.split(separator), where)
+                        continue
+                    if re.search("[A-DF-Za-df-z_]{2}", text):
+                        continue  # names of its own, which --columns replaces
+                assert table is not None
+                sample = table.sample(text.split(separator), where)
+                if sample.t_s <= before_s:
+                    raise StorageError(
+                        f"{where}: time {sample.t_s:.6f} s after {before_s:.6f} s; allowed: growing times"
+                    )
+                before_s = sample.t_s
+                yield sample
     except (OSError, UnicodeDecodeError) as error:
         raise StorageError(f"{path}: cannot be read as text: {getattr(error, 'strerror', None) or error}") from None
-    if log.empty:
+    if not separator:
         raise StorageError(f"{path}: the file is empty")
 
 
@@ -143,49 +150,6 @@ def read_arrays(path: Path, columns: str | None = None) -> tuple[Floats, Floats,
         flat.extend((sample.t_s, *sample.gyro_rad_s, *sample.accel_m_s2, temperature_degc))
     table = np.frombuffer(flat).reshape(-1, 8)
     return table[:, 0].copy(), table[:, 1:7].copy(), table[:, 7].copy()
-
-
-class _Log:
-    """One pass over a file: what is known of it from the lines before."""
-
-    def __init__(self, path: Path, names: str | None) -> None:
-        self.empty = True
-        """Whether there was nothing but remarks."""
-        self._path = path
-        self._columns = None if names is None else _Columns(names.split(","), "--columns")
-        self._separator = ","
-        self._lines = 0
-        self._before_s = -math.inf
-
-    def sample(self, line: str) -> ImuSample | None:
-        """What the next line holds; None where that is no sample.
-
-        Raises:
-            StorageError: it cannot be; says where and why.
-        """
-        self._lines += 1
-        where = f"{self._path}, line {self._lines}"
-        if len(line) == _LONGEST:
-            raise StorageError(f"{where}: found no line end within {_LONGEST} characters")
-        text = line.strip()
-        if not text or text.startswith("#"):
-            return None
-        if self.empty:
-            self._separator = max(",;\t", key=text.count)
-            self.empty = False
-            if self._columns is None:
-                if not re.search("[A-Za-z]{2}", text):
-                    raise StorageError(f"{where}: no names of columns; name them: --columns t_s,gx_rad_s,...")
-                self._columns = _Columns(text.split(self._separator), where)
-                return None
-            if re.search("[A-DF-Za-df-z_]{2}", text):
-                return None  # names of its own, which --columns replaces
-        assert self._columns is not None
-        sample = self._columns.sample(text.split(self._separator), where)
-        if sample.t_s <= self._before_s:
-            raise StorageError(f"{where}: time {sample.t_s:.6f} s after {self._before_s:.6f} s; allowed: growing times")
-        self._before_s = sample.t_s
-        return sample
 
 
 MIN_STILL_S: Final = 5.0

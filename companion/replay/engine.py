@@ -23,7 +23,7 @@ from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.record import Record, from_json
 from companion.config.sections import Config
 from companion.configured import models
-from companion.configured.devices import Role, SerialDevice, collect, parts_of, serial_devices
+from companion.configured.models import Role, SerialDevice, collect, parts_of, serial_devices
 from companion.errors import CalibrationRefusedError, StorageError
 from companion.links.mavlink.link import MavlinkLink
 from companion.protocols.decoding.base import Decoder
@@ -149,24 +149,20 @@ class Replay:
             cut = self._recording.cut_short
             whose = f"{cut}, before anything was recorded" if cut else "an MCAP file, but not a recording of companion"
             raise StorageError(f"{self._recording.path}: {whose}; nothing to replay")
+        seconds = 0.0 if self._first_s is None else self._now_s - self._first_s
+        estimate = None
+        if not self._calibrations.again:
+            unix_s = float(self._versions.get("unix_s", "0"))
+            draft = Draft(datetime.datetime.fromtimestamp(unix_s, tz=datetime.UTC))
+            estimate = self._calibrations.estimate(self._collector, self._now_s, draft, seconds)
         notes = [*self._version_notes(), *self._notes, *(f"{words}: {n} times" for words, n in self._strange.items())]
         return Result(
             calibrations=self._calibrations.again,
-            estimate=None if self._calibrations.again else self._estimate(self._collector),
-            seconds=self._seconds,
+            estimate=estimate,
+            seconds=seconds,
             cut_short=self._recording.cut_short,
             notes=notes,
         )
-
-    @property
-    def _seconds(self) -> float:
-        return 0.0 if self._first_s is None else self._now_s - self._first_s
-
-    def _estimate(self, collector: RollingCollector) -> Record:
-        """What a calibration would have found at the end."""
-        unix_s = float(self._versions.get("unix_s", "0"))
-        draft = Draft(datetime.datetime.fromtimestamp(unix_s, tz=datetime.UTC))
-        return self._calibrations.estimate(collector, self._now_s, draft, self._seconds)
 
     def _version_notes(self) -> list[str]:
         ours = versions()
@@ -226,20 +222,12 @@ class Replay:
         # Samples of serial devices come from their bytes.
         return None
 
-    def _at(self, t_s: float) -> None:
-        self._now_s = t_s
-
-    @property
-    def _is_past(self) -> bool:
-        """Whether this happened before the recording was begun."""
-        return self._first_s is not None and self._now_s < self._first_s
-
     def _start(self, data: bytes) -> None:
         config = self._config
         if config is None:
             return
         entry = msgspec.json.decode(data, type=topics.StartEntry)
-        self._at(entry.t_s)
+        self._now_s = entry.t_s
         if self._first_s is None:
             self._first_s = entry.t_s
         if entry.lost:
@@ -269,7 +257,7 @@ class Replay:
 
     def _take_serial(self, name: str, data: bytes) -> None:
         raw = _raw.decode(data)
-        self._at(raw.t_s)
+        self._now_s = raw.t_s
         decoder = self._decoders[name]
         if raw.data is None:
             decoder.interrupted()
@@ -281,7 +269,7 @@ class Replay:
 
     def _take_mavlink(self, data: bytes) -> None:
         raw = _raw.decode(data)
-        self._at(raw.t_s)
+        self._now_s = raw.t_s
         if not self._autopilots:
             return  # nobody takes a sample from it
         self._telemetry.receive(raw.data, raw.t_s)
@@ -289,7 +277,8 @@ class Replay:
     def _take_telemetry(self, name: str, data: bytes) -> None:
         """A sample of the autopilot that counted."""
         sample, strange = self._telemetry.sample(msgspec.json.decode(data, type=topics.ImuEntry))
-        if strange is not None and not self._is_past:
+        happened_before = self._first_s is not None and self._now_s < self._first_s
+        if strange is not None and not happened_before:
             self._strange[f"imu {name}: {strange}"] += 1
         if self._collector is not None:
             self._collector.add_imu(name, sample)
@@ -299,7 +288,7 @@ class Replay:
         collector = self._collector
         if collector is None:
             return
-        self._at(entry.t_s)
+        self._now_s = entry.t_s
         if entry.event == "tick":
             collector.tick(entry.t_s)
             return
@@ -328,5 +317,5 @@ class Replay:
     def _take_record(self, data: bytes) -> None:
         entry = msgspec.json.decode(data, type=topics.RecordEntry)
         recorded = from_json(entry.record.encode())
-        self._at(entry.t_s)
+        self._now_s = entry.t_s
         self._calibrations.recorded(recorded)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.configured.devices import Role, SerialDevice
+from companion.configured.models import Role, SerialDevice
 from companion.daemon.devices.sensors import SerialSensor
 from companion.protocols.registry import PROTOCOLS, Kind
 from companion.samples import CompassSample, Sample, TiltSample

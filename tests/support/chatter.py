@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 from companion.calibration.collector.rolling import RollingCollector
-from companion.configured.devices import Role, SerialDevice
+from companion.configured.models import Role, SerialDevice
 from companion.daemon.devices.sensor_watch import SensorWatch
 from companion.daemon.devices.sensors import SerialSensor
 from companion.protocols.registry import PROTOCOLS

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from companion.config import parse
 from companion.config.sections import Config
-from companion.configured.devices import Role, SerialDevice, serial_devices
+from companion.configured.models import Role, SerialDevice, serial_devices
 from companion.daemon.devices import sensors
 from companion.daemon.devices.sensors import SerialSensor
 from companion.links.serial.bytestream import ByteLink

@@ -96,7 +96,7 @@ class Draft:
             accel_bias_m_s2=_axes(accel),
             accel_sigma_stat_m_s2=_axes(estimate.accel_sigma_stat_m_s2 if has_accel else None),
             accel_sigma_use_m_s2=_axes(estimate.accel_sigma_use_m_s2 if has_accel else None),
-            covariance=_covariance(estimate.covariance, gyro=has_gyro, accel=has_accel),
+            covariance=_where_known(estimate.covariance, _known(estimate), _known(estimate)),
             residual_gyro_rad_s=_axes(estimate.gyro_rad_s if owner_corrects else None),
             residual_accel_m_s2=_axes(estimate.accel_m_s2 if owner_corrects else None),
             warnings=(*estimate.warnings, *self.imu_warnings.get(estimate.name, ())),
@@ -111,23 +111,19 @@ def _axes(values: Array | None) -> Vector | None:
     return None if values is None else vector(values)
 
 
-def _covariance(matrix: Matrix, *, gyro: bool, accel: bool) -> tuple[tuple[float | None, ...], ...] | None:
-    if not gyro and not accel:
-        return None
-    known = [gyro] * 3 + [accel] * 3
-    return _where_known(matrix, known, known)
+def _known(imu: ImuSolution) -> list[bool]:
+    return [imu.gyro_rad_s is not None] * 3 + [imu.accel_m_s2 is not None] * 3
 
 
 def _cross(solution: Solution) -> tuple[CrossCovariance, ...]:
-    known = {imu.name: [imu.gyro_rad_s is not None] * 3 + [imu.accel_m_s2 is not None] * 3 for imu in solution.imus}
-    return tuple(
-        CrossCovariance(imus=(one, other), covariance=_where_known(matrix, known[one], known[other]))
-        for (one, other), matrix in solution.cross.items()
-        if any(known[one]) and any(known[other])
-    )
+    known = {imu.name: _known(imu) for imu in solution.imus}
+    found = {pair: _where_known(matrix, *(known[name] for name in pair)) for pair, matrix in solution.cross.items()}
+    return tuple(CrossCovariance(imus=pair, covariance=matrix) for pair, matrix in found.items() if matrix is not None)
 
 
-def _where_known(matrix: Matrix, rows: list[bool], columns: list[bool]) -> tuple[tuple[float | None, ...], ...]:
+def _where_known(matrix: Matrix, rows: list[bool], columns: list[bool]) -> tuple[tuple[float | None, ...], ...] | None:
+    if not any(rows) or not any(columns):
+        return None
     return tuple(tuple(float(matrix[i, j]) if rows[i] and columns[j] else None for j in range(6)) for i in range(6))
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from companion.config.sections import Config
-from companion.configured.devices import serial_devices
+from companion.configured.models import serial_devices
 from companion.errors import LinkError
 from companion.links.serial.faults import port_faults, same_ports, unnamed
 from companion.links.serial.listening import Heard, listen

@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from companion.configured.devices import Role, SerialDevice, parts_of
+from companion.configured.models import Role, SerialDevice, parts_of
 from companion.daemon.core import Offload
 from companion.daemon.devices.sensor_health import SensorHealth, line_of
 from companion.links.serial.bytestream import ByteLink

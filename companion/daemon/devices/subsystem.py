@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from companion.autopilot.firmware.imu_calibration import accel_taken_off
 from companion.autopilot.firmware.px4 import SlotMemory
 from companion.configured import models
-from companion.configured.devices import Role, collect, serial_devices
+from companion.configured.models import Role, collect, serial_devices
 from companion.daemon.core import Core, Subsystem, Task
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.devices.reach import Reach
