@@ -56,8 +56,6 @@ _REFUSALS = {
     "nothing_to_undo": mavlink.MAV_RESULT_DENIED,
     "other": mavlink.MAV_RESULT_DENIED,
     "busy": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
-    # The service calls it the same, but we have no job whose end we could promise an ACK for.
-    "same": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
 }
 _WORDS = {
     What.BOTH: "gyros and accelerometers",
@@ -264,17 +262,7 @@ class CommandServer:
     def _finish(self, running: _Running, now_s: float) -> None:
         """Acknowledge the end. Its words are the service's: it knows the ends of jobs that others asked for too."""
         self._running = None
-        finished = running.job.finished
-        if finished.cancelled():
-            outcome, words = "cancelled", "Cancelled"
-        elif (error := finished.exception()) is not None:
-            logger.error("a job ended with an error", exc_info=error)
-            outcome, words = "failed", "Failed: internal error, see the log"
-        else:
-            outcome, words = finished.result().outcome, ""
-        if words:
-            self._say(Severity.ERROR, words, Weight.RESULT)
-        self._finally(running.key, _RESULTS[outcome], now_s)
+        self._finally(running.key, _RESULTS[running.job.finished.result().outcome], now_s)
 
     def _refuse(
         self, key: requests.Key, result: int, reason: str, now_s: float, severity: Severity = Severity.WARNING

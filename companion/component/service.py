@@ -22,7 +22,7 @@ WRITTEN_PERCENT: Final = 80.0
 class Refusal(msgspec.Struct, frozen=True):
     """Why a request was not taken; `reason` is one line for people, without a leading "refused"."""
 
-    kind: Literal["armed", "unknown", "busy", "same", "nothing_to_undo", "other"]
+    kind: Literal["armed", "unknown", "busy", "nothing_to_undo", "other"]
     reason: str
 
 

@@ -49,7 +49,6 @@ class Severity(enum.IntEnum):
     WARNING = 4
     NOTICE = 5
     INFO = 6
-    DEBUG = 7
 
 
 class Weight(enum.IntEnum):

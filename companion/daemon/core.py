@@ -42,11 +42,8 @@ class Wanted:
         """Whether results are written to the autopilot."""
         self.settings = models.settings(config)
         """How good is good enough."""
-        self._listeners: Listeners[Settings] = Listeners()
-
-    def watch(self, retarget: Callable[[Settings], object]) -> None:
-        """Tell when something else is good enough."""
-        self._listeners.add(retarget)
+        self.on_retarget: Listeners[Settings] = Listeners()
+        """Told when something else is good enough."""
 
     def switch(self, *, at_arm: AtArm | None = None, push: bool | None = None) -> None:
         """Change what happens at arming, or whether results are written."""
@@ -56,7 +53,7 @@ class Wanted:
     def retarget(self, **targets: float) -> None:
         """Change how good is good enough: `target_...` as in `Settings`."""
         self.settings = msgspec.structs.replace(self.settings, **targets)
-        self._listeners.tell(self.settings)
+        self.on_retarget.tell(self.settings)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

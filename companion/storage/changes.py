@@ -17,7 +17,6 @@ import msgspec
 
 from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.autopilot.parameters.change import Change
-from companion.autopilot.vehicle.vehicle import Firmware
 from companion.storage.state import StateFile, remove_durably, write_atomically
 
 _UNDO: Final = re.compile(r"undo-(\d{1,3})\.json")
@@ -86,11 +85,6 @@ class ChangeLog:
         """Of all vehicles of which there is one."""
         numbers = [match[1] for match in map(_UNDO.fullmatch, self._names()) if match]
         return [self.undo_of(int(number)) for number in sorted(numbers) if number == str(int(number))]
-
-    def strange_to(self, firmware: Firmware | None, changes: ChangeSet) -> list[str]:
-        """The parameters that we never write on this firmware."""
-        known = CALIBRATION.get(firmware or "other", {})
-        return [name for name in changes.names if name not in known]
 
     def check_writable(self) -> None:
         """Find out now, not at the first write, whether anything can be kept here.

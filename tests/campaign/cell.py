@@ -260,7 +260,7 @@ class _Course:
             job = stage.service.calibrating.conductor.job
             if job is not None and not job.finished.done():
                 return f"the {job.kind} still runs: {job.words}"
-            if stage.service.offsets.recovery.pending:
+            if stage.service.offsets.ledger.pending:
                 return "old values are still to be put back"
             return ""
 

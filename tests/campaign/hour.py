@@ -159,7 +159,7 @@ async def _to_rest(stage: Stage) -> None:
     conductor = stage.service.calibrating.conductor
     await asyncio.sleep(5.0)
     await stage.until(
-        lambda: (conductor.job is None or conductor.job.finished.done()) and not stage.service.offsets.recovery.pending,
+        lambda: (conductor.job is None or conductor.job.finished.done()) and not stage.service.offsets.ledger.pending,
         240.0,
     )
 

@@ -290,7 +290,7 @@ def test_a_dither_that_is_interrupted_leaves_the_offsets_as_they_were(tmp_path: 
             result = await job.finished
             assert result.outcome == ("cancelled" if fate is cancelled else "failed"), result
             assert "put back" in result.reason or "NOT back" in result.reason
-            await rig.until(lambda: not rig.service.offsets.recovery.pending, 120.0)
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 120.0)
             assert offsets(rig) == before
             assert ChangeLog(tmp_path).journal.read() is None
             if fate is cancelled:
@@ -319,7 +319,7 @@ def test_a_daemon_killed_in_the_middle_of_a_dither_puts_the_offsets_back_at_its_
         for name, value in in_force.items():
             again.double.set_parameter(name, value)
         async with again.running():
-            await again.until(lambda: not again.service.offsets.recovery.pending, 30.0)
+            await again.until(lambda: not again.service.offsets.ledger.pending, 30.0)
             assert offsets(again) == before
         assert not journal.exists()
 
@@ -358,7 +358,7 @@ def test_an_offset_that_somebody_else_sets_during_the_dither_stays_as_set(tmp_pa
             rig.double.write_as_another_station(NAMES[5], 0.0123)
             result = await job.finished
             assert result.outcome == "failed"
-            await rig.until(lambda: not rig.service.offsets.recovery.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
             assert offsets(rig) == {**before, NAMES[5]: float(np.float32(0.0123))}
 
     run_virtual(main())

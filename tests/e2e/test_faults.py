@@ -83,7 +83,7 @@ def test_an_autopilot_that_does_not_answer_for_one_parameter(tmp_path: Path, ver
             assert "no answer" in result.reason
             rig.double.faults.ignore = set()
             await rig.until(lambda: values(rig.double) == before, 60.0)
-            await rig.until(lambda: not rig.service.offsets.recovery.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
 
     run_virtual(main())
 
@@ -129,7 +129,7 @@ def test_arming_in_the_middle_of_the_write_is_reported_and_mended_once_disarmed(
                 assert name in result.reason
                 assert record.imus[0].written[name].outcome == "failed"
             assert len(rig.double.writes) == 2  # the arming came with the second write; there was no third
-            assert rig.service.offsets.recovery.pending
+            assert rig.service.offsets.ledger.pending
             refusal = rig.service.calibrating.conductor.start_calibration(What.BOTH, "test")
             assert isinstance(refusal, Refusal)
             assert refusal.kind == "armed"
@@ -137,7 +137,7 @@ def test_arming_in_the_middle_of_the_write_is_reported_and_mended_once_disarmed(
             await asyncio.sleep(20.0)
             assert len(rig.double.writes) == writes  # armed: hands off, however long it takes
             rig.double.disarm()
-            await rig.until(lambda: not rig.service.offsets.recovery.pending, 20.0)
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 20.0)
             assert values(rig.double) == before
             await rig.until(lambda: any("put back" in text for text in rig.ground.texts()), 5.0)
 
@@ -154,7 +154,7 @@ def test_a_write_interrupted_by_a_power_cut_is_mended_at_the_next_start(tmp_path
     async def main() -> None:
         half_written = dict(zip(names[:2], afters[:2], strict=True))
         async with Rig(tmp_path, parameters={**dict.fromkeys(names, 0.0), **half_written}).running() as rig:
-            await rig.until(lambda: not rig.service.offsets.recovery.pending, 20.0)
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 20.0)
             assert [rig.double.parameter(name) for name in names] == [0.0, 0.0, 0.0]
             assert ChangeLog(tmp_path).journal.read() is None
 
@@ -168,7 +168,7 @@ def test_values_that_somebody_else_has_set_since_are_left_alone(tmp_path: Path) 
 
     async def main() -> None:
         async with Rig(tmp_path, parameters=dict.fromkeys(names, 0.0025)).running() as rig:
-            await rig.until(lambda: not rig.service.offsets.recovery.pending, 20.0)
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 20.0)
             assert rig.double.writes == []
             assert any("left alone" in text for text in rig.ground.texts())
 
@@ -289,7 +289,7 @@ def test_cancelled_anywhere_nothing_is_left_changed(tmp_path: Path, state: State
             assert result.outcome == "cancelled"
             assert "the test" in result.reason
             assert values(rig.double) == before
-            assert not rig.service.offsets.recovery.pending
+            assert not rig.service.offsets.ledger.pending
             assert rig.service.calibrating.conductor.state is State.CANCELLED
             assert not rig.service.calibrating.conductor.cancel("the test")
 
@@ -311,9 +311,9 @@ def test_cancelled_and_armed_at_once_the_old_values_come_back_once_disarmed(tmp_
             assert "old values NOT back in INS_" in result.reason
             assert result.reason.endswith(": will be once disarmed")
             assert values(rig.double) != before
-            assert rig.service.offsets.recovery.pending
+            assert rig.service.offsets.ledger.pending
             rig.double.disarm()
-            await rig.until(lambda: not rig.service.offsets.recovery.pending, 20.0)
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 20.0)
             assert values(rig.double) == before
 
     run_virtual(main())
@@ -439,7 +439,7 @@ def test_a_disk_that_fills_up_during_the_calibration_leaves_the_old_values(
             assert "No space left on device" in result.reason
             assert job.record is not None
             assert outcomes(job.record) == {"rolled_back"}
-            await rig.until(lambda: values(rig.double) == before and not rig.service.offsets.recovery.pending, 30.0)
+            await rig.until(lambda: values(rig.double) == before and not rig.service.offsets.ledger.pending, 30.0)
 
     run_virtual(main())
 
@@ -474,7 +474,7 @@ def test_an_undo_that_a_power_cut_interrupted_is_finished_and_is_not_there_to_un
 
     async def main() -> None:
         async with Rig(tmp_path, parameters={names[0]: 0.0, names[1]: 0.0078125, names[2]: 0.0078125}).running() as rig:
-            await rig.until(lambda: not rig.service.offsets.recovery.pending, 20.0)
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 20.0)
             assert [rig.double.parameter(name) for name in names] == [0.0, 0.0, 0.0]
             refusal = rig.service.calibrating.conductor.start_undo("test")
             assert isinstance(refusal, Refusal)
@@ -528,7 +528,7 @@ def test_a_daemon_that_died_while_the_firmware_calibrated_its_gyros_puts_their_o
             await asyncio.sleep(runs_s)
             for name in names:
                 rig.double.set_parameter(name, 0.001)
-            await rig.until(lambda: not rig.service.offsets.recovery.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
             await asyncio.sleep(1.0)
             assert [rig.double.parameter(name) for name in names] == [0.0, 0.0, 0.0]
 

@@ -269,7 +269,7 @@ def test_a_reboot_in_any_phase_leaves_the_old_values_or_says_what_the_boot_has_m
             rig.double.reboot(down_s=1.0)
             result = await job.finished
             assert result.outcome == "failed", result
-            await rig.until(lambda: not rig.service.offsets.recovery.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
             after = imu_parameters(rig)
             differ = {name for name in before if after[name] != before[name]}
             if gyr_cal:
@@ -296,7 +296,7 @@ def test_a_reboot_in_the_middle_of_the_calibration_itself(tmp_path: Path) -> Non
             result, _ = await calibrated(rig)
             assert result.outcome == "failed"
             assert "restarted" in result.reason or "rebooted" in result.reason
-            await rig.until(lambda: not rig.service.offsets.recovery.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
             assert imu_parameters(rig) == before
 
     run_virtual(main())
@@ -319,7 +319,7 @@ def test_a_daemon_that_died_during_the_firmwares_calibration_puts_everything_bac
         (folder / "journal.json").write_bytes(journal)
         left = {name: coarse if "GYR" in name and "OFFS" in name else value for name, value in left.items()}
         async with make(folder, auxiliary=True, parameters=left).running() as rig:
-            await rig.until(lambda: not rig.service.offsets.recovery.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
             assert imu_parameters(rig) == before
             assert not (folder / "journal.json").exists()
 
@@ -344,7 +344,7 @@ def test_a_daemon_that_died_after_it_leaves_alone_what_others_have_changed_since
     async def again(before: dict[str, float], left: dict[str, float]) -> None:
         assert left[foreign] != before[foreign]
         async with make(second, auxiliary=True, parameters={**left, foreign: 0.0025}).running() as rig:
-            await rig.until(lambda: not rig.service.offsets.recovery.pending, 60.0)
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
             assert imu_parameters(rig) == {**before, foreign: np.float32(0.0025)}
 
     run_virtual(again(*run_virtual(until_it_dies())))
@@ -359,7 +359,7 @@ def test_a_fifth_of_all_packets_lost_leaves_the_whole_result_or_the_old_values(t
             before = imu_parameters(rig)
             rig.wire.loss = 0.2
             result, _ = await calibrated(rig)
-            await rig.until(lambda: not rig.service.offsets.recovery.pending, 120.0)
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 120.0)
             assert sent.commands <= 1
             if result.outcome == "done":
                 assert gyro_error_deg_h(rig) < FINE_DEG_H + 15.0

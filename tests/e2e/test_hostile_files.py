@@ -56,8 +56,8 @@ def test_it_starts_says_so_and_writes_nothing(
             (said,) = [words for words in caplog.messages if path.name in words]
             assert said in rig.service.status()["warnings"]
             assert said.startswith(f"{path}: cannot be {'read' if what == 'a FIFO' else 'used'}: ")
-            assert rig.service.offsets.recovery.fault is None
-            assert not rig.service.offsets.recovery.pending
+            assert rig.service.offsets.ledger.fault is None
+            assert not rig.service.offsets.ledger.pending
             if name == "undo-1.json":
                 answer = rig.service.calibrating.conductor.start_undo("test")
                 assert isinstance(answer, Refusal)
@@ -79,7 +79,7 @@ def test_nothing_else_in_the_storage_ends_or_hangs_the_start(tmp_path: Path, nam
     async def main() -> None:
         async with Rig(tmp_path).running() as rig:
             await rig.ready()
-            assert rig.service.offsets.recovery.fault is None
+            assert rig.service.offsets.ledger.fault is None
 
     run_virtual(main())
 
@@ -95,7 +95,7 @@ def test_a_journal_of_parameters_that_this_autopilot_has_not_is_brought_to_an_en
 
     async def main() -> None:
         async with Rig(tmp_path, version=version, parameters={"INS_GYROFFS_X": 0.001}).running() as rig:
-            await rig.until(lambda: not rig.service.offsets.recovery.pending, 20.0)
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 20.0)
             ours = name.startswith("INS")
             assert rig.double.parameter("INS_GYROFFS_X") == pytest.approx(0.0 if ours else 0.001)
             assert len(rig.double.writes) == int(ours)

@@ -181,9 +181,7 @@ async def _one(folder: Path, seed: int) -> tuple[int, int, int]:
         double.disarm()
         await asyncio.sleep(2.0)  # what is still on the wire, and the autopilot's reboot, if it is in one
         await rig.until(
-            lambda: (
-                (conductor.job is None or conductor.job.finished.done()) and not rig.service.offsets.recovery.pending
-            ),
+            lambda: (conductor.job is None or conductor.job.finished.done()) and not rig.service.offsets.ledger.pending,
             240.0,
         )
         records = rig.service.calibrating.store.history()[::-1]

@@ -77,7 +77,7 @@ class Automatic:
         """Of `run`, so that it is seen to go on."""
         self.stopped: str | None = None
         """Why it waits for a request, for people; None while it works."""
-        conductor.watch(self._on_ended)
+        conductor.on_ended.add(self._on_ended)
 
     # --- may it
 

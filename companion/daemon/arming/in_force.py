@@ -92,8 +92,8 @@ class InForce:
         self.calibration: Record | None = None
         """The last finished calibration of this run, while at least one of its values is in force."""
         self.undone = False
-        conductor.watch(self._on_ended)
-        alignment.watch(self._realigned)
+        conductor.on_ended.add(self._on_ended)
+        alignment.on_change.add(self._realigned)
 
     # --- what is known
 

@@ -212,7 +212,7 @@ class Readiness:
             return ArmAnswer("refuse", owed)
         if glance.moving or glance.steady_s < STEADY_S:
             return ArmAnswer.hold_still(STEADY_S - glance.steady_s)
-        return ArmAnswer("accept", self.in_words(now_s))
+        return ArmAnswer("accept", self.state(now_s)[1])
 
     def until_calibrated_s(self, now_s: float) -> float:
         """Seconds of holding still until a calibration by itself would be in force."""
@@ -248,10 +248,6 @@ class Readiness:
         if confirmed_s is not None:
             return "checked", f"offsets checked {_ago(now_s - confirmed_s)} ago, {sigmas}"
         return "uncalibrated", "not calibrated yet" if self.in_force.held_back is None else ""
-
-    def in_words(self, now_s: float) -> str:
-        """The state in one short line."""
-        return self.state(now_s)[1]
 
     def _sigmas(self) -> list[str]:
         gyro, accel = self.in_force.sigma("gyro"), self.in_force.sigma("accel")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 
 from companion.calibration.alignment.align_record import AlignmentRecord, GradienterSettings
 from companion.calibration.means.pose import GradienterModel
@@ -27,11 +26,8 @@ class AlignmentInForce:
         """What is kept, whether or not it is used."""
         self.unused: str | None = None
         """Why what is kept is not used, in one line; None while it is used, or nothing is kept."""
-        self._listeners: Listeners[[]] = Listeners()
-
-    def watch(self, tell: Callable[[], None]) -> None:
-        """Tell when another zero is in force."""
-        self._listeners.add(tell)
+        self.on_change: Listeners[[]] = Listeners()
+        """Told when another zero is in force."""
 
     def load(self) -> None:
         """Read what was kept before this start; blocking. What cannot be used is set aside and said."""
@@ -49,7 +45,7 @@ class AlignmentInForce:
         """
         await self._offload(self._store.write, record)
         self._take(record)
-        self._listeners.tell()
+        self.on_change.tell()
 
     async def forget(self) -> bool:
         """Go back to what the configuration says; whether there was anything to forget.
@@ -61,7 +57,7 @@ class AlignmentInForce:
         await self._offload(self._store.clear)
         self._take(None)
         if was:
-            self._listeners.tell()
+            self.on_change.tell()
         return was
 
     def settings(self) -> GradienterSettings | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import datetime
 import logging
-from collections.abc import Awaitable, Callable, Collection, Coroutine
+from collections.abc import Awaitable, Collection, Coroutine
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -34,8 +34,6 @@ from companion.links.system.listeners import Listeners
 
 logger = logging.getLogger(__name__)
 
-OnEnded = Callable[[Job, JobResult], None]
-
 
 class Conductor:
     """The calibration service behind MAVLink, the control socket and whoever else asks."""
@@ -57,14 +55,11 @@ class Conductor:
         self.job: Job | None = None
         self.reason = "ready"
         """What the present state means, in words."""
-        self._listeners: Listeners[Job, JobResult] = Listeners()
+        self.on_ended: Listeners[Job, JobResult] = Listeners()
+        """Told of every end, before the requester is."""
         self._unsubscribe = core.vehicle.watch(self._on_event)
-        core.wanted.watch(self._retarget)
-        recovery.watch(self._recovered)
-
-    def watch(self, on_ended: OnEnded) -> None:
-        """Be told of every end, before the requester is."""
-        self._listeners.add(on_ended)
+        core.wanted.on_retarget.add(self._retarget)
+        recovery.on_recovered.add(self._recovered)
 
     # --- what others ask of it (component.service.CalibrationService)
 
@@ -92,14 +87,14 @@ class Conductor:
 
     def why_not(self, rungs: Collection[Rung] = tuple(Rung)) -> Obstacle | None:
         """What of these stands in the way of starting something."""
-        return obstacle(self._vehicle, self._recovery, self.running, rungs)
+        return obstacle(self._vehicle, self._recovery.ledger, self.running, rungs)
 
     @property
     def mav_state(self) -> int:
         """MAV_STATE_* for the heartbeat."""
         if self._machine.state.busy:
             return mavlink.MAV_STATE_CALIBRATING
-        if self._recovery.fault is not None:
+        if self._recovery.ledger.fault is not None:
             return mavlink.MAV_STATE_CRITICAL
         return mavlink.MAV_STATE_ACTIVE if self._vehicle.arm_state is ArmState.ARMED else mavlink.MAV_STATE_STANDBY
 
@@ -204,7 +199,7 @@ class Conductor:
         if not (job.automatic and result.outcome == "failed" and self._vehicle.arm_state is ArmState.ARMED):
             # The pilot who has just armed has no use for the end of what nobody asked for.
             self._say(max(severity, Severity.WARNING) if job.automatic else severity, words, Weight.RESULT)
-        self._listeners.tell(job, result)
+        self.on_ended.tell(job, result)
         job.finish(result)
 
     def _on_event(self, event: VehicleEvent) -> None:

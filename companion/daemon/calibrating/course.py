@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Container, Mapping
 from typing import Final, NamedTuple
 
 import msgspec
@@ -161,13 +161,10 @@ class Solving:
 
     def __init__(self, core: Core, alignment: AlignmentInForce, memory: BiasMemory) -> None:
         self._core, self._alignment, self._memory = core, alignment, memory
-        self._listeners: Listeners[Window, Window, Whereabouts, What, Expectation] = Listeners()
+        self.on_solved: Listeners[Window, Window, Whereabouts, What, Expectation] = Listeners()
+        """Told of every solution: the window measured and used, the place, what was asked for, what was known."""
         self._written = {imu.name for imu in core.config.imu if imu.source == "autopilot" or imu.autopilot_instance}
         """IMUs whose offsets are in the autopilot."""
-
-    def watch(self, tell: Callable[[Window, Window, Whereabouts, What, Expectation], object]) -> None:
-        """Tell of every solution: the window measured and used, the place, what was asked for, what was known."""
-        self._listeners.add(tell)
 
     async def solve(self, measured: Window, window: Window, job: Job, draft: Draft) -> Solution:
         """The biases; fills the draft, and says what contradicts earlier ones.
@@ -188,7 +185,7 @@ class Solving:
         for name, words in memory.forgotten().items():
             draft.warn(name, words)
         expectation: Expectation = await offload(memory.expectation, solution, unix_s)
-        self._listeners.tell(measured, window, where, job.what, expectation)
+        self.on_solved.tell(measured, window, where, job.what, expectation)
         whole = memory.whole(solution)
         weighed: Weighed = await offload(weigh, solution, whole, expectation)
         started_at = draft.started_at.isoformat(timespec="milliseconds")

@@ -41,111 +41,6 @@ class RequestRefusedError(CalibrationRefusedError):
         self.kind = refusal.kind
 
 
-class Commands:
-    """Turns requests into what the conductor does, and what comes of it into replies.
-
-    Each raises `RequestRefusedError` where it is not taken, and another `CompanionError` where it cannot be carried
-    out.
-    """
-
-    def __init__(self, conductor: Conductor, alignment: AlignmentInForce) -> None:
-        self._conductor, self._alignment = conductor, alignment
-
-    def by_name(self) -> Mapping[str, Handler]:
-        """Which handler answers which command."""
-        return {"calibrate": self._calibrate, "align": self._align, "cancel": self._cancel, "undo": self._undo}
-
-    async def _calibrate(self, request: Object, face: str) -> AsyncIterator[Object]:
-        try:
-            what = What[str(request.get("what", "both")).upper()]
-        except KeyError as error:
-            raise CalibrationRefusedError(f"calibrate: {error} is not understood") from None
-        timeout_s = request.get("timeout_s")
-        if timeout_s is not None and not is_time_limit(timeout_s):
-            raise CalibrationRefusedError(
-                f"calibrate: 'timeout_s': found {timeout_s!r}; allowed: a number of seconds above 0"
-            )
-        reboot = request.get("reboot") is True
-        job = _accepted(self._conductor.start_calibration(what, f"{face} calibrate", timeout_s, reboot=reboot))
-        if not request.get("wait"):
-            yield {"kind": "result", "state": self._conductor.state.shown, "reason": "calibration started"}
-            return
-        async for reply in self._progress(job):
-            yield reply
-        yield {"kind": "result", "record": msgspec.to_builtins(job.record)}
-
-    async def _cancel(self, _request: Object, face: str) -> AsyncIterator[Object]:
-        running = self._conductor.cancel(f"{face} cancel")
-        if running and self._conductor.job is not None:
-            await asyncio.shield(self._conductor.job.finished)
-        reason = self._conductor.reason if running else "nothing was running"
-        yield {"kind": "result", "state": self._conductor.state.shown, "reason": reason}
-
-    async def _undo(self, request: Object, face: str) -> AsyncIterator[Object]:
-        job = _accepted(self._conductor.start_undo(f"{face} undo", force=request.get("force") is True))
-        result = await asyncio.shield(job.finished)
-        written = msgspec.to_builtins(job.product or {})
-        yield {"kind": "result", "state": result.outcome, "reason": result.reason, "written": written}
-
-    async def _align(self, request: Object, face: str) -> AsyncIterator[Object]:
-        """Show, forget or measure the alignment."""
-        action = request.get("action")
-        if action == "show":
-            yield {"kind": "result", **self._shown()}
-        elif action == "forget":
-            if (busy := self._conductor.why_not((Rung.BUSY,))) is not None:
-                raise CalibrationRefusedError(busy.words)
-            was = await self._alignment.forget()
-            words = "the configuration's zero and sigma are in force" if was else "there was no alignment to forget"
-            yield {"kind": "result", "state": "done", "reason": words}
-        else:
-            job = self._start_alignment(request, face)
-            async for reply in self._progress(job):
-                yield {**reply, "job": ALIGNMENT}
-            result = job.finished.result()
-            yield {
-                "kind": "result",
-                "state": result.outcome,
-                "reason": result.reason,
-                "alignment": msgspec.to_builtins(job.product),
-            }
-
-    def _shown(self) -> Object:
-        alignment = self._alignment
-        if alignment.used is not None:
-            state, reason = "in force", ""
-        elif alignment.unused is not None:
-            state, reason = "not used", alignment.unused
-        else:
-            state, reason = "none", "no alignment is kept: companion align zero measures one"
-        return {"state": state, "reason": reason, "alignment": msgspec.to_builtins(alignment.record)}
-
-    def _start_alignment(self, request: Object, face: str) -> Job:
-        action, headings = request.get("action"), request.get("headings", 2)
-        timeout_s = request.get("timeout_s")
-        timeout_s = ALIGN_TIMEOUT_S if timeout_s is None else timeout_s
-        if action not in ("zero", "tilts") or headings not in (2, HEADINGS) or not is_time_limit(timeout_s):
-            raise CalibrationRefusedError(f"align: {request} is not understood")
-        plan = Plan(action, headings, quick=request.get("quick") is True)
-        return _accepted(self._conductor.start_alignment(plan, f"{face} align", float(timeout_s)))
-
-    async def _progress(self, job: Job) -> AsyncIterator[Object]:
-        while job.is_running:
-            yield {
-                "kind": "progress",
-                "state": self._conductor.state.shown,
-                "percent": self._conductor.progress_percent,
-                "text": job.words,
-            }
-            await asyncio.wait([job.finished], timeout=PROGRESS_EVERY_S)
-
-
-def _accepted(answer: Job | Refusal) -> Job:
-    if isinstance(answer, Refusal):
-        raise RequestRefusedError(answer)
-    return answer
-
-
 class Calibrating(Subsystem):
     """From request to record."""
 
@@ -169,8 +64,9 @@ class Calibrating(Subsystem):
         self.memory.load()
         self._results.load()
 
-    def commands(self) -> Mapping[str, Handler]:  # noqa: D102
-        return Commands(self.conductor, self.alignment).by_name()
+    def commands(self) -> Mapping[str, Handler]:
+        """As in the base class; each raises `RequestRefusedError`, or another `CompanionError` once it was taken."""
+        return {"calibrate": self._calibrate, "align": self._align, "cancel": self._cancel, "undo": self._undo}
 
     def status(self) -> Object:  # noqa: D102
         conductor, job = self.conductor, self.conductor.running
@@ -184,6 +80,96 @@ class Calibrating(Subsystem):
             "alignment": self.alignment.status(),
             "last": _summary(conductor.last),
         }
+
+    async def _calibrate(self, request: Object, face: str) -> AsyncIterator[Object]:
+        try:
+            what = What[str(request.get("what", "both")).upper()]
+        except KeyError as error:
+            raise CalibrationRefusedError(f"calibrate: {error} is not understood") from None
+        timeout_s = request.get("timeout_s")
+        if timeout_s is not None and not is_time_limit(timeout_s):
+            raise CalibrationRefusedError(
+                f"calibrate: 'timeout_s': found {timeout_s!r}; allowed: a number of seconds above 0"
+            )
+        reboot = request.get("reboot") is True
+        job = _accepted(self.conductor.start_calibration(what, f"{face} calibrate", timeout_s, reboot=reboot))
+        if not request.get("wait"):
+            yield {"kind": "result", "state": self.conductor.state.shown, "reason": "calibration started"}
+            return
+        async for reply in self._progress(job):
+            yield reply
+        yield {"kind": "result", "record": msgspec.to_builtins(job.record)}
+
+    async def _cancel(self, _request: Object, face: str) -> AsyncIterator[Object]:
+        running = self.conductor.cancel(f"{face} cancel")
+        if running and self.conductor.job is not None:
+            await asyncio.shield(self.conductor.job.finished)
+        reason = self.conductor.reason if running else "nothing was running"
+        yield {"kind": "result", "state": self.conductor.state.shown, "reason": reason}
+
+    async def _undo(self, request: Object, face: str) -> AsyncIterator[Object]:
+        job = _accepted(self.conductor.start_undo(f"{face} undo", force=request.get("force") is True))
+        result = await asyncio.shield(job.finished)
+        written = msgspec.to_builtins(job.product or {})
+        yield {"kind": "result", "state": result.outcome, "reason": result.reason, "written": written}
+
+    async def _align(self, request: Object, face: str) -> AsyncIterator[Object]:
+        """Show, forget or measure the alignment."""
+        action = request.get("action")
+        if action == "show":
+            yield {"kind": "result", **self._shown()}
+        elif action == "forget":
+            if (busy := self.conductor.why_not((Rung.BUSY,))) is not None:
+                raise CalibrationRefusedError(busy.words)
+            was = await self.alignment.forget()
+            words = "the configuration's zero and sigma are in force" if was else "there was no alignment to forget"
+            yield {"kind": "result", "state": "done", "reason": words}
+        else:
+            job = self._start_alignment(request, face)
+            async for reply in self._progress(job):
+                yield {**reply, "job": ALIGNMENT}
+            result = job.finished.result()
+            yield {
+                "kind": "result",
+                "state": result.outcome,
+                "reason": result.reason,
+                "alignment": msgspec.to_builtins(job.product),
+            }
+
+    def _shown(self) -> Object:
+        alignment = self.alignment
+        if alignment.used is not None:
+            state, reason = "in force", ""
+        elif alignment.unused is not None:
+            state, reason = "not used", alignment.unused
+        else:
+            state, reason = "none", "no alignment is kept: companion align zero measures one"
+        return {"state": state, "reason": reason, "alignment": msgspec.to_builtins(alignment.record)}
+
+    def _start_alignment(self, request: Object, face: str) -> Job:
+        action, headings = request.get("action"), request.get("headings", 2)
+        timeout_s = request.get("timeout_s")
+        timeout_s = ALIGN_TIMEOUT_S if timeout_s is None else timeout_s
+        if action not in ("zero", "tilts") or headings not in (2, HEADINGS) or not is_time_limit(timeout_s):
+            raise CalibrationRefusedError(f"align: {request} is not understood")
+        plan = Plan(action, headings, quick=request.get("quick") is True)
+        return _accepted(self.conductor.start_alignment(plan, f"{face} align", float(timeout_s)))
+
+    async def _progress(self, job: Job) -> AsyncIterator[Object]:
+        while job.is_running:
+            yield {
+                "kind": "progress",
+                "state": self.conductor.state.shown,
+                "percent": self.conductor.progress_percent,
+                "text": job.words,
+            }
+            await asyncio.wait([job.finished], timeout=PROGRESS_EVERY_S)
+
+
+def _accepted(answer: Job | Refusal) -> Job:
+    if isinstance(answer, Refusal):
+        raise RequestRefusedError(answer)
+    return answer
 
 
 def _summary(record: Record | None) -> Object | None:

@@ -14,7 +14,7 @@ from typing import Final, Literal, NamedTuple
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.component.service import Refusal
 from companion.daemon.job import Job
-from companion.daemon.offsets.ledger import Recovery
+from companion.daemon.offsets.ledger import Ledger
 from companion.links.system.budget import Budget
 
 STARTS_PER_S: Final = 1.0
@@ -62,15 +62,15 @@ class Obstacle(NamedTuple):
 
 
 def obstacle(
-    vehicle: Vehicle, recovery: Recovery, job: Job | None, rungs: Collection[Rung] = tuple(Rung)
+    vehicle: Vehicle, ledger: Ledger, job: Job | None, rungs: Collection[Rung] = tuple(Rung)
 ) -> Obstacle | None:
     """The first of these that stands in the way; None where nothing does."""
-    return next((found for found in _obstacles(vehicle, recovery, job) if found.rung in rungs), None)
+    return next((found for found in _obstacles(vehicle, ledger, job) if found.rung in rungs), None)
 
 
-def _obstacles(vehicle: Vehicle, recovery: Recovery, job: Job | None) -> Iterator[Obstacle]:
-    if recovery.fault is not None:
-        yield Obstacle(Rung.FAULT, recovery.fault)
+def _obstacles(vehicle: Vehicle, ledger: Ledger, job: Job | None) -> Iterator[Obstacle]:
+    if ledger.fault is not None:
+        yield Obstacle(Rung.FAULT, ledger.fault)
     if vehicle.conflict is not None:
         yield Obstacle(Rung.CONFLICT, vehicle.conflict)
     if job is not None and job.is_running:
@@ -81,7 +81,7 @@ def _obstacles(vehicle: Vehicle, recovery: Recovery, job: Job | None) -> Iterato
         age_s = vehicle.heartbeat_age_s
         words = "no autopilot heard yet" if age_s is None else f"no heartbeat for {age_s:.0f} s: armed?"
         yield Obstacle(Rung.UNKNOWN, words)
-    if recovery.pending:
+    if ledger.pending:
         yield Obstacle(Rung.PENDING, "putting old values back first")
 
 

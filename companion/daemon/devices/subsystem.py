@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from companion.autopilot.firmware.imu_calibration import accel_taken_off
 from companion.autopilot.firmware.px4 import SlotMemory
@@ -16,6 +16,7 @@ from companion.daemon.devices.reach import Reach
 from companion.daemon.devices.sensor_watch import UNTOUCHED, Corrected, SensorWatch
 from companion.daemon.devices.sensors import SensorRole, SerialSensor
 from companion.daemon.devices.signing import LinkSigning
+from companion.links.system.listeners import Listeners
 from companion.links.system.request import Object
 from companion.samples import Sample
 
@@ -41,11 +42,8 @@ class Devices(Subsystem):
         self.watch = SensorWatch(self.sensors, core.collector, self._corrected, core.say)
         self.signing = LinkSigning(core.config, core.link, core.vehicle, core.say, core.offload)
         self.reach = Reach(core.link, core.vehicle, core.parameters)
-        self._pose_watchers: list[Callable[[Sample], None]] = []
-
-    def watch_pose(self, take: Callable[[Sample], None]) -> None:
-        """Tell of every reading of gradienter and compass that counts."""
-        self._pose_watchers.append(take)
+        self.on_pose: Listeners[Sample] = Listeners()
+        """Told of every reading of gradienter and compass that counts."""
 
     @property
     def not_heard(self) -> str:
@@ -88,8 +86,7 @@ class Devices(Subsystem):
     def _take(self, role: Role, part: Sample) -> None:
         reading = collect(self._core.collector, role, part)
         if reading is not None:
-            for take in self._pose_watchers:
-                take(reading)
+            self.on_pose.tell(reading)
 
     def _corrected(self, name: str) -> Corrected | None:
         imu = self.imus.get(name)

@@ -59,7 +59,7 @@ class Faces(Subsystem):
             own_parameters(core.wanted),
             Senders(core.config.mavlink.allow),
         )
-        calibrating.conductor.watch(self._show_result)
+        calibrating.conductor.on_ended.add(self._show_result)
         self._headlines = Headlines(core, devices, calibrating.conductor, arming, heading.attitude)
         self.answers = Answers([self, devices, offsets, calibrating, arming, heading, recorder], heading.pose)
         self.mqtt = _mqtt(core, self.answers, calibrating, heading)

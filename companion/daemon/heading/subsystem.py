@@ -39,7 +39,7 @@ class Heading(Subsystem):
         self.attitude = _attitude(core, devices, calibrating, arming)
         """None unless a heading is pushed."""
         self.pose = PoseNow(core, calibrating.alignment, None if self.attitude is None else self.attitude.pose)
-        devices.watch_pose(self.pose.take)
+        devices.on_pose.add(self.pose.take)
 
     def commands(self) -> Mapping[str, Handler]:  # noqa: D102 - as in the base class
         return {"autopilot-setup": self._answer_setup}

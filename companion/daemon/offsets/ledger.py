@@ -12,6 +12,7 @@ import logging
 from collections.abc import AsyncIterator, Callable, Sequence
 from typing import Final
 
+from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.autopilot.firmware.gyro_calibration import wait_until_over
 from companion.autopilot.parameters.change import NothingWrittenError, WriteFailedError
 from companion.autopilot.parameters.client import ParameterClient
@@ -124,7 +125,7 @@ class Ledger:
         kept = self._log.undo_of(changes.system_id)
         await self._offload(kept.write, changes)
         try:
-            await self._close()
+            await self.undone()
         except StorageError:
             # The write will be put back, so there will be nothing to undo.
             self.undoable.pop(changes.system_id, None)
@@ -139,16 +140,14 @@ class Ledger:
         Raises:
             StorageError: the disk refuses; the write stays open.
         """
-        await self._close()
-
-    async def _close(self) -> None:
         await self._offload(self._log.journal.clear)
         self._open = None
         self._orphaned.clear()
 
     def strange_to(self, firmware: Firmware | None, changes: ChangeSet) -> list[str]:
         """The parameters among them that we never write on this firmware."""
-        return self._log.strange_to(firmware, changes)
+        known = CALIBRATION.get(firmware or "other", {})
+        return [name for name in changes.names if name not in known]
 
     async def forget_undo(self, system_id: int) -> None:
         """What could be undone on a vehicle has been.
@@ -173,38 +172,25 @@ class Recovery:
         changing: Callable[[], contextlib.AbstractContextManager[None]],
     ) -> None:
         self._vehicle, self._parameters, self._writer = vehicle, parameters, writer
-        self._ledger, self._say, self._changing = ledger, say, changing
-        self._listeners: Listeners[str] = Listeners()
-
-    def watch(self, on_recovered: Callable[[str], None]) -> None:
-        """Be told, in words, of what was put in order."""
-        self._listeners.add(on_recovered)
-
-    @property
-    def fault(self) -> str | None:
-        """Why nothing may be written at all, for people."""
-        return self._ledger.fault
-
-    @property
-    def pending(self) -> bool:
-        """Whether an interrupted write still waits to be put back."""
-        return self._ledger.pending
+        self.ledger, self._say, self._changing = ledger, say, changing
+        self.on_recovered: Listeners[str] = Listeners()
+        """Told, in words, of what was put in order."""
 
     def why_no_undo(self) -> str | None:
         """Why there is nothing to undo, or None when there is."""
-        undoable = self._ledger.undoable
+        undoable = self.ledger.undoable
         if not undoable:
-            return "nothing to undo" + ("; what was kept could not be used" if self._ledger.unusable else "")
+            return "nothing to undo" + ("; what was kept could not be used" if self.ledger.unusable else "")
         if self._vehicle.system_id not in undoable:
             return f"nothing to undo here, only on system {', '.join(map(str, sorted(undoable)))}"
         return None
 
     async def run(self) -> None:
         """Bring interrupted writes to an end, whenever there is one, until cancelled."""
-        if self._ledger.lost_write:
+        if self.ledger.lost_write:
             self._say(Severity.WARNING, "Interrupted write, file damaged: calibrate", Weight.RESULT)
         while True:
-            open_set = await self._ledger.interrupted()
+            open_set = await self.ledger.interrupted()
             try:
                 await self._recover(open_set)
             except (AutopilotError, StorageError) as error:
@@ -213,13 +199,13 @@ class Recovery:
 
     async def _recover(self, open_set: ChangeSet) -> None:
         await self._vehicle.wait_found()
-        strange = self._ledger.strange_to(self._vehicle.firmware, open_set)
+        strange = self.ledger.strange_to(self._vehicle.firmware, open_set)
         if strange or open_set.system_id != self._vehicle.system_id:
             names = ", ".join(open_set.names)
             words = f"An interrupted write on system {open_set.system_id} is not this aircraft's; there check: {names}"
             logger.warning("%s", words)
             self._say(Severity.WARNING, words, Weight.REFUSAL)
-            await self._ledger.undone()
+            await self.ledger.undone()
             return
         while self._vehicle.arm_state is not ArmState.DISARMED:
             await asyncio.sleep(POLL_S)
@@ -230,15 +216,15 @@ class Recovery:
         if ours:
             with self._changing():
                 await self._writer.restore(ours)
-        if self._ledger.undoable.get(open_set.system_id) == open_set:
+        if self.ledger.undoable.get(open_set.system_id) == open_set:
             # It was an undo that was interrupted, and now it is done.
-            await self._ledger.forget_undo(open_set.system_id)
-        await self._ledger.undone()
+            await self.ledger.forget_undo(open_set.system_id)
+        await self.ledger.undone()
         words = f"Interrupted write: {f'{len(ours)} old values put back' if ours else 'nothing of ours was in force'}"
         if foreign:
             words += f"; changed by others, left alone: {', '.join(foreign)}"
         logger.warning("%s", words)
-        self._listeners.tell(words)
+        self.on_recovered.tell(words)
         self._say(Severity.WARNING, words, Weight.RESULT)
 
     async def undo(self, *, force: bool = False) -> dict[str, WrittenParameter]:
@@ -254,7 +240,7 @@ class Recovery:
                 disarmed).
             StorageError: the disk refuses.
         """
-        undoable = self._ledger.undoable.get(self._vehicle.system_id or 0)
+        undoable = self.ledger.undoable.get(self._vehicle.system_id or 0)
         why = self.why_no_undo()
         if undoable is None or why is not None:
             raise AutopilotError(why or "nothing to undo")
@@ -266,11 +252,11 @@ class Recovery:
             )
         if foreign:
             logger.warning("changed by somebody else since, left alone: %s", "; ".join(foreign))
-        async with self._ledger.transaction(undoable):
+        async with self.ledger.transaction(undoable):
             with self._changing():
                 written = await self._writer.undo(ours)
-            await self._ledger.forget_undo(undoable.system_id)
-            await self._ledger.undone()
+            await self.ledger.forget_undo(undoable.system_id)
+            await self.ledger.undone()
         return written
 
     async def _sort(self, changes: ChangeSet) -> tuple[Sequence[Change], Sequence[str]]:

@@ -45,8 +45,8 @@ class Offsets(Subsystem):
 
     def status(self) -> Object:  # noqa: D102
         return {
-            "fault": self.recovery.fault,
-            "putting_back": self.recovery.pending,
+            "fault": self.ledger.fault,
+            "putting_back": self.ledger.pending,
             "why_no_undo": self.recovery.why_no_undo(),
             "warnings": [*self.ledger.unusable, *self.rivalry.warnings],
         }

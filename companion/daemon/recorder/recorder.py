@@ -127,8 +127,8 @@ class Recorder(Subsystem):
         link.watch_bytes(self._on_mavlink)
         for sensor in devices.sensors:
             sensor.on_bytes.add(self._on_serial)
-        calibrating.solving.watch(self._on_solved)
-        calibrating.conductor.watch(self._on_ended)
+        calibrating.solving.on_solved.add(self._on_solved)
+        calibrating.conductor.on_ended.add(self._on_ended)
 
     # --- what happens
 
