@@ -67,7 +67,6 @@ _NAMES: dict[type, str] = {requests.Calibrate: "Calibration", requests.Undo: "Un
 # Arm authorisation is a verdict, not a job, and silence is one of its answers.
 _LEFT_TO_OTHERS = frozenset({mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST})
 
-
 MAX_REMEMBERED: Final = 32
 
 

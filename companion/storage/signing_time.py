@@ -40,21 +40,8 @@ def this_boot() -> str:
         return ""
 
 
-def load(directory: Path) -> SigningTime | None:
-    """What was kept; None where nothing is, or nothing that can be used: that is set aside."""
-    return _file(directory).take()
-
-
-def save(directory: Path, time: SigningTime) -> None:
-    """Keep it.
-
-    Raises:
-        StorageError: it cannot be written.
-    """
-    _file(directory).write(time)
-
-
-def _file(directory: Path) -> StateFile[SigningTime]:
+def kept_in(directory: Path) -> StateFile[SigningTime]:
+    """What is kept in a storage directory."""
     return StateFile(directory / FILE, SigningTime, _check)
 
 

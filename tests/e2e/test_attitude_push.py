@@ -337,14 +337,15 @@ def test_a_heading_that_differs_is_told(tmp_path: Path) -> None:
         async with flight(tmp_path, used=False) as flying:
             rig = flying.rig
             await flying.sleep(5.0)
-            assert not flying.attitude.warnings
+            assert not flying.attitude.health.warning
             rig.double.estimator.yaw_error_rad = math.radians(16.0)
             await flying.sleep(8.0)
-            (warning,) = flying.attitude.warnings
+            warning = flying.attitude.health.warning
+            assert warning is not None
             assert "deg in heading" in warning
             assert warning in rig.service.status()["warnings"]
             assert sum("deg in heading" in text for text in rig.ground.texts()) == 1
-            await rig.until(lambda: not flying.attitude.warnings, 120.0)
+            await rig.until(lambda: not flying.attitude.health.warning, 120.0)
             assert flying.attitude.health.pushing
 
     run_virtual(main())

@@ -15,7 +15,7 @@ from companion.calibration.solution.record import Arming
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from companion.storage.learned import AlignmentStore, BiasStore
 from companion.storage.records import RecordStore
-from companion.storage.signing_time import FILE, load
+from companion.storage.signing_time import FILE
 from companion.storage.state import BoundedList, sealed
 
 NAMES = st.sampled_from(
@@ -68,7 +68,7 @@ def test_any_bytes_in_any_file(data: bytes) -> None:
         AlignmentStore(folder).take()
         BiasStore(folder).read()
         BoundedList(folder / "armings.json", Arming, 5).read()
-        load(folder)
+        kept_in(folder).take()
         RecordStore(folder).history()
 
 

@@ -23,6 +23,7 @@ from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.signing import EPOCH_S, TICKS_PER_S, SigningClock
 from companion.storage import signing_time
 from companion.storage.signing_time import FILE, this_boot
+from companion.storage.state import StateFile
 from tests.support.rig import inline
 from tests.support.virtual_time import run_virtual
 from tests.unit.test_config import GOOD
@@ -130,13 +131,13 @@ def test_a_clock_that_is_right_is_believed_and_one_that_steps_back_is_not(
 def test_the_disk_is_written_rarely(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def main() -> None:
         board, writes = Board(tmp_path, monkeypatch, wall_s=NOW_S), list[int]()
-        real = signing_time.save
+        real = StateFile.write
 
-        def count(folder: Path, what: signing_time.SigningTime) -> None:
+        def count(file: StateFile[signing_time.SigningTime], what: signing_time.SigningTime) -> None:
             writes.append(what.ticks)
-            real(folder, what)
+            real(file, what)
 
-        monkeypatch.setattr(signing_time, "save", count)
+        monkeypatch.setattr(StateFile, "write", count)
         async with board.daemon():
             await asyncio.sleep(600.0)
         assert 600 / AHEAD_S <= len(writes) <= 600 / (AHEAD_S - 6.0) + 2
@@ -153,7 +154,7 @@ def test_a_disk_that_cannot_be_written_is_said_once_and_costs_nothing_else(
         def full(*_: Any) -> None:
             raise StorageError("disk full")
 
-        signing_time.save(tmp_path, signing_time.SigningTime(0, 0, 0.0, ""))
+        signing_time.kept_in(tmp_path).write(signing_time.SigningTime(0, 0, 0.0, ""))
         monkeypatch.setattr(signing_time, "save", full)
         async with board.daemon() as one:
             await asyncio.sleep(200.0)
@@ -172,7 +173,7 @@ def test_a_disk_that_cannot_be_written_is_said_once_and_costs_nothing_else(
 )
 def test_a_broken_file_is_none(tmp_path: Path, content: bytes) -> None:
     (tmp_path / FILE).write_bytes(content)
-    assert signing_time.load(tmp_path) is None
+    assert signing_time.kept_in(tmp_path).take() is None
 
 
 def test_the_unit_hands_the_boot_id_over(monkeypatch: pytest.MonkeyPatch) -> None:

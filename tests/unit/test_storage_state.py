@@ -68,7 +68,7 @@ FILES: dict[str, Callable[[Path], Any]] = {
     "alignment.json": lambda folder: AlignmentStore(folder).take(),
     "biases.json": lambda folder: BiasStore(folder).read() or None,
     "armings.json": lambda folder: BoundedList(folder / "armings.json", Arming, 200).read() or None,
-    signing_time.FILE: signing_time.load,
+    signing_time.FILE: lambda folder: signing_time.kept_in(folder).take(),
 }
 
 

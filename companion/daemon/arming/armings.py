@@ -34,7 +34,7 @@ class Armings:
         self._file = BoundedList(core.config.storage.path / "armings.json", Arming, KEEP)
         self._queue: asyncio.Queue[Arming] = asyncio.Queue(QUEUE)
         self.last: Arming | None = None
-        self._unsubscribe = core.vehicle.watch(self._on_event)
+        core.vehicle.watch(self._on_event)
 
     async def run(self) -> None:
         """Keep every arming until cancelled; what is still waiting then is written as well."""
@@ -42,7 +42,6 @@ class Armings:
             while True:
                 await self._keep(await self._queue.get())
         finally:
-            self._unsubscribe()
             while not self._queue.empty():
                 with contextlib.suppress(StorageError):
                     self._file.append(self._queue.get_nowait())

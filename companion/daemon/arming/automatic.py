@@ -35,7 +35,6 @@ from companion.storage.state import BoundedList
 
 logger = logging.getLogger(__name__)
 
-
 REQUESTER: Final = "the companion itself"
 POLL_S: Final = 1.0
 SPACING_S: Final = 300.0

@@ -14,7 +14,6 @@ from companion.errors import AutopilotError
 
 logger = logging.getLogger(__name__)
 
-
 POLL_S: Final = 1.0
 RETRY_S: Final = 30.0
 SCRIPT_STARTS_S: Final = 10.0
@@ -35,29 +34,26 @@ class GateSetup:
         self.problem: str | None = None
         """What has to be set, for people; None while all is well or not known yet."""
         self.known = False
-        self._unsubscribe = (core.vehicle.watch(self._on_event), core.parameters.watch(self._on_parameter))
+        core.vehicle.watch(self._on_event)
+        core.parameters.watch(self._on_parameter)
 
     async def run(self) -> None:
         """Look whenever there is something new, until cancelled."""
-        try:
-            while True:
-                await self._stale.wait()
-                while self._readiness.at_arm != "gate":  # may be set at the flight line
-                    await asyncio.sleep(POLL_S)
-                await self._vehicle.wait_found()
-                self._stale.clear()
-                try:
-                    self.problem = await self._look()
-                except AutopilotError as error:
-                    logger.info("whether the gate is set up is not known: %s", error)
-                    self._stale.set()
-                    await asyncio.sleep(RETRY_S)
-                else:
-                    self.known = True
-                    self._tell()
-        finally:
-            for unsubscribe in self._unsubscribe:
-                unsubscribe()
+        while True:
+            await self._stale.wait()
+            while self._readiness.at_arm != "gate":  # may be set at the flight line
+                await asyncio.sleep(POLL_S)
+            await self._vehicle.wait_found()
+            self._stale.clear()
+            try:
+                self.problem = await self._look()
+            except AutopilotError as error:
+                logger.info("whether the gate is set up is not known: %s", error)
+                self._stale.set()
+                await asyncio.sleep(RETRY_S)
+            else:
+                self.known = True
+                self._tell()
 
     def _on_event(self, event: VehicleEvent) -> None:
         if event in ("found", "rebooted"):

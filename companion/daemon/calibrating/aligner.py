@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import datetime
-import logging
 import math
 from collections.abc import Mapping
 from typing import Final
@@ -36,9 +35,6 @@ from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG
 from companion.samples import Vector
 
-logger = logging.getLogger(__name__)
-
-
 STAND_S: Final = 12.0
 """Seconds of stillness for each stand: averaging beyond 10 s buys an accelerometer nothing (method section 2.3)."""
 SETTLE_S: Final = 1.0
@@ -48,7 +44,6 @@ GYRO_TURN_SIGMA_DEG: Final = 3.0
 """Sigma of a half turn by the gyros alone: scale errors of 1 %, and an axis that is not vertical."""
 SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
-
 
 ARMED: Final = "armed during the alignment; the one before stays in force"
 

@@ -10,7 +10,6 @@ import datetime
 import logging
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -36,10 +35,10 @@ from companion.physics.frames import vector
 from companion.samples import Triad
 from companion.storage.learned import KEEP_POINTS, BiasStore, KnownImu
 from companion.storage.records import RecordStore
+from companion.storage.signing_time import this_boot
 
 logger = logging.getLogger(__name__)
 
-_BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 _TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 _IN_WORDS: Final = {
     "system": "vehicle",
@@ -77,7 +76,7 @@ class BiasMemory:
         self._store = BiasStore(config.storage.path)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], _Reference] = {}
-        self._host = _host()
+        self._host = this_boot() or os.urandom(8).hex()
 
     def load(self) -> None:
         """Read what was kept before this start; blocking."""
@@ -273,13 +272,6 @@ def _of_autopilot(calibration: ImuCalibration) -> dict[str, str]:
 
 def _plain(value: object) -> str:
     return " ".join(f"{each:.6g}" for each in value) if isinstance(value, list | tuple) else str(value)
-
-
-def _host() -> str:
-    try:
-        return _BOOT_ID.read_text(encoding="ascii").strip()
-    except (OSError, ValueError):
-        return os.urandom(8).hex()
 
 
 class Results:

@@ -57,7 +57,7 @@ class Conductor:
         """What the present state means, in words."""
         self.on_ended: Listeners[Job, JobResult] = Listeners()
         """Told of every end, before the requester is."""
-        self._unsubscribe = core.vehicle.watch(self._on_event)
+        core.vehicle.watch(self._on_event)
         core.wanted.on_retarget.add(self._retarget)
         recovery.on_recovered.add(self._recovered)
 
@@ -157,7 +157,6 @@ class Conductor:
 
     async def close(self) -> None:
         """Stop: cancel what runs and wait until it has left the autopilot in order."""
-        self._unsubscribe()
         self.cancel("the daemon's end")
         if self._task is not None:
             await asyncio.wait([self._task])

@@ -253,11 +253,11 @@ class Course:
         if not job.automatic:
             self._core.say(Severity.NOTICE, "Calibration started: keep the aircraft still")
         self._measuring.begin()
-        for _ in range(WRONG_IMU_ATTEMPTS - 1):
+        for left in reversed(range(WRONG_IMU_ATTEMPTS)):
             try:
                 await self._measure_and_push(job, draft)
             except WriteFailedError as error:
-                if error.kind not in ("not as believed", "without effect") or error.left_changed:
+                if not left or error.kind not in ("not as believed", "without effect") or error.left_changed:
                     raise
                 self._machine.on(Event.MOVED)
                 if error.kind == "not as believed":
@@ -269,8 +269,6 @@ class Course:
                 job.check_cancelled()
             else:
                 break
-        else:
-            await self._measure_and_push(job, draft)
         await self._solving.remember(job, draft)
 
     async def _measure_and_push(self, job: Job, draft: Draft) -> None:

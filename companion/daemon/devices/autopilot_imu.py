@@ -90,17 +90,14 @@ class AutopilotImu:
             rate_hz=rate_hz,
             on_kind_change=self._kind_changed,
         )
-        self._unsubscribe = (core.parameters.watch(self._on_parameter), core.vehicle.watch(self._on_event))
+        core.parameters.watch(self._on_parameter)
+        core.vehicle.watch(self._on_event)
 
     async def run(self) -> None:
         """Ask for the telemetry and follow the offsets until cancelled."""
-        try:
-            async with asyncio.TaskGroup() as group:
-                group.create_task(self.stream.run(), name=f"{self.name} telemetry")
-                group.create_task(self._follow(), name=f"{self.name} offsets")
-        finally:
-            for unsubscribe in self._unsubscribe:
-                unsubscribe()
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self.stream.run(), name=f"{self.name} telemetry")
+            group.create_task(self._follow(), name=f"{self.name} offsets")
 
     @contextlib.contextmanager
     def changing(self) -> Iterator[None]:

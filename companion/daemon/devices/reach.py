@@ -33,15 +33,12 @@ class Reach:
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, parameters: ParameterClient) -> None:
         self._vehicle, self._parameters = vehicle, parameters
-        self._link = link
         self._heard_s = -math.inf
         self._forwards: dict[int, bool] | None = None
         self._stale = asyncio.Event()
         self._stale.set()
-        self._unsubscribe = (
-            link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat),
-            vehicle.watch(self._on_event),
-        )
+        link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
+        vehicle.watch(self._on_event)
 
     @property
     def heard(self) -> bool:
@@ -92,20 +89,16 @@ class Reach:
 
     async def run(self) -> None:
         """Read what there is to know, again after every restart, until cancelled."""
-        try:
-            while True:
-                await self._stale.wait()
-                self._stale.clear()
-                await self._vehicle.wait_found()
-                try:
-                    await self._read()
-                except AutopilotError as error:
-                    logger.debug("forwarding is not known yet: %s", error)
-                    await asyncio.sleep(RETRY_S)
-                    self._stale.set()
-        finally:
-            for unsubscribe in self._unsubscribe:
-                unsubscribe()
+        while True:
+            await self._stale.wait()
+            self._stale.clear()
+            await self._vehicle.wait_found()
+            try:
+                await self._read()
+            except AutopilotError as error:
+                logger.debug("forwarding is not known yet: %s", error)
+                await asyncio.sleep(RETRY_S)
+                self._stale.set()
 
     async def _read(self) -> None:
         if self._vehicle.firmware != "px4":

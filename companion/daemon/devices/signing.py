@@ -21,8 +21,7 @@ from companion.daemon.core import Offload
 from companion.errors import LinkError, StorageError
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.signing import TICKS_PER_S, Reason, Signing, read_key, uptime_s
-from companion.storage import signing_time
-from companion.storage.signing_time import SigningTime, this_boot
+from companion.storage.signing_time import SigningTime, kept_in, this_boot
 
 logger = logging.getLogger(__name__)
 
@@ -186,6 +185,7 @@ class LinkSigning:
         self.signing: Signing | None = None
         self.trouble = ""
         """Why there is no key; empty when there is one."""
+        self._kept = kept_in(config.storage.path)
         self._reserved = 0
         self._unwritable = self._setup_told = False
         self._told: set[tuple[Reason, int, int]] = set()
@@ -199,8 +199,7 @@ class LinkSigning:
     def load(self) -> None:
         """Read time and key, before anything is sent; a key that cannot be read is tried again in `run`."""
         if self.signing is not None:
-            kept = signing_time.load(self._config.storage.path)
-            self.signing.clock.heard(_go_on_from(kept, uptime_s(), this_boot()))
+            self.signing.clock.heard(_go_on_from(self._kept.take(), uptime_s(), this_boot()))
             self._take_key(self.signing)
 
     async def run(self) -> None:
@@ -255,9 +254,7 @@ class LinkSigning:
         now = signing.clock.now()
         reserved = now + int(ahead_s * TICKS_PER_S)
         try:
-            await self._offload(
-                signing_time.save, self._config.storage.path, SigningTime(now, reserved, uptime_s(), this_boot())
-            )
+            await self._offload(self._kept.write, SigningTime(now, reserved, uptime_s(), this_boot()))
             self._unwritable = False
         except StorageError as error:
             level = logging.DEBUG if self._unwritable else logging.WARNING

@@ -113,11 +113,9 @@ class AttitudeService:
         self.timesync = TimesyncResponder(link, vehicle)
         self._wanted = StandingRequests(vehicle.commands)
         self._wanted.add(mavlink.MAVLink_attitude_message, ATTITUDE_RATE_HZ)
-        self._unsubscribe = [
-            link.subscribe(mavlink.MAVLink_attitude_message, self._on_attitude),
-            link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat),
-            link.subscribe(mavlink.MAVLink_vfr_hud_message, self._on_vfr_hud),
-        ]
+        link.subscribe(mavlink.MAVLink_attitude_message, self._on_attitude)
+        link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
+        link.subscribe(mavlink.MAVLink_vfr_hud_message, self._on_vfr_hud)
         self._fixed_wing = False
         self._airspeed_s = -math.inf
         self._looked_s = -math.inf
@@ -219,8 +217,6 @@ class AttitudeService:
         finally:
             self._running = False
             self.health.stop("the companion ends")
-            for unsubscribe in (*self._unsubscribe, self.difference.close, self.timesync.close, self.carrier.close):
-                unsubscribe()
 
     async def _turn(self, now_s: float) -> None:
         if now_s - self._airspeed_s > AIRSPEED_OLD_S:
@@ -257,11 +253,6 @@ class AttitudeService:
             self._say(severity, words, Weight.NEWS)
 
     # --- what is known
-
-    @property
-    def warnings(self) -> list[str]:
-        """For everybody who shows warnings."""
-        return [self.health.warning] if self.health.warning is not None else []
 
     @property
     def concern(self) -> str | None:

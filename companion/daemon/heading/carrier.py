@@ -180,7 +180,7 @@ class Carrier:
         """What came on the ground within `KEPT_S`, read by read."""
         self._wanted = False
         self._checked_s = -math.inf
-        self.close = core.vehicle.watch(self._on_event)
+        core.vehicle.watch(self._on_event)
 
     # --- what comes in, in the turn of the loop in which it was read
 

@@ -70,16 +70,13 @@ class Difference:
         self._vehicle, self._now, self._kept_at = vehicle, now, kept_at
         self._offset_s: float | None = None
         self._heard_s = -math.inf
-        self._since_s = -math.inf
-        self._sine = self._cosine = 0.0
-        self._down: Triple = (0.0, 0.0, 0.0)
         self.forget()
-        self.close = link.subscribe(mavlink.MAVLink_attitude_message, self._on_attitude)
+        link.subscribe(mavlink.MAVLink_attitude_message, self._on_attitude)
 
     def forget(self) -> None:
         """What we carry has been set anew."""
         self._sine = self._cosine = 0.0
-        self._down = (0.0, 0.0, 0.0)
+        self._down: Triple = (0.0, 0.0, 0.0)
         self._since_s = math.inf
 
     def is_known(self, now_s: float) -> bool:

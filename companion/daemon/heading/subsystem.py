@@ -24,7 +24,6 @@ from companion.samples import CompassSample, Sample, TiltSample
 if TYPE_CHECKING:
     from companion.daemon.heading.attitude_service import AttitudeService
 
-
 REBOOT: Final = "restart the autopilot then: until that it goes on as before"
 OLDEST_S: Final = 1.0
 """A reading older than this is none."""
@@ -52,7 +51,7 @@ class Heading(Subsystem):
         return {
             "pose": self.pose.now(),
             "readings": self.pose.readings(),
-            "warnings": [] if attitude is None else attitude.warnings,
+            "warnings": [] if attitude is None or attitude.health.warning is None else [attitude.health.warning],
             "attitude": None if attitude is None else attitude.view(),
             "devices": [] if attitude is None else [attitude.status()],
         }

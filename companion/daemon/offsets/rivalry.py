@@ -18,7 +18,6 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu
 
 logger = logging.getLogger(__name__)
 
-
 JUST_NOW_S: Final = 20.0
 """How long after a landing or a start a rewritten offset is taken for the work of who acts then."""
 
@@ -33,20 +32,15 @@ class Rivalry:
         self._told: set[str] = set()
         self._disarmed_s = self._rebooted_s = -math.inf
         self._was_armed = False
-        self._unsubscribe = core.vehicle.watch(self._on_event)
+        core.vehicle.watch(self._on_event)
         for name, imu in imus.items():
             imu.on_read.add(functools.partial(self._on_read, name))
 
     @property
-    def rivals(self) -> tuple[Rival, ...]:
-        """Those that are switched on, as far as it is known at the moment."""
-        found = {r.parameter: r for imu in self._imus.values() if imu.calibration for r in imu.calibration.rivals}
-        return tuple(found.values())
-
-    @property
     def warnings(self) -> list[str]:
-        """For `companion status` and `check`."""
-        return [rival.words for rival in self.rivals]
+        """Of those that are switched on, as far as it is known at the moment."""
+        known = [imu.calibration for imu in self._imus.values() if imu.calibration is not None]
+        return list(dict.fromkeys(rival.words for calibration in known for rival in calibration.rivals))
 
     def changes(self, calibrations: Sequence[ImuCalibration]) -> list[Change]:
         """What to write, before the biases, so that they stay; nothing unless that is configured."""
@@ -63,10 +57,6 @@ class Rivalry:
     def switch(self, *, stop_rivals: bool) -> None:
         """Change whether rivals are switched off with the next write."""
         self.stop_rivals = stop_rivals
-
-    def close(self) -> None:
-        """Stop listening."""
-        self._unsubscribe()
 
     def _on_event(self, event: VehicleEvent) -> None:
         now_s = asyncio.get_running_loop().time()

@@ -97,7 +97,7 @@ class Service:
                     # Before the links go: a write under way needs them to come to its end.
                     await self.calibrating.conductor.close()
         finally:
-            self.close()
+            self.core.vehicle.close()
 
     async def _connect(self) -> None:
         await run_transport(self.core.link, self.config.mavlink.url)
@@ -117,12 +117,7 @@ class Service:
             for task in running:
                 task.cancel()
             await asyncio.gather(*running, return_exceptions=True)
-            self.close()
-
-    def close(self) -> None:
-        """Stop listening to the autopilot."""
-        self.offsets.rivalry.close()
-        self.core.vehicle.close()
+            self.core.vehicle.close()
 
     def status(self) -> Object:
         """What the daemon is doing, as JSON can hold it."""

@@ -50,6 +50,7 @@ MOST_FILE_BYTES: Final = 4 << 30
 PROGRESS_S: Final = 0.5
 HANGS_S: Final = 5.0
 """How long the daemon's end waits for the disk at most."""
+INTERNAL: Final = "internal error; the log has the details"
 HOW_TO_INSTALL: Final = "recording needs more than is installed: pip install 'companion[recording]'"
 
 
@@ -180,7 +181,7 @@ class Recorder(Subsystem):
                 except Exception:
                     # Whatever it is, it must not take the daemon along.
                     logger.exception("recordings: internal error; none are kept until the next start")
-                    self.fault = "internal error; the log has the details"
+                    self.fault = INTERNAL
                     if self._on_request is not None:
                         await self._end(self._on_request, self.fault, state="failed")
                     self._journal.end()
@@ -239,9 +240,6 @@ class Recorder(Subsystem):
                 await self._in_thread(ring.close)
         except StorageError as error:
             self._stop_ring(str(error))
-        except Exception:
-            logger.exception("recordings: internal error")
-            self._stop_ring("internal error; the log has the details")
         else:
             if self.fault is not None:
                 logger.info("recordings: written again")
@@ -251,7 +249,7 @@ class Recorder(Subsystem):
         """Run a call that touches a file; a cancel waits for its end, since two of them must never overlap.
 
         Raises:
-            StorageError: as the call.
+            StorageError: as the call; and for any fault of the program in it.
         """
         task: asyncio.Future[T] = asyncio.ensure_future(self._offload(function, *arguments))
         try:
@@ -263,6 +261,11 @@ class Recorder(Subsystem):
             if (error := task.exception()) is not None:
                 logger.debug("recordings: %s", error)
             raise
+        except StorageError:
+            raise
+        except Exception as error:
+            logger.exception("recordings: internal error")
+            raise StorageError(INTERNAL) from error
 
     def _stop_ring(self, why: str) -> None:
         self._ring_again_s = asyncio.get_running_loop().time() + RETRY_S
@@ -275,9 +278,6 @@ class Recorder(Subsystem):
             await self._in_thread(recording.file.write, messages, beginning)
         except StorageError as error:
             await self._end(recording, str(error), state="failed")
-        except Exception:
-            logger.exception("recording: internal error")
-            await self._end(recording, "internal error; the log has the details", state="failed")
         else:
             if recording.until_s is not None and asyncio.get_running_loop().time() >= recording.until_s:
                 await self._end(recording, "recorded as long as was asked for")

@@ -26,7 +26,6 @@ from companion.links.system.request import Object
 
 logger = logging.getLogger(__name__)
 
-
 MAX_PENDING: Final = 8
 """The most requests that wait for their end, such as cancels in the middle of a write."""
 REMEMBERED: Final = 32
