@@ -15,7 +15,7 @@ from companion.calibration.solution.record import Arming
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from companion.storage.learned import AlignmentStore, BiasStore
 from companion.storage.records import RecordStore
-from companion.storage.signing_time import FILE
+from companion.storage.signing_time import FILE, kept_in
 from companion.storage.state import BoundedList, sealed
 
 NAMES = st.sampled_from(

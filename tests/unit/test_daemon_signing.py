@@ -155,7 +155,7 @@ def test_a_disk_that_cannot_be_written_is_said_once_and_costs_nothing_else(
             raise StorageError("disk full")
 
         signing_time.kept_in(tmp_path).write(signing_time.SigningTime(0, 0, 0.0, ""))
-        monkeypatch.setattr(signing_time, "save", full)
+        monkeypatch.setattr(StateFile, "write", full)
         async with board.daemon() as one:
             await asyncio.sleep(200.0)
             assert one.signing is not None
