@@ -44,43 +44,30 @@ _CELLS_PER_SIGMA: Final = 4.0
 _MAD_TO_SIGMA: Final = 1.4826
 
 
-class IntegerMeans(msgspec.Struct, frozen=True):
-    """Columns of one or several streams over the same seconds; LSB."""
-
-    values: Floats
-    """(m, c) mean of every second."""
-    second_sigma: Floats
-    """(c,) of one second's mean, from the Fisher information."""
-    hidden: Floats
-    """(c,) sigma that no averaging takes away: half a step where not identified, what the shape of the noise may hide
-    where identified."""
-    identified: NDArray[np.bool_]
-    """By its own readings; else by the noise of the triad's other axes, or not at all."""
-    useless: NDArray[np.bool_]
-    """(c,) not identified nor worked out with another axis' noise, and zero is among the readings: the mean could be
-    anything within a step of it."""
-    edge_rms: Floats
-    """(c,) displacement of the integers' edges that the readings show or may hide."""
-
-
 class IntegerColumns(msgspec.Struct, frozen=True):
     """What is different about the columns of truncated streams among those of all; (c,) or (m, c), SI units."""
 
     of: NDArray[np.bool_]
     """Which columns those are; the other figures of the rest are neutral."""
     values: Floats
+    """(m, c) mean of every second."""
     huber_c: Floats
     least: Floats
     """Sigma of one second's mean, from the Fisher information."""
     hidden: Floats
+    """Sigma that no averaging takes away: half a step where not identified, what the shape of the noise may hide where
+    identified."""
     unknown: NDArray[np.bool_]
+    """Not identified by their own readings, but by the noise of the triad's other axes, or not at all."""
     useless: NDArray[np.bool_]
+    """Nor worked out with another axis' noise, and zero is among the readings: the mean could be anything within a step
+    of it."""
     edge_rms: Floats
-    """In steps."""
+    """Displacement of the integers' edges that the readings show or may hide, in steps."""
 
 
 def integer_columns(
-    batches: Sequence[Sequence[Batch]], steps: Floats, truncates: NDArray[np.bool_], edges: Floats | None = None
+    batches: Sequence[Sequence[Batch]], steps: Floats, truncates: NDArray[np.bool_], edges: Floats
 ) -> IntegerColumns:
     """Work out all truncated streams.
 
@@ -111,23 +98,14 @@ def integer_columns(
             continue
         # One triad of a stream may be floats; its columns are worked out with any step and not used.
         step = np.where(of[part], steps[part], 1.0)
-        found = integer_means(own, step, edges=None if edges is None else edges[part])
-        result.values[:, part] = found.values * step
-        result.least[part] = np.where(of[part], found.second_sigma * step, 0.0)
-        result.hidden[part] = found.hidden * step
-        result.unknown[part] = of[part] & ~found.identified
-        result.useless[part] = of[part] & found.useless
-        result.edge_rms[part] = np.where(of[part], found.edge_rms, 0.0)
+        _work_out(own, step, edges[part], result, part)
     return result
 
 
-def integer_means(batches: Sequence[Batch], steps: Floats, edges: Floats | None = None) -> IntegerMeans:
-    """Work out one stream.
+def _work_out(batches: Sequence[Batch], steps: Floats, edges: Floats, result: IntegerColumns, part: slice) -> None:
+    """Work out one stream's `part` of the columns, from good seconds, at least one, with their counts.
 
-    Args:
-        batches: its good seconds, at least one, with their counts (a second without any is taken at its plain mean).
-        steps: (c,) of the stream.
-        edges: (c,) rms displacement of the integers' edges that is known, LSB.
+    A second without counts is taken at its plain mean.
     """
     sizes = np.array([batch.n for batch in batches], dtype=np.float64)
     plain = np.array([batch.mean for batch in batches]) / steps
@@ -158,14 +136,13 @@ def integer_means(batches: Sequence[Batch], steps: Floats, edges: Floats | None 
     sided = np.abs(_sides(pooled, start)) == 1.0
     unknown = np.where(sided, HALF_STEP, NO_SIDE)
     means = _half_step_means(tables, start, pooled, plain)
-    return IntegerMeans(
-        values=np.where(known, values, means),
-        second_sigma=np.where(known, second, 0.0),
-        hidden=np.where(known, np.sqrt(shape + np.square(slope)), unknown),
-        identified=own,
-        useless=np.asarray(~known & has_zero),
-        edge_rms=np.where(own, edge, 0.0),
-    )
+    of = result.of[part]
+    result.values[:, part] = np.where(known, values, means) * steps
+    result.least[part] = np.where(of & known, second, 0.0) * steps
+    result.hidden[part] = np.where(known, np.sqrt(shape + np.square(slope)), unknown) * steps
+    result.unknown[part] = of & ~own
+    result.useless[part] = of & ~known & has_zero
+    result.edge_rms[part] = np.where(of & own, edge, 0.0)
 
 
 def _borrowed(found: Fit, counts: Floats) -> Floats | None:
