@@ -202,7 +202,7 @@ class StreamHealth:
         found = likeliest(self._tail)
         self.speaks = found.protocol if found is not None and found.protocol != self._protocol else None
         if found is not None and self.speaks is not None:
-            return f"this is {found.protocol} ({_a_kind(found.kinds)})"
+            return f"this is {found.protocol} ({' or '.join(found.kinds)})"
         if (stranger := strangers(self._tail)) is not None:
             return f"this is {stranger}"
         if looks_garbled(self._tail):
@@ -251,10 +251,6 @@ def _valueless(lately: _Mark) -> Trouble | None:
     if (count := lately.rejected[reasons.OVER_RANGE]) and count >= least:
         return Trouble(reasons.OVER_RANGE, f"{count} readings are over range: level it")
     return None
-
-
-def _a_kind(kinds: Sequence[str]) -> str:
-    return " or ".join(kinds)
 
 
 def _wraps(clock_s: float) -> bool:

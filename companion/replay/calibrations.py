@@ -18,7 +18,7 @@ from companion.calibration.means.windows import Window
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.joint import weigh
-from companion.calibration.solution.record import AlignmentUsed, ImuRecord, Record
+from companion.calibration.solution.record import AlignmentUsed, Record
 from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.calibration.solution.solve import ImuSolution, Solution, solve
 from companion.config.sections import Config
@@ -97,7 +97,12 @@ def record_again(recorded: Record, solution: Solution, solved_with: Mapping[str,
         cross_covariance=again.cross_covariance if recorded.cross_covariance else (),
         duration_s=recorded.duration_s,
         warnings=_with_rest(again.warnings, recorded.warnings),
-        imus=tuple(_imu_again(imu, before.get(imu.name)) for imu in again.imus),
+        imus=tuple(
+            msgspec.structs.replace(imu, written=was.written, warnings=_with_rest(imu.warnings, was.warnings))
+            if (was := before.get(imu.name))
+            else imu
+            for imu in again.imus
+        ),
     )
 
 
@@ -112,12 +117,6 @@ def refined_window(window: Window, refined: Window | None) -> Window:
 def _with_rest(ours: tuple[str, ...], recorded: tuple[str, ...]) -> tuple[str, ...]:
     """Our warnings first, as ever; then those that come from the autopilot."""
     return (*ours, *recorded[len(ours) :])
-
-
-def _imu_again(imu: ImuRecord, recorded: ImuRecord | None) -> ImuRecord:
-    if recorded is None:
-        return imu
-    return msgspec.structs.replace(imu, written=recorded.written, warnings=_with_rest(imu.warnings, recorded.warnings))
 
 
 WINDOWS_KEPT: Final = 4000

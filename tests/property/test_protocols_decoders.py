@@ -18,8 +18,7 @@ from companion.protocols.compasses.nmea import NmeaDecoder
 from companion.protocols.compasses.os5000 import Os5000Decoder
 from companion.protocols.compasses.pni import LONGEST as PNI_LONGEST
 from companion.protocols.compasses.pni import PniDecoder
-from companion.protocols.decoding.base import Decoder, LineDecoder, SentenceDecoder, xor_checksum
-from companion.protocols.decoding.framing import FrameDecoder
+from companion.protocols.decoding.base import Decoder, FrameDecoder, LineDecoder, SentenceDecoder, xor_checksum
 from companion.protocols.imus import xsens as xsens_protocol
 from companion.protocols.imus.imu_line import ImuLineDecoder
 from companion.protocols.imus.mip import MipDecoder

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.collector.intake import Source, SourceStatus
+from companion.calibration.collector.intake import SourceStatus
 from companion.calibration.means.windows import WHITE_SHARE, Estimate, ImuEstimate
 from companion.calibration.noise.allan import floor_variance
 
@@ -58,26 +58,6 @@ class Glance(msgspec.Struct, frozen=True, kw_only=True):
     def moving(self) -> bool:
         """Whether a movement is in the way."""
         return self.obstacle is not None and self.obstacle.moving
-
-
-def obstacle(sources: Sequence[Source], now_s: float, *, good_now: bool, min_good: int) -> Obstacle | None:
-    """A silent source, or the latest second was not still; None when nothing is in the way."""
-    if (silence := next(filter(None, (source.silence(now_s) for source in sources)), None)) is not None:
-        return Obstacle(silence)
-    if good_now:
-        return None
-    said = [source.verdict for source in sources if source.verdict.words]
-    moving = not any(verdict.fault for verdict in said)
-    if not said:
-        return Obstacle(f"hold still {min_good} s", moving, min_good)
-    words = said[0].words
-    return Obstacle(words if said[0].fault else f"waiting for still: {words}", moving)
-
-
-def settling(sources: Iterable[Source | None], slots: Sequence[int], needed: int, left_s: int) -> str | None:
-    """What the mean of a pose sensor over these seconds and the next `left_s` has to wait for; None for nothing."""
-    lacks = (source.lacks(slots, needed, left_s) for source in sources if source is not None)
-    return next(filter(None, lacks), None)
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True):

@@ -21,8 +21,6 @@ from companion.calibration.collector.outlook import (
     Status,
     expected_s,
     is_enough,
-    obstacle,
-    settling,
 )
 from companion.calibration.collector.trace import Snapshot, TraceLog
 from companion.calibration.means.pose import CompassModel, GradienterModel
@@ -292,7 +290,18 @@ class RollingCollector(Intake):
                 source.gate.accept(batch)
 
     def _obstacle(self, now_s: float) -> Obstacle | None:
-        return obstacle(self._sources(), now_s, good_now=self._stretch.good_now, min_good=self._min_good)
+        """A silent source, or the latest second was not still; None when nothing is in the way."""
+        sources = self._sources()
+        if (silence := next(filter(None, (source.silence(now_s) for source in sources)), None)) is not None:
+            return Obstacle(silence)
+        if self._stretch.good_now:
+            return None
+        said = [source.verdict for source in sources if source.verdict.words]
+        moving = not any(verdict.fault for verdict in said)
+        if not said:
+            return Obstacle(f"hold still {self._min_good} s", moving, self._min_good)
+        words = said[0].words
+        return Obstacle(words if said[0].fault else f"waiting for still: {words}", moving)
 
     def _waiting_for(self, now_s: float) -> Obstacle | None:
         if (moves := self._obstacle(now_s)) is not None:
@@ -304,7 +313,10 @@ class RollingCollector(Intake):
         return Obstacle(f"hold still {left_s} s more", hold_still_s=left_s) if left_s else None
 
     def _settles(self, slots: list[int], left_s: int) -> str | None:
-        return settling((self._tilt, self._heading), slots, min(MIN_BATCHES, self._min_good), left_s)
+        """What the mean of a pose sensor over these seconds and the next `left_s` has to wait for; None for nothing."""
+        needed = min(MIN_BATCHES, self._min_good)
+        sources = filter(None, (self._tilt, self._heading))
+        return next(filter(None, (source.lacks(slots, needed, left_s) for source in sources)), None)
 
     def _slots(self, since_s: float | None) -> list[int]:
         start = self._stretch.start

@@ -20,9 +20,8 @@ import struct
 from typing import ClassVar, Final
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import RejectedError
+from companion.protocols.decoding.base import ECHO, WAIT, FrameDecoder, RejectedError
 from companion.protocols.decoding.dialogue import PollDialogue
-from companion.protocols.decoding.framing import ECHO, WAIT, FrameDecoder
 from companion.samples import CompassSample, MagSample, Sample, TiltSample
 
 SHORTEST: Final = 5

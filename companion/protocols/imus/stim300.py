@@ -32,25 +32,17 @@ from typing import ClassVar, Final
 
 from companion.physics.units import DEG, G
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import RejectedError, check_imu
-from companion.protocols.decoding.framing import WAIT, FrameDecoder
+from companion.protocols.decoding.base import WAIT, FrameDecoder, RejectedError, check_imu
 from companion.samples import ImuSample, Sample, TiltSample, Vector
 
 CRC_BYTES: Final = 4
-PART_NUMBER, SERIAL_NUMBER = (0xB1, 0xB3), (0xB5, 0xB7)
 CONFIGURATION: Final = (0xBC, 0xBD)
-EXTENDED_ERROR, BIAS_TRIM = (0xBE, 0xBF), (0xD1, 0xD2)
 
 SPECIAL_BYTES: Final[dict[int, int]] = {
-    identifier: size
-    for identifiers, size in (
-        (PART_NUMBER, 20),
-        (SERIAL_NUMBER, 20),
-        (CONFIGURATION, 26),
-        (EXTENDED_ERROR, 21),
-        (BIAS_TRIM, 40),
-    )
-    for identifier in identifiers
+    **dict.fromkeys((0xB1, 0xB3, 0xB5, 0xB7), 20),  # part number, serial number
+    **dict.fromkeys(CONFIGURATION, 26),
+    **dict.fromkeys((0xBE, 0xBF), 21),  # extended error
+    **dict.fromkeys((0xD1, 0xD2), 40),  # bias trim
 }
 """Sizes, with the CRC, of the datagrams that are sent at start-up or on demand; the second of each ends in CR LF."""
 

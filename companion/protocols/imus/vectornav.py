@@ -22,6 +22,8 @@ from typing import ClassVar
 
 from companion.protocols.decoding import reasons
 from companion.protocols.decoding.base import (
+    WAIT,
+    FrameDecoder,
     RejectedError,
     body_of_sentence,
     check_imu,
@@ -30,7 +32,6 @@ from companion.protocols.decoding.base import (
     xor_checksum,
 )
 from companion.protocols.decoding.dialogue import WakeDialogue
-from companion.protocols.decoding.framing import WAIT, FrameDecoder
 from companion.samples import ImuSample, MagSample, Sample, Vector
 
 _Fields = tuple[tuple[str, str], ...]

@@ -26,7 +26,7 @@ from typing import Final
 
 from companion.physics.units import DEG, MG
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.framing import WAIT, FrameDecoder
+from companion.protocols.decoding.base import WAIT, FrameDecoder
 from companion.samples import ImuSample, MagSample, Sample, TiltSample, Vector
 
 FRAME_BYTES: Final = 11

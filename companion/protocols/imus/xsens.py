@@ -18,9 +18,8 @@ import struct
 from typing import ClassVar, Final
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import RejectedError, check_imu, check_vector
+from companion.protocols.decoding.base import WAIT, FrameDecoder, RejectedError, check_imu, check_vector
 from companion.protocols.decoding.dialogue import WakeDialogue
-from companion.protocols.decoding.framing import WAIT, FrameDecoder
 from companion.samples import ImuSample, MagSample, Sample, Vector
 
 MAX_DATA_BYTES: Final = 1024

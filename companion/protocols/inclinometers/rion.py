@@ -17,9 +17,8 @@ from __future__ import annotations
 from typing import ClassVar, Final
 
 from companion.protocols.decoding import reasons
-from companion.protocols.decoding.base import RejectedError
+from companion.protocols.decoding.base import ECHO, WAIT, FrameDecoder, RejectedError
 from companion.protocols.decoding.dialogue import PollDialogue
-from companion.protocols.decoding.framing import ECHO, WAIT, FrameDecoder
 from companion.samples import CompassSample, Sample, TiltSample
 
 LONGEST: Final = 51
