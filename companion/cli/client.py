@@ -14,14 +14,25 @@ from companion.daemon.faces.control import ask
 Object = dict[str, Any]
 
 
-async def request(options: argparse.Namespace, wanted: Object) -> Object:
-    """Send a request, show its progress on stderr, return its last reply."""
+async def request(options: argparse.Namespace, wanted: Object, at_interrupt: Object | None = None) -> Object:
+    """Send a request, show its progress on stderr, return its last reply.
+
+    Args:
+        options: of the command line.
+        wanted: the request.
+        at_interrupt: what to ask at Ctrl-C, where it has begun: its reply is the last then. None: it is only left.
+    """
     reply: Object = {}
     shown = ""
-    async for reply in ask(load_config(options).control.path, wanted):
-        if reply["kind"] == "progress" and reply["text"] != shown:
-            shown = reply["text"]
-            print_lines(f"[{reply['percent']:3d} %] {reply['state']}: {shown}", error=True)
+    try:
+        async for reply in ask(load_config(options).control.path, wanted):
+            if reply["kind"] == "progress" and reply["text"] != shown:
+                shown = reply["text"]
+                print_lines(f"[{reply['percent']:3d} %] {reply['state']}: {shown}", error=True)
+    except asyncio.CancelledError:
+        if at_interrupt is None or not reply:
+            raise
+        return await request(options, at_interrupt)
     return reply
 
 
@@ -58,32 +69,30 @@ async def calibrate(options: argparse.Namespace) -> int:
     if "record" in reply:
         record = reply["record"]
         return finish(options, reply, record, show.record_lines(record), good=record["state"] == "done")
-    answer = {key: reply.get(key) for key in ("state", "reason")}
-    return finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=True)
+    return _finish_briefly(options, reply)
+
+
+def _finish_briefly(options: argparse.Namespace, reply: Object, *more: str, good: bool = True) -> int:
+    answer = {key: reply.get(key) for key in ("state", "reason", *more)}
+    return finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=good)
 
 
 async def cancel(options: argparse.Namespace) -> int:
     """`companion cancel`."""
-    reply = await request(options, {"command": "cancel"})
-    answer = {key: reply.get(key) for key in ("state", "reason")}
-    return finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=True)
+    return _finish_briefly(options, await request(options, {"command": "cancel"}))
 
 
 async def undo(options: argparse.Namespace) -> int:
     """`companion undo`."""
     reply = await request(options, {"command": "undo", "force": options.force})
-    answer = {key: reply.get(key) for key in ("state", "reason", "written")}
-    return finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=answer["state"] == "done")
+    return _finish_briefly(options, reply, "written", good=reply.get("state") == "done")
 
 
 async def history(options: argparse.Namespace) -> int:
     """`companion history`."""
     reply = await request(options, {"command": "history", "limit": options.limit})
-    records = reply.get("records", [])
-    armings = reply.get("armings", [])
-    numbers = reply.get("numbers", [])
-    answer = {"numbers": numbers, "records": records, "armings": armings}
-    return finish(options, reply, answer, show.history_lines(numbers, records, armings), good=True)
+    answer = {key: reply.get(key, []) for key in ("numbers", "records", "armings")}
+    return finish(options, reply, answer, show.history_lines(**answer), good=True)
 
 
 async def setup(options: argparse.Namespace) -> int:
@@ -130,40 +139,17 @@ def add_command(add: AddCommand) -> None:
 
 async def align(options: argparse.Namespace) -> int:
     """`companion align`; Ctrl-C cancels it in the daemon too."""
-    path = load_config(options).control.path
     action = "show" if options.show else "forget" if options.forget else options.what
-    request = {"command": "align", "action": action, "headings": options.headings, "quick": options.quick}
+    wanted = {"command": "align", "action": action, "headings": options.headings, "quick": options.quick}
     if options.timeout is not None:
-        request["timeout_s"] = options.timeout
-    reply: Object = {}
-    shown, running = "", False
-    try:
-        async for reply in ask(path, request):
-            if reply["kind"] == "progress":
-                running = True
-                if reply["text"] != shown:
-                    shown = reply["text"]
-                    print_lines(f"[{reply['percent']:3d} %] {shown}", error=True)
-    except asyncio.CancelledError:
-        if not running:
-            raise
-        reply = await _cancel(path)
-    return _finish(options, action, reply)
-
-
-async def _cancel(path: Any) -> Object:
-    """Ctrl-C: end what was begun, and say how that went."""
-    replies = [reply async for reply in ask(path, {"command": "cancel"})]
-    return {**replies[-1], "alignment": None}
-
-
-def _finish(options: argparse.Namespace, action: str, reply: Object) -> int:
-    answer = {key: value for key, value in reply.items() if key != "kind"}
+        wanted["timeout_s"] = options.timeout
+    reply = await request(options, wanted, {"command": "cancel"})
+    answer = {"alignment": None, **{key: value for key, value in reply.items() if key != "kind"}}
     lines: list[str] = []
     if reply["kind"] != "error":
         state = answer["state"].upper()
         lines = [f"{state}: {answer['reason']}" if answer["reason"] else state]
-        lines += alignment_lines(answer["alignment"]) if answer.get("alignment") else []
+        lines += alignment_lines(answer["alignment"]) if answer["alignment"] else []
     good = answer.get("state") in ("done", "in force") or (action == "show" and answer.get("state") != "refused")
     return finish(options, reply, answer, lines, good=good)
 
@@ -178,16 +164,17 @@ def alignment_lines(record: Object) -> list[str]:
     ]
     for imu in record["imus"]:
         lines.append(f"{imu['name']}:")
-        lines.append(_axes("bias when level", "mg", imu["level_bias_mg"], imu["level_sigma_mg"], ".3f", 1.0))
+        level = show.axes(imu["level_bias_mg"], imu["level_sigma_mg"], "+.3f")
+        lines.append(f"  {'bias when level':16} {'mg':6} {level}")
         for words, unit, key, form, scale in (
-            ("accel bias", "mg", "accel_bias_mg", ".3f", 1.0),
-            ("accel scale", "%", "accel_scale", ".4f", 100.0),
-            ("misalignment", "deg", "misalignment_deg", ".3f", 1.0),
-            ("gyro bias", "deg/h", "gyro_bias_deg_h", ".1f", 1.0),
+            ("accel bias", "mg", "accel_bias_mg", "+.3f", 1.0),
+            ("accel scale", "%", "accel_scale", "+.4f", 0.01),
+            ("misalignment", "deg", "misalignment_deg", "+.3f", 1.0),
+            ("gyro bias", "deg/h", "gyro_bias_deg_h", "+.1f", 1.0),
         ):
             found = imu[key]
             if all(found["known"]):
-                lines.append(_axes(words, unit, found["value"], found["sigma"], form, scale))
+                lines.append(f"  {words:16} {unit:6} {show.axes(found['value'], found['sigma'], form, scale)}")
     lines += [f"warning: {words}" for words in record["warnings"]]
     configured = record["gradienter"]["offset_deg"]
     lines += [
@@ -197,11 +184,3 @@ def alignment_lines(record: Object) -> list[str]:
         f"    sigma_deg = {sigma:.4f}",
     ]
     return lines
-
-
-def _axes(words: str, unit: str, values: list[float], sigmas: list[float], form: str, scale: float) -> str:
-    axes = "  ".join(
-        f"{axis} {value * scale:+{form}} +- {sigma * scale:{form}}"
-        for axis, value, sigma in zip("xyz", values, sigmas, strict=True)
-    )
-    return f"  {words:16} {unit:6} {axes}"

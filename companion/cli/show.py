@@ -28,17 +28,11 @@ def record_lines(record: Object) -> list[str]:
     pose = record.get("pose")
     if pose is not None:
         sigma = pose["sigma_deg"]
-        lines.append(
-            "pose: "
-            + ", ".join(
-                f"{words} {_number(pose[key], '.2f')} deg (sigma {_number(sigma[short], '.2f')})"
-                for words, key, short in (
-                    ("pitch", "theta_deg", "theta"),
-                    ("roll", "gamma_deg", "gamma"),
-                    ("heading", "psi_deg", "psi"),
-                )
-            )
+        angles = (
+            f"{words} {_number(pose[f'{key}_deg'], '.2f')} deg (sigma {_number(sigma[key], '.2f')})"
+            for words, key in (("pitch", "theta"), ("roll", "gamma"), ("heading", "psi"))
         )
+        lines.append(f"pose: {', '.join(angles)}")
     lines += _magnetic_lines(record.get("magnetic"))
     for imu in record["imus"]:
         lines += _imu_lines(imu)
@@ -63,17 +57,21 @@ def _imu_lines(imu: Object) -> list[str]:
     ):
         if imu[bias] is None:
             continue
-        axes = "  ".join(
-            f"{axis} {value / scale:{form}} +- {one / scale:.{form[-2]}f}"
-            for axis, value, one in zip("xyz", imu[bias], imu[sigma], strict=True)
-        )
-        lines.append(f"  {triad:5} bias {unit} {axes}{_held_back(imu, triad)}")
+        lines.append(f"  {triad:5} bias {unit} {axes(imu[bias], imu[sigma], form, scale)}{_held_back(imu, triad)}")
     for name, written in imu["written"].items():
         lines.append(
             f"  {name:16} {_number(written['before'], '+.6f')} -> {written['after']:+.6f}  {written['outcome']}"
         )
     lines += [f"  warning: {warning}" for warning in imu["warnings"]]
     return lines
+
+
+def axes(values: Sequence[float], sigmas: Sequence[float], form: str, scale: float = 1.0) -> str:
+    """Three figures with their sigmas, in a unit that is so many of theirs; `form` such as "+9.1f"."""
+    return "  ".join(
+        f"{axis} {value / scale:{form}} +- {sigma / scale:.{form[-2]}f}"
+        for axis, value, sigma in zip("xyz", values, sigmas, strict=True)
+    )
 
 
 def _number(value: float | None, form: str) -> str:
@@ -115,9 +113,7 @@ def status_lines(status: Object) -> list[str]:
     )
     lines.append(f"in force: {arming['in_force']}")
     lines += [f"profile {each['imu']}: {each['summary']}" for each in status["profiles"]]
-    if status["page"] is not None:
-        lines.append(f"page: {'' if status['page']['good'] else 'none: '}{status['page']['summary']}")
-    lines.append(_last_line(status))
+    lines += _end_lines(status)
     if status["last"] is not None:
         lines += _magnetic_lines(status["last"].get("magnetic"))
     return lines
@@ -161,10 +157,11 @@ def headline_line(status: Object) -> str:
     return f"{headline['word']}: {headline['reason']}"
 
 
-def _last_line(status: Object) -> str:
-    last = status["last"]
+def _end_lines(status: Object) -> list[str]:
+    page, last = status["page"], status["last"]
+    lines = [] if page is None else [f"page: {'' if page['good'] else 'none: '}{page['summary']}"]
     found = f"{last['state']} at {last['started_at']}: {last['reason']}" if last is not None else "none yet"
-    return f"last calibration: {found}"
+    return [*lines, f"last calibration: {found}"]
 
 
 def monitor_lines(status: Object) -> list[str]:
@@ -190,9 +187,7 @@ def monitor_lines(status: Object) -> list[str]:
     lines += ["", *(f"{'ok ' if good else 'BAD'}  {name:{width}}  {words}" for good, name, words in links), ""]
     lines += _bias_lines(status["calibration"])
     lines.append(f"in force: {status['arming']['in_force']}")
-    if status["page"] is not None:
-        lines.append(f"page: {'' if status['page']['good'] else 'none: '}{status['page']['summary']}")
-    lines.append(_last_line(status))
+    lines += _end_lines(status)
     return lines
 
 
@@ -203,11 +198,8 @@ def _bias_lines(calibration: Object | None) -> list[str]:
             biases, sigmas = imu[f"{words}_bias_{unit}"], imu[f"{words}_sigma_{unit}"]
             if biases is None:
                 continue
-            axes = "  ".join(
-                f"{axis} {bias:{form}} +- {sigma:.{form[-2]}f}"
-                for axis, bias, sigma in zip("xyz", biases, sigmas, strict=True)
-            )
-            lines.append(f"{imu['name']:8} {words:5} {unit.replace('_', '/'):5} {axes}{_held_back(imu, words)}")
+            figures = f"{axes(biases, sigmas, form)}{_held_back(imu, words)}"
+            lines.append(f"{imu['name']:8} {words:5} {unit.replace('_', '/'):5} {figures}")
     return lines
 
 

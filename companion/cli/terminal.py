@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from companion import config
-from companion.config.profiles import SavedProfiles
+from companion.config import SavedProfiles
 from companion.config.sections import Config, Storage
 from companion.errors import ConfigError
 from companion.printable import printable

@@ -14,7 +14,7 @@ import msgspec
 
 from companion import formats
 from companion.calibration.noise.allan import PROFILES, AllanModel, NoiseProfile
-from companion.config.profiles import CATALOGUE
+from companion.config import CATALOGUE
 from companion.config.sections import Noise
 from companion.errors import ConfigError, StorageError
 from companion.storage.state import UNREADABLE, read_regular, sealed, unsealed, write_atomically

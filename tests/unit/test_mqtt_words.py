@@ -12,8 +12,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from companion.config.sections import Mqtt
 from companion.errors import LinkError
-from companion.links.mqtt.credentials import is_open_to_all, read_password, tls_context
-from companion.links.mqtt.words import explain
+from companion.links.mqtt.broker import explain, is_open_to_all, read_password, tls_context
 
 HOST = "192.0.2.1"
 

@@ -18,10 +18,9 @@ from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from companion.config.sections import Mqtt
-from companion.links.mqtt.credentials import is_open_to_all, read_password, tls_context
+from companion.links.mqtt.broker import explain, is_of_protocol, is_open_to_all, read_password, tls_context
 from companion.links.mqtt.filter import LEAVE_DEADLINE_S, MAX_PACKET_BYTES, MqttFilter
 from companion.links.mqtt.outbox import Outbox
-from companion.links.mqtt.words import explain, is_of_protocol
 from companion.links.system.connection import Backoff, Reconnection
 
 if TYPE_CHECKING:
