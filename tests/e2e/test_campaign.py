@@ -22,7 +22,7 @@ from tests.campaign.stage import VARIANTS, Stage
 # A daemon that is killed closes no file.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
-CELLS = slice_of(SEED, 24)
+CELLS = slice_of(SEED, 16)
 CELLS_A_TEST = 4
 
 
@@ -51,7 +51,7 @@ def test_the_catalogue_is_whole() -> None:
 
 
 def test_a_slice_is_the_same_every_time_and_of_every_room() -> None:
-    assert CELLS == slice_of(SEED, 24) != slice_of(SEED + 1, 24)
+    assert CELLS == slice_of(SEED, 16) != slice_of(SEED + 1, 16)
     assert len({FAULTS[name].room for name, _, _ in CELLS}) >= 8
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.daemon.devices import signing as daemon_signing
+from companion.links.mavlink import signing as link_signing
 from companion.links.mavlink.signing import ticks_of
 from sim.px4.double import PX4Double
 from tests.e2e.test_interleavings import people
@@ -24,7 +24,7 @@ from tests.support.extent import extent
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
-CASES = extent(whole=1000, a_slice=50)
+CASES = extent(whole=1000, a_slice=25)
 CASES_A_TEST = 25
 ACTS_S = 10.0
 WIRE_S = 0.05
@@ -165,7 +165,7 @@ def test_nothing_is_written_to_an_armed_aircraft_whoever_says_disarmed(
     tmp_path: Path, first: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "fsync", lambda descriptor: None)
-    monkeypatch.setattr(daemon_signing, "SigningClock", virtual_clock)
+    monkeypatch.setattr(link_signing, "SigningClock", virtual_clock)
     writes = conflicts = 0
     for seed in range(first, first + CASES_A_TEST):
         folder = tmp_path / str(seed)

@@ -50,7 +50,7 @@ def test_calibrated_and_undone_from_the_ground(tmp_path: Path) -> None:
             sigma_rad_s = max(sigma for imu in record["imus"] for sigma in imu["gyro_sigma_use_rad_s"])
             assert done.json["gyro_sigma_deg_h"] == pytest.approx(sigma_rad_s * 57.29578 * 3600, rel=1e-3)
             assert done.json["accel_sigma_mg"] is None
-            assert f"{done.json['gyro_sigma_deg_h']:.1f} deg/h" in done.json["reason"]
+            assert f"sigma {done.json['gyro_sigma_deg_h']:.3g} deg/h" in done.json["reason"]
             for words in ("Calibration started", "[ 70 %]", "writing", "checking", "Calibration done"):
                 assert words in done.err
 

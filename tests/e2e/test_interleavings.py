@@ -23,7 +23,7 @@ from tests.support.extent import extent
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
-CASES = extent(whole=1000, a_slice=100)
+CASES = extent(whole=1000, a_slice=50)
 CASES_A_TEST = 25
 ACTS_S = 10.0
 COMMANDS = (CALIBRATE, CANCEL, UNDO)

@@ -47,9 +47,11 @@ class Scene(NamedTuple):
 
 
 @contextlib.asynccontextmanager
-async def scene(folder: Path, bind: str, size: tuple[int, int]) -> AsyncIterator[Scene]:
+async def scene(
+    folder: Path, bind: str, size: tuple[int, int], still_s: tuple[float, float] = (3.0, 4.0)
+) -> AsyncIterator[Scene]:
     async with (
-        flight_line(folder, more=f'[web]\nbind = "{bind}"\n') as line,
+        flight_line(folder, more=f'[web]\nbind = "{bind}"\n', still_s=still_s) as line,
         chromium(folder / "profile") as browser,
     ):
         status = await companion("-c", str(line.config), "status", "--json")
@@ -184,7 +186,8 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
 
 def test_a_laptop_beyond_the_board_needs_the_token(tmp_path: Path) -> None:
     async def main() -> None:
-        async with scene(tmp_path, "0.0.0.0:0", DESKTOP) as here:
+        # It is not done before it has been cancelled.
+        async with scene(tmp_path, "0.0.0.0:0", DESKTOP, still_s=(600.0, 600.0)) as here:
             tab = here.tab
             kept = await companion("-c", str(here.line.config), "web-token", "--json")
             token = kept.json["token"]

@@ -20,7 +20,8 @@ from typing import Any, Final
 
 PHONE: Final = (390, 844)
 DESKTOP: Final = (1280, 800)
-REPLY_WITHIN_S: Final = 40.0
+REPLY_WITHIN_S: Final = 120.0
+"""Longer than `Tab.until` waits: it says what the page shows instead."""
 LIMIT: Final = 32 * 1024 * 1024
 
 FLAGS: Final = (
