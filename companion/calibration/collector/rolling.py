@@ -77,7 +77,6 @@ class RollingCollector(Intake):
         self._next: int | None = None
         self._now_s = -math.inf
         self._good: dict[int, bool] = {}
-        self._best_progress = 0.0
         self._estimates = Estimates()
         self._trace = TraceLog()
         self._restarts = 0
@@ -156,15 +155,11 @@ class RollingCollector(Intake):
                 progress = 1.0 if enough else self._stretch.good / needed
         elif self._stretch.start is not None:
             progress = min(self._stretch.good / self._max_slots, 0.99)
-        if self._stretch.start is None:
-            self._best_progress = 0.0
-        # The forecast moves with the noise seen so far; a bar that goes back and forth helps nobody.
-        self._best_progress = min(max(self._best_progress, progress), 1.0 if enough else 0.99)
         return Status(
             still_s=float(self._stretch.good),
             obstacle=waiting,
             enough=enough,
-            progress=self._best_progress,
+            progress=min(progress, 1.0 if enough else 0.99),
             sources=tuple(source.status(now_s) for source in sources),
         )
 
@@ -227,7 +222,6 @@ class RollingCollector(Intake):
         self._stretch.clear()
         self._good.clear()
         self._estimates.clear()
-        self._best_progress = 0.0
         for source in self._sources():
             source.gate.new_stretch()
 
