@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 
 from companion.config import parse
-from companion.daemon.devices.doctor import Finding
-from companion.daemon.process.check import run_check
+from companion.daemon.process.check import Finding, run_check
 from sim.uart import Setting
 from tests.e2e.test_commands import companion
 from tests.support.chatter import Chatter, compass_frame, tilt_frame

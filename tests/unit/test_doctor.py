@@ -9,7 +9,7 @@ import pytest
 
 from companion.config import parse
 from companion.config.sections import Config
-from companion.daemon.devices.doctor import sensor_findings, system_findings, where_it_may_be
+from companion.daemon.process.check import sensor_findings, system_findings, where_it_may_be
 from companion.links.serial.faults import PortFault, port_faults, same_ports
 from companion.links.serial.ports import lasting_name, latency_timer_ms
 from tests.support.usb_tree import UsbTree

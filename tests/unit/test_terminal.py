@@ -23,7 +23,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.cli import logs, main, monitor
 from companion.cli.logs import JournalFormatter, OneLineFormatter
-from companion.daemon.devices.doctor import Finding
+from companion.daemon.process.check import Finding
 from companion.errors import LinkError
 from companion.ground.display import Display
 from companion.ground.heard import Heard, Target
