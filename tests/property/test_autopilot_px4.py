@@ -115,7 +115,6 @@ def test_what_is_read_and_written_takes_the_residual_out(
             gyro_step, accel_step = output_step(found, changes)
             np.testing.assert_allclose(gyro + gyro_step, gyro_then, atol=1e-8)
             np.testing.assert_allclose(accel + accel_step, accel_then, atol=1e-6)
-        client.close()
         vehicle.close()
 
     run_virtual(main())

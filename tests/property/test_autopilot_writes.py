@@ -102,7 +102,6 @@ def test_nothing_leaves_unless_disarmed_and_what_is_reported_is_true(
                 trouble.cancel()
             assert client.writes == link.sets
             assert link.forbidden == []
-            client.close()
             vehicle.close()
 
     run_virtual(main())
@@ -154,7 +153,6 @@ def test_a_cancel_at_any_moment_leaves_the_old_values(seed: int, loss: float, af
             if loss == 0.0:
                 assert left == []
             assert link.forbidden == []
-            client.close()
             vehicle.close()
 
     run_virtual(main())

@@ -37,7 +37,6 @@ async def aboard(autopilot: ScriptedAutopilot) -> AsyncIterator[tuple[ParameterC
         await vehicle.wait_found()
         await asyncio.sleep(1.0)
         yield client, vehicle, wire
-    client.close()
     vehicle.close()
 
 

@@ -45,7 +45,6 @@ async def aboard(px4: ScriptedPx4) -> AsyncIterator[Aboard]:
         await vehicle.wait_found()
         await asyncio.sleep(1.0)
         yield Aboard(px4, vehicle, client, ParameterWriter(client, vehicle))
-    client.close()
     vehicle.close()
 
 

@@ -83,7 +83,6 @@ class Stage:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-            self.client.close()
             self.vehicle.close()
 
     async def mean(self, seconds: float) -> tuple[Any, Any, Any]:

@@ -34,7 +34,6 @@ async def aboard(autopilot: ScriptedAutopilot) -> AsyncIterator[tuple[ParameterW
         await vehicle.wait_found()
         await asyncio.sleep(1.0)
         yield ParameterWriter(client, vehicle), vehicle, wire
-    client.close()
     vehicle.close()
 
 

@@ -70,7 +70,6 @@ async def aboard(px4: ScriptedPx4, folder: Path) -> AsyncIterator[Stage]:
         await vehicle.wait_found()
         await asyncio.sleep(1.0)
         yield Stage(px4, client, writer, writes, memory)
-    client.close()
     vehicle.close()
 
 

@@ -76,11 +76,9 @@ class ParameterClient:
         """Names that this boot of the autopilot has shown not to have: told by silence, that takes seconds to learn."""
         self._types: dict[str, int] = {}
         """MAV_PARAM_TYPE by name, as heard since the last restart; so these exist, however silent it is about them."""
-        self._unsubscribe = [
-            link.subscribe(mavlink.MAVLink_param_value_message, self._on_value),
-            link.subscribe(mavlink.MAVLink_param_error_message, self._on_error),
-            vehicle.watch(self._on_event),
-        ]
+        link.subscribe(mavlink.MAVLink_param_value_message, self._on_value)
+        link.subscribe(mavlink.MAVLink_param_error_message, self._on_error)
+        vehicle.watch(self._on_event)
 
     async def read(self, name: str) -> float:
         """Ask for a parameter by name and return what comes.
@@ -221,11 +219,6 @@ class ParameterClient:
     def watch(self, callback: Callable[[str, float], None]) -> Unsubscribe:
         """Be told of every PARAM_VALUE of the autopilot, whoever caused it; returns how to stop that."""
         return self._listeners.add(callback)
-
-    def close(self) -> None:
-        """Stop listening."""
-        for unsubscribe in self._unsubscribe:
-            unsubscribe()
 
     @property
     def _bytewise(self) -> bool:

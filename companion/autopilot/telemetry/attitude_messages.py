@@ -77,12 +77,12 @@ def attitude_messages(
 
 
 class TimesyncResponder:
-    """Answers the latched autopilot, with the clock that stamps what we send; ask for it with `close` to stop."""
+    """Answers the latched autopilot, with the clock that stamps what we send."""
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
         self.answered = 0
         self._link, self._vehicle = link, vehicle
-        self.close = link.subscribe(mavlink.MAVLink_timesync_message, self._on_timesync)
+        link.subscribe(mavlink.MAVLink_timesync_message, self._on_timesync)
 
     def _on_timesync(self, message: mavlink.MAVLink_timesync_message, _t_s: float) -> None:
         if message.tc1 == 0 and self._vehicle.sent(message):

@@ -86,16 +86,14 @@ class BootWatch:
         self._sent, self._on_restart = sent, on_restart
         self._clock = BootClock()
         self._heard = asyncio.Event()
-        self._unsubscribe = [
-            link.subscribe(mavlink.MAVLink_system_time_message, self._on_boot_ms),
-            link.subscribe(mavlink.MAVLink_global_position_int_message, self._on_boot_ms),
-            link.subscribe(mavlink.MAVLink_attitude_message, self._on_boot_ms),
-            link.subscribe(mavlink.MAVLink_scaled_imu_message, self._on_boot_ms),
-            link.subscribe(mavlink.MAVLink_scaled_imu2_message, self._on_boot_ms),
-            link.subscribe(mavlink.MAVLink_scaled_imu3_message, self._on_boot_ms),
-            link.subscribe(mavlink.MAVLink_raw_imu_message, self._on_boot_us),
-            link.subscribe(mavlink.MAVLink_highres_imu_message, self._on_boot_us),
-        ]
+        for kind in (
+            mavlink.MAVLink_system_time_message, mavlink.MAVLink_global_position_int_message,
+            mavlink.MAVLink_attitude_message, mavlink.MAVLink_scaled_imu_message, mavlink.MAVLink_scaled_imu2_message,
+            mavlink.MAVLink_scaled_imu3_message,
+        ):  # fmt: skip
+            link.subscribe(kind, self._on_boot_ms)
+        link.subscribe(mavlink.MAVLink_raw_imu_message, self._on_boot_us)
+        link.subscribe(mavlink.MAVLink_highres_imu_message, self._on_boot_us)
 
     @property
     def latest_s(self) -> float | None:
@@ -115,11 +113,6 @@ class BootWatch:
         except TimeoutError:
             return False
         return True
-
-    def close(self) -> None:
-        """Stop listening."""
-        for unsubscribe in self._unsubscribe:
-            unsubscribe()
 
     def _on_boot_ms(self, message: Any, t_s: float) -> None:
         if self._sent(message):

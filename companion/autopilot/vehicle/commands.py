@@ -51,7 +51,7 @@ class Commands:
         self._in_flight: dict[int, _Request] = {}
         self._timers: dict[int, asyncio.TimerHandle] = {}
         self._last_ack = (0, 0, 0, -math.inf)
-        self._unsubscribe = link.subscribe(mavlink.MAVLink_command_ack_message, self._on_ack)
+        link.subscribe(mavlink.MAVLink_command_ack_message, self._on_ack)
 
     def send(self, command: int, *parameters: float, timeout_s: float = 0.5) -> asyncio.Future[int | None]:
         """Send when its turn comes; the future brings the MAV_RESULT, or None when none came in time.
@@ -80,7 +80,6 @@ class Commands:
 
     def close(self) -> None:
         """Stop; whoever waits gets None."""
-        self._unsubscribe()
         for timer in self._timers.values():
             timer.cancel()
         self._timers.clear()

@@ -106,14 +106,11 @@ class Vehicle:
         self._lost_timer: asyncio.TimerHandle | None = None
         self._tick_timer: asyncio.TimerHandle | None = None
         self._tick_due_s = math.inf
-        self._closed = False
-        self._unsubscribe = [
-            link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat),
-            link.subscribe(mavlink.MAVLink_system_time_message, self._of_ours(self.place.hear_time)),
-            link.subscribe(mavlink.MAVLink_autopilot_version_message, self._of_ours(self._on_version)),
-            link.subscribe(mavlink.MAVLink_global_position_int_message, self._of_ours(self.place.hear_estimate)),
-            link.subscribe(mavlink.MAVLink_gps_raw_int_message, self._of_ours(self.place.hear_receiver)),
-        ]
+        self._unsubscribe = link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
+        link.subscribe(mavlink.MAVLink_system_time_message, self._of_ours(self.place.hear_time))
+        link.subscribe(mavlink.MAVLink_autopilot_version_message, self._of_ours(self._on_version))
+        link.subscribe(mavlink.MAVLink_global_position_int_message, self._of_ours(self.place.hear_estimate))
+        link.subscribe(mavlink.MAVLink_gps_raw_int_message, self._of_ours(self.place.hear_receiver))
 
     @property
     def arm_state(self) -> ArmState:
@@ -210,13 +207,10 @@ class Vehicle:
         return True
 
     def close(self) -> None:
-        """Stop listening; the arm state is UNKNOWN from here on."""
-        self._closed = True
+        """Hear no heartbeat any more; the arm state is UNKNOWN from here on."""
         self._lost = True
         self._found.clear()
-        for unsubscribe in self._unsubscribe:
-            unsubscribe()
-        self.boot.close()
+        self._unsubscribe()
         for timer in (self._lost_timer, self._tick_timer):
             if timer is not None:
                 timer.cancel()
@@ -319,8 +313,6 @@ class Vehicle:
         if now_s - self._tick_due_s > _STALL_S:
             self._trusted_from_s = now_s + 0.1
             logger.warning("the event loop stood still for %.1f s", now_s - self._tick_due_s)
-        if self._closed:
-            return
         self._tick_due_s = now_s + _TICK_S
         self._tick_timer = loop.call_at(self._tick_due_s, self._tick)
         if not self._lost:
