@@ -90,11 +90,6 @@ REFUSED_S: Final = 20.0
 """A compass that has been outside the gate for so long is worth a word to the pilot."""
 
 
-def innovation_of_heading(heading_true_rad: float, yaw_rad: float) -> float:
-    """How much the attitude's heading should turn, in [-pi, pi]."""
-    return math.remainder(heading_true_rad - yaw_rad, 2.0 * math.pi)
-
-
 class HeadingAid:
     """Decides what of an innovation is believed."""
 
@@ -107,7 +102,7 @@ class HeadingAid:
 
         Args:
             t_s: of the reading.
-            innovation_rad: as the functions above give it.
+            innovation_rad: how much the attitude's heading should turn, in [-pi, pi].
             sigma_rad: of the heading that we have.
             compass_sigma_rad: of the reading.
         """

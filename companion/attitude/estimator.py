@@ -16,7 +16,7 @@ from typing import Final, Literal
 import msgspec
 import numpy as np
 
-from companion.attitude.corrections import STEEP_RAD, HeadingAid, Leveller, innovation_of_heading
+from companion.attitude.corrections import STEEP_RAD, HeadingAid, Leveller
 from companion.attitude.quaternion import (
     Quaternion,
     Triple,
@@ -268,7 +268,13 @@ class AttitudeEstimator:
         _, pitch, yaw = roll_pitch_yaw(found[1])
         if abs(pitch) > STEEP_RAD:
             return False
-        return self._turn(t_s, innovation_of_heading(heading_true_rad, yaw), sigma_rad)
+        innovation_rad = math.remainder(heading_true_rad - yaw, 2.0 * math.pi)
+        gain = self._heading.gain(t_s, innovation_rad, self._uncertainty.heading_sigma_rad, sigma_rad)
+        if gain == 0.0:
+            return False
+        self._leveller.turn_heading(gain * innovation_rad)
+        self._uncertainty.head(gain, sigma_rad)
+        return True
 
     def kept_at(self, t_s: float) -> tuple[float, Quaternion] | None:
         """What is remembered of the attitude then, body to NED, by the present opinion of level and north.
@@ -279,14 +285,6 @@ class AttitudeEstimator:
             if then_s <= t_s:
                 return then_s, multiply(multiply(self._leveller.ned_from_e, orientation), self._sensor_from_vehicle)
         return None
-
-    def _turn(self, t_s: float, innovation_rad: float, sigma_rad: float) -> bool:
-        gain = self._heading.gain(t_s, innovation_rad, self._uncertainty.heading_sigma_rad, sigma_rad)
-        if gain == 0.0:
-            return False
-        self._leveller.turn_heading(gain * innovation_rad)
-        self._uncertainty.head(gain, sigma_rad)
-        return True
 
     # ------------------------------------------------------------------------------------------------- result
 

@@ -46,9 +46,6 @@ class Uncertainty:
         self._gravity = gravity_m_s2
         self._level_variance = (max(accel_sigma_m_s2) / gravity_m_s2) ** 2
         self._bias_start = np.asarray(bias_covariance, dtype=np.float64)
-        self._covariance = np.zeros((6, 6))
-        self._levelled = 0.0
-        self._turned = np.zeros(3)
         self.restart(np.eye(3) * HEADING_UNKNOWN_RAD**2)
 
     def restart(self, attitude_covariance: Matrix) -> None:

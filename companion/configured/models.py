@@ -70,14 +70,13 @@ def profiles(config: Config) -> list[dict[str, object]]:
     store = ProfileStore(config.storage.path)
     found: list[dict[str, object]] = []
     for imu in config.imu:
-        fitted = isinstance(imu.profile, Noise)
-        name = imu.profile.name if isinstance(imu.profile, Noise) else imu.profile
+        fitted = imu.profile.name if isinstance(imu.profile, Noise) else None
         found.append(
             {
                 "imu": imu.name,
-                "name": name,
-                "fitted": fitted,
-                "file": str(store.path(imu.profile.name)) if isinstance(imu.profile, Noise) else None,
+                "name": fitted or imu.profile,
+                "fitted": fitted is not None,
+                "file": None if fitted is None else str(store.path(fitted)),
                 "summary": profile_in_words(imu.profile),
             }
         )
@@ -111,33 +110,22 @@ def attitude_rate_hz(config: Config) -> float:
 
 def cannot_work(config: Config) -> list[str]:
     """What the configuration asks for and cannot come about: said at start, never silently ignored."""
-    found = []
-    if config.push.attitude != "off" and config.compass is None:
-        found.append(f'push.attitude = "{config.push.attitude}" needs [compass]: without one no heading is known')
-    return found
+    if config.push.attitude == "off" or config.compass is not None:
+        return []
+    return [f'push.attitude = "{config.push.attitude}" needs [compass]: without one no heading is known']
 
 
 def doubtful(config: Config) -> list[str]:
     """What in the configuration is taken as it stands, and is probably not meant."""
-    return [*_unused_key(config), *_other_law(config)]
-
-
-def _unused_key(config: Config) -> list[str]:
-    if config.mavlink.signing_mode != "off" or config.mavlink.signing_key_file is None:
-        return []
-    return ['mavlink.signing_key_file is named, but signing = "off": nothing is signed or checked']
-
-
-def _other_law(config: Config) -> list[str]:
-    gradienter = config.gradienter
-    if gradienter is None:
-        return []
-    law = PROTOCOLS["gradienter"][gradienter.protocol].law
-    if law is None or law == gradienter.law:
-        return []
-    return [
-        f'gradienter.law: found "{gradienter.law}"; protocol "{gradienter.protocol}" gives "{law}" angles: say that'
-    ]
+    found, gradienter = [], config.gradienter
+    if config.mavlink.signing_mode == "off" and config.mavlink.signing_key_file is not None:
+        found.append('mavlink.signing_key_file is named, but signing = "off": nothing is signed or checked')
+    law = gradienter and PROTOCOLS["gradienter"][gradienter.protocol].law
+    if gradienter is not None and law is not None and law != gradienter.law:
+        found.append(
+            f'gradienter.law: found "{gradienter.law}"; protocol "{gradienter.protocol}" gives "{law}" angles: say that'
+        )
+    return found
 
 
 def imu_input(imu: Imu, kind: StreamKind | None, grid: tuple[float, float] = (0.0, 0.0)) -> ImuInput:

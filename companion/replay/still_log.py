@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import itertools
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
@@ -103,13 +104,10 @@ def _read_recording(path: Path) -> list[StillLog]:
     truncated: set[str] = set()
     profiles: dict[str, str | Noise | None] = {}
     offset_s: float | None = None
-    for item in Recording(path):
+    for item in Recording(path).items(lambda topic: topic == topics.JOURNAL or topic.startswith(topics.IMU)):
         if isinstance(item, Message):
-            imu = item.topic.startswith(topics.IMU)
-            if not imu and item.topic != topics.JOURNAL:
-                continue
             try:
-                entry = (imu_entry if imu else journal).decode(item.data)
+                entry = (journal if item.topic == topics.JOURNAL else imu_entry).decode(item.data)
             except msgspec.MsgspecError as error:
                 raise StorageError(
                     f"{path}: a message on {item.topic} cannot be used by this version ({error})"
@@ -130,37 +128,26 @@ def _read_recording(path: Path) -> list[StillLog]:
             profiles = _profiles(item.data)
     if not entries:
         raise StorageError(f"{path}: no samples of an IMU in it")
-    logs = [
-        _log(path, name, own, offset_s, profiles.get(name), truncated=name in truncated)
-        for name, own in entries.items()
-    ]
-    return [msgspec.structs.replace(log, breaks_s=tuple(breaks)) for log in logs]
-
-
-def _log(
-    path: Path,
-    name: str,
-    entries: list[topics.ImuEntry],
-    offset_s: float | None,
-    profile: str | Noise | None,
-    *,
-    truncated: bool,
-) -> StillLog:
-    nan = float("nan")
-    rows = np.array([(*entry.gyro_rad_s, *entry.accel_m_s2) for entry in entries], dtype=np.float64).reshape(-1, 6)
-    temperatures = (nan if entry.temperature_degc is None else entry.temperature_degc for entry in entries)
-    t_s = np.array([entry.t_s for entry in entries], dtype=np.float64)
-    return StillLog(
-        imu=name,
-        files=(path.name,),
-        began_unix_s=None if offset_s is None or not len(t_s) else float(t_s[0]) + offset_s,
-        t_s=t_s,
-        readings=rows,
-        temperature_degc=np.fromiter(temperatures, dtype=np.float64, count=len(entries)),
-        profile=profile,
-        truncated=truncated and not entries,
-        clock_offset_s=offset_s,
-    )
+    logs = []
+    for name, own in entries.items():
+        t_s = np.array([entry.t_s for entry in own], dtype=np.float64)
+        rows = np.array([(*entry.gyro_rad_s, *entry.accel_m_s2) for entry in own], dtype=np.float64).reshape(-1, 6)
+        temperatures = [math.nan if entry.temperature_degc is None else entry.temperature_degc for entry in own]
+        logs.append(
+            StillLog(
+                imu=name,
+                files=(path.name,),
+                began_unix_s=None if offset_s is None or not own else own[0].t_s + offset_s,
+                t_s=t_s,
+                readings=rows,
+                temperature_degc=np.array(temperatures, dtype=np.float64),
+                profile=profiles.get(name),
+                truncated=name in truncated and not own,
+                clock_offset_s=offset_s,
+                breaks_s=tuple(breaks),
+            )
+        )
+    return logs
 
 
 def _offset(table: dict[str, str]) -> float | None:

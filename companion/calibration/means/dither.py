@@ -88,7 +88,7 @@ def why_void(steps: Sequence[Step], latest: Step, steps_lsb: Floats) -> str | No
         return "too few readings"
     corrected, scatter = _corrected(latest, steps_lsb)
     for batch in latest.batches:
-        if batch.counts is None or _has_zero(batch):
+        if _has_zero(batch):
             return "a reading too near to zero"
     if not steps:
         return None

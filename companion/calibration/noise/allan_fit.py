@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import FLOOR_OF_FLICKER, allan_variance
-from companion.physics.frames import Floats
+from companion.physics.frames import Floats, vector
 
 Slots = NDArray[np.int64]
 
@@ -116,20 +116,15 @@ def fit_axis(curves: Sequence[Curve], column: int) -> AxisFit:
             break
     information, _ = _normal_equations(parts, theta)
     sigmas = np.sqrt(np.diag(np.linalg.inv(information)))
-    upper = [_upper(parts, theta, which, float(sigmas[which])) for which in range(3)]
-    scale = np.array([1.0, 1.0, 1.0]) * unit2
-    figures, limits = np.sqrt(theta * scale), np.sqrt(np.array(upper) * scale)
+    upper = np.array([_upper(parts, theta, which, float(sigmas[which])) for which in range(3)])
+    n, b, k = (theta > KNOWN_SIGMAS * sigmas).tolist()
     return AxisFit(
-        (float(figures[0]), float(figures[1]), float(figures[2])),
-        (float(sigmas[0] * unit2), float(sigmas[1] * unit2), float(sigmas[2] * unit2)),
-        (float(limits[0]), float(limits[1]), float(limits[2])),
-        (_tells(theta, sigmas, 0), _tells(theta, sigmas, 1), _tells(theta, sigmas, 2)),
-        _excess(parts, theta),
+        figures=vector(np.sqrt(theta * unit2)),
+        sigmas=vector(sigmas * unit2),
+        upper=vector(np.sqrt(upper * unit2)),
+        known=(n, b, k),
+        excess=_excess(parts, theta),
     )
-
-
-def _tells(theta: Floats, sigmas: Floats, which: int) -> bool:
-    return bool(theta[which] > KNOWN_SIGMAS * sigmas[which])
 
 
 class _Part:

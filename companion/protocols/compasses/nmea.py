@@ -85,7 +85,6 @@ class NmeaDecoder(SentenceDecoder):
             else:
                 raise RejectedError(reasons.UNKNOWN_SENTENCE)
             return
-        # All in one piece, because it is what comes most.
         rank, size, marks, north = plain
         if len(fields) != size:
             raise RejectedError(reasons.FIELD_COUNT)
@@ -95,12 +94,8 @@ class NmeaDecoder(SentenceDecoder):
                 heading_deg = (heading_deg + _easting(fields[2], fields[3])) % 360.0
         elif fields[2] not in marks:
             raise RejectedError(reasons.NOT_A_MEASUREMENT if rank == _THS else reasons.UNKNOWN_FIELD)
-        if not 0.0 <= heading_deg < 360.0:
-            heading_deg = _full_circle(heading_deg)
-        if rank == self._heading_from:
-            self._heading_s = t_s
-        else:
-            self._claim_heading(rank, t_s)
+        heading_deg = _full_circle(heading_deg)
+        self._claim_heading(rank, t_s)
         samples.append(CompassSample(t_s, heading_deg, None, None, north))
 
     def _claim_heading(self, sentence: int, t_s: float) -> None:
@@ -130,8 +125,7 @@ class NmeaDecoder(SentenceDecoder):
             heading_deg *= _DEGREES_PER_MIL
         if not (-90.0 <= pitch_deg <= 90.0 and -90.0 <= roll_deg <= 90.0):
             raise _out_of_range(pitch_deg + roll_deg)
-        if not 0.0 <= heading_deg < 360.0:
-            heading_deg = _full_circle(heading_deg)
+        heading_deg = _full_circle(heading_deg)
         if no_heading:
             samples.append(TiltSample(t_s, roll_deg, pitch_deg))
         else:
