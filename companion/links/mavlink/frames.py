@@ -1,16 +1,13 @@
-"""Reading the common case of a MAVLink frame quickly: version 2, unsigned, whole, its checksum right.
+"""What a MAVLink frame is, in the common case: version 2, unsigned, whole, its checksum right.
 
-pymavlink's own decoder takes 40 us for what can be had in 10, and has to decode a message to tell its name; an
-autopilot sends hundreds a second, most of which nobody here wants. What it makes of a frame and what comes of it here
-is the same, field by field. Format: MAVLink developer guide, "Packet Serialization", "Payload Truncation".
+pymavlink has to decode a message to tell its name; an autopilot sends hundreds a second, most of which nobody here
+wants. Format: MAVLink developer guide, "Packet Serialization".
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
-from operator import itemgetter
-from typing import Any, Final
+from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -23,9 +20,6 @@ CHECKSUM_BYTES: Final = 2
 MARKER: Final = 0xFD
 KINDS: Final[dict[int, Kind]] = mavlink.mavlink_map
 _EXTRA: Final[dict[Kind, bytes]] = {}
-_PLANS: Final[dict[Kind, tuple[struct.Struct, Callable[[Any], tuple[Any, ...]] | None] | None]] = {}
-"""How the payload is unpacked and in which order its fields are given; None: it has text or arrays in it."""
-_ZEROS: Final = bytes(256)
 _STREAM_NAMES: Final = (
     "AHRS", "AHRS2", "AIRSPEED_AUTOCAL", "ALTITUDE", "ATTITUDE", "ATTITUDE_QUATERNION", "ATTITUDE_TARGET",
     "BATTERY_STATUS", "EKF_STATUS_REPORT", "ESTIMATOR_STATUS", "GLOBAL_POSITION_INT", "GPS2_RAW", "GPS_RAW_INT",
@@ -92,37 +86,3 @@ def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:
         extra = _EXTRA[kind] = bytes((kind.crc_extra,))
     checksum = _crc(data[at + 1 : end - 2] + extra)
     return (kind, end) if checksum == data[end - 2] | data[end - 1] << 8 else None
-
-
-def read(kind: Kind, data: bytes, at: int, end: int) -> Message | None:
-    """The message of a frame that `kind_at` has found; None where this is for the codec."""
-    try:
-        plan = _PLANS[kind]
-    except KeyError:
-        plan = _PLANS[kind] = _plan(kind)
-    if plan is None:
-        return None
-    unpacker, ordered = plan
-    frame = bytearray(data[at:end])
-    payload = data[at + HEADER_BYTES : end - CHECKSUM_BYTES]
-    missing = unpacker.size - len(payload)
-    if missing > 0:
-        payload += _ZEROS[:missing]
-    values = unpacker.unpack_from(payload)
-    message: Any = kind(*(values if ordered is None else ordered(values)))
-    message._msgbuf = frame  # noqa: SLF001 - as the codec itself does, which gives no other way
-    message._payload = frame[6:-2]  # noqa: SLF001
-    message._crc = frame[-2] | frame[-1] << 8  # noqa: SLF001
-    header = message._header  # noqa: SLF001
-    _, header.mlen, _, header.compat_flags, header.seq, header.srcSystem, header.srcComponent = frame[:7]
-    return message  # type: ignore[no-any-return]
-
-
-def _plan(kind: Kind) -> tuple[struct.Struct, Callable[[Any], tuple[Any, ...]] | None] | None:
-    unpacker: struct.Struct = kind.unpacker
-    if any(length != 1 for length in kind.lengths) or "s" in unpacker.format or "c" in unpacker.format:
-        return None
-    orders = list(kind.orders)
-    if orders == sorted(orders) or len(orders) < 2:
-        return unpacker, None
-    return unpacker, itemgetter(*orders)

@@ -14,7 +14,7 @@ from typing import Literal, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.links.mavlink.frames import Codec, goes_ahead, kind_at, may_wait, read
+from companion.links.mavlink.frames import Codec, goes_ahead, kind_at, may_wait
 from companion.links.mavlink.signing import NEVER_SIGNED, Signing
 from companion.links.system.listeners import Listeners
 from companion.links.system.together import Take, Together
@@ -186,9 +186,8 @@ class MavlinkLink:
     def _frames(self, data: bytes) -> Iterator[tuple[str, Sender, Message | None]]:
         """Name, sender and message of what is whole and admitted; no message where nobody wants it.
 
-        The good frames at the front are read here. The codec, which knows everything and takes several times as long,
-        gets the rest from the first frame on that is anything special: signed, of version 1, with text or arrays in it
-        for somebody, damaged, cut off.
+        Of good frames at the front only those that somebody wants are decoded. The codec gets everything from the first
+        frame on that is anything special: signed, of version 1, damaged, cut off.
         """
         if self._codec.buf:
             data = self.half_received + data
@@ -198,8 +197,9 @@ class MavlinkLink:
             kind, end = found
             message = None
             if self._handlers.get(kind.msgname):
-                message = read(kind, data, at, end)
-                if message is None:
+                try:
+                    message = self._codec.decode(bytearray(data[at:end]))
+                except mavlink.MAVError:
                     break
             yield kind.msgname, (data[at + 5], data[at + 6]), message
             at = end
