@@ -265,7 +265,6 @@ def _posed(window: Window, pose: PoseGiven) -> tuple[Window, Whereabouts, Gradie
     gradienter = compass = None
     if pose.pitch_deg is not None and pose.roll_deg is not None:
         tilt = TiltWindow(
-            samples=0,
             x_deg=pose.roll_deg,
             y_deg=pose.pitch_deg,
             x_sigma_deg=0.0,
@@ -274,7 +273,7 @@ def _posed(window: Window, pose: PoseGiven) -> tuple[Window, Whereabouts, Gradie
         )
         gradienter = GradienterModel("euler", level, (0.0, 0.0), pose.sigma_deg)
     if pose.heading_deg is not None:
-        heading = HeadingWindow(samples=0, heading_deg=pose.heading_deg, sigma_deg=0.0)
+        heading = HeadingWindow(heading_deg=pose.heading_deg, sigma_deg=0.0)
         compass = CompassModel(
             magnetic=False, vehicle_from_sensor=north, offset_deg=0.0, sigma_deg=pose.heading_sigma_deg
         )

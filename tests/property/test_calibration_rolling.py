@@ -93,7 +93,7 @@ def test_a_source_survives_any_stream(stream: list[tuple[float, float, float | N
         for batch in source.batches.values():
             assert (batch.low <= batch.high).all()
             assert batch.n >= 1
-            assert batch.slot <= batch.first_s <= batch.last_s < batch.slot + 1
+            assert 0.0 <= batch.largest_gap_s <= 1.0
 
 
 VALUES = st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=40)

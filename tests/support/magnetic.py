@@ -101,12 +101,12 @@ def window(
         maker.take_tilt(TiltSample(10.0, tilt.x_deg, tilt.y_deg))
         made = maker.take(MagSample(10.0, (x, y, z)))
         assert made is not None, maker.hint
-        heading = HeadingWindow(samples=80, heading_deg=made.heading_deg, sigma_deg=0.0, from_field=True)
+        heading = HeadingWindow(heading_deg=made.heading_deg, sigma_deg=0.0, from_field=True)
     else:
-        heading = HeadingWindow(samples=80, heading_deg=device_heading_deg % 360.0, sigma_deg=0.0)
+        heading = HeadingWindow(heading_deg=device_heading_deg % 360.0, sigma_deg=0.0)
     return msgspec.structs.replace(
         found,
         tilt=tilt,
         heading=heading,
-        field=FieldWindow(samples=80, field=(x, y, z), sigma=(0.0, 0.0, 0.0), unit=unit),
+        field=FieldWindow(field=(x, y, z), sigma=(0.0, 0.0, 0.0), unit=unit),
     )

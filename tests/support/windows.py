@@ -78,6 +78,6 @@ def ideal_window(
         start_s=0.0,
         end_s=10.0,
         imus=(imu,),
-        tilt=TiltWindow(samples=100, x_deg=x_deg, y_deg=y_deg, x_sigma_deg=0.0, y_sigma_deg=0.0, temperature_degc=None),
-        heading=HeadingWindow(samples=80, heading_deg=heading_deg % 360.0, sigma_deg=0.0),
+        tilt=TiltWindow(x_deg=x_deg, y_deg=y_deg, x_sigma_deg=0.0, y_sigma_deg=0.0, temperature_degc=None),
+        heading=HeadingWindow(heading_deg=heading_deg % 360.0, sigma_deg=0.0),
     )

@@ -34,7 +34,6 @@ def test_a_second_is_summed_up() -> None:
     assert batch.low == pytest.approx([1.0, 5.0])
     assert batch.high == pytest.approx([4.0, 6.0])
     assert batch.distinct.tolist() == [3, 2]
-    assert (batch.first_s, batch.last_s) == (100.125, 100.875)
     assert batch.largest_gap_s == pytest.approx(0.25)
     assert batch.temperature_degc == 21.5
     assert not batch.clipped

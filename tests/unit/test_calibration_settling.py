@@ -199,7 +199,7 @@ def test_a_filter_of_either_sensor_is_waited_for(gradienter: bool) -> None:
 def batch(slot: int, low: float, high: float, mean: float, n: int = 10) -> Batch:
     one = np.ones(1)
     return Batch(
-        slot=slot, n=n, first_s=slot + 0.05, last_s=slot + 0.95, mean=mean * one, variance=0 * one, white=1e-12 * one,
+        slot=slot, n=n, mean=mean * one, variance=0 * one, white=1e-12 * one,
         low=low * one, high=high * one, distinct=np.array([5]), clipped=False, largest_gap_s=0.1, missing=None,
         temperature_degc=None,
     )  # fmt: skip

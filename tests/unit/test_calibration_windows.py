@@ -28,8 +28,6 @@ def batches_of(means: Floats, *, spread: float = 1.0, first: int = 100, n: int =
         Batch(
             slot=first + index,
             n=n,
-            first_s=first + index + 0.005,
-            last_s=first + index + 0.995,
             mean=row,
             variance=np.full(width, spread**2),
             white=np.full(width, spread**2),
@@ -207,7 +205,6 @@ def test_gradienter_mean_and_sigma() -> None:
     scaled = []
     for _ in range(300):
         window = tilt_window(batches_of(rng.normal([1.0, -2.0], 0.01, (30, 2)), n=10))
-        assert window.samples == 300
         scaled += [(window.x_deg - 1.0) / window.x_sigma_deg, (window.y_deg + 2.0) / window.y_sigma_deg]
     assert 0.93 < float(np.mean(np.abs(scaled) < 1.96)) < 0.975
 

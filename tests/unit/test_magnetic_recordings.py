@@ -102,8 +102,8 @@ FLIPPED = np.array([1.0, -1.0, -1.0])
 def assessed(where: LocalEarth, field: Floats, sigma: Floats, up: Floats) -> Heading:
     (x, y, z), (sx, sy, sz) = (field * FLIPPED).tolist(), sigma.tolist()
     return assess(
-        HeadingWindow(samples=1000, heading_deg=0.0, sigma_deg=0.0, from_field=True),
-        FieldWindow(samples=1000, field=(x, y, z), sigma=(sx, sy, sz), unit="gauss"),
+        HeadingWindow(heading_deg=0.0, sigma_deg=0.0, from_field=True),
+        FieldWindow(field=(x, y, z), sigma=(sx, sy, sz), unit="gauss"),
         compass(),
         where,
         up * FLIPPED,

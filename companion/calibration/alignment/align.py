@@ -82,12 +82,9 @@ class Alignment:
     """What the gradienter shows too much, on top of the configured offset; (2,)."""
     offset_covariance_deg2: Matrix
     imus: tuple[ImuAlignment, ...]
-    gravity_m_s2: float
     slope_deg: float
     """Of the spot; 0 without one."""
     attitudes: tuple[Matrix, ...]
-    covariance: Matrix
-    """Of all parameters, in the order of `Model`; zero where nothing was sought."""
     chi_square: float
     freedom: int
     checked: bool
@@ -136,10 +133,8 @@ def align(
         offset_deg=at.offset_rad / DEG,
         offset_covariance_deg2=covariance[model.offset, model.offset] / DEG**2,
         imus=tuple(_imu(model, at, covariance, k) for k in range(len(model.names))),
-        gravity_m_s2=at.gravity_m_s2,
         slope_deg=float(np.hypot(*at.spot)) / DEG if any(stand.on_spot for stand in stands) else 0.0,
         attitudes=tuple(at.attitudes),
-        covariance=covariance,
         chi_square=chi_square,
         freedom=freedom,
         checked=checked,

@@ -89,7 +89,6 @@ _MAX_DECIMALS: Final = 4
 class TiltWindow(msgspec.Struct, frozen=True, kw_only=True):
     """Means of the gradienter in its own axes; sigmas are statistical."""
 
-    samples: int
     x_deg: float
     y_deg: float
     x_sigma_deg: float
@@ -100,7 +99,6 @@ class TiltWindow(msgspec.Struct, frozen=True, kw_only=True):
 class HeadingWindow(msgspec.Struct, frozen=True, kw_only=True):
     """Mean on the circle of the compass' heading in [0, 360); sigma is statistical."""
 
-    samples: int
     heading_deg: float
     sigma_deg: float
     from_field: bool = False
@@ -115,7 +113,6 @@ FieldUnit = Literal["gauss", "counts"]
 class FieldWindow(msgspec.Struct, frozen=True, kw_only=True):
     """Mean of the magnetic field in the compass' own axes; sigmas are statistical."""
 
-    samples: int
     field: tuple[float, float, float]
     sigma: tuple[float, float, float]
     unit: FieldUnit
@@ -126,7 +123,6 @@ def tilt_window(batches: Sequence[Batch]) -> TiltWindow:
     mean, sigma = _pose_mean(batches, np.array([batch.mean for batch in batches]))
     temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
     return TiltWindow(
-        samples=sum(batch.n for batch in batches),
         x_deg=float(mean[0]),
         y_deg=float(mean[1]),
         x_sigma_deg=float(sigma[0]),
@@ -143,7 +139,6 @@ def heading_window(
     turned = np.array([np.mod(batch.mean - first + 180.0, 360.0) - 180.0 for batch in batches])
     mean, sigma = _pose_mean(batches, turned)
     return HeadingWindow(
-        samples=sum(batch.n for batch in batches),
         heading_deg=float(np.mod(mean[0] + first[0], 360.0)),
         sigma_deg=float(sigma[0]),
         from_field=from_field,
@@ -155,7 +150,7 @@ def field_window(batches: Sequence[Batch], unit: FieldUnit) -> FieldWindow:
     """The field's window from the batches of good seconds, at least one."""
     mean, sigma = _pose_mean(batches, np.array([batch.mean for batch in batches]))
     (x, y, z), (sx, sy, sz) = mean.tolist(), sigma.tolist()
-    return FieldWindow(samples=sum(batch.n for batch in batches), field=(x, y, z), sigma=(sx, sy, sz), unit=unit)
+    return FieldWindow(field=(x, y, z), sigma=(sx, sy, sz), unit=unit)
 
 
 def _pose_mean(batches: Sequence[Batch], values: Floats) -> tuple[Floats, Floats]:

@@ -42,8 +42,6 @@ class Batch(msgspec.Struct, frozen=True):
 
     slot: int
     n: int
-    first_s: float
-    last_s: float
     mean: Floats
     variance: Floats
     """Of one sample, n - 1 in the denominator; zero for a single sample."""
@@ -85,8 +83,6 @@ def summary(
     return Batch(
         slot=slot,
         n=n,
-        first_s=float(times[0]),
-        last_s=float(times[-1]),
         mean=np.mod(centre, 360.0) if circle else centre,
         variance=np.add.reduce(off * off, axis=0) / (n - 1) if n > 1 else np.zeros(rows.shape[1]),
         white=np.add.reduce(successive * successive, axis=0) / (n - 1) / 2.0 if n > 1 else np.zeros(rows.shape[1]),
