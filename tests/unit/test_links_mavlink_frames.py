@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.links.mavlink import frames as mavlink_frames
 from companion.links.mavlink.frames import kind_at
 from companion.links.mavlink.link import MavlinkLink
 
@@ -105,13 +104,6 @@ def test_the_link_hears_what_the_codec_alone_would_in_any_split(seed: int, wante
     assert heard == [everything(message) for message in expected if type(message) in wanted]
     assert link.received == names
     assert link.half_received == b""
-
-
-def test_without_the_checksum_in_c_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    data = frame(mavlink.MAVLink_highres_imu_message, random.Random(1))
-    monkeypatch.setattr(mavlink_frames, "_C_CRC", None)
-    assert kind_at(data, 0) == (mavlink.MAVLink_highres_imu_message, len(data))
-    assert kind_at(data[:-1] + bytes((data[-1] ^ 1,)), 0) is None
 
 
 def test_a_transport_that_is_changed_by_a_message_leaves_nothing_behind() -> None:

@@ -6,7 +6,6 @@ wants. Format: MAVLink developer guide, "Packet Serialization".
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -36,12 +35,6 @@ AHEAD: Final = frozenset(
 )
 """Asked of us, and answered from what is known anyway, ahead of telemetry that waits. Not so parameters, heartbeats and
 answers: what was measured before them was measured under other offsets, or before arming."""
-_C_CRC: Final[Callable[[bytes, int], int] | None] = getattr(mavlink, "mcrf4xx", None)
-""""CRC-16/MCRF4XX" in C, where pymavlink has found it."""
-
-
-def _crc(data: bytes) -> int:
-    return mavlink.x25crc(data).crc if _C_CRC is None else _C_CRC(data, 0xFFFF)
 
 
 def may_wait(datagram: bytes) -> bool:
@@ -84,5 +77,5 @@ def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:
     extra = _EXTRA.get(kind)
     if extra is None:
         extra = _EXTRA[kind] = bytes((kind.crc_extra,))
-    checksum = _crc(data[at + 1 : end - 2] + extra)
+    checksum = mavlink.x25crc(data[at + 1 : end - 2] + extra).crc
     return (kind, end) if checksum == data[end - 2] | data[end - 1] << 8 else None
