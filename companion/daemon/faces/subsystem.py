@@ -62,8 +62,18 @@ class Faces(Subsystem):
         calibrating.conductor.on_ended.add(self._show_result)
         self._headlines = Headlines(core, devices, calibrating.conductor, arming, heading.attitude)
         self.answers = Answers([self, devices, offsets, calibrating, arming, heading, recorder], heading.pose)
-        self.mqtt = _mqtt(core, self.answers, calibrating, heading)
-        self.page = _page(core, self.answers)
+        # What nobody asked for costs the start nothing: it is imported only where it is configured.
+        self.mqtt: MqttFace | None = None
+        if core.config.mqtt is not None:
+            from companion.daemon.faces.mqtt.face import MqttFace
+
+            self.mqtt = MqttFace(core, core.config.mqtt, self.answers, calibrating.conductor, heading.pose)
+        self.page: Page | None = None
+        if core.config.web is not None:
+            from companion.web.server import Page
+
+            answers, bind = self.answers, core.config.web.bind
+            self.page = Page(bind, core.config.storage.path, answers.answer, answers.look, core.offload)
 
     def _show_result(self, job: Job, _result: JobResult) -> None:
         if (record := job.record) is not None:
@@ -106,25 +116,6 @@ class Faces(Subsystem):
         if self.page is not None and self._core.only_listening is None:
             tasks.append(("page", self.page.run))
         return tasks
-
-
-# What nobody asked for costs the start nothing: it is imported only where it is configured.
-
-
-def _mqtt(core: Core, answers: Answers, calibrating: Calibrating, heading: Heading) -> MqttFace | None:
-    if core.config.mqtt is None:
-        return None
-    from companion.daemon.faces.mqtt.face import MqttFace
-
-    return MqttFace(core, core.config.mqtt, answers, calibrating.conductor, heading.pose)
-
-
-def _page(core: Core, answers: Answers) -> Page | None:
-    if core.config.web is None:
-        return None
-    from companion.web.server import Page
-
-    return Page(core.config.web.bind, core.config.storage.path, answers.answer, answers.look, core.offload)
 
 
 def own_parameters(wanted: Wanted) -> list[Parameter]:

@@ -35,8 +35,13 @@ class Heading(Subsystem):
 
     def __init__(self, core: Core, devices: Devices, calibrating: Calibrating, arming: Arming) -> None:
         self._core = core
-        self.attitude = _attitude(core, devices, calibrating, arming)
+        self.attitude: AttitudeService | None = None
         """None unless a heading is pushed."""
+        if core.config.push.attitude != "off":
+            # What nobody asked for costs the start nothing.
+            from companion.daemon.heading.attitude_service import AttitudeService
+
+            self.attitude = AttitudeService(core, devices, arming.in_force, calibrating.alignment)
         self.pose = PoseNow(core, calibrating.alignment, None if self.attitude is None else self.attitude.pose)
         devices.on_pose.add(self.pose.take)
 
@@ -44,7 +49,39 @@ class Heading(Subsystem):
         return {"autopilot-setup": self._answer_setup}
 
     async def _answer_setup(self, _request: Object, _face: str) -> AsyncIterator[Object]:
-        yield await autopilot_setup(self._core)
+        """What is set, what should be, and what to do.
+
+        Raises:
+            AutopilotError: it does not answer, or cannot take in a heading.
+        """
+        firmware = self._core.vehicle.firmware
+        wanted = wanted_for(firmware)
+        found = await self._core.parameters.read_many([one.parameter for one in wanted], optional=True)
+        changes = changes_for(firmware, found)
+        if changes:
+            todo = ", ".join(f"{change.parameter} {change.after:g}" for change in changes)
+            reason = f"set {todo}; {REBOOT}"
+        elif self._core.config.push.attitude == "off":
+            reason = 'the autopilot is set up, but push.attitude is "off": the heading never comes'
+        else:
+            reason = "the autopilot is set up"
+        yield {
+            "kind": "result",
+            "state": "not applied" if changes else "applied",
+            "reason": reason,
+            "firmware": firmware,
+            "parameters": [
+                {
+                    "parameter": one.parameter,
+                    "now": now,
+                    "wanted": None if now is None else one.after(now),
+                    "why": one.why,
+                }
+                for one in wanted
+                for now in (found.get(one.parameter),)
+            ],
+            "risks": list(RISKS.get(firmware or "other", ())),
+        }
 
     def status(self) -> Object:  # noqa: D102
         attitude = self.attitude
@@ -58,51 +95,6 @@ class Heading(Subsystem):
 
     def tasks(self) -> Sequence[Task]:  # noqa: D102
         return [] if self.attitude is None else [("attitude", self.attitude.run)]
-
-
-def _attitude(core: Core, devices: Devices, calibrating: Calibrating, arming: Arming) -> AttitudeService | None:
-    if core.config.push.attitude == "off":
-        return None
-    # What nobody asked for costs the start nothing.
-    from companion.daemon.heading.attitude_service import AttitudeService
-
-    return AttitudeService(core, devices, arming.in_force, calibrating.alignment)
-
-
-async def autopilot_setup(core: Core) -> Object:
-    """What is set, what should be, and what to do.
-
-    Raises:
-        AutopilotError: it does not answer, or cannot take in a heading.
-    """
-    firmware = core.vehicle.firmware
-    wanted = wanted_for(firmware)
-    found = await core.parameters.read_many([one.parameter for one in wanted], optional=True)
-    changes = changes_for(firmware, found)
-    if changes:
-        todo = ", ".join(f"{change.parameter} {change.after:g}" for change in changes)
-        reason = f"set {todo}; {REBOOT}"
-    elif core.config.push.attitude == "off":
-        reason = 'the autopilot is set up, but push.attitude is "off": the heading never comes'
-    else:
-        reason = "the autopilot is set up"
-    return {
-        "kind": "result",
-        "state": "not applied" if changes else "applied",
-        "reason": reason,
-        "firmware": firmware,
-        "parameters": [
-            {
-                "parameter": one.parameter,
-                "now": now,
-                "wanted": None if now is None else one.after(now),
-                "why": one.why,
-            }
-            for one in wanted
-            for now in (found.get(one.parameter),)
-        ],
-        "risks": list(RISKS.get(firmware or "other", ())),
-    }
 
 
 class PoseNow:

@@ -236,7 +236,9 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
     else:
         findings.append(Finding("daemon", good=True, words="not running: ports opened by this check"))
         findings.append(_storage(config.storage.path))
-        status = await _listen(config, seconds)
+        # The status that a daemon would have after some seconds; nothing is written anywhere.
+        service = Service(config, only_listening="only a check is running: start companion run")
+        status = await service.listen(seconds)
     findings += [Finding("configuration", good=False, words=words) for words in cannot_work(config)]
     findings += [Finding("warning", good=True, words=words) for words in doubtful(config)]
     vehicle = status["vehicle"]
@@ -287,11 +289,6 @@ async def _heading(config: Config) -> Finding:
     """Whether the autopilot takes in our heading."""
     replies = [reply async for reply in ask(config.control.path, {"command": "autopilot-setup"})]
     return Finding("heading", good=replies[-1].get("state") == "applied", words=replies[-1]["reason"])
-
-
-async def _listen(config: Config, seconds: float) -> Object:
-    """The status that a daemon would have after some seconds; writes nothing anywhere."""
-    return await Service(config, only_listening="only a check is running: start companion run").listen(seconds)
 
 
 def _storage(directory: Path) -> Finding:

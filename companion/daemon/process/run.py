@@ -34,18 +34,6 @@ SETTLED_AFTER_S: Final = 3.0
 Apply = Callable[[Service, Any], None]
 
 
-def _stop_rivals(service: Service, value: bool) -> None:  # noqa: FBT001 - as all in the table
-    service.offsets.rivalry.switch(stop_rivals=value)
-
-
-def _allow(service: Service, value: tuple[str, ...]) -> None:
-    service.faces.component.permission.allow(Senders(value))
-
-
-def _log_level(_service: Service, value: str) -> None:
-    logging.getLogger().setLevel(value.upper())
-
-
 def _parameter(name: str, number: Callable[[Any], float] = float) -> Apply:
     """Of what a ground station can set as well: as if it had."""
 
@@ -63,9 +51,9 @@ RELOADABLE: Final[Mapping[str, Apply]] = {
     "calibration.target_accel_sigma_mg": _parameter("CMP_ACC_TGT"),
     "calibration.at_arm": _parameter("CMP_AT_ARM", AT_ARM.index),
     "push.parameters": _parameter("CMP_PUSH"),
-    "push.stop_rivals": _stop_rivals,
-    "mavlink.allow": _allow,
-    "log.level": _log_level,
+    "push.stop_rivals": lambda service, value: service.offsets.rivalry.switch(stop_rivals=value),
+    "mavlink.allow": lambda service, value: service.faces.component.permission.allow(Senders(value)),
+    "log.level": lambda _, value: logging.getLogger().setLevel(value.upper()),
 }
 """What can change without a restart, and how."""
 

@@ -120,19 +120,6 @@ class Topics:
         return topic.removeprefix(prefix) if topic.startswith(prefix) else None
 
 
-def base_of(settings: Mqtt, system_id: int) -> str:
-    """What the topics of a vehicle begin with."""
-    return settings.base_topic or f"companion/{system_id}"
-
-
-def client_id_of(settings: Mqtt, base: str) -> str:
-    """Who we are to the broker.
-
-    The same after every restart: so our own old connection, and its last will with it, gives way to the new one.
-    """
-    return settings.client_id or base.replace("/", "-")
-
-
 class MqttFace:
     """One broker's view of the daemon; `run` it. Where the daemon only listens, the broker is left alone."""
 
@@ -172,12 +159,13 @@ class MqttFace:
         return self._vehicle.system_id or self._system_id
 
     def _base(self) -> str:
-        return base_of(self._settings, self._known_system_id or 1)
+        return self._settings.base_topic or f"companion/{self._known_system_id or 1}"
 
     async def _speak_as(self, base: str) -> None:
         """Serve under a base topic until it is another one."""
         self.topics = topics = Topics(base)
-        client_id = client_id_of(self._settings, base)
+        # The same after every restart: so our own old connection, and its last will with it, gives way to the new one.
+        client_id = self._settings.client_id or base.replace("/", "-")
         if self._only_listening:
             self.link = link = MqttLink(self._settings, client_id=f"{client_id}-check", offload=self._offload)
             await link.run()
@@ -205,17 +193,14 @@ class MqttFace:
                 await self._try_to_look(link, topics)
                 link.outbox.keep(topics.status, OFFLINE)
             else:
-                self._withdraw(link, topics)
+                for topic in topics.kept:
+                    # What is ours no longer: the broker forgets it.
+                    link.outbox.keep(topic, b"")
             await link.flush(FLUSH_S)
             # A publication that is answered in that moment swallows the cancellation (asyncio.wait_for of Python 3.11).
             while not running.done():
                 running.cancel()
                 await asyncio.wait([running], timeout=LOOK_S)
-
-    def _withdraw(self, link: MqttLink, topics: Topics) -> None:
-        """Have the broker forget everything under a topic that is ours no longer."""
-        for topic in topics.kept:
-            link.outbox.keep(topic, b"")
 
     async def _try_to_look(self, link: MqttLink, topics: Topics) -> None:
         try:

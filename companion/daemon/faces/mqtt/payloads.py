@@ -80,14 +80,6 @@ def _is_transaction(value: object) -> bool:
     return value is None or (isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_NUMBER)
 
 
-def _is_flag(value: object) -> bool:
-    return isinstance(value, bool)
-
-
-def _is_what(value: object) -> bool:
-    return value in _WHAT
-
-
 def _shown(value: object) -> str:
     """A value as JSON, short enough for one line."""
     try:
@@ -99,11 +91,11 @@ def _shown(value: object) -> str:
 
 
 _WHAT: Final = [what.name.lower() for what in What]
-_FLAG: Final = (_is_flag, "true or false")
+_FLAG: Final = (lambda value: isinstance(value, bool), "true or false")
 
 KEYS: Final[dict[str, dict[str, tuple[Callable[[object], bool], str]]]] = {
     "calibrate": {
-        "what": (_is_what, ", ".join(f'"{what}"' for what in _WHAT)),
+        "what": (_WHAT.__contains__, ", ".join(f'"{what}"' for what in _WHAT)),
         "timeout_s": (is_time_limit, "a number of seconds above 0"),
         "reboot": _FLAG,
     },
