@@ -48,7 +48,6 @@ class ArmAuthoriser:
         self._link, self._vehicle, self._gate, self._say = link, vehicle, gate, say
         self._attempt_s = -math.inf
         self._repeat: asyncio.TimerHandle | None = None
-        self.answered = 0
         self._unsubscribe = link.subscribe(mavlink.MAVLink_command_long_message, self._on_message)
 
     def close(self) -> None:
@@ -84,7 +83,6 @@ class ArmAuthoriser:
         )
         self._link.send(ack)
         self._repeat = asyncio.get_running_loop().call_later(REPEAT_S, self._link.send, ack)
-        self.answered += 1
         if self._begins_attempt(message.confirmation, now_s) and answer.verdict != "accept":
             words = f"{'Not armed' if gate else 'Arming uncalibrated'}: {answer.words}"
             self._say(Severity.WARNING, words, Weight.REFUSAL)

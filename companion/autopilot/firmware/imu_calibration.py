@@ -213,14 +213,18 @@ class ImuCalibration:
     warnings: tuple[str, ...] = ()
 
     @property
-    def corrections(self) -> dict[str, float]:
-        """By parameter: everything that acts on this IMU's output, as far as single parameters tell."""
+    def offsets(self) -> dict[str, float]:
+        """By parameter, gyro offsets first."""
         names = self.parameters
         return {
             **dict(zip(names.gyro_offset, self.gyro_offset_rad_s, strict=True)),
             **dict(zip(names.accel_offset, self.accel_offset_m_s2, strict=True)),
-            **dict(zip(names.accel_scale, self.accel_scale, strict=True)),
         }
+
+    @property
+    def corrections(self) -> dict[str, float]:
+        """By parameter: everything that acts on this IMU's output, as far as single parameters tell."""
+        return {**self.offsets, **dict(zip(self.parameters.accel_scale, self.accel_scale, strict=True))}
 
     def contradicts(self, values: Mapping[str, float]) -> bool:
         """Whether one of these parameters is among the corrections and has another value there."""

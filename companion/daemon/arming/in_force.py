@@ -47,8 +47,7 @@ from companion.samples import Triad, Vector
 
 logger = logging.getLogger(__name__)
 
-_GYRO: Final[Triad] = "gyro"
-_ACCEL: Final[Triad] = "accel"
+_TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 _ZERO: Final[Vector] = (0.0, 0.0, 0.0)
 # Causes that a measurement settles. What the pilot undid and what somebody else chose is theirs until asked for, and
 # what a boot replaced is pushed again.
@@ -77,7 +76,7 @@ class InForce:
             "accel": settings.target_accel_sigma_m_s2,
         }
         self._sources = {imu.name: imu for imu in _judged(config)}
-        triads = (_GYRO, _ACCEL) if config.gradienter is not None else (_GYRO,)
+        triads = _TRIADS if config.gradienter is not None else _TRIADS[:1]
         self._held: dict[Key, Held | Why] = {(name, triad): Why.NEVER for name in self._sources for triad in triads}
         self._left_out: set[Key] = set()
         """What no calibration can settle, and is not judged."""
@@ -168,7 +167,7 @@ class InForce:
 
     def record_of(self, name: str) -> ImuRecord | None:
         """What the last calibration found in one IMU; None when nothing did, or something has replaced it."""
-        keys = [(name, _GYRO), (name, _ACCEL)]
+        keys: list[Key] = [(name, triad) for triad in _TRIADS]
         if self.calibration is None or any(
             isinstance(self._held.get(key), Why) or key in self._held_back for key in keys
         ):
@@ -302,10 +301,9 @@ class InForce:
         for imu in solution.imus:
             if imu.temperature_degc is not None:
                 self._temperatures[imu.name] = imu.temperature_degc
-            for key, residual, sigma in (
-                ((imu.name, _GYRO), imu.gyro_rad_s, imu.gyro_sigma_use_rad_s),
-                ((imu.name, _ACCEL), imu.accel_m_s2, imu.accel_sigma_use_m_s2),
-            ):
+            found = ((imu.gyro_rad_s, imu.gyro_sigma_use_rad_s), (imu.accel_m_s2, imu.accel_sigma_use_m_s2))
+            for triad, (residual, sigma) in zip(_TRIADS, found, strict=True):
+                key = (imu.name, triad)
                 if key in solution.unknown:
                     self._leave_out(key)
                     continue

@@ -17,7 +17,6 @@ from companion.calibration.solution.validity import Why
 from companion.component.service import JobResult
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import ALIGNMENT, Job
-from companion.samples import Vector
 
 logger = logging.getLogger(__name__)
 
@@ -25,8 +24,8 @@ logger = logging.getLogger(__name__)
 class _Known(msgspec.Struct, frozen=True):
     """The offsets that the autopilot had when they were looked at last."""
 
-    gyro: Vector
-    accel: Vector
+    offsets: dict[str, float]
+    """By parameter."""
     boots: int
 
 
@@ -71,14 +70,13 @@ class OffsetWatch:
             calibration = imu.calibration
             if calibration is None:
                 continue
-            now = _Known(calibration.gyro_offset_rad_s, calibration.accel_offset_m_s2, self._vehicle.boots)
+            now = _Known(calibration.offsets, self._vehicle.boots)
             known = self._known.get(name)
             self._known[name] = now
             if known is None:
                 self._look_after_job(name, self._before.pop(name, now), now, calibration)
             elif known.boots != now.boots:
-                replaced = (known.gyro, known.accel) != (now.gyro, now.accel)
-                self._lost(name, Why.REPLACED if replaced else Why.REBOOTED)
+                self._lost(name, Why.REPLACED if known.offsets != now.offsets else Why.REBOOTED)
             elif known != now:
                 self._changed_by_others(name)
 
@@ -86,7 +84,7 @@ class OffsetWatch:
         """What a job has left is compared with what there is: between the two the EKF may have settled for minutes."""
         written = self._written.pop(name, {})
         restarted = before.boots != now.boots and not self._asked_restart
-        if self._failed and (before.gyro, before.accel) != (now.gyro, now.accel):
+        if self._failed and before.offsets != now.offsets:
             # What was ours has been put back by now; what a restart has not replaced is somebody else's.
             if before.boots == now.boots:
                 self._changed_by_others(name)

@@ -33,7 +33,6 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG
-from companion.samples import Vector
 
 STAND_S: Final = 12.0
 """Seconds of stillness for each stand: averaging beyond 10 s buys an accelerometer nothing (method section 2.3)."""
@@ -59,7 +58,7 @@ class _Taken:
     window: Window
     seen: Seen
     heading_sigma_deg: float
-    offsets: dict[str, tuple[Vector, Vector]]
+    offsets: dict[str, dict[str, float]]
 
 
 class Aligner:
@@ -166,13 +165,8 @@ class Aligner:
             if taken[0].offsets.get(name, offsets) != offsets:
                 raise _changed(name)
 
-    def _offsets(self) -> dict[str, tuple[Vector, Vector]]:
-        known = {name: imu.calibration for name, imu in self._imus.items()}
-        return {
-            name: (found.gyro_offset_rad_s, found.accel_offset_m_s2)
-            for name, found in known.items()
-            if found is not None
-        }
+    def _offsets(self) -> dict[str, dict[str, float]]:
+        return {name: imu.calibration.offsets for name, imu in self._imus.items() if imu.calibration is not None}
 
     async def _measure(self, model: GradienterModel, taken: list[_Taken], since_s: float) -> _Taken:
         window = await self._core.window(since_s=since_s + SETTLE_S)

@@ -69,11 +69,6 @@ class SensorHealth:
             return None
         return Trouble(found.key, f"{line_of(self.link)}: {found.words}", found.implausible)
 
-    def words(self, now_s: float) -> str | None:
-        """What is wrong with it in one line, or None while good samples come."""
-        found = self.trouble(now_s)
-        return found.words if found is not None else None
-
     def _is_flooded(self, now_s: float) -> bool:
         budget = self.link.budget
         return budget is not None and budget.exceeded_s is not None and now_s - budget.exceeded_s < FLOOD_S

@@ -264,4 +264,5 @@ class SerialSensor:
     @property
     def problem(self) -> str | None:
         """What is wrong with the device in one line, or None while samples come."""
-        return self.health.words(asyncio.get_running_loop().time())
+        found = self.health.trouble(asyncio.get_running_loop().time())
+        return found.words if found is not None else None

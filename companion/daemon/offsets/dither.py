@@ -15,7 +15,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.autopilot.firmware.imu_calibration import ImuCalibration
+from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
 from companion.autopilot.parameters.pace import has_passed, moment
 from companion.autopilot.parameters.writer import Change, ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState
@@ -64,7 +64,12 @@ class _Work:
     @property
     def before(self) -> dict[str, float]:
         """The parameters as they were and must be again."""
-        return _in_force(self.calibration)
+        return self.calibration.offsets
+
+    def step(self, values: Mapping[str, float], batches: Sequence[Batch]) -> Step:
+        """What was seen under these parameters."""
+        changes = [Change(name, before, values[name]) for name, before in self.before.items()]
+        return Step(np.concatenate(output_step(self.calibration, changes)) / self.steps_si, batches)
 
 
 class Ditherer:
@@ -122,7 +127,7 @@ class Ditherer:
                 kind = JobCancelledError if isinstance(error, JobCancelledError) else AutopilotError
                 raise kind(words) from error
         await imu.refresh()
-        if _in_force(imu.in_force) != work.before:
+        if imu.in_force.offsets != work.before:
             raise AutopilotError(f"imu {work.name}: somebody changed its offsets while they were dithered")
         return combine(done, work.steps_si, self._profiles[window.name], self._horizon_s)
 
@@ -213,7 +218,7 @@ class Ditherer:
         finally:
             stop()
         batches: Sequence[Batch] = list(source.batches.values())[:SECONDS]
-        return Step(_shift_of(work.calibration, values) / work.steps_si, batches), moved
+        return work.step(values, batches), moved
 
     def _moving(self, own: str) -> str | None:
         """What another device says of the aircraft; the dithered IMU itself takes no part at present."""
@@ -233,14 +238,6 @@ class Ditherer:
         return "old offsets NOT back yet: will be once disarmed and heard"
 
 
-def _in_force(calibration: ImuCalibration) -> dict[str, float]:
-    names = calibration.parameters
-    return {
-        **dict(zip(names.gyro_offset, calibration.gyro_offset_rad_s, strict=True)),
-        **dict(zip(names.accel_offset, calibration.accel_offset_m_s2, strict=True)),
-    }
-
-
 def _offsets(calibration: ImuCalibration, shift: Array) -> dict[str, float]:
     """The parameters that shift the output (6, vehicle FRD) by so much: off - R^-1 shift, accelerometer over scale."""
     names, rotation = calibration.parameters, calibration.orientation
@@ -249,14 +246,6 @@ def _offsets(calibration: ImuCalibration, shift: Array) -> dict[str, float]:
     pairs = [*zip(names.gyro_offset, gyro, strict=True), *zip(names.accel_offset, accel, strict=True)]
     # As the autopilot keeps them: the shift that is taken off again is that of the rounded values.
     return {name: float(np.float32(value)) for name, value in pairs}
-
-
-def _shift_of(calibration: ImuCalibration, values: Mapping[str, float]) -> Array:
-    """By how much these parameters shift the output, (6,) vehicle FRD."""
-    names, rotation = calibration.parameters, calibration.orientation
-    gyro = np.asarray(calibration.gyro_offset_rad_s) - [values[name] for name in names.gyro_offset]
-    accel = np.asarray(calibration.accel_offset_m_s2) - [values[name] for name in names.accel_offset]
-    return np.concatenate([rotation @ gyro, rotation @ (np.asarray(calibration.accel_scale) * accel)])
 
 
 def _with(window: ImuWindow, found: Dithered) -> ImuWindow:
