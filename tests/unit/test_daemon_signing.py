@@ -200,12 +200,14 @@ def test_who_is_not_believed_is_told_of_once(tmp_path: Path, caplog: pytest.LogC
                 assert status["summary"] == "0 messages checked, 3 dropped"
                 assert one.rejecting is None
                 one.signing.admits(b"\xfd\x00\x00\x00\x00\x01\x01\x00\x00\x00\x00\x00")
+                await asyncio.sleep(1.5)
                 assert one.rejecting == "1 unsigned messages dropped: the autopilot does not sign on this link"
 
     with caplog.at_level(logging.WARNING):
         run_virtual(main())
     assert [record.getMessage() for record in caplog.records] == [
-        "mavlink: 255/190 does not sign: its messages are dropped"
+        "mavlink: 255/190 does not sign: its messages are dropped",
+        "mavlink: 1/1 does not sign: its messages are dropped",
     ]
 
 

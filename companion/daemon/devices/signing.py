@@ -92,7 +92,8 @@ class _SignatureWatch:
         self._seen: Counter[Reason] = Counter()
         self._believed = 0
         self._bad_since_s: float | None = None
-        self._dropped: Counter[Reason] = Counter()
+        self.dropped: Counter[Reason] = Counter()
+        """Of the autopilot, or of who claims to be one: what was not right since the last that was."""
         self._asked: int | None = None
         self._unanswered = 0
         self._ask_s = -math.inf
@@ -103,11 +104,6 @@ class _SignatureWatch:
     def warning(self) -> str | None:
         """What does not fit, and what to do; None while all does, or nobody is heard."""
         return None if self._kind is None else _WORDS[self._kind][0]
-
-    def dropped(self) -> Counter[Reason]:
-        """Of the autopilot, or of who claims to be one: what was not right since the last that was."""
-        self._count()
-        return self._dropped
 
     def look(self, now_s: float) -> None:
         """See how it is now, and say what has changed."""
@@ -130,11 +126,8 @@ class _SignatureWatch:
 
     # --- we judge
 
-    def _count(self) -> None:
-        """Take note of what has come of it since the last look."""
-        signing, vehicle = self._signing, self._vehicle
-        if signing is None:
-            return
+    def _unbelieved(self, signing: Signing, now_s: float) -> _Kind | None:
+        vehicle = self._vehicle
         seen: Counter[Reason] = Counter()
         for (reason, system, component), number in signing.strangers.items():
             # Before it is known which autopilot is ours: whoever claims to be one.
@@ -142,15 +135,12 @@ class _SignatureWatch:
                 seen[reason] += number
         believed = signing.believed[vehicle.system_id or 0, vehicle.component_id]
         if believed > self._believed:
-            self._dropped.clear()
+            self.dropped.clear()
         else:
-            self._dropped += seen - self._seen
+            self.dropped += seen - self._seen
         self._seen, self._believed = seen, believed
-
-    def _unbelieved(self, signing: Signing, now_s: float) -> _Kind | None:
-        self._count()
-        found = max(_TELLING[signing.required], key=lambda reason: self._dropped[reason])
-        if not self._dropped[found]:
+        found = max(_TELLING[signing.required], key=lambda reason: self.dropped[reason])
+        if not self.dropped[found]:
             self._bad_since_s = None
             return None
         if self._bad_since_s is None:
@@ -282,7 +272,7 @@ class LinkSigning:
         if self.trouble:
             return self.trouble
         # Only who claims to be an autopilot explains why none is heard.
-        ((reason, number),) = self._watch.dropped().most_common(1) or [("unsigned", 0)]
+        ((reason, number),) = self._watch.dropped.most_common(1) or [("unsigned", 0)]
         if number == 0 or self._vehicle.alive:
             return None
         return {
