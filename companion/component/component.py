@@ -36,7 +36,7 @@ class Component:
         parameters: Sequence[Parameter],
         senders: Senders,
     ) -> None:
-        self._link, self._vehicle, self._service, self._texts = link, vehicle, service, texts
+        self._link, self._service, self._texts = link, service, texts
         self._woken = texts.woken
         self._known_as = link.system_id
         """The system id under which we were heard last."""
@@ -92,14 +92,13 @@ class Component:
         )
 
     def _follow_vehicle(self) -> None:
-        """Take over the vehicle's system id, and be heard under it at once."""
-        system_id = self._vehicle.system_id
-        if system_id is not None and system_id != self._known_as:
-            self._known_as = self._link.system_id = system_id
+        """Be heard under the vehicle's system id as soon as the link belongs to it."""
+        if self._link.system_id != self._known_as:
+            self._known_as = self._link.system_id
             self._next_heartbeat_s = -math.inf
 
     def _on_heartbeat(self, _message: mavlink.MAVLink_heartbeat_message, _t_s: float) -> None:
-        if self._vehicle.system_id not in (None, self._known_as):
+        if self._link.system_id != self._known_as:
             self._woken.set()
 
 

@@ -206,6 +206,8 @@ async def bench(
     """The component running at one end of a wire."""
     link, ground = MavlinkLink(), ground or Ground()
     service, vehicle, gate = ScriptedService(), FakeVehicle(system_id), ScriptedGate()
+    if system_id is not None:
+        link.join((system_id, 1))
     texts = StatusText(link)
     component = Component(link, vehicle, service, gate, texts, parameters, Senders(tuple(allow)))
     wire = Wire(link, ground, seed=seed, loss=loss, duplicate=duplicate)

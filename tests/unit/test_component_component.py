@@ -120,7 +120,7 @@ def test_we_are_heard_under_the_vehicles_system_id_as_soon_as_it_is_known() -> N
     async def main() -> None:
         async with bench() as b:
             await asyncio.sleep(0.3)
-            b.vehicle.system_id = 42
+            b.link.join((42, 1))
             autopilot = Ground(42, 1)
             b.ground.send_raw(autopilot.pack(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)))
             await asyncio.sleep(0.1)
@@ -140,9 +140,9 @@ def test_a_vehicle_found_without_a_heartbeat_to_wake_us_is_followed_within_a_sec
     async def main() -> None:
         async with bench() as b:
             await asyncio.sleep(0.3)
-            b.vehicle.system_id = 7
+            b.link.join((7, 1))
             await asyncio.sleep(1.0)
-            assert b.link.system_id == 7
+            assert [m.get_srcSystem() for _, m in b.ground.received] == [1, 7]
 
     run_virtual(main())
 

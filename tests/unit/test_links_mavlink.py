@@ -101,7 +101,7 @@ def test_sequence_numbers_count_and_wrap() -> None:
     assert [packet[4] for packet in sent] == [i % 256 for i in range(600)]
     assert {(packet[5], packet[6]) for packet in sent} == {(9, 191)}
     assert link.sent == 600
-    link.system_id = 42
+    link.join((42, 1))
     link.send(HEARTBEAT(18, 8, 0, 0, 4, 3))
     assert sent[-1][5] == 42
 

@@ -36,7 +36,7 @@ _ANYBODYS = frozenset(mavlink.mavlink_map[number].msgname for number in NEVER_SI
 class MavlinkLink:
     """One MAVLink connection as one component sees it.
 
-    `system_id` may be changed while running: it is latched from the autopilot's heartbeat. All calls are made on
+    `system_id` changes while running: it is latched from the autopilot's heartbeat. All calls are made on
     the event loop's thread; handlers must not block.
     """
 
@@ -75,14 +75,10 @@ class MavlinkLink:
         """The system id under which we send."""
         return self._codec.srcSystem
 
-    @system_id.setter
-    def system_id(self, value: int) -> None:
-        self._codec.srcSystem = value
-
     def join(self, autopilot: Sender) -> None:
         """Belong to this autopilot's vehicle from here on: we send under its system id."""
         self.autopilot = autopilot
-        self.system_id = autopilot[0]
+        self._codec.srcSystem = autopilot[0]
 
     @property
     def half_received(self) -> bytes:
