@@ -74,11 +74,11 @@ def _make(
     options: argparse.Namespace, directory: Path, profiles: dict[str, NoiseProfile]
 ) -> tuple[Path | None, list[str]]:
     from companion.report.calibration_page import calibration_page
-    from companion.report.source import Storage
+    from companion.report.source import material
     from companion.storage.state import write_atomically
 
     now = datetime.datetime.now(tz=datetime.UTC)
-    one = Storage(directory).calibration(options.record, profiles)
+    one = material(directory, options.record, profiles)
     content, damaged = calibration_page(one, now), list(one.damaged)
     name = f"companion-report-{one.number:06d}.html"
     if options.output == "-":

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from companion.calibration.solution.record import Arming, Record
 from companion.errors import StorageError
-from companion.report import calibration_page
+from companion.report.calibration_page import Material
 from companion.report.page import Profiles
 from companion.storage.records import Entry, RecordStore
 from companion.storage.state import BoundedList
@@ -16,81 +17,75 @@ MAX_EARLIER: Final = 60
 """The most calibrations in the drift plots of a page."""
 
 
-class Storage:
-    """One storage folder, read once.
+def material(directory: Path, wanted: str | None, profiles: Profiles) -> Material:
+    """What the page of one calibration is made of, by its number or the beginning of its time; None: the latest.
+
+    Args:
+        directory: the storage folder.
+        wanted: which calibration.
+        profiles: of today's configuration.
 
     Raises:
-        StorageError: there is nothing to make a page of, and why.
+        StorageError: there is nothing to make a page of, none of that number or time, or it cannot be read.
     """
+    store, records = RecordStore(directory), directory / "records"
+    try:
+        # Else a folder that only root may enter looks like one that is not there.
+        next(iter(records.iterdir()), None)
+    except FileNotFoundError:
+        raise StorageError(f"no calibration yet: there is no {records}") from None
+    except OSError as error:
+        hint = "; run it with sudo" if isinstance(error, PermissionError) else ""
+        raise StorageError(f"{records}: cannot be read: {error.strerror}{hint}") from error
+    entries = list(store.entries())[::-1]  # oldest first
+    damaged = [f"{entry.path.name}: {entry.problem}" for entry in entries if entry.record is None]
+    if not entries:
+        raise StorageError(f"no calibration yet: {records} is empty")
+    if not any(entry.record for entry in entries):
+        raise StorageError(f"no calibration can be read: {'; '.join(damaged[:3])}")
+    entry, record = _find(entries, wanted)
+    armings: list[Arming] = []
+    try:
+        armings = BoundedList(directory / "armings.json", Arming, keep=0).all()
+    except StorageError as error:
+        damaged.append(str(error))
+    trace, why = None, "this record has no trace of its seconds (it is older, or its trace made room)."
+    try:
+        trace = store.trace(entry)
+    except StorageError as error:
+        why = f"{error}."
+        damaged.append(str(error))
+    earlier = [
+        (one.number, one.record)
+        for one in entries
+        if one.record is not None and one.number <= entry.number and one.record.system_id == record.system_id
+    ]
+    return Material(
+        number=entry.number,
+        record=record,
+        trace=trace,
+        no_trace="" if trace is not None else why,
+        earlier=earlier[-MAX_EARLIER:],
+        armings=[arming for arming in armings if arming.calibration == record.started_at],
+        profiles=profiles,
+        damaged=damaged,
+    )
 
-    def __init__(self, directory: Path) -> None:
-        self._store = RecordStore(directory)
-        records = directory / "records"
-        try:
-            # Else a folder that only root may enter looks like one that is not there.
-            next(iter(records.iterdir()), None)
-        except FileNotFoundError:
-            raise StorageError(f"no calibration yet: there is no {records}") from None
-        except OSError as error:
-            hint = "; run it with sudo" if isinstance(error, PermissionError) else ""
-            raise StorageError(f"{records}: cannot be read: {error.strerror}{hint}") from error
-        self.entries = list(self._store.entries())[::-1]
-        """Oldest first."""
-        self.damaged = [f"{entry.path.name}: {entry.problem}" for entry in self.entries if entry.record is None]
-        if not self.entries:
-            raise StorageError(f"no calibration yet: {records} is empty")
-        if not any(entry.record for entry in self.entries):
-            raise StorageError(f"no calibration can be read: {'; '.join(self.damaged[:3])}")
-        self._armings: list[Arming] = []
-        try:
-            self._armings = BoundedList(directory / "armings.json", Arming, keep=0).all()
-        except StorageError as error:
-            self.damaged.append(str(error))
 
-    def calibration(self, wanted: str | None, profiles: Profiles) -> calibration_page.Material:
-        """One calibration, by its number or the beginning of its time; None: the latest.
-
-        Raises:
-            StorageError: there is none of that number or time, or it cannot be read.
-        """
-        entry, record = self._find(wanted)
-        trace, why = None, "this record has no trace of its seconds (it is older, or its trace made room)."
-        problems = list(self.damaged)
-        try:
-            trace = self._store.trace(entry)
-        except StorageError as error:
-            why = f"{error}."
-            problems.append(str(error))
-        earlier = [
-            (one.number, one.record)
-            for one in self.entries
-            if one.record is not None and one.number <= entry.number and one.record.system_id == record.system_id
-        ]
-        return calibration_page.Material(
-            number=entry.number,
-            record=record,
-            trace=trace,
-            no_trace="" if trace is not None else why,
-            earlier=earlier[-MAX_EARLIER:],
-            armings=[arming for arming in self._armings if arming.calibration == record.started_at],
-            profiles=profiles,
-            damaged=problems,
-        )
-
-    def _find(self, wanted: str | None) -> tuple[Entry, Record]:
-        if wanted is None:
-            return next((entry, entry.record) for entry in reversed(self.entries) if entry.record is not None)
-        if wanted.isdecimal():
-            found = [entry for entry in self.entries if entry.number == int(wanted)]
-            if found and found[0].record is None:
-                raise StorageError(f"{found[0].path}: {found[0].problem}")
-        else:
-            begins = wanted.strip().replace(" ", "T", 1)
-            found = [entry for entry in self.entries if entry.record and entry.record.started_at.startswith(begins)]
-        if len(found) > 1:
-            numbers = ", ".join(str(entry.number) for entry in found[-5:])
-            raise StorageError(f"{len(found)} calibrations begin with {wanted!r}; the latest are number {numbers}")
-        if not found or found[0].record is None:
-            first, last = self.entries[0].number, self.entries[-1].number
-            raise StorageError(f"no calibration {wanted!r}; there are number {first} to {last} (companion history)")
-        return found[0], found[0].record
+def _find(entries: Sequence[Entry], wanted: str | None) -> tuple[Entry, Record]:
+    if wanted is None:
+        return next((entry, entry.record) for entry in reversed(entries) if entry.record is not None)
+    if wanted.isdecimal():
+        found = [entry for entry in entries if entry.number == int(wanted)]
+        if found and found[0].record is None:
+            raise StorageError(f"{found[0].path}: {found[0].problem}")
+    else:
+        begins = wanted.strip().replace(" ", "T", 1)
+        found = [entry for entry in entries if entry.record and entry.record.started_at.startswith(begins)]
+    if len(found) > 1:
+        numbers = ", ".join(str(entry.number) for entry in found[-5:])
+        raise StorageError(f"{len(found)} calibrations begin with {wanted!r}; the latest are number {numbers}")
+    if not found or found[0].record is None:
+        first, last = entries[0].number, entries[-1].number
+        raise StorageError(f"no calibration {wanted!r}; there are number {first} to {last} (companion history)")
+    return found[0], found[0].record

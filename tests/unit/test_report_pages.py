@@ -22,7 +22,7 @@ from companion.physics.units import DEG_H, MG
 from companion.report import calibration_page as calibration
 from companion.report import page, svg
 from companion.report.calibration_page import calibration_page
-from companion.report.source import Storage
+from companion.report.source import material
 from companion.samples import Vector
 from companion.storage.records import RecordStore
 from tests.support.histories import a_season, arming, imu_record, record, white_trace
@@ -83,7 +83,7 @@ def _store(folder: Path) -> RecordStore:
 
 
 def _calibration(folder: Path, wanted: str | None = None) -> str:
-    return calibration_page(Storage(folder).calibration(wanted, {}), NOW)
+    return calibration_page(material(folder, wanted, {}), NOW)
 
 
 def test_the_figures_are_those_of_the_record(tmp_path: Path) -> None:
@@ -163,7 +163,7 @@ def test_a_page_needs_nothing_else_and_stays_small(tmp_path: Path) -> None:
     for k in range(230):
         one = record(k, imus=tuple(imu_record(name, k) for name in names), warnings=tuple(["x" * 5000] * 100))
         store.save(one, white_trace(one, 590) if k == 229 else None)
-    content = calibration_page(Storage(tmp_path).calibration(None, {}), NOW)
+    content = calibration_page(material(tmp_path, None, {}), NOW)
     assert len(content.encode()) < LARGEST
     found = Page(content)
     assert "5 more IMUs are not shown" in found.text
@@ -197,10 +197,9 @@ def test_nothing_from_a_file_becomes_a_tag(tmp_path: Path) -> None:
     store.save(failed)
     guilty = msgspec.structs.replace(arming(one), reason=evil)
     (tmp_path / "armings.json").write_bytes(msgspec.json.encode([guilty]))
-    storage = Storage(tmp_path)
     for content in (
-        calibration_page(storage.calibration("1", {}), NOW),
-        calibration_page(storage.calibration("2", {}), NOW),
+        calibration_page(material(tmp_path, "1", {}), NOW),
+        calibration_page(material(tmp_path, "2", {}), NOW),
     ):
         found = Page(content)
         assert {tag for tag, _ in found.tags} <= {
@@ -411,8 +410,7 @@ CHROMIUM = shutil.which("chromium")
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_a_browser_shows_it_on_a_phone_without_scrolling_sideways(tmp_path: Path, scheme: str) -> None:
     a_season(tmp_path / "kept", 8)
-    storage = Storage(tmp_path / "kept")
-    content = calibration_page(storage.calibration(None, {}), NOW)
+    content = calibration_page(material(tmp_path / "kept", None, {}), NOW)
     # Windows cannot be as narrow as a phone, and the page forbids scripts: it is looked at inside of another one.
     probe = """<!DOCTYPE html><html style="color-scheme: light dark"><title>unseen</title>
     <iframe width="390" height="3000" style="border: 0" sandbox="allow-same-origin" srcdoc="%s"></iframe><script>

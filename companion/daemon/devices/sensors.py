@@ -120,9 +120,14 @@ class SerialSensor:
         # Only an IMU: where none of our own is fast, the autopilot's may be what the attitude is carried with.
         driven = together if "imu" in self.kinds else None
         self.link = ByteLink(
-            settings, self._arrived, name=name, on_state=self._on_state, budget=Budget(), together=driven
+            settings,
+            self._arrived,
+            name=name,
+            on_state=self._on_state,
+            budget=Budget(),
+            together=driven,
+            on_gap=self._on_gap,
         )
-        self.link.on_gap = self._on_gap
         self._together = Together() if together is None else together
         self.health = SensorHealth(
             self.link, device.roles[0].kind, self.protocol, self.decoder, polled=self.dialogue is not None

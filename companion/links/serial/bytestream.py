@@ -92,7 +92,8 @@ class ByteLink:
 
     `t_s` is the loop's time at which the chunk was read. `on_state(connected, reason)` tells of every change, of the
     reason too while attempts go on; a decoder should be told (`Decoder.interrupted`), as bytes are missing between
-    two connections. All calls are made on the loop's thread; the callbacks must neither block nor raise.
+    two connections, and where `on_gap` tells of bytes that were thrown away. All calls are made on the loop's thread;
+    the callbacks must neither block nor raise.
     """
 
     def __init__(
@@ -104,7 +105,8 @@ class ByteLink:
         on_state: OnState | None = None,
         budget: Budget | None = None,
         together: Together | None = None,
-        on_turn: Callable[[], None] | None = None,
+        on_turn: Callable[[], None] = lambda: None,
+        on_gap: Callable[[], None] = lambda: None,
     ) -> None:
         self.settings = settings
         self.name = name
@@ -112,8 +114,6 @@ class ByteLink:
         """How much is taken in; None: whatever comes. What comes beyond it is thrown away unread."""
         self.together = together
         """What waits for the next read, whenever this stream is collected; None: nothing."""
-        self.on_gap: Callable[[], None] = lambda: None
-        """Called when bytes were thrown away between the last ones and the next ones."""
         self.bytes_received = 0
         self.reconnects = 0
         """How often the port was opened again after it had been open."""
@@ -121,7 +121,7 @@ class ByteLink:
         """Turns of `run`, one at least every `BEAT_WITHIN_S`, whether bytes come or not."""
         self.last_byte_s: float | None = None
         """The loop's time of the last read that brought bytes."""
-        self._on_bytes, self._on_turn = on_bytes, on_turn
+        self._on_bytes, self._on_turn, self._on_gap = on_bytes, on_turn, on_gap
         self._reconnection = Reconnection(name, Backoff(cap_s=LONGEST_PAUSE_S), worth_s=WORTH_S, on_state=on_state)
         self._descriptor: int | None = None
         self._reads = 0
@@ -203,8 +203,7 @@ class ByteLink:
 
     def _turn(self) -> None:
         self.turns += 1
-        if self._on_turn is not None:
-            self._on_turn()
+        self._on_turn()
 
     async def _open(self) -> int:
         if self.settings.is_tcp:
@@ -312,7 +311,7 @@ class ByteLink:
                 self.last_byte_s = loop.time()
         except OSError:
             pass  # empty, or gone: the reader will find it
-        self.on_gap()
+        self._on_gap()
         self._reads, self._attempts, self._reads_since = 0, 0, (loop.time(), self.bytes_received)
         loop.add_reader(self._descriptor, self._readable)
 
