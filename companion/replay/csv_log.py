@@ -199,7 +199,7 @@ def estimate(
     imu = ImuInput(name=NAME, rotation=rotation_matrix(mounting), profile=noise_profile(profile))
     collector = RollingCollector(settings, [imu], gradienter=False, compass=False)
     draft = Draft(datetime.datetime.now(tz=datetime.UTC))
-    found: list[Measurement | str] = []
+    found: list[Measurement] = []
     still_s, obstacle = 0.0, "no samples"
     offset_s: float | None = None
     now_s = looked_s = _FIRST_S
@@ -214,13 +214,13 @@ def estimate(
             glance = collector.glance(now_s)
             obstacle = obstacle if glance.obstacle is None else glance.obstacle.words
             if glance.obstacle is None and glance.still_s >= max(MIN_STILL_S, _LONGER * still_s):
-                found.append(_measurement(collector, now_s))
+                found.append(collector.measurement(now_s))
                 still_s = glance.still_s
         collector.add_imu(NAME, ImuSample(now_s, sample.gyro_rad_s, sample.accel_m_s2, sample.temperature_degc))
     collector.tick(now_s + 0.3)
     glance = collector.glance(now_s + 0.3)
     if glance.obstacle is None and glance.still_s > max(still_s, MIN_STILL_S - 1.0):
-        found.append(_measurement(collector, now_s + 0.3))
+        found.append(collector.measurement(now_s + 0.3))
     best, refused = _latest(found)
     seconds = now_s - _FIRST_S
     if best is None:
@@ -237,22 +237,12 @@ def estimate(
     return draft.record("done", in_words(draft.solution), seconds)
 
 
-def _measurement(collector: RollingCollector, now_s: float) -> Measurement | str:
-    """Of the stretch that lasts until now, or why there is none."""
-    try:
-        return collector.measurement(now_s)
-    except CalibrationRefusedError as error:
-        return str(error)
-
-
-def _latest(found: list[Measurement | str]) -> tuple[Window | None, str]:
+def _latest(found: list[Measurement]) -> tuple[Window | None, str]:
     """The window of the latest that gives one; where none does, why the very latest gives none."""
     refused = ""
     for each in reversed(found):
         try:
-            if isinstance(each, Measurement):
-                return each.window(), ""
-            raise CalibrationRefusedError(each)
+            return each.window(), ""
         except CalibrationRefusedError as error:
             refused = refused or str(error)
     return None, refused

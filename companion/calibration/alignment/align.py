@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from companion.calibration.alignment.align_model import DOWN, Ground, Model, Part, Priors, Row, Stand, Unknowns
 from companion.errors import CalibrationRefusedError
-from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
+from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, skew
 from companion.physics.gradienter import Law, up_in_sensor
 from companion.physics.units import DEG, MG
 
@@ -272,9 +272,7 @@ def _level_bias(model: Model, at: Unknowns, k: int) -> tuple[Array, Matrix]:
     """
     gravity, up = at.gravity_m_s2, LEVEL
     by = np.zeros((3, model.size))
-    by[:, model.imu(k, Part.MISALIGNMENT)] = gravity * np.array(
-        [[0.0, -up[2], up[1]], [up[2], 0.0, -up[0]], [-up[1], up[0], 0]]
-    )
+    by[:, model.imu(k, Part.MISALIGNMENT)] = gravity * skew(up)
     by[:, model.imu(k, Part.SCALE)] = gravity * np.diag(up)
     by[:, model.imu(k, Part.SHEAR)] = gravity * np.array(
         [[up[1], up[2], 0.0], [up[0], 0.0, up[2]], [0.0, up[0], up[1]]]

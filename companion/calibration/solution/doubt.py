@@ -98,7 +98,7 @@ _IN_SHORT: Final[dict[Cause, str]] = {
 def doubts(
     triad: Triad, witnesses: Sequence[Witness], up: Array, by_reading: Matrix | None, *, today: bool
 ) -> list[Doubt]:
-    """Everything that contradicts; empty while all is well. `today`: what was known is from this very power-up.
+    """Everything that contradicts; empty while all is well.
 
     Args:
         triad: which half.

@@ -29,7 +29,7 @@ from companion.calibration.alignment.align_record import Determined, ImuAlignmen
 from companion.calibration.noise.allan import AllanModel, floor_variance
 from companion.calibration.solution.history import Measured, Point, PowerUp, believed
 from companion.calibration.solution.record import Effective
-from companion.physics.frames import Array, Floats, Matrix, vector
+from companion.physics.frames import Array, Floats, Matrix, skew, vector
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import Triad, Vector
 
@@ -97,7 +97,7 @@ def pose_effect(aligned: ImuAlignmentRecord | None) -> PoseEffect:
     return PoseEffect(
         mean=np.diag(scale) + _beside(shear),
         sigma=np.diag(scale_sigma) + _beside(shear_sigma),
-        misalignment_mean=np.array([[0.0, turn[2], -turn[1]], [-turn[2], 0.0, turn[0]], [turn[1], -turn[0], 0.0]]),
+        misalignment_mean=-skew(turn),
         misalignment_sigma=_beside(turn_sigma[::-1]),
         source="alignment" if aligned is not None and any(aligned.accel_scale.known) else "assumed",
     )

@@ -151,15 +151,12 @@ def judge(
     if held.temperature_degc is not None and temperature_degc is not None:
         change = temperature_degc - held.temperature_degc
         if abs(change) > limits.max_temperature_change_k:
-            found.append(Finding(Why.TEMPERATURE, f"imu {name} is {abs(change):.0f} K {_warmer(change)} than then"))
+            warmer = "warmer" if change > 0 else "colder"
+            found.append(Finding(Why.TEMPERATURE, f"imu {name} is {abs(change):.0f} K {warmer} than then"))
     limit_s = min(limits.max_age_s, age_limit_s(model, held.sigma_use, held.averaged_s))
     if (age_s := now_s - held.confirmed_s) > limit_s:
         found.append(Finding(Why.OLD, f"calibrated {age_s / 60:.0f} min ago, limit {limit_s / 60:.0f}"))
     return found
-
-
-def _warmer(change: float) -> str:
-    return "warmer" if change > 0 else "colder"
 
 
 def worst_axis(held: Held, present: Present) -> float | None:

@@ -175,13 +175,13 @@ class SampleTimes:
             at_s = sample.t_s
             if isinstance(sample, ImuSample):
                 raw_s, sequence = sample.t_device_s, sample.sequence
-                breaks = clock.restarts + clock.jumps
+                breaks = clock.breaks
                 t_s: float | None = at_s - frame_s
                 device_s: float | None = None
                 if raw_s is not None and math.isfinite(raw_s):
                     t_s = clock.host_s(raw_s, at_s - frame_s)
                     device_s = clock.device_s
-                    anew, breaks = breaks, clock.restarts + clock.jumps
+                    anew, breaks = breaks, clock.breaks
                     if sequence is not None:
                         sequence = self._counted(sequence, breaks > anew)
                 elif sequence is not None:
