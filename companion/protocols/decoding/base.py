@@ -275,11 +275,18 @@ def check_imu(gyro_rad_s: Vector, accel_m_s2: Vector, temperature_degc: float | 
     Raises:
         RejectedError: a value is not finite, or beyond what any IMU can measure.
     """
+    gx, gy, gz = gyro_rad_s
+    ax, ay, az = accel_m_s2
     temperature = temperature_degc or 0.0
-    if not math.isfinite(sum(gyro_rad_s) + sum(accel_m_s2) + temperature):
+    if not math.isfinite(gx + gy + gz + ax + ay + az + temperature):
         raise RejectedError(reasons.NON_FINITE)
-    rate, force = max(map(abs, gyro_rad_s)), max(map(abs, accel_m_s2))
-    if rate > GYRO_LIMIT_RAD_S or force > ACCEL_LIMIT_M_S2 or abs(temperature) > TEMPERATURE_LIMIT_DEGC:
+    rate, force = GYRO_LIMIT_RAD_S, ACCEL_LIMIT_M_S2
+    # Of every sample of every IMU: in comparisons alone, which cost half of what `max` and `abs` do.
+    if not (
+        (-rate <= gx <= rate and -rate <= gy <= rate and -rate <= gz <= rate)
+        and (-force <= ax <= force and -force <= ay <= force and -force <= az <= force)
+        and -TEMPERATURE_LIMIT_DEGC <= temperature <= TEMPERATURE_LIMIT_DEGC
+    ):
         raise RejectedError(reasons.OUT_OF_RANGE)
 
 
