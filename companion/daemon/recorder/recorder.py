@@ -296,9 +296,13 @@ class Recorder(Subsystem):
             StorageError: the file cannot be created, or recording is not possible.
         """
         if request.get("stop") is True:
-            if self._on_request is None:
+            if (recording := self._on_request) is None:
                 raise StorageError("nothing is being recorded on request")
-            yield {"kind": "result", **await self._stop(self._on_request, "stopped")}
+            await self._flush()
+            async with self._flushing:
+                if not recording.ended.done():
+                    await self._end(recording, "stopped")
+            yield {"kind": "result", **recording.ended.result()}
             return
         seconds, name = request.get("seconds"), request.get("file")
         if not (seconds is None or is_time_limit(seconds)) or not (name is None or isinstance(name, str)):
@@ -339,13 +343,6 @@ class Recorder(Subsystem):
         if self._on_request is not None:
             path = self._on_request.file.path
             raise StorageError(f"already recording to {path}; end it with: companion record --stop")
-
-    async def _stop(self, recording: _OnRequest, why: str) -> Object:
-        await self._flush()
-        async with self._flushing:
-            if not recording.ended.done():
-                await self._end(recording, why)
-        return recording.ended.result()
 
     async def _end(self, recording: _OnRequest, why: str, state: str = "done") -> None:
         self._on_request = None
