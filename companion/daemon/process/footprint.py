@@ -17,9 +17,6 @@ _M_ARENA_MAX: Final = -8
 _THRESHOLD_BYTES: Final = 128 * 1024
 """glibc's own beginning; left alone it grows to that of the largest piece ever freed, which stays in the process."""
 
-_ENUMERATIONS_USED: Final = frozenset({"MAV_RESULT"})
-_UNUSED_METHODS: Final = ("_send", "_encode")
-
 
 def prepare() -> None:
     """Call it first: before numpy and the dialect are imported, and before there are threads."""
@@ -29,7 +26,6 @@ def prepare() -> None:
     _allocate_sparingly()
     # A thread for every processor, with its own buffers, for matrices of 6 by 6.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    _slim_dialect()
 
 
 def settle() -> None:
@@ -53,16 +49,3 @@ def _allocate_sparingly() -> None:
     mallopt(_M_ARENA_MAX, 1)
     mallopt(_M_MMAP_THRESHOLD, _THRESHOLD_BYTES)
     mallopt(_M_TRIM_THRESHOLD, _THRESHOLD_BYTES)
-
-
-def _slim_dialect() -> None:
-    """Drop what the generated dialect has for others: two methods a message that send it, and prose about its numbers.
-
-    We pack messages ourselves (`links/mavlink/link.py`); every message is received and sent as before.
-    """
-    from pymavlink.dialects.v20 import ardupilotmega as dialect
-
-    for name in [name for name in vars(dialect.MAVLink) if name.endswith(_UNUSED_METHODS)]:
-        delattr(dialect.MAVLink, name)
-    for name in dialect.enums.keys() - _ENUMERATIONS_USED:
-        del dialect.enums[name]
