@@ -56,7 +56,7 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
 
 
 def _parser() -> Parser:
-    from companion.cli import client, ground, install, local, monitor, profile, recordings, report
+    from companion.cli import client, ground, local, monitor, profile, recordings
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -92,7 +92,7 @@ def _parser() -> Parser:
         local.lua,
         "print the arming script for ArduPilot (> APM/scripts/companion_arming.lua), and how to install it",
     )
-    install.add_commands(add)
+    local.add_commands(add)
     add("status", client.status, "what the daemon is doing")
     calibrate = add("calibrate", client.calibrate, "calibrate now (the aircraft must be disarmed and still)")
     what = calibrate.add_mutually_exclusive_group()
@@ -114,7 +114,6 @@ def _parser() -> Parser:
     add("autopilot-setup", client.setup, "what the autopilot needs set to take in our heading")
     history = add("history", client.history, "list past calibrations")
     history.add_argument("-n", "--limit", type=count, default=20, metavar="N", help="the latest N (default 20)")
-    report.add_command(add)
     add("monitor", monitor.monitor, "watch the daemon until Ctrl-C")
     add("web-token", local.web_token, "where the page is, and the token that its buttons need")
     recordings.add_commands(add)

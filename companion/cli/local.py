@@ -1,22 +1,50 @@
-"""The commands that need no daemon: run it, check what it would find, list ports."""
+"""The commands that need no daemon: run it, check what it would find, list ports, install it, make a report."""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
 import dataclasses
+import datetime
 import faulthandler
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from companion.cli import logs, show
-from companion.cli.terminal import DONE, FAILED, config_path, load_config, print_json, print_lines
-from companion.errors import CompanionError, LinkError
+from companion.cli.terminal import DONE, FAILED, USAGE, AddCommand, config_path, load_config, print_json, print_lines
+from companion.errors import CompanionError, ConfigError, LinkError, StorageError
 
 if TYPE_CHECKING:
+    from companion.calibration.noise.allan import NoiseProfile
+    from companion.installation.install import Step, Target
     from companion.links.serial.listening import Heard
     from companion.links.serial.ports import SerialPort
+
+
+def add_commands(add: AddCommand) -> None:
+    """Add those that have options of their own: to install, to uninstall, and to report."""
+    for name, command, words in (
+        ("install-service", install, "start the companion at every boot: unit, udev rules, configuration"),
+        ("uninstall-service", uninstall, "take that away again; configuration and records stay"),
+    ):
+        service = add(name, command, words)
+        service.add_argument("--root", default="/", metavar="DIR", help="below this folder, for packages (default /)")
+        service.add_argument(
+            "--prefix", type=Path, default=Path("/usr/local"), help="whose lib takes the unit (default /usr/local)"
+        )
+        service.add_argument("--dry-run", action="store_true", help="only tell what would be done")
+        if command is install:
+            service.add_argument("--executable", metavar="PATH", help="the companion (default: the one that runs this)")
+    sub = add("report", report, "make a page (one HTML file) of a calibration: needs no daemon, no network")
+    sub.add_argument(
+        "record", nargs="?", metavar="RECORD", help="its number, or the beginning of its time (default: the latest)"
+    )
+    sub.add_argument("-o", "--output", metavar="FILE", help="default: companion-report-….html here; - is stdout")
+    sub.add_argument(
+        "--storage", type=Path, metavar="DIR", help="the folder with records/ (default: as in the configuration)"
+    )
 
 
 async def run(options: argparse.Namespace) -> int:
@@ -141,3 +169,108 @@ async def check(options: argparse.Namespace) -> int:
         for finding in findings:
             print_lines(f"{'ok ' if finding.good else 'BAD'}  {finding.name:{width}}  {finding.words}")
     return DONE if good else FAILED
+
+
+async def install(options: argparse.Namespace) -> int:
+    """`companion install-service`."""
+    from companion.installation import install as installing
+
+    return _tell(options, installing.install(_target(options, options.executable or installing.own_executable())))
+
+
+async def uninstall(options: argparse.Namespace) -> int:
+    """`companion uninstall-service`."""
+    from companion.installation import install as installing
+
+    return _tell(options, installing.uninstall(_target(options, installing.own_executable())))
+
+
+def _target(options: argparse.Namespace, executable: str) -> Target:
+    from companion.installation.install import Target
+
+    return Target(Path(options.root).absolute(), options.prefix, executable, dry_run=options.dry_run)
+
+
+def _tell(options: argparse.Namespace, steps: Iterable[Step]) -> int:
+    as_json = getattr(options, "json", False)
+    done: list[Step] = []
+    for step in steps:
+        done.append(step)
+        line = f"{step.outcome:9}  {step.what}" + (f": {step.words}" if step.words else "")
+        print_lines(line, error=as_json)
+    failed = [step for step in done if step.outcome == "failed"]
+    if as_json:
+        reason = "; ".join(f"{step.what}: {step.words}" for step in failed)
+        state = "failed" if failed else "would be done" if options.dry_run else "done"
+        print_json({"state": state, "reason": reason, "steps": [dataclasses.asdict(step) for step in done]})
+    elif options.dry_run:
+        print_lines("this was a dry run: nothing was changed", error=True)
+    return FAILED if failed else DONE
+
+
+async def report(options: argparse.Namespace) -> int:
+    """`companion report`."""
+    as_json = getattr(options, "json", False)
+    if options.output == "-" and as_json:
+        print_lines("companion report: -o - and --json both want stdout", error=True)
+        return USAGE
+    directory, profiles = _where(options)
+    try:
+        path, damaged = _make(options, directory, profiles)
+    except CompanionError as error:
+        print_lines(f"companion: {error}", error=True)
+        if as_json:
+            print_json({"state": "failed", "reason": str(error), "file": None})
+        return FAILED
+    skipped = f"skipped: {'; '.join(damaged)}" if damaged else ""
+    if skipped:
+        print_lines(f"companion: {skipped}", error=True)
+    if as_json:
+        print_json({"state": "done", "reason": skipped, "file": str(path)})
+    elif path is not None:
+        print_lines(path)
+    return DONE
+
+
+def _where(options: argparse.Namespace) -> tuple[Path, dict[str, NoiseProfile]]:
+    """The storage folder, and the noise profiles that the configuration names.
+
+    Raises:
+        ConfigError: there is no configuration to say where, and no --storage.
+    """
+    from companion.calibration.noise.allan import noise_profile
+
+    try:
+        config = load_config(options, profiles=True)
+    except ConfigError as error:
+        if options.storage is not None:
+            # A folder copied to another computer needs no configuration there.
+            return options.storage, {}
+        raise ConfigError(f"{error} (or name the folder with the records: --storage DIR)") from error
+    profiles = {imu.name: noise_profile(imu.profile) for imu in config.imu if imu.profile is not None}
+    return options.storage or config.storage.path, profiles
+
+
+def _make(
+    options: argparse.Namespace, directory: Path, profiles: dict[str, NoiseProfile]
+) -> tuple[Path | None, list[str]]:
+    from companion.report.calibration_page import calibration_page
+    from companion.report.source import material
+    from companion.storage.state import write_atomically
+
+    now = datetime.datetime.now(tz=datetime.UTC)
+    one = material(directory, options.record, profiles)
+    content, damaged = calibration_page(one, now), list(one.damaged)
+    name = f"companion-report-{one.number:06d}.html"
+    if options.output == "-":
+        # As the file says of itself, whatever the terminal speaks.
+        sys.stdout.buffer.write(content.encode("utf-8", "replace"))
+        sys.stdout.flush()
+        return None, damaged
+    path = Path(options.output or name).absolute()
+    if not path.parent.is_dir():
+        raise StorageError(f"{path}: there is no folder {path.parent}")
+    if path.is_dir():
+        path = path / name
+    write_atomically(path, content.encode("utf-8", "replace"), mode=0o644)
+    return path, damaged

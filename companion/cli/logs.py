@@ -24,8 +24,6 @@ _PRIORITIES: Final = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, log
 LINES_PER_S: Final = 0.1
 BURST: Final = 10.0
 """The most lines of each place in the program: more than a day at the flight line makes at once."""
-SAID_AFTER_S: Final = 60.0
-"""How long after the last suppressed line their count is added to the next line of any place."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -34,9 +32,7 @@ class _Place:
 
     budget: Budget = dataclasses.field(default_factory=lambda: Budget(LINES_PER_S, BURST))
     left_out: int = 0
-    since_s: float = 0.0
-    last: tuple[logging.LogRecord, float] | None = None
-    """The latest that was left out, and when."""
+    """Since the last line that was written."""
 
 
 class LimitedHandler(logging.StreamHandler[TextIO]):
@@ -53,35 +49,17 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
         self._places: dict[tuple[str, int, int], _Place] = {}
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write the record, or count it."""
+        """Write the record with the count of those left out before it, or count it."""
         now_s = self._clock()
-        here = self._places.setdefault((record.pathname, record.lineno, record.levelno), _Place())
-        for place in self._places.values():
-            if place is not here and place.last is not None and now_s - place.last[1] >= SAID_AFTER_S:
-                self._say_left_out(place, place.last[0], place.left_out - 1, now_s)
-        if here.budget.left(now_s) < 1.0:
-            here.since_s = here.since_s if here.left_out else now_s
-            here.left_out, here.last = here.left_out + 1, (record, now_s)
+        place = self._places.setdefault((record.pathname, record.lineno, record.levelno), _Place())
+        if place.budget.left(now_s) < 1.0:
+            place.left_out += 1
             return
-        here.budget.take(1, now_s)
-        if here.left_out:
-            self._say_left_out(here, record, here.left_out, now_s)
-        else:
-            super().emit(record)
-
-    def close(self) -> None:
-        """Say what has been left out and not been said."""
-        for place in self._places.values():
-            if place.last is not None:
-                self._say_left_out(place, place.last[0], place.left_out - 1, self._clock())
-        super().close()
-
-    def _say_left_out(self, place: _Place, record: logging.LogRecord, others: int, now_s: float) -> None:
-        if others:
+        place.budget.take(1, now_s)
+        if place.left_out:
             record = copy.copy(record)
-            words = f"{record.getMessage()} (and {others} more like this in the last {now_s - place.since_s:.0f} s)"
-            record.msg, record.args = words, ()
-        place.left_out, place.last = 0, None
+            record.msg = f"{record.getMessage()} (after {place.left_out} more like this, left out)"
+            record.args, place.left_out = (), 0
         super().emit(record)
 
 

@@ -38,7 +38,6 @@ ELSEWHERE = {
     "companion/component/requests.py": "likewise, of a MAVLink command's parameters",
     "companion/daemon/faces/mqtt/payloads.py": "likewise, of a request's payload",
     "companion/installation": "printed by commands that are run at home, with what to do",
-    "companion/cli/install.py": "printed by commands that are run at home, with what to do",
     "companion/cli/profile.py": "the table and its notes: docs/profiles.md",
     "companion/calibration/machine.py": "labels of the diagram in docs/calibration.md",
     "companion/recording/topics.py": "names of fields in a recording",
