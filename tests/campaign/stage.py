@@ -241,7 +241,7 @@ class Stage(Rig):
         machine.on = watched  # type: ignore[method-assign]
         self.on_start()
         control = self.config.control
-        async with ControlServer(control.path, self.service.faces.answers.answer):
+        async with ControlServer(control.path, self.service.faces.answer):
             await self.service.serve(mavlink=False)
 
     async def stop(self) -> None:

@@ -215,9 +215,7 @@ def test_it_outlives_a_restart_and_is_not_used_with_another_configuration(tmp_pa
             assert result.outcome == "done", result
             assert (record.alignment is None) == (words is not None)
             if forget:
-                replies = [
-                    r async for r in fresh.service.faces.answers.answer({"command": "align", "action": "forget"})
-                ]
+                replies = [r async for r in fresh.service.faces.answer({"command": "align", "action": "forget"})]
                 assert replies[-1]["state"] == "done"
                 assert fresh.service.status()["alignment"] is None
                 assert not (tmp_path / "alignment.json").exists()
@@ -311,7 +309,7 @@ def test_a_client_that_vanishes_stops_nothing(tmp_path: Path) -> None:
     async def main() -> None:
         async with made.running():
             await made.ready()
-            replies = made.service.faces.answers.answer({"command": "align", "action": "zero"})
+            replies = made.service.faces.answer({"command": "align", "action": "zero"})
             first = await anext(replies)
             assert first["kind"] == "progress"
             await replies.aclose()  # type: ignore[attr-defined]
@@ -319,7 +317,7 @@ def test_a_client_that_vanishes_stops_nothing(tmp_path: Path) -> None:
             assert job is not None
             result = await follow(made, hands, job)
             assert result.outcome == "done", result
-            shown = [r async for r in made.service.faces.answers.answer({"command": "align", "action": "show"})]
+            shown = [r async for r in made.service.faces.answer({"command": "align", "action": "show"})]
             assert shown[-1]["state"] == "in force"
 
     run_virtual(main())

@@ -225,7 +225,7 @@ def test_what_was_in_force_at_arming_is_kept_and_shown_with_its_record(tmp_path:
             rig.px4.arm()
             await asyncio.sleep(1.5)
             history: dict[str, Any] = {}
-            async for reply in rig.service.faces.answers.answer({"command": "history"}):
+            async for reply in rig.service.faces.answer({"command": "history"}):
                 history = reply
             return history
 

@@ -24,7 +24,7 @@ AFTER: dict[Firmware, dict[str, float]] = {
 
 
 async def ask(rig: Rig) -> dict[str, Any]:
-    (reply,) = [reply async for reply in rig.service.faces.answers.answer({"command": "autopilot-setup"})]
+    (reply,) = [reply async for reply in rig.service.faces.answer({"command": "autopilot-setup"})]
     return reply
 
 

@@ -220,7 +220,7 @@ def test_done_is_a_hundred_per_cent_while_the_record_is_on_its_way_to_the_disk(t
 
         async def looking(function: Callable[..., Any], *arguments: Any) -> Any:
             if hasattr(rig, "service"):
-                status = rig.service.faces.answers.status()
+                status = rig.service.faces.all_status()
                 seen.add((status["state"], status["progress"]))
             return function(*arguments)
 

@@ -60,7 +60,7 @@ def test_the_session_happens_as_shown(
         async with Rig(tmp_path, at_arm="warn").running() as rig:
 
             async def ask(_path: Path, request: dict[str, Any]) -> AsyncIterator[dict[str, Any]]:
-                async for reply in rig.service.faces.answers.answer(request):
+                async for reply in rig.service.faces.answer(request):
                     yield json.loads(msgspec.json.encode(reply))
 
             for module in (client, check):

@@ -96,7 +96,7 @@ def test_a_cancel_from_another_face_is_seen_here(tmp_path: Path) -> None:
                 await rig.ready()
                 await watcher.publish("field/heron/request/calibrate", {"transaction": "x"})
                 await watcher.response("field/heron", "calibrate", "x", "accepted")
-                replies = [reply async for reply in rig.service.faces.answers.answer({"command": "cancel"})]
+                replies = [reply async for reply in rig.service.faces.answer({"command": "cancel"})]
                 assert replies[-1]["state"] == "cancelled"
                 ended = await watcher.response("field/heron", "calibrate", "x", "cancelled")
                 assert ended["reason"] == "cancelled by companion cancel"

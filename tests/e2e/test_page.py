@@ -37,7 +37,7 @@ async def press(rig: Rig, action: str, **body: Any) -> tuple[int, str]:
 async def at_the_socket(rig: Rig, command: str) -> str:
     """The reason that the control socket gives for the same."""
     try:
-        replies = [reply async for reply in rig.service.faces.answers.answer({"command": command})]
+        replies = [reply async for reply in rig.service.faces.answer({"command": command})]
     except Exception as error:  # noqa: BLE001 - refusals are exceptions there
         return str(error)
     return str(replies[-1]["reason"])
@@ -196,7 +196,7 @@ def test_the_attitude_and_the_biases_that_are_shown_are_the_true_ones(tmp_path: 
             magnetic = rig.service.status()["pose"]
             assert magnetic["north"] == "magnetic"
             await rig.until(lambda: rig.service.core.vehicle.place.position is not None, 10.0)
-            true_north = (await rig.service.faces.answers.look())["pose"]
+            true_north = (await rig.service.faces.look())["pose"]
             assert magnetic["pitch_deg"] == pytest.approx(POSE.pitch_deg, abs=0.05)
             assert magnetic["roll_deg"] == pytest.approx(POSE.roll_deg, abs=0.05)
             assert magnetic["heading_deg"] == pytest.approx(POSE.heading_deg - rig.site.declination_deg, abs=2.0)

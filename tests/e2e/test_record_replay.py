@@ -530,7 +530,7 @@ def foxglove_takes(schema: dict[str, Any]) -> None:
 
 
 async def asked(rig: Rig, **request: Any) -> list[Object]:
-    return [reply async for reply in rig.service.faces.answers.answer({"command": "record", **request})]
+    return [reply async for reply in rig.service.faces.answer({"command": "record", **request})]
 
 
 def test_recording_on_request(tmp_path: Path) -> None:

@@ -42,12 +42,12 @@ def test_a_silent_gradienter_is_the_headline_with_what_to_look_at(tmp_path: Path
     async def main() -> None:
         async with watched(Rig(tmp_path, at_arm="warn")) as rig:
             rig.unplugged.add("gradienter")
-            answers = rig.service.faces.answers
-            await rig.until(lambda: "silent (power? wiring?" in answers.status()["headline"]["reason"], 10.0)
-            headline = answers.status()["headline"]
+            faces = rig.service.faces
+            await rig.until(lambda: "silent (power? wiring?" in faces.all_status()["headline"]["reason"], 10.0)
+            headline = faces.all_status()["headline"]
             assert headline["word"] == "NOT CALIBRATED"
             assert headline["reason"].startswith("gradienter: /nowhere/gradienter at 9600 baud")
             rig.unplugged.clear()
-            await rig.until(lambda: "silent" not in rig.service.faces.answers.status()["headline"]["reason"], 3.0)
+            await rig.until(lambda: "silent" not in faces.all_status()["headline"]["reason"], 3.0)
 
     run_virtual(main())

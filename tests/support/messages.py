@@ -27,6 +27,8 @@ NOT_FOR_PEOPLE = {
     "debug", "info",
     # Command lines that cannot be read are answered at once, with what is allowed.
     "ArgumentTypeError",
+    # What a request over MQTT found, and what is allowed.
+    "Misfit",
     # Expressions and templates of other tools.
     "compile", "Formatter", "JournalFormatter", "OneLineFormatter",
     # Names of tasks.
@@ -36,7 +38,6 @@ NOT_FOR_PEOPLE = {
 ELSEWHERE = {
     "companion/config": "every line names file, key, what was found and what is allowed; one row tells so",
     "companion/component/requests.py": "likewise, of a MAVLink command's parameters",
-    "companion/daemon/faces/mqtt/payloads.py": "likewise, of a request's payload",
     "companion/installation": "printed by commands that are run at home, with what to do",
     "companion/cli/profile.py": "the table and its notes: docs/profiles.md",
     "companion/calibration/machine.py": "labels of the diagram in docs/calibration.md",

@@ -29,7 +29,7 @@ def test_a_time_that_is_none_is_refused_in_one_line(
     async def main() -> None:
         service = Service(parse(ALONE.format(folder=tmp_path, more=""), "test.toml"))
         with pytest.raises(CompanionError, match=words) as caught:
-            async for _ in service.faces.answers.answer({**request_, key: seconds}):
+            async for _ in service.faces.answer({**request_, key: seconds}):
                 pass
         assert "\n" not in str(caught.value)
 

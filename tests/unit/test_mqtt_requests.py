@@ -10,8 +10,7 @@ import pytest
 
 from companion.component.service import Refusal
 from companion.daemon.calibrating.subsystem import RequestRefusedError
-from companion.daemon.faces.mqtt.payloads import Misfit, Request, parse
-from companion.daemon.faces.mqtt.requests import MAX_PENDING, REMEMBER_S, REMEMBERED, Requests
+from companion.daemon.faces.mqtt.requests import MAX_PENDING, REMEMBER_S, REMEMBERED, Misfit, Request, Requests, parse
 from tests.support.virtual_time import run_virtual
 
 Object = dict[str, Any]

@@ -80,7 +80,7 @@ def replies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Object]:
                 {"command": "align", "action": "show"},
                 {"command": "autopilot-setup"},
             ):
-                async for reply in rig.service.faces.answers.answer(request):
+                async for reply in rig.service.faces.answer(request):
                     found[f"{request['command']}{' under way' if reply['kind'] == 'progress' else ''}"] = reply
 
     run_virtual(asked())

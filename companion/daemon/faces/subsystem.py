@@ -1,8 +1,12 @@
-"""The faces: the component on MAVLink, the control socket, MQTT and the page, all by one door."""
+"""The faces: the component on MAVLink, the control socket, MQTT and the page, all by one door.
+
+Each command is answered by the subsystem whose it is, and the status by all of them together.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import asyncio
+from collections.abc import AsyncIterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, get_args
 
 import msgspec
@@ -14,9 +18,8 @@ from companion.component.service import JobResult
 from companion.config.sections import AtArm, Senders
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.subsystem import Calibrating
-from companion.daemon.core import Core, Subsystem, Task, Wanted
+from companion.daemon.core import Core, Handler, Subsystem, Task, Wanted, joined
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.faces.answers import Answers
 from companion.daemon.faces.headline import Headlines
 from companion.daemon.heading.subsystem import Heading
 from companion.daemon.job import Job
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
 AT_ARM: Final[tuple[AtArm, ...]] = ("off", "warn", "gate")
 STATE_NUMBER: Final = {"done": 1.0, "failed": 2.0, "cancelled": 3.0}
 LARGEST: Final = 1e6
+MONITOR_EVERY_S: Final = 0.5
 
 
 class Faces(Subsystem):
@@ -61,19 +65,56 @@ class Faces(Subsystem):
         )
         calibrating.conductor.on_ended.add(self._show_result)
         self._headlines = Headlines(core, devices, calibrating.conductor, arming, heading.attitude)
-        self.answers = Answers([self, devices, offsets, calibrating, arming, heading, recorder], heading.pose)
+        self._pose = heading.pose
+        self._subsystems = (self, devices, offsets, calibrating, arming, heading, recorder)
+        self._handlers: dict[str, Handler] = {"status": self._status, "monitor": self._monitor}
+        for subsystem in self._subsystems:
+            self._handlers |= subsystem.commands()
         # What nobody asked for costs the start nothing: it is imported only where it is configured.
         self.mqtt: MqttFace | None = None
         if core.config.mqtt is not None:
             from companion.daemon.faces.mqtt.face import MqttFace
 
-            self.mqtt = MqttFace(core, core.config.mqtt, self.answers, calibrating.conductor, heading.pose)
+            self.mqtt = MqttFace(
+                core, core.config.mqtt, self.answer, self.all_status, calibrating.conductor, heading.pose
+            )
         self.page: Page | None = None
         if core.config.web is not None:
             from companion.web.server import Page
 
-            answers, bind = self.answers, core.config.web.bind
-            self.page = Page(bind, core.config.storage.path, answers.answer, answers.look, core.offload)
+            bind, folder = core.config.web.bind, core.config.storage.path
+            self.page = Page(bind, folder, self.answer, self.look, core.offload)
+
+    async def answer(self, request: Object, face: str = "companion") -> AsyncIterator[Object]:
+        """Answer one request of the control socket, or of another face that speaks its words.
+
+        Raises:
+            CompanionError: it is not taken, and why, or it could not be carried out.
+        """
+        command = request.get("command")
+        handler = self._handlers.get(command) if isinstance(command, str) else None
+        if handler is None:
+            yield {"kind": "error", "reason": f"unknown command {command!r}"}
+            return
+        async for reply in handler(request, face):
+            yield reply
+
+    async def _status(self, _request: Object, _face: str) -> AsyncIterator[Object]:
+        yield {"kind": "result", "status": await self.look()}
+
+    async def _monitor(self, _request: Object, _face: str) -> AsyncIterator[Object]:
+        while True:
+            yield {"kind": "progress", "status": await self.look()}
+            await asyncio.sleep(MONITOR_EVERY_S)
+
+    async def look(self) -> Object:
+        """`all_status`, with the declination of the place looked up when it is time to."""
+        await self._pose.look()
+        return self.all_status()
+
+    def all_status(self) -> Object:
+        """What the daemon is doing, as JSON can hold it."""
+        return joined([subsystem.status() for subsystem in self._subsystems])
 
     def _show_result(self, job: Job, _result: JobResult) -> None:
         if (record := job.record) is not None:

@@ -64,7 +64,7 @@ class Service:
         for words in (*models.cannot_work(self.config), *models.doubtful(self.config)):
             logger.warning("%s", words)
         control = self.config.control
-        async with ControlServer(control.path, self.faces.answers.answer, group=control.group_name):
+        async with ControlServer(control.path, self.faces.answer, group=control.group_name):
             with only_daemon(self.config.storage.path):
                 logger.info("ready: %s", control.path)
                 on_ready()
@@ -121,4 +121,4 @@ class Service:
 
     def status(self) -> Object:
         """What the daemon is doing, as JSON can hold it."""
-        return self.faces.answers.status()
+        return self.faces.all_status()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+from collections.abc import Callable
 from typing import Final
 
 import msgspec
@@ -16,8 +17,7 @@ import msgspec
 from companion.calibration.solution.record import to_json
 from companion.config.sections import Mqtt
 from companion.daemon.calibrating.conductor import Conductor
-from companion.daemon.core import Core
-from companion.daemon.faces.answers import Answers
+from companion.daemon.core import Core, Handler
 from companion.daemon.faces.mqtt.requests import Requests
 from companion.daemon.heading.subsystem import PoseNow
 from companion.links.mqtt.client import Incoming, MqttLink
@@ -123,8 +123,16 @@ class Topics:
 class MqttFace:
     """One broker's view of the daemon; `run` it. Where the daemon only listens, the broker is left alone."""
 
-    def __init__(self, core: Core, settings: Mqtt, answers: Answers, conductor: Conductor, pose: PoseNow) -> None:
-        self._settings, self._answers, self._conductor = settings, answers, conductor
+    def __init__(
+        self,
+        core: Core,
+        settings: Mqtt,
+        answer: Handler,
+        status: Callable[[], Object],
+        conductor: Conductor,
+        pose: PoseNow,
+    ) -> None:
+        self._settings, self._answer, self._all_status, self._conductor = settings, answer, status, conductor
         self._vehicle, self._offload, self._pose = core.vehicle, core.offload, pose
         self._system_id = core.config.vehicle.system_id
         self._only_listening = core.only_listening is not None
@@ -177,7 +185,7 @@ class MqttFace:
             on_message=self._on_message,
             offload=self._offload,
         )
-        self._requests = Requests(self._answers.answer, self._respond, self._on_retained)
+        self._requests = Requests(self._answer, self._respond, self._on_retained)
         self._pace, self._state_s, self._state = Pace(), -math.inf, ""
         self._progress, self._progress_s = b"", -math.inf
         link.outbox.keep(topics.status, ONLINE)
@@ -232,7 +240,7 @@ class MqttFace:
         """What costs more than a glance."""
         if self._conductor.last is not None:
             link.outbox.keep(topics.record, to_json(self._conductor.last))
-        said = summary(self._answers.status())
+        said = summary(self._all_status())
         if self._pace.is_due(said, now_s):
             link.outbox.keep(topics.state, _json(said))
 
