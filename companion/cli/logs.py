@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from typing import Final, TextIO
 
-from companion.links.system.budget import Budget
+from companion.links.system.connection import Budget
 from companion.printable import printable
 
 # The journal reads the level from "<N>" at the beginning of a line, so that `journalctl -p warning` finds it.

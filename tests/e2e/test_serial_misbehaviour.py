@@ -21,7 +21,7 @@ import pytest
 
 from companion.daemon.devices.sensor_health import RENEW_AFTER_S, RENEW_POLLED_AFTER_S
 from companion.links.serial import port as serial_port
-from companion.links.system.budget import BURST_BYTES, BYTES_PER_S
+from companion.links.system.connection import BURST_BYTES, BYTES_PER_S
 from sim.uart import Setting
 from tests.support.chatter import RECOVERY_S, Chatter, Listening, compass_frame, imu_frame, listening, tilt_frame
 

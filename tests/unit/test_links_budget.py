@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from companion.links.system.budget import Budget
+from companion.links.system.connection import Budget
 
 
 def test_a_steady_stream_within_the_budget_is_never_stopped() -> None:

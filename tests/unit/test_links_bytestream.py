@@ -26,8 +26,7 @@ from companion.links.serial import bytestream
 from companion.links.serial import port as serial_port
 from companion.links.serial.bytestream import OUT_BUFFER_BYTES, QUICK_READS, ByteLink, PortSettings
 from companion.links.serial.port import SerialOpener, open_serial
-from companion.links.system.budget import Budget
-from companion.links.system.connection import Backoff
+from companion.links.system.connection import Backoff, Budget
 from companion.links.system.together import Together
 
 NOBODY = 65534

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.links.mavlink.frames import kind_at
-from companion.links.mavlink.link import MavlinkLink
+from companion.links.mavlink.link import MavlinkLink, kind_at
 
 KINDS: dict[int, Any] = mavlink.mavlink_map
 MIXTURE = [

@@ -25,9 +25,8 @@ from companion.autopilot.parameters.change import (
     WriteFailedError,
 )
 from companion.autopilot.parameters.client import ParameterClient
-from companion.autopilot.parameters.pace import let_pass, moment
 from companion.autopilot.parameters.wire import same_float32
-from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.autopilot.vehicle.vehicle import ArmState, Moment, Vehicle
 from companion.calibration.solution.record import Outcome, WrittenParameter
 from companion.errors import (
     AutopilotError,
@@ -179,7 +178,7 @@ class ParameterWriter:
         done = await self.apply(swapped)
         if any(change.via is not None for change in changes):
             # Nobody looks at the telemetry after this, and who is told that it is done may arm.
-            await let_pass(self._vehicle, moment(self._vehicle), TAKEN_S)
+            await Moment(self._vehicle).let_pass(TAKEN_S)
         self.written = {
             c.parameter: structs.replace(done[c.parameter], before=c.before, after=c.after, outcome="rolled_back")
             for c in changes
@@ -219,9 +218,9 @@ class ParameterWriter:
             await self._write(item, via)
         if not indirect:
             return
-        written = moment(self._vehicle)
+        written = Moment(self._vehicle)
         wrong = None if on_the_way is None else await on_the_way()
-        await let_pass(self._vehicle, written, HOLD_S)
+        await written.let_pass(HOLD_S)
         await self._check_end()
         if wrong is not None:
             raise _Failure("not as believed", wrong)

@@ -30,7 +30,7 @@ from companion.autopilot.vehicle.whereabouts import TimeAndPlace
 from companion.links.mavlink.link import Handler, M, MavlinkLink, Message
 from companion.links.system.listeners import Listeners, Unsubscribe
 
-__all__ = ["ArmState", "Firmware", "Vehicle", "VehicleEvent"]
+__all__ = ["ArmState", "Firmware", "Moment", "Vehicle", "VehicleEvent"]
 
 logger = logging.getLogger(__name__)
 
@@ -49,6 +49,9 @@ _HEARTBEAT_ID: Final[int] = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 _OVERDUE_S: Final = 1.1
 _TICK_S: Final = 0.5
 _STALL_S: Final = 1.0
+_SLOWEST: Final = 5.0
+"""The most of our seconds that are given for one of the autopilot's."""
+_POLL_S: Final = 0.05
 
 VehicleEvent = Literal["armed", "disarmed", "lost", "found", "rebooted"]
 """What `Vehicle.watch` tells. "found": latched, or heard again after "lost". "armed" and "disarmed": the heartbeat
@@ -355,3 +358,31 @@ class Vehicle:
     def _on_version(self, message: mavlink.MAVLink_autopilot_version_message, _t_s: float) -> None:
         self.version = version_text(message.flight_sw_version)
         self.capabilities = message.capabilities
+
+
+class Moment:
+    """This instant on our clock and on the autopilot's, which a simulated one on a busy machine lets run slower.
+
+    What an autopilot does "at most once a second" (autopilots 9.2) it does by its own clock. To conclude after so many
+    of our seconds that it has ignored a value would blame a slow simulator for what it had no time to do.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._vehicle, self._t_s = vehicle, asyncio.get_running_loop().time()
+        self._boot_s, self._boots = vehicle.boot.latest_s, vehicle.boots
+
+    def has_passed(self, seconds: float) -> bool:
+        """Whether so much time has gone by on both clocks; or on ours alone, where the other tells nothing."""
+        gone_s = asyncio.get_running_loop().time() - self._t_s
+        if gone_s < seconds:
+            return False
+        vehicle, boot_s = self._vehicle, self._vehicle.boot.latest_s
+        if self._boot_s is None or boot_s is None or vehicle.boots != self._boots or not vehicle.alive:
+            return True
+        return boot_s - self._boot_s >= seconds or gone_s >= _SLOWEST * seconds
+
+    async def let_pass(self, seconds: float) -> None:
+        """Wait until `has_passed`."""
+        await asyncio.sleep(self._t_s + seconds - asyncio.get_running_loop().time())
+        while not self.has_passed(seconds):
+            await asyncio.sleep(_POLL_S)

@@ -15,7 +15,7 @@ from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.component.service import Refusal
 from companion.daemon.job import Job
 from companion.daemon.offsets.ledger import Ledger
-from companion.links.system.budget import Budget
+from companion.links.system.connection import Budget
 
 STARTS_PER_S: Final = 1.0
 """Requests a second that one sender may make for long: nobody presses faster."""

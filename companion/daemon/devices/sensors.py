@@ -14,7 +14,7 @@ from companion.daemon.core import Offload
 from companion.daemon.devices.sensor_health import SensorHealth, line_of
 from companion.links.serial.bytestream import ByteLink
 from companion.links.serial.ports import find_holders
-from companion.links.system.budget import Budget
+from companion.links.system.connection import Budget
 from companion.links.system.listeners import Listeners
 from companion.links.system.together import Together
 from companion.protocols.registry import Kind

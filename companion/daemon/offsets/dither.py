@@ -16,9 +16,8 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
-from companion.autopilot.parameters.pace import has_passed, moment
 from companion.autopilot.parameters.writer import Change, ParameterWriter
-from companion.autopilot.vehicle.vehicle import ArmState
+from companion.autopilot.vehicle.vehicle import ArmState, Moment
 from companion.calibration.collector.intake import LIMITS_IMU
 from companion.calibration.machine import Event
 from companion.calibration.means.dither import SECONDS, STEPS, Dithered, Step, combine, shifts_lsb, why_void
@@ -195,8 +194,8 @@ class Ditherer:
     async def _collect(self, work: _Work, values: Mapping[str, float], job: Job) -> tuple[Step, str | None]:
         """The seconds of one step, after the telemetry has had time to show it, and who says that it moved."""
         loop = asyncio.get_running_loop()
-        written = moment(self._vehicle)
-        while not has_passed(self._vehicle, written, SETTLE_S.get(self._vehicle.firmware or "", 2.5)):
+        written = Moment(self._vehicle)
+        while not written.has_passed(SETTLE_S.get(self._vehicle.firmware or "", 2.5)):
             await job.pause(POLL_S)
             self._check(job, work)
         settled_s = loop.time()

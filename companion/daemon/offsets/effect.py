@@ -17,11 +17,10 @@ import numpy as np
 from companion.autopilot.firmware.firmwares import settle_s
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step
 from companion.autopilot.firmware.px4 import Sensor
-from companion.autopilot.parameters.pace import has_passed, moment
 from companion.autopilot.parameters.verify import Observation, Verdict, judge
 from companion.autopilot.parameters.writer import Change
 from companion.autopilot.telemetry.imu_stream import StreamKind
-from companion.autopilot.vehicle.vehicle import ArmState
+from companion.autopilot.vehicle.vehicle import ArmState, Moment
 from companion.calibration.collector.rolling import MIN_BATCHES
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.noise.allan import AllanModel, floor_variance, noise_profile
@@ -77,9 +76,9 @@ class EffectWatch:
         if not watched:
             return None, "no autopilot IMU is in the telemetry"
         loop = asyncio.get_running_loop()
-        written = moment(self._vehicle)
+        written = Moment(self._vehicle)
         words = "waiting for the telemetry"
-        while not has_passed(self._vehicle, written, settle_s(self._vehicle.firmware)):
+        while not written.has_passed(settle_s(self._vehicle.firmware)):
             go_on(words)
             await asyncio.sleep(POLL_S)
         since_s = loop.time()

@@ -22,10 +22,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step, vector_changes
 from companion.autopilot.firmware.px4 import NO_IMU, WORDS, Sensor, SlotMemory
 from companion.autopilot.parameters.change import Change, WriteFailedError
-from companion.autopilot.parameters.pace import let_pass, moment
 from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.telemetry import imu_messages
-from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
+from companion.autopilot.vehicle.vehicle import ArmState, Moment, Vehicle
 from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.offsets.ledger import Ledger
@@ -126,13 +125,13 @@ class _FarStepWatch:
                     answer = self._vehicle.commands.request_message_interval(message.message.id, RATE_HZ)
                     answer.add_done_callback(functools.partial(self._answered, instance))
             self._sums = before = _Sums()
-            await let_pass(self._vehicle, moment(self._vehicle), BEFORE_S)
+            await Moment(self._vehicle).let_pass(BEFORE_S)
             self._sums = None
 
             async def look() -> str | None:
-                await let_pass(self._vehicle, moment(self._vehicle), SETTLE_S)
+                await Moment(self._vehicle).let_pass(SETTLE_S)
                 self._sums = during = _Sums()
-                await let_pass(self._vehicle, moment(self._vehicle), LOOK_S)
+                await Moment(self._vehicle).let_pass(LOOK_S)
                 self._sums = None
                 # A restart brings other offsets into use by itself: whoever moved or did not, it says nothing.
                 return None if self._vehicle.boots != boots else self._judge(steps, before, during)

@@ -3,6 +3,10 @@
 pymavlink's generated dialect class is the codec; `mavutil` is not used (it blocks, prints, and weighs 41 MiB).
 No socket is opened here: a transport (links.mavlink_transport, or a test's) hands received bytes to `receive` and
 gives `attach` a function that sends.
+
+pymavlink has to decode a message to tell its name; an autopilot sends hundreds a second, most of which nobody here
+wants. So frames in the common case (version 2, unsigned, whole, their checksum right) are told here. Format: MAVLink
+developer guide, "Packet Serialization".
 """
 
 from __future__ import annotations
@@ -10,27 +14,84 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import Literal, TypeVar
+from typing import Final, Literal, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.links.mavlink.frames import Codec, goes_ahead, kind_at, may_wait
 from companion.links.mavlink.signing import NEVER_SIGNED, Signing
-from companion.links.system.listeners import Listeners
+from companion.links.system.listeners import Listeners, Unsubscribe
 from companion.links.system.together import Take, Together
 
 logger = logging.getLogger(__name__)
 
+Codec = mavlink.MAVLink
 Message = mavlink.MAVLink_message
+Kind = type[Message]
 M = TypeVar("M", bound=mavlink.MAVLink_message)
 Handler = Callable[[M, float], None]
-Unsubscribe = Callable[[], None]
 Direction = Literal["in", "out"]
 Sender = tuple[int, int]
 """System and component."""
 
 _COMPACT_BYTES = 4096
 _ANYBODYS = frozenset(mavlink.mavlink_map[number].msgname for number in NEVER_SIGNED)
+
+HEADER_BYTES: Final = 10
+CHECKSUM_BYTES: Final = 2
+MARKER: Final = 0xFD
+KINDS: Final[dict[int, Kind]] = mavlink.mavlink_map
+_EXTRA: Final[dict[Kind, bytes]] = {}
+_STREAM_NAMES: Final = (
+    "AHRS", "AHRS2", "AIRSPEED_AUTOCAL", "ALTITUDE", "ATTITUDE", "ATTITUDE_QUATERNION", "ATTITUDE_TARGET",
+    "BATTERY_STATUS", "EKF_STATUS_REPORT", "ESTIMATOR_STATUS", "GLOBAL_POSITION_INT", "GPS2_RAW", "GPS_RAW_INT",
+    "HIGHRES_IMU", "HWSTATUS", "LOCAL_POSITION_NED", "MEMINFO", "NAV_CONTROLLER_OUTPUT", "ODOMETRY",
+    "POSITION_TARGET_GLOBAL_INT", "POSITION_TARGET_LOCAL_NED", "POWER_STATUS", "RANGEFINDER", "RAW_IMU",
+    "RC_CHANNELS", "RC_CHANNELS_RAW", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3", "SCALED_PRESSURE",
+    "SCALED_PRESSURE2", "SERVO_OUTPUT_RAW", "SYS_STATUS", "TERRAIN_REPORT", "VFR_HUD", "VIBRATION", "WIND",
+    "WIND_COV",
+)  # fmt: skip
+STREAMS: Final = frozenset(getattr(mavlink, f"MAVLINK_MSG_ID_{name}") for name in _STREAM_NAMES)
+"""Sent again and again, each the successor of the one before: nobody asks something with them or waits for one."""
+AHEAD: Final = frozenset(
+    {mavlink.MAVLINK_MSG_ID_TIMESYNC, mavlink.MAVLINK_MSG_ID_COMMAND_LONG, mavlink.MAVLINK_MSG_ID_COMMAND_INT}
+)
+"""Asked of us, and answered from what is known anyway, ahead of telemetry that waits. Not so parameters, heartbeats and
+answers: what was measured before them was measured under other offsets, or before arming."""
+
+
+def _holds_only(datagram: bytes, numbers: frozenset[int]) -> bool:
+    """Whether there are whole unsigned frames of such messages in it and nothing else; their sums are not checked."""
+    at = 0
+    while (found := _frame_at(datagram, at)) is not None:
+        number, at = found
+        if number not in numbers:
+            return False
+    return 0 < at == len(datagram)
+
+
+def _frame_at(data: bytes, at: int) -> tuple[int, int] | None:
+    """The message's number and the end of a whole unsigned frame of version 2; nobody has checked its sum."""
+    size = len(data)
+    if size - at < HEADER_BYTES + CHECKSUM_BYTES or data[at] != MARKER or data[at + 2]:
+        return None
+    end = at + HEADER_BYTES + data[at + 1] + CHECKSUM_BYTES
+    return None if end > size else (data[at + 7] | data[at + 8] << 8 | data[at + 9] << 16, end)
+
+
+def kind_at(data: bytes, at: int) -> tuple[Kind, int] | None:
+    """Which message begins there and where it ends; None where it is not the common case."""
+    found = _frame_at(data, at)
+    if found is None:
+        return None
+    number, end = found
+    kind = KINDS.get(number)
+    if kind is None:
+        return None
+    extra = _EXTRA.get(kind)
+    if extra is None:
+        extra = _EXTRA[kind] = bytes((kind.crc_extra,))
+    checksum = mavlink.x25crc(data[at + 1 : end - 2] + extra).crc
+    return (kind, end) if checksum == data[end - 2] | data[end - 1] << 8 else None
 
 
 class MavlinkLink:
@@ -59,7 +120,7 @@ class MavlinkLink:
         self._codec.robust_parsing = True
         self._transmit: Callable[[bytes], object] | None = None
         self._attached = 0
-        self._handlers: dict[str, list[Handler[mavlink.MAVLink_message]]] = {}
+        self._handlers: dict[str, Listeners[Message, float]] = {}
         self._bytes: Listeners[Direction, bytes | None, float | None] = Listeners()
 
     def watch_bytes(self, tell: Callable[[Direction, bytes | None, float | None], object]) -> None:
@@ -124,14 +185,7 @@ class MavlinkLink:
 
     def subscribe(self, kind: type[M], handler: Handler[M]) -> Unsubscribe:
         """Call `handler(message, t_s)` for every message of a kind, whoever sent it; returns how to stop that."""
-        handlers = self._handlers.setdefault(kind.msgname, [])
-        handlers.append(handler)  # type: ignore[arg-type]
-
-        def unsubscribe() -> None:
-            if handler in handlers:
-                handlers.remove(handler)
-
-        return unsubscribe
+        return self._handlers.setdefault(kind.msgname, Listeners()).add(handler)  # type: ignore[arg-type]
 
     def arrived(self, datagram: bytes, t_s: float, take: Take) -> None:
         """Have a datagram taken by `take(datagram, t_s)`: streams of telemetry with the next read of a fast stream.
@@ -139,10 +193,10 @@ class MavlinkLink:
         Whatever else comes is taken at once, behind what waits; some of what is asked of us ahead of it.
         """
         together = self.together
-        if together.driven and may_wait(datagram):
+        if together.driven and _holds_only(datagram, STREAMS):
             together.put(take, datagram, t_s)
             return
-        if not (together.driven and goes_ahead(datagram)):
+        if not (together.driven and _holds_only(datagram, AHEAD)):
             together.take()
         take(datagram, t_s)
 
@@ -235,11 +289,5 @@ class MavlinkLink:
 
     def _dispatch(self, name: str, message: Message | None, t_s: float) -> None:
         self.received[name] += 1
-        if message is None:
-            return
-        for handler in tuple(self._handlers.get(name, ())):
-            try:
-                handler(message, t_s)
-            except Exception:
-                self.received["handler error"] += 1
-                logger.exception("handling %s failed", name)
+        if message is not None and name in self._handlers and (failed := self._handlers[name].tell(message, t_s)):
+            self.received["handler error"] += failed

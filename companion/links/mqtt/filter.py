@@ -16,8 +16,7 @@ import struct
 from typing import Final, Self
 
 from companion.errors import LinkError
-from companion.links.system.budget import Budget
-from companion.links.system.connection import connect
+from companion.links.system.connection import Budget, connect
 
 CONNECT_DEADLINE_S: Final = 8.0
 """For the name, the connection and TLS together; a resolver whose first server is dead takes five."""

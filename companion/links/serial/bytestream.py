@@ -16,8 +16,7 @@ from urllib.parse import urlsplit
 
 from companion.errors import LinkError
 from companion.links.serial.port import SerialOpener, close_serial
-from companion.links.system.budget import Budget
-from companion.links.system.connection import Backoff, OnState, Reconnection, connect_tcp, words_of
+from companion.links.system.connection import Backoff, Budget, OnState, Reconnection, connect_tcp, words_of
 from companion.links.system.together import Together
 
 READ_BYTES = 4096

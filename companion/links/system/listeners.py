@@ -31,10 +31,13 @@ class Listeners(Generic[P]):
 
         return unsubscribe
 
-    def tell(self, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Call all of them."""
+    def tell(self, *args: P.args, **kwargs: P.kwargs) -> int:
+        """Call all of them; how many of them failed."""
+        failed = 0
         for callback in tuple(self._callbacks):
             try:
                 callback(*args, **kwargs)
             except Exception:
-                logger.exception("a listener failed on %r", args)
+                failed += 1
+                logger.exception("a listener failed on %.200s", args[0] if args else "nothing")
+        return failed
