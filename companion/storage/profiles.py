@@ -65,18 +65,17 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def noise(self) -> Noise:
         """As the configuration carries it."""
-        gyro, accel = self.gyro, self.accel
-        return Noise(
-            name=self.name,
-            gyro=(gyro.white, gyro.flicker, gyro.walk),
-            accel=(accel.white, accel.flicker, accel.walk),
-            origin=self.origin,
-        )
+        return _noise(self.name, self.gyro, self.accel, self.origin)
 
     @property
     def profile(self) -> NoiseProfile:
         """As the estimator takes it."""
         return NoiseProfile(self.name, self.gyro, self.accel)
+
+
+def _noise(name: str, gyro: AllanModel, accel: AllanModel, origin: str) -> Noise:
+    astuple = msgspec.structs.astuple
+    return Noise(name=name, gyro=astuple(gyro), accel=astuple(accel), origin=origin)
 
 
 def check_name(name: str) -> None:
@@ -150,12 +149,8 @@ class ProfileStore:
             return None
         logger.warning("%s; its sigmas are those of the worst common parts", error)
         worst = PROFILES["unknown"]
-        return Noise(
-            name=name,
-            gyro=msgspec.structs.astuple(worst.gyro),
-            accel=msgspec.structs.astuple(worst.accel),
-            origin="which cannot be used: sigmas are those of the worst common parts",
-        )
+        origin = "which cannot be used: sigmas are those of the worst common parts"
+        return _noise(name, worst.gyro, worst.accel, origin)
 
     def write(self, profile: SavedProfile) -> Path:
         """Keep a profile, in the place of one of that name; returns its file.
@@ -216,7 +211,7 @@ def given_profile(wanted: str, directory: Callable[[], Path]) -> str | Noise:
 def _from_json(data: bytes) -> SavedProfile:
     found: SavedProfile = formats.decode(data, SavedProfile, FORMAT_VERSION)
     for model in (found.gyro, found.accel):
-        figures = (model.white, model.flicker, model.walk)
+        figures = msgspec.structs.astuple(model)
         if not all(map(math.isfinite, figures)) or min(figures) < 0.0 or model.white == 0.0:
             raise ValueError(f"found N, B, K of {figures}; allowed: N above 0, none negative")
     return found

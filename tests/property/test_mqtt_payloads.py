@@ -31,7 +31,5 @@ def test_no_payload_raises_and_every_verdict_is_one_short_line(command: str, pay
         assert set(verdict.content) <= set(KEYS[command])
         sent = json.loads(payload) if payload.strip() else {}
         assert verdict.transaction == sent.get("transaction")
-        assert verdict.question == {
-            "command": command,
-            **{key: value for key, value in sent.items() if key != "transaction"},
-        }
+        assert verdict.command == command
+        assert verdict.content == {key: value for key, value in sent.items() if key != "transaction"}

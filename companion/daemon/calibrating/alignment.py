@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 
+import msgspec
+
 from companion.calibration.alignment.align_record import AlignmentRecord, GradienterSettings
 from companion.calibration.means.pose import GradienterModel
 from companion.calibration.solution.record import AlignmentUsed
@@ -62,14 +64,10 @@ class AlignmentInForce:
 
     def settings(self) -> GradienterSettings | None:
         """What an alignment belongs to; None without a gradienter."""
-        if self._gradienter is None:
-            return None
-        return GradienterSettings(
-            port=self._gradienter.port,
-            protocol=self._gradienter.protocol,
-            law=self._gradienter.law,
-            mounting=self._gradienter.mounting,
-            offset_deg=self._gradienter.offset_deg,
+        return (
+            None
+            if self._gradienter is None
+            else msgspec.convert(self._gradienter, GradienterSettings, from_attributes=True)
         )
 
     @property
@@ -77,9 +75,7 @@ class AlignmentInForce:
         """For the record of a calibration: what of it is in force; None where nothing is."""
         if self.record is None or self.unused is not None:
             return None
-        return AlignmentUsed(
-            measured_at=self.record.measured_at, offset_deg=self.record.offset_deg, sigma_deg=self.record.sigma_deg
-        )
+        return msgspec.convert(self.record, AlignmentUsed, from_attributes=True)
 
     def model(self) -> GradienterModel | None:
         """The gradienter's model as it is in force."""

@@ -293,14 +293,7 @@ class LinkSigning:
         if signing is None:
             if self.warning is None:
                 return None
-            return {
-                "good": False,
-                "mode": self.mode,
-                "summary": self.warning,
-                "verified": 0,
-                "doubted": {},
-                "strangers": [],
-            }
+            signing = Signing(required=False)  # nobody was checked
         doubted = sum(signing.doubted.values())
         summary = self.rejecting or self.trouble or self.warning
         if not summary:

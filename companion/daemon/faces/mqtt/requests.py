@@ -52,11 +52,6 @@ class Request(msgspec.Struct, frozen=True):
     content: Object
     """Everything but the transaction."""
 
-    @property
-    def question(self) -> Object:
-        """In the words of the control socket."""
-        return {"command": self.command, **self.content}
-
 
 class Misfit(msgspec.Struct, frozen=True):
     """A request that is none, and why, in one line."""
@@ -227,7 +222,9 @@ class Requests:
         task.add_done_callback(self._tasks.discard)
 
     async def _run(self, request: Request) -> None:
-        question = {**request.question, "wait": True} if request.command == "calibrate" else request.question
+        question = {"command": request.command, **request.content}
+        if request.command == "calibrate":
+            question["wait"] = True
         accepted = False
         try:
             async for reply in self._ask(question, "mqtt"):
