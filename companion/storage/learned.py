@@ -1,7 +1,8 @@
-"""What is known from before: the gradienter's alignment in force, and what earlier calibrations found of each IMU."""
+"""What is known from before: the alignment in force, the biases of each IMU, how far the time in our signatures is."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Final
 
@@ -43,7 +44,7 @@ class BiasStore:
     """`biases.json` in the storage directory."""
 
     def __init__(self, directory: Path) -> None:
-        self._file: StateFile[_File] = StateFile(directory / "biases.json", _File, _check, FORMAT_VERSION)
+        self._file: StateFile[_File] = StateFile(directory / "biases.json", _File, _check_biases, FORMAT_VERSION)
 
     def read(self) -> dict[str, KnownImu]:
         """By IMU, what is kept; what cannot be used is set aside and begun anew, since nothing hangs on it."""
@@ -64,7 +65,47 @@ class BiasStore:
         self._file.write(_File(imus=kept))
 
 
-def _check(found: _File) -> None:
+def _check_biases(found: _File) -> None:
     for known in found.imus.values():
         for point in known.points:
             history.check(point)
+
+
+SIGNING_FILE: Final = "mavlink-signing-time.json"
+MOST_UPTIME_S: Final = 3.2e9
+"""A century."""
+_BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
+
+
+class SigningTime(msgspec.Struct, frozen=True):
+    """What was used, and when. Ticks are 10 us since 2015."""
+
+    ticks: int
+    reserved: int
+    """None beyond this may have been used before the next one was written."""
+    uptime_s: float
+    """Of the board, when this was written."""
+    boot_id: str
+    """Which start of the board it was; empty: unknown."""
+
+
+def this_boot() -> str:
+    """Of the running kernel; empty where it cannot be had."""
+    # The service's unit hides the file, and hands the id over instead.
+    handed = os.environ.get("COMPANION_BOOT_ID", "")
+    if handed:
+        return handed.replace("-", "")
+    try:
+        return _BOOT_ID.read_text(encoding="ascii").strip().replace("-", "")
+    except OSError:
+        return ""
+
+
+def signing_time_in(directory: Path) -> StateFile[SigningTime]:
+    """What is kept in a storage directory."""
+    return StateFile(directory / SIGNING_FILE, SigningTime, _check_time)
+
+
+def _check_time(found: SigningTime) -> None:
+    if not 0 <= found.ticks <= found.reserved < 2**48 or not 0.0 <= found.uptime_s < MOST_UPTIME_S:
+        raise msgspec.ValidationError(f"ticks {found.ticks} to {found.reserved} at {found.uptime_s:g} s cannot be")

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from companion.calibration.solution.record import Arming
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
-from companion.storage.learned import AlignmentStore, BiasStore
+from companion.storage.learned import SIGNING_FILE, AlignmentStore, BiasStore, signing_time_in
 from companion.storage.records import RecordStore
-from companion.storage.signing_time import FILE, kept_in
 from companion.storage.state import BoundedList, sealed
 
 NAMES = st.sampled_from(
@@ -59,7 +58,7 @@ def test_any_bytes_in_any_file(data: bytes) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "records").mkdir()
-        files = ("journal.json", "undo-1.json", "alignment.json", "biases.json", "armings.json", FILE)
+        files = ("journal.json", "undo-1.json", "alignment.json", "biases.json", "armings.json", SIGNING_FILE)
         for file in (*files, "records/000001.json"):
             (folder / file).write_bytes(data)
         log = ChangeLog(folder)
@@ -68,7 +67,7 @@ def test_any_bytes_in_any_file(data: bytes) -> None:
         AlignmentStore(folder).take()
         BiasStore(folder).read()
         BoundedList(folder / "armings.json", Arming, 5).read()
-        kept_in(folder).take()
+        signing_time_in(folder).take()
         RecordStore(folder).history()
 
 

@@ -21,8 +21,7 @@ from companion.errors import StorageError
 from companion.links.mavlink import signing as link_signing
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.signing import EPOCH_S, TICKS_PER_S, SigningClock
-from companion.storage import signing_time
-from companion.storage.signing_time import FILE, this_boot
+from companion.storage.learned import SIGNING_FILE, SigningTime, signing_time_in, this_boot
 from companion.storage.state import StateFile
 from tests.support.rig import inline
 from tests.support.virtual_time import run_virtual
@@ -71,12 +70,12 @@ class Board:
         kept: bytes | None = None
         try:
             yield found
-            kept = (self.folder / FILE).read_bytes()
+            kept = (self.folder / SIGNING_FILE).read_bytes()
         finally:
             task.cancel()
             await asyncio.wait([task])
         if killed and kept is not None:
-            (self.folder / FILE).write_bytes(kept)
+            (self.folder / SIGNING_FILE).write_bytes(kept)
 
 
 def test_in_1970_time_goes_on_behind_what_was_used_whatever_ends_it(
@@ -133,7 +132,7 @@ def test_the_disk_is_written_rarely(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         board, writes = Board(tmp_path, monkeypatch, wall_s=NOW_S), list[int]()
         real = StateFile.write
 
-        def count(file: StateFile[signing_time.SigningTime], what: signing_time.SigningTime) -> None:
+        def count(file: StateFile[SigningTime], what: SigningTime) -> None:
             writes.append(what.ticks)
             real(file, what)
 
@@ -154,7 +153,7 @@ def test_a_disk_that_cannot_be_written_is_said_once_and_costs_nothing_else(
         def full(*_: Any) -> None:
             raise StorageError("disk full")
 
-        signing_time.kept_in(tmp_path).write(signing_time.SigningTime(0, 0, 0.0, ""))
+        signing_time_in(tmp_path).write(SigningTime(0, 0, 0.0, ""))
         monkeypatch.setattr(StateFile, "write", full)
         async with board.daemon() as one:
             await asyncio.sleep(200.0)
@@ -172,8 +171,8 @@ def test_a_disk_that_cannot_be_written_is_said_once_and_costs_nothing_else(
     "content", [b"", b"{", b'{"ticks": -1}', b'{"ticks":9,"reserved":1,"uptime_s":1,"boot_id":""}']
 )
 def test_a_broken_file_is_none(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / FILE).write_bytes(content)
-    assert signing_time.kept_in(tmp_path).take() is None
+    (tmp_path / SIGNING_FILE).write_bytes(content)
+    assert signing_time_in(tmp_path).take() is None
 
 
 def test_the_unit_hands_the_boot_id_over(monkeypatch: pytest.MonkeyPatch) -> None:

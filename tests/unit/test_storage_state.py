@@ -17,9 +17,8 @@ import pytest
 
 from companion.calibration.solution.record import Arming
 from companion.errors import StorageError
-from companion.storage import signing_time
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
-from companion.storage.learned import AlignmentStore, BiasStore
+from companion.storage.learned import SIGNING_FILE, AlignmentStore, BiasStore, signing_time_in
 from companion.storage.profiles import ProfileStore, read_profile
 from companion.storage.records import RecordStore
 from companion.storage.state import MOST_ASIDE, BoundedList, sealed, unsealed
@@ -68,7 +67,7 @@ FILES: dict[str, Callable[[Path], Any]] = {
     "alignment.json": lambda folder: AlignmentStore(folder).take(),
     "biases.json": lambda folder: BiasStore(folder).read() or None,
     "armings.json": lambda folder: BoundedList(folder / "armings.json", Arming, 200).read() or None,
-    signing_time.FILE: lambda folder: signing_time.kept_in(folder).take(),
+    SIGNING_FILE: lambda folder: signing_time_in(folder).take(),
 }
 
 

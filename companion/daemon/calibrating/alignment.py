@@ -64,11 +64,9 @@ class AlignmentInForce:
 
     def settings(self) -> GradienterSettings | None:
         """What an alignment belongs to; None without a gradienter."""
-        return (
-            None
-            if self._gradienter is None
-            else msgspec.convert(self._gradienter, GradienterSettings, from_attributes=True)
-        )
+        if self._gradienter is None:
+            return None
+        return msgspec.convert(self._gradienter, GradienterSettings, from_attributes=True)
 
     @property
     def used(self) -> AlignmentUsed | None:

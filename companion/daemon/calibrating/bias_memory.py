@@ -33,9 +33,8 @@ from companion.daemon.devices.sensors import SerialSensor
 from companion.errors import StorageError
 from companion.physics.frames import vector
 from companion.samples import Triad
-from companion.storage.learned import KEEP_POINTS, BiasStore, KnownImu
+from companion.storage.learned import KEEP_POINTS, BiasStore, KnownImu, this_boot
 from companion.storage.records import RecordStore
-from companion.storage.signing_time import this_boot
 
 logger = logging.getLogger(__name__)
 

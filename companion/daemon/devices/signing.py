@@ -21,7 +21,7 @@ from companion.daemon.core import Offload
 from companion.errors import LinkError, StorageError
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.signing import TICKS_PER_S, Reason, Signing, read_key, uptime_s
-from companion.storage.signing_time import SigningTime, kept_in, this_boot
+from companion.storage.learned import SigningTime, signing_time_in, this_boot
 
 logger = logging.getLogger(__name__)
 
@@ -175,7 +175,7 @@ class LinkSigning:
         self.signing: Signing | None = None
         self.trouble = ""
         """Why there is no key; empty when there is one."""
-        self._kept = kept_in(config.storage.path)
+        self._kept = signing_time_in(config.storage.path)
         self._reserved = 0
         self._unwritable = self._setup_told = False
         self._told: set[tuple[Reason, int, int]] = set()
