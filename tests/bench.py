@@ -34,7 +34,7 @@ from companion.replay.engine import Replay
 from companion.samples import ImuSample
 from tests import bench_attitude, bench_daemon, bench_learning, bench_reading, bench_replay, bench_start
 from tests.bench_text import against_pynmeagps
-from tests.support.component import FakeVehicle, ScriptedGate
+from tests.support.component import ScriptedGate
 from tests.support.decoders import make_decoder
 from tests.support.frames import (
     imu_line,
@@ -183,8 +183,9 @@ def arm_request() -> Callable[[], object]:
     sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     frame = mavlink.MAVLink_command_long_message(1, 0, 3001, 0, 0, 0, 0, 0, 0, 0, 0).pack(sender)
     link, answers = MavlinkLink(), deque[bytes](maxlen=1)
+    link.join((1, 1))
     link.attach(answers.append)
-    ArmAuthoriser(link, FakeVehicle(1), ScriptedGate(), lambda severity, text, weight: None)
+    ArmAuthoriser(link, ScriptedGate(), lambda severity, text, weight: None)
 
     def work() -> None:
         link.receive(frame, 1.0)

@@ -20,7 +20,7 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.component.service import ArmGate, VehicleView
+from companion.component.service import ArmGate
 from companion.component.statustext import Say, Severity, Weight, to_ascii
 from companion.links.mavlink.link import MavlinkLink
 
@@ -38,14 +38,8 @@ ATTEMPT_S: Final = 1.5
 class ArmAuthoriser:
     """Answers MAV_CMD_ARM_AUTHORIZATION_REQUEST of our autopilot; of anybody else it is ignored."""
 
-    def __init__(
-        self,
-        link: MavlinkLink,
-        vehicle: VehicleView,
-        gate: ArmGate,
-        say: Say,
-    ) -> None:
-        self._link, self._vehicle, self._gate, self._say = link, vehicle, gate, say
+    def __init__(self, link: MavlinkLink, gate: ArmGate, say: Say) -> None:
+        self._link, self._gate, self._say = link, gate, say
         self._attempt_s = -math.inf
         self._repeat: asyncio.TimerHandle | None = None
         self._unsubscribe = link.subscribe(mavlink.MAVLink_command_long_message, self._on_message)
@@ -59,9 +53,9 @@ class ArmAuthoriser:
     def _on_message(self, message: mavlink.MAVLink_command_long_message, now_s: float) -> None:
         if message.command != mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST:
             return
-        system_id = self._vehicle.system_id
+        autopilot = self._link.autopilot
         sender = (message.get_srcSystem(), message.get_srcComponent())
-        if system_id is None or sender != (system_id, mavlink.MAV_COMP_ID_AUTOPILOT1):
+        if autopilot is None or sender != (autopilot[0], mavlink.MAV_COMP_ID_AUTOPILOT1):
             return
         target = (message.target_system, message.target_component)
         if target not in ((self._link.system_id, 0), (self._link.system_id, self._link.component_id)):
@@ -109,18 +103,18 @@ _TUNNEL_BYTES: Final = 128
 class ArmingScript:
     """Speaks to the script while the gate asks for it; `step` must be called at the times it asks for."""
 
-    def __init__(self, link: MavlinkLink, vehicle: VehicleView, gate: ArmGate) -> None:
-        self._link, self._vehicle, self._gate = link, vehicle, gate
+    def __init__(self, link: MavlinkLink, gate: ArmGate) -> None:
+        self._link, self._gate = link, gate
         self._next_s = -math.inf
 
     def step(self, now_s: float) -> float:
         """Send what is due; returns when something is due next (infinity: nobody asks; heartbeats bring us back)."""
-        system_id = self._vehicle.system_id
-        if system_id is None or not self._link.connected or not self._gate.asks_script:
+        autopilot = self._link.autopilot
+        if autopilot is None or not self._link.connected or not self._gate.asks_script:
             return math.inf
         if now_s >= self._next_s:
             self._next_s = now_s + PERIOD_S
-            self._link.send(self._message(system_id))
+            self._link.send(self._message(autopilot[0]))
         return self._next_s
 
     def _message(self, system_id: int) -> mavlink.MAVLink_tunnel_message:

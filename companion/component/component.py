@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.component.arm_authorisation import ArmAuthoriser, ArmingScript
 from companion.component.commands import CommandServer, Permission
 from companion.component.own_parameters import OwnParameters, Parameter
-from companion.component.service import ArmGate, CalibrationService, VehicleView
+from companion.component.service import ArmGate, CalibrationService
 from companion.component.statustext import StatusText
 from companion.config.sections import Senders
 from companion.links.mavlink.link import MavlinkLink
@@ -29,7 +29,6 @@ class Component:
     def __init__(
         self,
         link: MavlinkLink,
-        vehicle: VehicleView,
         service: CalibrationService,
         gate: ArmGate,
         texts: StatusText,
@@ -46,8 +45,8 @@ class Component:
         self.permission = Permission(senders)
         self.parameters = OwnParameters(link, parameters, texts.say, self._woken.set, self.permission)
         self._commands = CommandServer(link, service, texts.say, self._woken.set, self.permission)
-        self._authoriser = ArmAuthoriser(link, vehicle, gate, texts.say)
-        self._script = ArmingScript(link, vehicle, gate)
+        self._authoriser = ArmAuthoriser(link, gate, texts.say)
+        self._script = ArmingScript(link, gate)
         self._unsubscribe = link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
 
     async def run(self) -> None:

@@ -1,4 +1,4 @@
-"""What the component needs from the rest of the house: someone who calibrates, and the vehicle's system id.
+"""What the component needs from the rest of the house: someone who calibrates, and who knows whether it may arm.
 
 Whether the aircraft is armed, and everything else that decides if a calibration may start, is the service's to
 know; the component carries requests in and verdicts out.
@@ -101,11 +101,3 @@ class ArmGate(Protocol):
 
     def answer(self) -> ArmAnswer:
         """The answer, ready made."""
-
-
-class VehicleView(Protocol):
-    """The vehicle as far as the component must know it."""
-
-    @property
-    def system_id(self) -> int | None:
-        """The autopilot's system id; None until it has been heard."""

@@ -163,11 +163,6 @@ class ScriptedService:
         return job
 
 
-class FakeVehicle:
-    def __init__(self, system_id: int | None = None) -> None:
-        self.system_id = system_id
-
-
 class ScriptedGate:
     """Says what the test tells it."""
 
@@ -184,7 +179,6 @@ class Bench(NamedTuple):
     link: MavlinkLink
     component: Component
     service: ScriptedService
-    vehicle: FakeVehicle
     ground: Ground
     wire: Wire
     task: asyncio.Task[None]
@@ -205,15 +199,15 @@ async def bench(
 ) -> AsyncIterator[Bench]:
     """The component running at one end of a wire."""
     link, ground = MavlinkLink(), ground or Ground()
-    service, vehicle, gate = ScriptedService(), FakeVehicle(system_id), ScriptedGate()
+    service, gate = ScriptedService(), ScriptedGate()
     if system_id is not None:
         link.join((system_id, 1))
     texts = StatusText(link)
-    component = Component(link, vehicle, service, gate, texts, parameters, Senders(tuple(allow)))
+    component = Component(link, service, gate, texts, parameters, Senders(tuple(allow)))
     wire = Wire(link, ground, seed=seed, loss=loss, duplicate=duplicate)
     task = asyncio.create_task(component.run())
     try:
-        yield Bench(link, component, service, vehicle, ground, wire, task, gate, texts)
+        yield Bench(link, component, service, ground, wire, task, gate, texts)
     finally:
         task.cancel()
         with suppress(asyncio.CancelledError):

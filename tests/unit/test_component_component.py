@@ -14,7 +14,7 @@ from companion.component.component import Component
 from companion.component.statustext import Severity, StatusText
 from companion.config.sections import EVERYBODY, Senders
 from companion.links.mavlink.link import MavlinkLink
-from tests.support.component import CALIBRATE, FakeVehicle, Ground, ScriptedGate, ScriptedService, bench
+from tests.support.component import CALIBRATE, Ground, ScriptedGate, ScriptedService, bench
 from tests.support.virtual_time import run_virtual
 from tests.support.wire import Wire
 
@@ -152,7 +152,7 @@ def test_the_first_heartbeat_on_a_late_link_comes_at_once() -> None:
         link, ground = MavlinkLink(), Ground()
         texts = StatusText(link)
         senders = Senders(EVERYBODY)
-        component = Component(link, FakeVehicle(), ScriptedService(), ScriptedGate(), texts, (), senders)
+        component = Component(link, ScriptedService(), ScriptedGate(), texts, (), senders)
         texts.say(Severity.INFO, "waited for the link")
         async with asyncio.TaskGroup() as group:
             task = group.create_task(component.run())

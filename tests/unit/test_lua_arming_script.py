@@ -16,7 +16,7 @@ from companion.component.arm_authorisation import ArmingScript
 from companion.component.service import ArmAnswer
 from companion.links.mavlink.link import MavlinkLink
 from companion.lua import ARMING_SCRIPT
-from tests.support.component import FakeVehicle, ScriptedGate
+from tests.support.component import ScriptedGate
 
 LUA = shutil.which("lua5.3")
 pytestmark = pytest.mark.skipif(LUA is None, reason="needs lua5.3 (Debian: apt install lua5.3)")
@@ -65,11 +65,12 @@ def script() -> Iterator[Script]:
 
 def sent(verdict: str = "accept", words: str = "", at_arm: str = "gate") -> mavlink.MAVLink_tunnel_message:
     """The message that the companion really sends for system 7."""
-    link, gate = MavlinkLink(system_id=7), ScriptedGate()
+    link, gate = MavlinkLink(), ScriptedGate()
+    link.join((7, 1))
     gate.asks_script, gate.at_arm, gate.says = True, at_arm, ArmAnswer(verdict, words)  # type: ignore[assignment, arg-type]
     data: list[bytes] = []
     link.attach(data.append)
-    assert ArmingScript(link, FakeVehicle(7), gate).step(0.0) < math.inf
+    assert ArmingScript(link, gate).step(0.0) < math.inf
     message = mavlink.MAVLink(None).parse_char(data[0])
     assert isinstance(message, mavlink.MAVLink_tunnel_message)
     return message

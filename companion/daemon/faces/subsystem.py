@@ -56,7 +56,6 @@ class Faces(Subsystem):
         self._core, self._devices = core, devices
         self.component = Component(
             core.link,
-            core.vehicle,
             calibrating.conductor,
             arming.readiness,
             core.texts,
