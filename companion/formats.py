@@ -1,4 +1,4 @@
-"""The format version in a file of ours: an older one is read, a newer one refused in one line."""
+"""JSON as it is let in: a file of ours by its format version (an older one is read, a newer one refused), a request."""
 
 from __future__ import annotations
 
@@ -24,3 +24,22 @@ def decode(data: bytes, kind: Any, newest: int | None) -> Any:
                 f"found format {version}; allowed: up to {newest} (a newer companion has saved it)"
             )
     return msgspec.json.decode(data, type=kind)
+
+
+Object = dict[str, Any]
+"""A request or an answer, as JSON can hold it."""
+
+Value = str | int | float | bool | None
+
+
+def parse_request(data: bytes) -> dict[str, Any]:
+    """Read an object of texts, numbers, true, false and null.
+
+    Raises:
+        ValueError: it is none, and why, in one line.
+    """
+    found = msgspec.json.decode(data, type=dict[str, Value])
+    for key, value in found.items():
+        if isinstance(value, str) and "\0" in value:
+            raise ValueError(f"{key!r}: found a text with a zero byte; allowed: texts without")
+    return found

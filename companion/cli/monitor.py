@@ -2,7 +2,7 @@
 
 A terminal is redrawn in place with a handful of escape sequences that every terminal since the VT100 knows: neither
 curses nor a library is needed for that. Where there is no such terminal (TERM=dumb, a pipe) a line is printed
-whenever something changes that is more than a figure.
+whenever the state, a device, a warning or the last result changes.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import os
-import re
 import shutil
 import sys
 import textwrap
@@ -29,8 +28,8 @@ SILENT_S: Final = 5.0
 """A daemon that says nothing for so long stands still."""
 AGAIN_S: Final = 1.0
 
-_SAID_ABOVE: Final = ("state:", "in force:", "at arming")
-"""Lines of the status that repeat the headline."""
+REASON_S: Final = 10.0
+"""How often another reason for the same state is worth a line: many count seconds, or carry a reading."""
 _COLOURS: Final = {"good": "1;97;42", "wait": "1;30;103", "busy": "1;97;44", "bad": "1;97;41"}
 _SIGNS: Final = {"good": "OK ", "wait": "...", "busy": ">>>", "bad": "!!!"}
 
@@ -88,23 +87,28 @@ class _Lines:
     """A line whenever something changes, each with the time of day."""
 
     def __init__(self) -> None:
-        self._before: set[str] = set()
+        self._before: set[tuple[object, ...]] = set()
+        self._stand: tuple[object, ...] = ()
+        self._reason, self._reason_s = "", 0.0
 
     def show(self, status: Object) -> None:
-        headline = show.headline_line(status)
+        headline, now_s = status["headline"], time.monotonic()
         # Every tenth of the way is news; what only counts seconds or frames is not.
-        tenth = status["progress"] // 10 if "%" in status["headline"]["word"] else ""
-        lines = {f"{_without_figures(headline)}{tenth}": headline}
-        *others, last = show.status_lines(status)[1:]
-        lines |= {_without_figures(line): line for line in others if not line.startswith(_SAID_ABOVE)}
-        lines[last] = last
-        self._print([line for key, line in lines.items() if key not in self._before])
+        stand = (status["state"], headline["tone"], (status["progress"] or 0) // 10)
+        if stand != self._stand or (headline["reason"] != self._reason and now_s - self._reason_s >= REASON_S):
+            self._stand, self._reason, self._reason_s = stand, headline["reason"], now_s
+        # What each line is about, by which it is known again when it says the same in other figures.
+        lines: dict[tuple[object, ...], str] = {(self._reason_s,): show.headline_line(status)}
+        lines |= {(name, good): f"{name}: {words}" for good, name, words in show.link_rows(status)}
+        lines |= {("warning", number): f"warning: {words}" for number, words in enumerate(status["warnings"])}
+        lines |= {(line,): line for line in show.end_lines(status)}
+        self._print([line for about, line in lines.items() if about not in self._before])
         self._before = set(lines)
 
     def gone(self, why: str) -> None:
-        if self._before != {why}:
+        if self._before != {(why,)}:
             self._print([f"NO DAEMON: {why}; waiting for it"])
-        self._before = {why}
+        self._before = {(why,)}
 
     def _print(self, lines: list[str]) -> None:
         now = time.strftime("%H:%M:%S")
@@ -152,7 +156,3 @@ class _Screen:
 def _wrapped(line: str, width: int) -> list[str]:
     """A line as the terminal holds it; what a wire may have slipped into it moves no cursor."""
     return textwrap.wrap(printable(line), max(width, 20), subsequent_indent="    ", drop_whitespace=False) or [""]
-
-
-def _without_figures(line: str) -> str:
-    return re.sub(r"\d+(\.\d+)?", "#", line)

@@ -113,7 +113,7 @@ def status_lines(status: Object) -> list[str]:
     )
     lines.append(f"in force: {arming['in_force']}")
     lines += [f"profile {each['imu']}: {each['summary']}" for each in status["profiles"]]
-    lines += _end_lines(status)
+    lines += end_lines(status)
     if status["last"] is not None:
         lines += _magnetic_lines(status["last"].get("magnetic"))
     return lines
@@ -157,7 +157,8 @@ def headline_line(status: Object) -> str:
     return f"{headline['word']}: {headline['reason']}"
 
 
-def _end_lines(status: Object) -> list[str]:
+def end_lines(status: Object) -> list[str]:
+    """Where the page is, and how the last calibration ended."""
     page, last = status["page"], status["last"]
     lines = [] if page is None else [f"page: {'' if page['good'] else 'none: '}{page['summary']}"]
     found = f"{last['state']} at {last['started_at']}: {last['reason']}" if last is not None else "none yet"
@@ -169,10 +170,22 @@ def monitor_lines(status: Object) -> list[str]:
     lines = []
     if (percent := status["progress"]) is not None:
         lines += [f"[{'#' * (percent * _BAR // 100):.<{_BAR}}] {percent} %", ""]
-    pose, vehicle = status["pose"], status["vehicle"]
+    pose = status["pose"]
     if pose is not None:
         heading = f"{_number(pose['heading_deg'], '.1f')} {pose['north'] or ''}"
         lines.append(f"pitch {pose['pitch_deg']:+.2f}  roll {pose['roll_deg']:+.2f}  heading {heading}")
+    links = [*link_rows(status), *((False, "warning", words) for words in status["warnings"])]
+    width = max(len(name) for _, name, _ in links)
+    lines += ["", *(f"{'ok ' if good else 'BAD'}  {name:{width}}  {words}" for good, name, words in links), ""]
+    lines += _bias_lines(status["calibration"])
+    lines.append(f"in force: {status['arming']['in_force']}")
+    lines += end_lines(status)
+    return lines
+
+
+def link_rows(status: Object) -> list[tuple[bool, str, str]]:
+    """What the companion is connected to: whether all is well with it, its name, how it stands."""
+    vehicle = status["vehicle"]
     heartbeat_s = vehicle["heartbeat_age_s"]
     links = [(heartbeat_s is not None and heartbeat_s < _HEARTBEAT_S, "autopilot", vehicle["summary"])]
     links += [(device["good"], device["name"], device["summary"]) for device in status["devices"]]
@@ -182,13 +195,7 @@ def monitor_lines(status: Object) -> list[str]:
         links.append((status["mqtt"]["good"], "mqtt", status["mqtt"]["summary"]))
     if status["recording"]["fault"] is not None:
         links.append((False, "recordings", status["recording"]["fault"]))
-    links += [(False, "warning", words) for words in status["warnings"]]
-    width = max(len(name) for _, name, _ in links)
-    lines += ["", *(f"{'ok ' if good else 'BAD'}  {name:{width}}  {words}" for good, name, words in links), ""]
-    lines += _bias_lines(status["calibration"])
-    lines.append(f"in force: {status['arming']['in_force']}")
-    lines += _end_lines(status)
-    return lines
+    return links
 
 
 def _bias_lines(calibration: Object | None) -> list[str]:

@@ -17,9 +17,9 @@ from companion.calibration.means.windows import Window
 from companion.component.statustext import Severity, StatusText, Weight
 from companion.config.sections import AtArm, Config
 from companion.configured import models
+from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.listeners import Listeners
-from companion.links.system.request import Object
 from companion.recording.journal import RecordedCollector
 
 TICK_S: Final = 0.2

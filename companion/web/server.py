@@ -21,8 +21,8 @@ import msgspec
 
 from companion import __version__
 from companion.errors import CompanionError
+from companion.formats import parse_request
 from companion.links.system.connection import Backoff, Reconnection
-from companion.links.system.request import parse_request
 from companion.web.access import (
     TOKEN_HEADER,
     Access,

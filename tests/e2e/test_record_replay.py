@@ -25,7 +25,7 @@ from companion.cli import main as companion
 from companion.config.sections import Config, Noise
 from companion.daemon.recorder import recorder as recorder_module
 from companion.errors import CompanionError, StorageError
-from companion.links.system.request import Object
+from companion.formats import Object
 from companion.recording import topics
 from companion.recording.files import Ring, versions
 from companion.recording.walk import MAGIC, Message, Recording

@@ -16,7 +16,7 @@ from companion.config.sections import Control
 from companion.daemon.faces import control
 from companion.daemon.faces.control import ControlServer, ask
 from companion.errors import CalibrationRefusedError, DaemonUnreachableError, LinkError
-from companion.links.system.request import Object
+from companion.formats import Object
 
 
 async def _echo(request: Object) -> AsyncIterator[Object]:

@@ -17,7 +17,7 @@ from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.offsets.subsystem import Offsets
-from companion.links.system.request import Object
+from companion.formats import Object
 from companion.physics.units import DEG_H, MG
 from companion.samples import Vector
 

@@ -25,7 +25,7 @@ from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.push import Conclusion
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import CalibrationRefusedError
-from companion.links.system.request import Object
+from companion.formats import Object
 from companion.storage.records import RecordStore
 
 PROGRESS_EVERY_S: Final = 0.2

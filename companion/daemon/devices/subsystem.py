@@ -16,8 +16,8 @@ from companion.daemon.devices.reach import Reach
 from companion.daemon.devices.sensor_watch import UNTOUCHED, Corrected, SensorWatch
 from companion.daemon.devices.sensors import SensorRole, SerialSensor
 from companion.daemon.devices.signing import LinkSigning
+from companion.formats import Object
 from companion.links.system.listeners import Listeners
-from companion.links.system.request import Object
 from companion.samples import Sample
 
 

@@ -26,7 +26,7 @@ from typing import Final, Self
 import msgspec
 
 from companion.errors import CompanionError, DaemonDeniedError, DaemonUnreachableError, LinkError
-from companion.links.system.request import Object, parse_request
+from companion.formats import Object, parse_request
 
 logger = logging.getLogger(__name__)
 

@@ -26,7 +26,7 @@ from companion.daemon.job import Job
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.recorder.recorder import Recorder
 from companion.errors import ConfigError
-from companion.links.system.request import Object
+from companion.formats import Object
 from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:

@@ -27,8 +27,8 @@ from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.heading.carrier import SLOWEST_AIRSPEED_M_S, Carrier, carrying_imu, without_truncation
 from companion.daemon.heading.health import Difference, Health
+from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
-from companion.links.system.request import Object
 from companion.physics.units import DEG
 from companion.samples import ImuSample, Sample
 

@@ -16,7 +16,7 @@ from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.subsystem import Devices
-from companion.links.system.request import Object
+from companion.formats import Object
 from companion.physics.frames import roll_pitch_from_up
 from companion.physics.units import DEG
 from companion.samples import CompassSample, Sample, TiltSample

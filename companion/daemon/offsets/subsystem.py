@@ -16,7 +16,7 @@ from companion.daemon.offsets.plan import Planner
 from companion.daemon.offsets.push import Pusher
 from companion.daemon.offsets.px4_writes import Px4Writes
 from companion.daemon.offsets.rivalry import Rivalry
-from companion.links.system.request import Object
+from companion.formats import Object
 from companion.storage.changes import ChangeLog
 
 logger = logging.getLogger(__name__)

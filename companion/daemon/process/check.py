@@ -18,10 +18,10 @@ from companion.daemon.devices.sensor_health import ABSENT
 from companion.daemon.faces.control import ask, process_behind
 from companion.daemon.process.service import Service
 from companion.errors import DaemonDeniedError, DaemonUnreachableError, LinkError
+from companion.formats import Object
 from companion.links.serial.faults import port_faults, same_ports, unnamed
 from companion.links.serial.listening import Heard, listen
 from companion.links.serial.ports import ROOT, list_ports
-from companion.links.system.request import Object
 from companion.protocols.guess import Line
 from companion.protocols.registry import PROTOCOLS, Kind, main_kind
 

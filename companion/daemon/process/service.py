@@ -17,9 +17,9 @@ from companion.daemon.faces.subsystem import Faces
 from companion.daemon.heading.subsystem import Heading
 from companion.daemon.offsets.subsystem import Offsets
 from companion.daemon.recorder.recorder import Recorder
+from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.mavlink.transport import run_transport
-from companion.links.system.request import Object
 from companion.storage.lock import only_daemon
 
 logger = logging.getLogger(__name__)

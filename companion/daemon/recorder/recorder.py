@@ -31,8 +31,8 @@ from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import Job
 from companion.errors import StorageError
+from companion.formats import Object
 from companion.links.mavlink.link import Direction
-from companion.links.system.request import Object
 from companion.recording import topics
 from companion.recording.files import FOLDER_MODE, Beginning, RecordingFile, Ring, is_available, versions
 from companion.recording.journal import Journal, KeyFilter, Offsets, Solved

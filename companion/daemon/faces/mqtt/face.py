@@ -20,8 +20,8 @@ from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.core import Core, Handler
 from companion.daemon.faces.mqtt.requests import Requests
 from companion.daemon.heading.subsystem import PoseNow
+from companion.formats import Object
 from companion.links.mqtt.client import Incoming, MqttLink
-from companion.links.system.request import Object
 
 logger = logging.getLogger(__name__)
 

@@ -25,7 +25,7 @@ import msgspec
 from companion.calibration.request import What, is_time_limit
 from companion.daemon.core import Handler
 from companion.errors import CompanionError
-from companion.links.system.request import Object
+from companion.formats import Object
 from companion.printable import printable
 
 logger = logging.getLogger(__name__)
