@@ -100,8 +100,8 @@ class _Lines:
         # What each line is about, by which it is known again when it says the same in other figures.
         lines: dict[tuple[object, ...], str] = {(self._reason_s,): show.headline_line(status)}
         lines |= {(name, good): f"{name}: {words}" for good, name, words in show.link_rows(status)}
-        lines |= {("warning", number): f"warning: {words}" for number, words in enumerate(status["warnings"])}
-        lines |= {(line,): line for line in show.end_lines(status)}
+        warnings = [f"warning: {words}" for words in status["warnings"]]
+        lines |= {(line,): line for line in [*warnings, *show.end_lines(status)]}
         self._print([line for about, line in lines.items() if about not in self._before])
         self._before = set(lines)
 
