@@ -55,7 +55,7 @@ class LimitedHandler(logging.StreamHandler[TextIO]):
         if place.budget.left(now_s) < 1.0:
             place.left_out += 1
             return
-        place.budget.take(1, now_s)
+        place.budget.spend(1, now_s)
         if place.left_out:
             record = copy.copy(record)
             record.msg = f"{record.getMessage()} (after {place.left_out} more like this, left out)"

@@ -81,7 +81,7 @@ class Heard:
         self._listeners: Listeners[[int, Text]] = Listeners()
         self._unfinished: dict[tuple[int, int], dict[int, str]] = {}
 
-    def take(self, name: str, source: Target, fields: Fields, now_s: float) -> None:
+    def update(self, name: str, source: Target, fields: Fields, now_s: float) -> None:
         """Take a HEARTBEAT or STATUSTEXT; others are not looked at."""
         if name == "HEARTBEAT":
             self._heartbeat(source, fields, now_s)

@@ -54,7 +54,7 @@ class SignedLink:
             self.link.subscribe(kind, self._hand_over)
         sdk.subscribe_raw_bytes_to_be_sent(self._in_a_thread)
 
-    def words(self) -> str:
+    def text(self) -> str:
         """What was dropped, for people; empty when nothing was."""
         if not self.signing.doubted:
             return ""
@@ -192,7 +192,7 @@ class GroundLink:
             logger.debug("%s of %s is no JSON: %.80s", name, source, fields_json)
             return
         if name != "COMMAND_ACK":
-            self.heard.take(name, source, fields, self._loop.time())
+            self.heard.update(name, source, fields, self._loop.time())
         elif fields.get("target_system") in (0, self.own.system_id) and fields.get("target_component") in (
             0,
             self.own.component_id,
@@ -251,7 +251,7 @@ async def open_link(url: str, heard: Heard, key: bytes | None = None) -> AsyncIt
         direct = MavlinkDirectServer(sdk.server_component_by_id(own.component_id))
         if key is not None:
             async with open_signed(sdk, own, url, key) as signed:
-                yield GroundLink(sdk, direct, own, heard, signed.words)
+                yield GroundLink(sdk, direct, own, heard, signed.text)
             return
         try:
             await asyncio.to_thread(sdk.add_any_connection_with_handle, f"{_SCHEMES[kind]}://{where}:{number}")

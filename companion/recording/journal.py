@@ -135,7 +135,7 @@ class Journal:
         """Nobody wants it any more."""
         self.is_on, self.lost, self._bytes, self.items = False, 0, 0, []
 
-    def take(self) -> list[Entry]:
+    def drain(self) -> list[Entry]:
         """Everything that waits, which then no longer does."""
         items, self.items, self._bytes = self.items, [], 0
         return items

@@ -48,7 +48,7 @@ class BiasStore:
 
     def read(self) -> dict[str, KnownImu]:
         """By IMU, what is kept; what cannot be used is set aside and begun anew, since nothing hangs on it."""
-        found = self._file.take()
+        found = self._file.load()
         return {} if found is None else found.imus
 
     def write(self, imus: dict[str, KnownImu]) -> None:

@@ -164,7 +164,7 @@ class StateFile(Generic[T]):
             raise StorageError(f"{self.path}: cannot be used: {error}") from error
         return found
 
-    def take(self) -> T | None:
+    def load(self) -> T | None:
         """What is kept, for the daemon: what cannot be used is set aside, said once, and counts as nothing."""
         self.unusable = None
         try:
@@ -220,7 +220,7 @@ class BoundedList(Generic[T]):
 
     def read(self) -> list[T]:
         """The latest entries, for the daemon; a file that cannot be used counts as empty."""
-        return _listed(self._file.take())[-self._keep :]
+        return _listed(self._file.load())[-self._keep :]
 
     def all(self) -> list[T]:
         """All entries, for whoever changes nothing.

@@ -107,7 +107,7 @@ def test_a_loop_that_stands_still_closes_the_gate(tmp_path: Path) -> None:
     async def main() -> None:
         async with px4(tmp_path).running() as rig:
             await ready(rig)
-            rig.service.arming.readiness.look = lambda: None  # type: ignore[method-assign]
+            rig.service.arming.readiness.update = lambda: None  # type: ignore[method-assign]
             await asyncio.sleep(2.0)
             assert rig.service.arming.readiness.answer().verdict == "wait"
             assert await try_to_arm(rig) == 1

@@ -196,7 +196,7 @@ def test_the_attitude_and_the_biases_that_are_shown_are_the_true_ones(tmp_path: 
             magnetic = rig.service.status()["pose"]
             assert magnetic["north"] == "magnetic"
             await rig.until(lambda: rig.service.core.vehicle.place.position is not None, 10.0)
-            true_north = (await rig.service.faces.look())["pose"]
+            true_north = (await rig.service.faces.refresh())["pose"]
             assert magnetic["pitch_deg"] == pytest.approx(POSE.pitch_deg, abs=0.05)
             assert magnetic["roll_deg"] == pytest.approx(POSE.roll_deg, abs=0.05)
             assert magnetic["heading_deg"] == pytest.approx(POSE.heading_deg - rig.site.declination_deg, abs=2.0)

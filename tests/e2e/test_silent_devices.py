@@ -62,7 +62,7 @@ def test_a_silent_device_is_brought_to_give_readings(
             finally:
                 running.cancel()
                 await asyncio.gather(running, return_exceptions=True)
-        assert sensor.words
+        assert sensor.text
         assert getattr(device, "stored", 0) == 0
         for part in taken:
             if isinstance(part, CompassSample):

@@ -27,7 +27,7 @@ def test_nobody_is_accused_who_works(tmp_path: Path, firmware: Literal["ardupilo
             async def look() -> None:
                 while True:
                     await asyncio.sleep(1.0)
-                    for name, age_s in beats.look(1.0).items():
+                    for name, age_s in beats.update(1.0).items():
                         oldest[name] = max(age_s, oldest.get(name, 0.0))
 
             looking = asyncio.create_task(look())

@@ -90,7 +90,7 @@ async def _survives(folder: Path, firmware: Literal["ardupilot", "px4"], seed: i
                 rig.wire.carry_from_other(hostile.pack(kind))
             await asyncio.sleep(0.02)
             if turn % 10 == 0:
-                await rig.service.faces.look()
+                await rig.service.faces.refresh()
         assert rig.link.received["handler error"] == 0
         assert rig.service.recorder.fault is None
         # Once it is over, all is as before: at the latest when the words of a spoofed restart have been looked into.
@@ -107,7 +107,7 @@ async def _survives(folder: Path, firmware: Literal["ardupilot", "px4"], seed: i
         assert again.record is not None
         assert again.record.site is not None
         assert again.record.site.latitude_deg == pytest.approx(rig.site.latitude_deg)
-        await rig.service.faces.look()
+        await rig.service.faces.refresh()
         assert rig.service.recorder.fault is None
 
 

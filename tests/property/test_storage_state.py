@@ -62,12 +62,12 @@ def test_any_bytes_in_any_file(data: bytes) -> None:
         for file in (*files, "records/000001.json"):
             (folder / file).write_bytes(data)
         log = ChangeLog(folder)
-        log.journal.take()
-        log.undo_of(1).take()
-        AlignmentStore(folder).take()
+        log.journal.load()
+        log.undo_of(1).load()
+        AlignmentStore(folder).load()
         BiasStore(folder).read()
         BoundedList(folder / "armings.json", Arming, 5).read()
-        signing_time_in(folder).take()
+        signing_time_in(folder).load()
         RecordStore(folder).history()
 
 
@@ -82,7 +82,7 @@ LIMITS = {"GYROFFS": 0.5, "GYRO0": 0.5, "OFF": 5.0, "GYR_ID": 2.0**24}
 def test_what_is_believed_of_a_journal_is_what_an_imu_can_have(changes: dict[str, Any]) -> None:
     with tempfile.TemporaryDirectory() as name:
         (Path(name) / "journal.json").write_bytes(sealed(encoded(changes)))
-        found = ChangeLog(Path(name)).journal.take()
+        found = ChangeLog(Path(name)).journal.load()
     if found is None:
         return
     assert 1 <= found.system_id <= 255

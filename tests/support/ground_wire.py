@@ -36,7 +36,7 @@ class StationOnTheWire(Ground):
             if self.deaf_to(message):
                 continue
             source = Target(message.get_srcSystem(), message.get_srcComponent())
-            self.heard.take(message.get_type(), source, message.to_dict(), t_s)
+            self.heard.update(message.get_type(), source, message.to_dict(), t_s)
             if isinstance(message, mavlink.MAVLink_command_ack_message):
                 for handler in [*self.handlers]:
                     handler(Ack(source, message.command, message.result, message.progress))

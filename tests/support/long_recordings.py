@@ -177,7 +177,7 @@ def write_recording(path: Path, *, seconds: float, rate_hz: float = 1000.0, imus
         _ticks(seconds),
     ]
     beginning = Beginning(begin_s, UNIX_S, versions(), msgspec.json.encode(settings), past)
-    file.write(past.messages(first.take()), beginning)
+    file.write(past.messages(first.drain()), beginning)
     entries = heapq.merge(*streams, key=lambda entry: entry[1])
     for _, second in itertools.groupby(entries, key=lambda entry: int(entry[1])):
         file.write(past.messages(list(second)), beginning)

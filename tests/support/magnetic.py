@@ -97,9 +97,9 @@ def window(
     if device_heading_deg is None:
         maker = FieldHeading(model, gradienter(), 10)
         maker.take_tilt(TiltSample(0.0, tilt.x_deg, tilt.y_deg))
-        maker.take(MagSample(0.0, (x, y, z)))
+        maker.add(MagSample(0.0, (x, y, z)))
         maker.take_tilt(TiltSample(10.0, tilt.x_deg, tilt.y_deg))
-        made = maker.take(MagSample(10.0, (x, y, z)))
+        made = maker.add(MagSample(10.0, (x, y, z)))
         assert made is not None, maker.hint
         heading = HeadingWindow(heading_deg=made.heading_deg, sigma_deg=0.0, from_field=True)
     else:

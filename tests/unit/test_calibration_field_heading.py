@@ -41,9 +41,9 @@ def test_the_vehicles_heading_comes_out_whatever_the_mounting_the_tilt_and_the_g
     model = compass(mounting=mounting)
     for pose in ((0.0, 0.0, 10.0), (25.0, -20.0, 200.0), (-30.0, 15.0, 359.0)):
         maker = FieldHeading(model, GRADIENTER, 10)
-        maker.take(field(pose, model, 0.0))
+        maker.add(field(pose, model, 0.0))
         maker.take_tilt(tilt(pose, 2.9, GRADIENTER.offset_deg))
-        made = maker.take(field(pose, model, 3.0))
+        made = maker.add(field(pose, model, 3.0))
         assert made is not None
         up = ned_from_body(*pose).T @ np.array([0.0, 0.0, -1.0])
         assert wrap_deg(vehicle_heading_rad(model, made.heading_deg, up) / DEG - pose[2]) == pytest.approx(0, abs=1e-9)
@@ -58,7 +58,7 @@ def test_a_devices_own_heading_counts_while_it_comes() -> None:
         maker.take_tilt(tilt((0.0, 0.0, 0.0), t_s))
         if k < 50:
             assert maker.takes_own(CompassSample(t_s, 12.0))
-        made.append(maker.take(field((0.0, 0.0, 90.0), model, t_s)))
+        made.append(maker.add(field((0.0, 0.0, 90.0), model, t_s)))
     assert made[:69] == [None] * 69
     late = [sample for sample in made[70:] if sample is not None]
     assert len(late) == 30
@@ -66,7 +66,7 @@ def test_a_devices_own_heading_counts_while_it_comes() -> None:
     assert maker.from_field
     # And again: its own is believed from its first word on.
     assert maker.takes_own(CompassSample(10.0, 12.0))
-    assert maker.take(field((0.0, 0.0, 90.0), model, 10.0)) is None
+    assert maker.add(field((0.0, 0.0, 90.0), model, 10.0)) is None
     assert not maker.from_field
 
 
@@ -75,7 +75,7 @@ def test_field_preferred_takes_no_heading_of_the_devices_own() -> None:
     maker = FieldHeading(model, PLAIN, 10)
     assert not maker.takes_own(CompassSample(0.0, 12.0))
     maker.take_tilt(tilt((0.0, 0.0, 0.0), 0.0))
-    assert maker.take(field((0.0, 0.0, 90.0), model, 0.1)) is not None
+    assert maker.add(field((0.0, 0.0, 90.0), model, 0.1)) is not None
 
 
 @pytest.mark.parametrize(
@@ -94,8 +94,8 @@ def test_why_there_is_no_heading_is_said(
     maker = FieldHeading(model, gradienter, 10)
     if tilt_s is not None:
         maker.take_tilt(tilt((0.0, 0.0, 0.0), tilt_s))
-    assert maker.take(field((0.0, 0.0, 90.0), model, 0.0)) is None
-    assert maker.take(field((0.0, 0.0, 90.0), model, 3.0)) is None
+    assert maker.add(field((0.0, 0.0, 90.0), model, 0.0)) is None
+    assert maker.add(field((0.0, 0.0, 90.0), model, 3.0)) is None
     assert part in maker.hint
 
 
@@ -103,18 +103,18 @@ def test_why_there_is_no_heading_is_said(
 def test_what_is_no_field_makes_no_heading_and_raises_nothing(bad: tuple[float, float, float]) -> None:
     maker = FieldHeading(compass(), PLAIN, 10)
     maker.take_tilt(TiltSample(3.0, 0.0, 0.0))
-    maker.take(MagSample(0.0, bad))
-    assert maker.take(MagSample(3.0, bad)) is None
-    assert maker.take(MagSample(3.0)) is None
+    maker.add(MagSample(0.0, bad))
+    assert maker.add(MagSample(3.0, bad)) is None
+    assert maker.add(MagSample(3.0)) is None
     maker.take_tilt(TiltSample(3.0, math.nan, math.inf))
-    maker.take(MagSample(3.0, (0.2, 0.1, 0.3)))
+    maker.add(MagSample(3.0, (0.2, 0.1, 0.3)))
 
 
 def test_counts_become_gauss_only_with_a_scale() -> None:
     for scale, unit, expected in ((None, "counts", (1000.0, -200.0, 1600.0)), (4000.0, "gauss", (0.25, -0.05, 0.4))):
         maker = FieldHeading(compass(counts_per_gauss=scale), PLAIN, 10)
         for k in range(40):
-            maker.take(MagSample(k * 0.1, counts=(1000, -200, 1600)))
+            maker.add(MagSample(k * 0.1, counts=(1000, -200, 1600)))
         found = maker.window([1, 2])
         assert found is not None
         assert found.unit == unit
@@ -225,5 +225,5 @@ def test_without_a_gradienter_the_field_alone_says_what_is_missing() -> None:
 
 def test_a_watch_without_witnesses_sees_nothing() -> None:
     watch = HeadingWatch()
-    watch.take(None, [])
+    watch.add_second(None, [])
     assert watch.wander_deg is None

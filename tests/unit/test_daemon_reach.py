@@ -25,7 +25,7 @@ def words_of(autopilot: ScriptedAutopilot) -> tuple[bool, str]:
         async with flying_on(link, autopilot):
             running = asyncio.create_task(reach.run())
             await asyncio.sleep(8.0)
-            found = reach.words()
+            found = reach.text()
             running.cancel()
             await asyncio.gather(running, return_exceptions=True)
         vehicle.close()

@@ -331,13 +331,13 @@ def test_while_another_program_has_the_port_open_nothing_is_sent(monkeypatch: py
         sensor = SerialSensor(device(*BOTH, dialogue=Chatterbox, port=path), lambda role, part: None)
         running = asyncio.create_task(sensor.run())
         try:
-            await until(lambda: "has the port open too" in sensor.words)
-            assert str(other.pid) in sensor.words
+            await until(lambda: "has the port open too" in sensor.text)
+            assert str(other.pid) in sensor.text
             await asyncio.sleep(0.6)  # more than two looks: time enough for a byte that must not come
             assert arrived(master) == b""
             other.communicate()
             await until(lambda: arrived(master) != b"")
-            assert sensor.words == ""
+            assert sensor.text == ""
         finally:
             running.cancel()
             await asyncio.gather(running, return_exceptions=True)
@@ -370,10 +370,10 @@ def test_a_stopped_hmr3300_is_polled_unless_it_may_only_be_read(tmp_path: Path, 
                     await asyncio.sleep(2.8)
                     assert not compass.streaming
                     assert taken == []
-                    assert sensor.words == ""
+                    assert sensor.text == ""
                 else:
                     await until(lambda: len(taken) >= 5)
-                    assert sensor.words == "asked 8 times a second with *Q"
+                    assert sensor.text == "asked 8 times a second with *Q"
             finally:
                 running.cancel()
                 await asyncio.gather(running, return_exceptions=True)

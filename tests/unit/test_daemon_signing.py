@@ -172,7 +172,7 @@ def test_a_disk_that_cannot_be_written_is_said_once_and_costs_nothing_else(
 )
 def test_a_broken_file_is_none(tmp_path: Path, content: bytes) -> None:
     (tmp_path / SIGNING_FILE).write_bytes(content)
-    assert signing_time_in(tmp_path).take() is None
+    assert signing_time_in(tmp_path).load() is None
 
 
 def test_the_unit_hands_the_boot_id_over(monkeypatch: pytest.MonkeyPatch) -> None:

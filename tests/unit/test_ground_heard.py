@@ -16,12 +16,12 @@ QUADROTOR, GCS, ONBOARD = 2, 6, 18
 
 def beat(heard: Heard, system: int, component: int, *, now_s: float = 10.0, **fields: int) -> None:
     defaults = {"type": ONBOARD, "autopilot": NO_AUTOPILOT, "base_mode": 0, "system_status": 3}
-    heard.take("HEARTBEAT", Target(system, component), {**defaults, **fields}, now_s)
+    heard.update("HEARTBEAT", Target(system, component), {**defaults, **fields}, now_s)
 
 
 def say(heard: Heard, text: str, text_id: int = 0, sequence: int = 0, *, component: int = 191) -> None:
     fields: Fields = {"severity": 6, "text": text, "id": text_id, "chunk_seq": sequence}
-    heard.take("STATUSTEXT", Target(1, component), fields, 10.0)
+    heard.update("STATUSTEXT", Target(1, component), fields, 10.0)
 
 
 def said(heard: Heard) -> list[str]:
@@ -102,7 +102,7 @@ anything = st.sampled_from([None, True, -1, 0, 2**70, 1.5, float("nan"), "", "x"
 def test_nothing_on_the_wire_raises(messages: list[tuple[str, dict[str, object]]]) -> None:
     heard = Heard(191)
     for name, fields in messages:
-        heard.take(name, Target(1, 191), fields, 0.0)
+        heard.update(name, Target(1, 191), fields, 0.0)
     heard.summary()
 
 

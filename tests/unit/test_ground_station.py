@@ -43,7 +43,7 @@ def station_on(wire: StationOnTheWire, notes: Notes | None = None) -> Station:
 
 def beat(wire: StationOnTheWire, system_id: int, component_id: int, kind: int, autopilot: int) -> None:
     fields = {"type": kind, "autopilot": autopilot, "base_mode": 0, "system_status": mavlink.MAV_STATE_STANDBY}
-    wire.heard.take("HEARTBEAT", Target(system_id, component_id), fields, asyncio.get_running_loop().time())
+    wire.heard.update("HEARTBEAT", Target(system_id, component_id), fields, asyncio.get_running_loop().time())
 
 
 async def until_started(b: Bench, jobs: int = 1) -> None:

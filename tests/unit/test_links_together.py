@@ -70,7 +70,7 @@ class TestWaiting:
             together.put(taker, b"", float(number))
             most = max(most, together.waiting)
         assert most == MOST_WAITING - 1
-        together.take()
+        together.drain()
         assert [t_s for _, t_s in taker.got] == [float(number) for number in range(1000)]
 
     def test_nothing_is_lost_when_the_last_stream_ends(self) -> None:
@@ -91,7 +91,7 @@ class TestWaiting:
         together.drive()
         together.put(fail, b"", 1.0)
         together.put(taker, b"a", 2.0)
-        together.take()
+        together.drain()
         assert taker.got == [(b"a", 2.0)]
         assert "taking what has waited failed" in caplog.text
 
@@ -100,13 +100,13 @@ class TestWaiting:
 
         def first(data: bytes, t_s: float) -> None:
             together.put(taker, b"late", t_s)
-            together.take()  # asks again from within, to no harm
+            together.drain()  # asks again from within, to no harm
             taker(data, t_s)
 
         together.drive()
         together.put(first, b"first", 1.0)
         together.put(taker, b"second", 1.0)
-        together.take()
+        together.drain()
         assert [data for data, _ in taker.got] == [b"first", b"second", b"late"]
 
 
@@ -130,7 +130,7 @@ class TestMavlink:
         link.arrived(attitude(1), 5.001, link.receive)
         link.arrived(attitude(2) + attitude(3), 5.002, link.receive)
         assert got == []
-        link.together.take()
+        link.together.drain()
         assert got == [("ATTITUDE", 5.001), ("ATTITUDE", 5.002), ("ATTITUDE", 5.002)]
 
     @pytest.mark.parametrize("place", ["alone", "before telemetry", "behind telemetry"])
@@ -157,7 +157,7 @@ class TestMavlink:
         link.arrived(attitude(1), 5.001, link.receive)
         link.arrived(mavlink.MAVLink_timesync_message(0, 77).pack(codec()), 5.002, link.receive)
         assert got == [("TIMESYNC", 5.002)]
-        link.together.take()
+        link.together.drain()
         assert got == [("TIMESYNC", 5.002), ("ATTITUDE", 5.001)]
 
     @pytest.mark.parametrize("damage", ["cut", "noise behind", "signed", "version 1", "empty"])

@@ -54,7 +54,7 @@ class Daemon:
         return [response["state"] for _, response, _ in self.responses]
 
     async def take(self, payload: bytes, command: str = "calibrate", *, retained: bool = False) -> None:
-        self.requests.take(command, payload, retained=retained)
+        self.requests.accept(command, payload, retained=retained)
         await asyncio.sleep(0.3)
 
 
@@ -128,7 +128,7 @@ def test_a_flood_is_refused_as_busy_and_leaves_nothing_behind() -> None:
     async def main() -> None:
         daemon = Daemon()
         for number in range(5000):
-            daemon.requests.take("cancel", b'{"transaction": %d}' % number, retained=False)
+            daemon.requests.accept("cancel", b'{"transaction": %d}' % number, retained=False)
         assert len(asyncio.all_tasks()) == MAX_PENDING + 1
         assert daemon.states() == ["refused"] * (5000 - MAX_PENDING)
         assert {response["refusal"] for _, response, _ in daemon.responses} == {"busy"}

@@ -32,7 +32,7 @@ def beginning(t_s: float = 1000.0) -> Beginning:
 
 
 def taken(journal: Journal) -> list[Written]:
-    return Past(60.0, ()).messages(journal.take())
+    return Past(60.0, ()).messages(journal.drain())
 
 
 def raw(count: int, size: int, seed: int = 0) -> list[Written]:
@@ -175,7 +175,7 @@ def test_what_finds_no_room_is_lost_in_one_piece_and_said_in_the_file(
     file.write(taken(made), beginning())
     for k in range(20, 90):  # the disk hangs
         made.raw("/serial/own", 1000.0 + k, bytes([k]))
-    assert made.take() == [], "nothing of a part with a hole in it"
+    assert made.drain() == [], "nothing of a part with a hole in it"
     assert made.lost == made.lost_in_all == 70
     made.begin(1090.0)
     for k in range(90, 95):
@@ -222,7 +222,7 @@ def test_a_file_begins_with_the_seconds_before_it_and_with_what_is_in_force(tmp_
         made.imu("fc", sample, "RAW_IMU")
         if second == 20:
             made.set_in_force(now_s, "expect", (True, True))
-        entries = made.take()
+        entries = made.drain()
         past.keep(entries, past.messages(entries), now_s + 0.5)
     start, in_force, *seconds = past.beginning(1200.0)
     assert (start[0], in_force[0]) == (topics.START, topics.JOURNAL)
@@ -240,11 +240,11 @@ def test_the_seconds_before_are_bounded_in_bytes_and_end_at_a_gap(monkeypatch: p
     made.begin(0.0)
     for second in range(20):
         made.raw("/serial/own", second, os.urandom(1500))
-        entries = made.take()
+        entries = made.drain()
         past.keep(entries, past.messages(entries), second)
     assert [message[1] for message in past.beginning(20.0)[1:]] == [14, 15, 16, 17, 18, 19]
     made.begin(30.0)
-    entries = made.take()
+    entries = made.drain()
     past.keep(entries, past.messages(entries), 30.0)
     assert [in_second(second) for second in past.beginning(30.0)[1:]] == [[]]
 

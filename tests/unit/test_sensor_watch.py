@@ -77,7 +77,7 @@ class Bench:
             if tick % 5 == 0:
                 self.one.sensor.health.stream.took(b"x", [sample(t_s)], t_s)
             if tick % 25 == 0:
-                self.one.watch.look(t_s)
+                self.one.watch.update(t_s)
                 found = self.one.sensor.health.trouble(t_s)
         self.now_s += seconds
         return found

@@ -62,12 +62,12 @@ HOSTILE: dict[str, Callable[[Path], Any]] = {
     "a loop": lambda path: path.symlink_to(path.name),
 }
 FILES: dict[str, Callable[[Path], Any]] = {
-    "journal.json": lambda folder: ChangeLog(folder).journal.take(),
-    "undo-1.json": lambda folder: ChangeLog(folder).undos()[0].take(),
-    "alignment.json": lambda folder: AlignmentStore(folder).take(),
+    "journal.json": lambda folder: ChangeLog(folder).journal.load(),
+    "undo-1.json": lambda folder: ChangeLog(folder).undos()[0].load(),
+    "alignment.json": lambda folder: AlignmentStore(folder).load(),
     "biases.json": lambda folder: BiasStore(folder).read() or None,
     "armings.json": lambda folder: BoundedList(folder / "armings.json", Arming, 200).read() or None,
-    SIGNING_FILE: lambda folder: signing_time_in(folder).take(),
+    SIGNING_FILE: lambda folder: signing_time_in(folder).load(),
 }
 
 
@@ -169,7 +169,7 @@ def test_a_file_that_may_not_be_read_is_set_aside_too(tmp_path: Path, monkeypatc
 
     monkeypatch.setattr(os, "open", denied)
     journal = ChangeLog(tmp_path).journal
-    assert journal.take() is None
+    assert journal.load() is None
     assert journal.unusable == f"{path}: cannot be read: Permission denied; set aside as journal.json.unusable"
 
 
@@ -183,7 +183,7 @@ def test_where_it_cannot_be_set_aside_it_is_named_and_not_used(tmp_path: Path, m
     monkeypatch.setattr(os, "replace", read_only)
     for _ in range(2):
         journal = ChangeLog(tmp_path).journal
-        assert journal.take() is None
+        assert journal.load() is None
         assert journal.unusable is not None
         assert journal.unusable.endswith("it cannot be set aside either")
 
@@ -192,7 +192,7 @@ def test_a_few_are_kept_of_each_name(tmp_path: Path) -> None:
     path = tmp_path / "journal.json"
     for number in range(MOST_ASIDE + 3):
         path.write_text(str(number))
-        assert ChangeLog(tmp_path).journal.take() is None
+        assert ChangeLog(tmp_path).journal.load() is None
     kept = {entry.name: entry.read_text() for entry in tmp_path.iterdir()}
     # The first that went wrong tells most.
     assert kept == {

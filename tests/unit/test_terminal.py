@@ -233,9 +233,9 @@ def test_what_is_heard_on_the_ground(
         wire, beat = StationOnTheWire(), {"type": 18, "autopilot": 8, "base_mode": 0, "system_status": 3}
         wire.heard = heard
         wire.values = {"CMP_STATE": 1.0, f"CMP_{EVIL}": 1.0}
-        heard.take("HEARTBEAT", Target(1, 191), beat, asyncio.get_running_loop().time())
+        heard.update("HEARTBEAT", Target(1, 191), beat, asyncio.get_running_loop().time())
         text = {"severity": mavlink.MAV_SEVERITY_CRITICAL, "text": EVIL, "id": 0, "chunk_seq": 0}
-        heard.take("STATUSTEXT", Target(1, 191), text, asyncio.get_running_loop().time())
+        heard.update("STATUSTEXT", Target(1, 191), text, asyncio.get_running_loop().time())
         yield wire
 
     monkeypatch.setattr("companion.ground.link.open_link", open_link)

@@ -92,7 +92,7 @@ class ParameterClient:
         if isinstance(answer, float):
             return answer
         if answer is not None:
-            raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.words}")
+            raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.text}")
         raise ParameterTimeoutError(
             f"{self.vehicle.name} does not answer for {name} ({tries} requests, {self._timeout_s:g} s each)"
             f"{self.vehicle.why_silent}"
@@ -122,7 +122,7 @@ class ParameterClient:
             if answer.code == _DOES_NOT_EXIST:
                 self._absent.add(name)
                 return None
-            raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.words}")
+            raise ParameterRefusedError(f"{self.vehicle.name} refuses to read {name}: {answer.text}")
         if not self.vehicle.alive or not await self._answers_at_all():
             raise ParameterTimeoutError(
                 f"{self.vehicle.name} answers neither for {name} nor for anything else{self.vehicle.why_silent}"
@@ -196,9 +196,7 @@ class ParameterClient:
                 deadline_s = self._send(self._set_message(name, carried, kind), inbox)
                 while (answer := await self._next(inbox, deadline_s)) is not None:
                     if isinstance(answer, Refusal):
-                        raise ParameterRefusedError(
-                            f"{self.vehicle.name} refuses {name} = {wanted:.9g}: {answer.words}"
-                        )
+                        raise ParameterRefusedError(f"{self.vehicle.name} refuses {name} = {wanted:.9g}: {answer.text}")
                     if answer == wanted if whole else same_float32(answer, wanted):
                         self._learn_loss(tries)
                         return answer

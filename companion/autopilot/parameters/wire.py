@@ -145,7 +145,7 @@ class Refusal:
         self.code = code
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """Why, for people."""
         return _ERROR_WORDS.get(self.code, f"error {self.code}")
 

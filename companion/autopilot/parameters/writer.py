@@ -326,7 +326,7 @@ class ParameterWriter:
                     await self._put_back_one(item, item.change.before, leave_foreign=foreign)
                 await asyncio.sleep(TAKEN_S if indirect and self._vehicle.alive else _LATE_ECHO_S)
                 for item in touched:
-                    item.read_back = await self._look(item.change.parameter)
+                    item.read_back = await self._read_in_force(item.change.parameter)
                     item.left = not _same(item.read_back, item.change.before)
                     item.outcome = "failed" if item.left else "rolled_back"
         finally:
@@ -340,7 +340,7 @@ class ParameterWriter:
         if leave_foreign or item.confirmed:
             # What is neither ours nor the old value came from a start-up calibration or another ground station. Of a
             # value that was never confirmed nobody knows: it may be what the autopilot has made of ours.
-            now = await self._look(change.parameter)
+            now = await self._read_in_force(change.parameter)
             if not any(_same(now, ours) for ours in change.ours) and (leave_foreign or now is not None):
                 return
         try:
@@ -348,7 +348,7 @@ class ParameterWriter:
         except AutopilotError as error:
             logger.warning("%s is not put back yet: %s", change.parameter, error)
 
-    async def _look(self, name: str) -> float | None:
+    async def _read_in_force(self, name: str) -> float | None:
         """What is in force, or None when it cannot be known; a restart meanwhile only means asking again."""
         if not self._vehicle.alive or self._late():
             return None

@@ -207,7 +207,7 @@ class Intake(ABC):
         """Take the compass' field; the heading that came of it, where that is the one that counts."""
         if self._heading is None or self._field is None:
             return None
-        heading = self._field.take(sample)
+        heading = self._field.add(sample)
         self._heading.hint = self._field.hint
         if heading is not None:
             self._take_heading(heading)

@@ -263,7 +263,7 @@ class RollingCollector(Intake):
             moved = moved or (source.kind == "imu" and not source.verdict.still and not source.verdict.fault)
         if self._heading is not None:
             others = [source.verdict for source in sources if source is not self._heading]
-            self._watch.take(self._heading.batches.batches.get(slot), others)
+            self._watch.add_second(self._heading.batches.batches.get(slot), others)
         self._trace.add(slot, sources, good=good)
         if not self._stretch.add(slot, good=good):
             self._break()

@@ -205,7 +205,7 @@ class FieldHeading:
         self._own_s, self.from_field, self.hint = sample.t_s, False, ""
         return True
 
-    def take(self, sample: MagSample) -> CompassSample | None:
+    def add(self, sample: MagSample) -> CompassSample | None:
         """Take a field; the heading that it gives, where that is the one that counts."""
         field = self._in_unit(sample)
         if field is None:

@@ -182,7 +182,7 @@ class HeadingWatch:
         self._range_deg: tuple[float, float] | None = None
         self._blind = 0
 
-    def take(self, heading: Batch | None, others: Sequence[Verdict]) -> None:
+    def add_second(self, heading: Batch | None, others: Sequence[Verdict]) -> None:
         """One second: its heading, where one came, and what the gates of all other sources said."""
         if any(not verdict.still and not verdict.fault for verdict in others) or not others:
             self._begin()

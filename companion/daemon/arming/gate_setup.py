@@ -46,7 +46,7 @@ class GateSetup:
             await self._vehicle.wait_found()
             self._stale.clear()
             try:
-                self.problem = await self._look()
+                self.problem = await self._find_missing()
             except AutopilotError as error:
                 logger.info("whether the gate is set up is not known: %s", error)
                 self._stale.set()
@@ -73,7 +73,7 @@ class GateSetup:
             logger.warning("arming is not gated: %s", self.problem)
             self._say(Severity.WARNING, f"NO GATE: {self.problem}", Weight.RESULT)
 
-    async def _look(self) -> str | None:
+    async def _find_missing(self) -> str | None:
         if self._vehicle.firmware == "px4":
             return await self._px4()
         if self._vehicle.firmware == "ardupilot":

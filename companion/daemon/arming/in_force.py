@@ -131,7 +131,7 @@ class InForce:
     @property
     def held_back(self) -> str | None:
         """What was measured and not written, and why, in one short line; None when nothing was."""
-        return self._held_back.words
+        return self._held_back.text
 
     @property
     def worth_writing_s(self) -> float:

@@ -158,18 +158,18 @@ class Readiness:
         loop = asyncio.get_running_loop()
         while True:
             try:
-                self.look()
+                self.update()
                 await asyncio.sleep(0)  # a question that has come meanwhile is answered in between
                 # What a write under way makes of the output says nothing about what will be in force after it.
                 if not self._writing and await self.in_force.measure(loop.time()):
-                    self.look()
+                    self.update()
                 self.turns += 1
             except Exception:
                 # Without a renewed answer the gate closes by itself.
                 logger.exception("looking whether it may arm failed")
             await asyncio.sleep(POLL_S)
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Work out the answer anew."""
         now_s = asyncio.get_running_loop().time()
         self.in_force.poll(writing=self._writing)

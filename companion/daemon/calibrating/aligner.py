@@ -133,7 +133,7 @@ class Aligner:
         moved, why = not taken, ""
         while True:
             now_s = loop.time()
-            status, waiting_for, hold_still_s = await self._measuring.look(job, ARMED)
+            status, waiting_for, hold_still_s = await self._measuring.read_state(job, ARMED)
             self._check_offsets(taken)
             moving = self._collector.glance(now_s).moving
             if moving:

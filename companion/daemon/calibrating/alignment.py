@@ -33,7 +33,7 @@ class AlignmentInForce:
 
     def load(self) -> None:
         """Read what was kept before this start; blocking. What cannot be used is set aside and said."""
-        self._take(self._store.take())
+        self._take(self._store.load())
         if self._store.unusable is not None:
             self.unused = self._store.unusable
         elif self.unused is not None:

@@ -78,7 +78,7 @@ class Measuring:
         """A calibration begins, which may measure more than once."""
         self._upsets = {name: imu.upsets for name, imu in self._imus.items()}
 
-    async def look(self, job: Job, if_armed: str) -> Stand:
+    async def read_state(self, job: Job, if_armed: str) -> Stand:
         """How it stands now.
 
         Raises:
@@ -116,7 +116,7 @@ class Measuring:
         stop = collector.seconds.add(job.look_again)
         try:
             while True:
-                status, waiting_for, hold_still_s = await self.look(
+                status, waiting_for, hold_still_s = await self.read_state(
                     job, "armed during the measurement; nothing was written"
                 )
                 self._check_imus(failures)

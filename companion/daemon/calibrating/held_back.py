@@ -50,7 +50,7 @@ class HeldBack:
         return key in self._kept
 
     @property
-    def words(self) -> str | None:
+    def text(self) -> str | None:
         """What was measured and not written, and why, in one short line; None when nothing was."""
         if not self._kept:
             return None

@@ -100,7 +100,7 @@ class StartLimit:
         if left < 1.0:
             wait_s = math.ceil((1.0 - left) / STARTS_PER_S)
             return Refusal("busy", f"too many requests, wait {wait_s} s")
-        budget.take(1, now_s)
+        budget.spend(1, now_s)
         return None
 
     def _budget(self, requester: str, now_s: float) -> Budget:

@@ -53,7 +53,7 @@ class Reach:
             count for word, count in results.items() if word not in ("no answer", "dropped")
         )
 
-    def words(self) -> tuple[bool, str]:
+    def text(self) -> tuple[bool, str]:
         """For `companion check`: whether all is well, and the facts with the fix."""
         if not self._vehicle.alive:
             return True, "not known: no autopilot"

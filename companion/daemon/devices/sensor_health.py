@@ -79,7 +79,7 @@ class SensorHealth:
         rate = f"{self._bytes_per_s / 1e3:.0f} kB/s" if self._bytes_per_s else "too much"
         return Trouble(FLOOD, f"floods us ({rate}); the surplus is thrown away: another device, or a loop-back?")
 
-    def look(self, now_s: float, stuck: Trouble | None = None) -> Trouble | None:
+    def update(self, now_s: float, stuck: Trouble | None = None) -> Trouble | None:
         """See how it does, count and say what has changed, and ask a silent peer anew; called about twice a second.
 
         `stuck`: its reading stays while the aircraft does not, as who sees the other sensors too has found.

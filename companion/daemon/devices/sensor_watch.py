@@ -58,7 +58,7 @@ class MotionWitness:
     def __init__(self) -> None:
         self._seconds: dict[str, deque[tuple[int, Array, float]]] = {}
 
-    def look(self, latest: Mapping[str, Batch], corrected: Callable[[str], Corrected | None]) -> None:
+    def update(self, latest: Mapping[str, Batch], corrected: Callable[[str], Corrected | None]) -> None:
         """Take note of the last whole second of each IMU.
 
         Args:
@@ -142,7 +142,7 @@ class SensorWatch:
         loop = asyncio.get_running_loop()
         while True:
             try:
-                self.look(loop.time())
+                self.update(loop.time())
             except Exception:
                 # What merely watches must not end what is watched, nor fill the log.
                 if not self._has_failed:
@@ -150,11 +150,11 @@ class SensorWatch:
                 self._has_failed = True
             await asyncio.sleep(PERIOD_S)
 
-    def look(self, now_s: float) -> None:
+    def update(self, now_s: float) -> None:
         """One look at all of them."""
-        self._witness.look(self._collector.imu_seconds(), self._corrected)
+        self._witness.update(self._collector.imu_seconds(), self._corrected)
         for sensor in self._sensors:
-            found = sensor.health.look(now_s, None if "imu" in sensor.kinds else self._stuck(sensor))
+            found = sensor.health.update(now_s, None if "imu" in sensor.kinds else self._stuck(sensor))
             if found is not None and found.implausible:
                 self._collector.reset(f"{sensor.name}: {found.words}", sensor.name if sensor.kinds == {"imu"} else None)
 

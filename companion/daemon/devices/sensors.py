@@ -75,7 +75,7 @@ class SensorRole:
     def status(self) -> dict[str, object]:
         """For `companion status` and `check`."""
         sensor = self._sensor
-        problem, words = self.problem, sensor.words
+        problem, words = self.problem, sensor.text
         summary = problem or f"{sensor.protocol} on {sensor.link.settings.url}, {self._rate_hz:.0f} frames/s"
         if problem is None and sensor.health.counts:
             summary += f"; so far {', '.join(f'{count} {key}' for key, count in sensor.health.counts.items())}"
@@ -160,7 +160,7 @@ class SerialSensor:
 
     def _on_state(self, connected: bool, reason: str) -> None:  # noqa: FBT001 - ByteLink's signature
         del reason
-        self._together.take()
+        self._together.drain()
         if connected:
             now_s = asyncio.get_running_loop().time()
             self._interrupted(now_s)
@@ -172,7 +172,7 @@ class SerialSensor:
 
     def _on_gap(self) -> None:
         """Bytes are missing from here on."""
-        self._together.take()
+        self._together.drain()
         self._interrupted(asyncio.get_running_loop().time())
 
     def _interrupted(self, now_s: float) -> None:
@@ -184,7 +184,7 @@ class SerialSensor:
         if self.link.collecting:
             self.receive(data, t_s)
         elif self._is_lively(t_s):
-            self._together.take()
+            self._together.drain()
             self.receive(data, t_s)
         else:
             self._together.put(self.receive, data, t_s)
@@ -235,7 +235,7 @@ class SerialSensor:
         self._alone = not self._held_by
         self._look_at_s = asyncio.get_running_loop().time() + (LOOK_AGAIN_S if self._alone else HELD_AGAIN_S)
         if self._held_by:
-            self._tell(self.words)
+            self._tell(self.text)
 
     def _speak(self, t_s: float) -> None:
         if self.dialogue is None or not self._alone or not self.link.connected or t_s - self._spoke_s < TICK_S:
@@ -244,7 +244,7 @@ class SerialSensor:
         if data:
             self._spoke_s = t_s
             self.link.write(data)
-            self._tell(self.words)
+            self._tell(self.text)
 
     def _tell(self, words: str) -> None:
         """In the log, once: a device that is not there is asked again for the whole day."""
@@ -253,7 +253,7 @@ class SerialSensor:
             logger.info("%s: %s", self.link.name, words)
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """What was last said to the device, or why nothing is; empty where there was no occasion."""
         if self._held_by:
             return f"nothing is said to it: {self._held_by} has the port open too"

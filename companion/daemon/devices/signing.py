@@ -105,7 +105,7 @@ class _SignatureWatch:
         """What does not fit, and what to do; None while all does, or nobody is heard."""
         return None if self._kind is None else _WORDS[self._kind][0]
 
-    def look(self, now_s: float) -> None:
+    def update(self, now_s: float) -> None:
         """See how it is now, and say what has changed."""
         found = self._unheard(now_s) if self._signing is None else self._unbelieved(self._signing, now_s)
         if found == self._kind:
@@ -189,7 +189,7 @@ class LinkSigning:
     def load(self) -> None:
         """Read time and key, before anything is sent; a key that cannot be read is tried again in `run`."""
         if self.signing is not None:
-            self.signing.clock.heard(_go_on_from(self._kept.take(), uptime_s(), this_boot()))
+            self.signing.clock.heard(_go_on_from(self._kept.load(), uptime_s(), this_boot()))
             self._take_key(self.signing)
 
     async def run(self) -> None:
@@ -198,7 +198,7 @@ class LinkSigning:
         if signing is None:
             while True:
                 await asyncio.sleep(LOOK_S)
-                self._watch.look(asyncio.get_running_loop().time())
+                self._watch.update(asyncio.get_running_loop().time())
         while signing.key is None:
             await asyncio.sleep(KEY_AGAIN_S)
             self._take_key(signing)
@@ -207,7 +207,7 @@ class LinkSigning:
                 if signing.clock.now() > self._reserved - int(RESERVE_BEFORE_S * TICKS_PER_S):
                     await self._keep(signing, AHEAD_S)
                 self._tell(signing)
-                self._watch.look(asyncio.get_running_loop().time())
+                self._watch.update(asyncio.get_running_loop().time())
                 await asyncio.sleep(LOOK_S)
         finally:
             # An orderly end reserves nothing: the next start goes on from here.

@@ -69,7 +69,7 @@ class Devices(Subsystem):
         return {
             "devices": [device.status() | counts.get(device.name, {}) for device in found],
             "profiles": models.profiles(self._core.config),
-            "ground_stations": dict(zip(("good", "summary"), self.reach.words(), strict=True)),
+            "ground_stations": dict(zip(("good", "summary"), self.reach.text(), strict=True)),
         }
 
     def tasks(self, *, ports: bool = True) -> Sequence[Task]:

@@ -82,7 +82,7 @@ class Faces(Subsystem):
             from companion.web.server import Page
 
             bind, folder = core.config.web.bind, core.config.storage.path
-            self.page = Page(bind, folder, self.answer, self.look, core.offload)
+            self.page = Page(bind, folder, self.answer, self.refresh, core.offload)
 
     async def answer(self, request: Object, face: str = "companion") -> AsyncIterator[Object]:
         """Answer one request of the control socket, or of another face that speaks its words.
@@ -99,16 +99,16 @@ class Faces(Subsystem):
             yield reply
 
     async def _status(self, _request: Object, _face: str) -> AsyncIterator[Object]:
-        yield {"kind": "result", "status": await self.look()}
+        yield {"kind": "result", "status": await self.refresh()}
 
     async def _monitor(self, _request: Object, _face: str) -> AsyncIterator[Object]:
         while True:
-            yield {"kind": "progress", "status": await self.look()}
+            yield {"kind": "progress", "status": await self.refresh()}
             await asyncio.sleep(MONITOR_EVERY_S)
 
-    async def look(self) -> Object:
+    async def refresh(self) -> Object:
         """`all_status`, with the declination of the place looked up when it is time to."""
-        await self._pose.look()
+        await self._pose.refresh()
         return self.all_status()
 
     def all_status(self) -> Object:

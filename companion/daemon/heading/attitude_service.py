@@ -152,13 +152,13 @@ class AttitudeService:
         found = [sample for sample in samples if isinstance(sample, ImuSample)]
         if not found:
             return
-        self.carrier.take(found)
+        self.carrier.add(found)
         self._push(read_s)
 
     def _on_autopilot_samples(self, samples: Sequence[Sample], read_s: float) -> None:
         step = self.carrier.gyro_step_rad_s
         found = [sample for sample in samples if isinstance(sample, ImuSample)]
-        self.carrier.take([without_truncation(sample, step) for sample in found] if step else found)
+        self.carrier.add([without_truncation(sample, step) for sample in found] if step else found)
         self._push(read_s)
 
     def _push(self, read_s: float) -> None:
@@ -229,7 +229,7 @@ class AttitudeService:
         self.health.judge(now_s)
         if now_s - self._looked_s >= LOOK_S:
             self._looked_s = now_s
-            await self.carrier.look(now_s)
+            await self.carrier.update(now_s)
         self.sender.count(now_s)
         self._tell(now_s)
 

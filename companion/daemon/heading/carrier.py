@@ -184,7 +184,7 @@ class Carrier:
 
     # --- what comes in, in the turn of the loop in which it was read
 
-    def take(self, samples: Sequence[ImuSample]) -> None:
+    def add(self, samples: Sequence[ImuSample]) -> None:
         """Take the samples of one read."""
         self.heard_s = samples[-1].t_s
         if self.phase == "ground":
@@ -245,7 +245,7 @@ class Carrier:
 
     # --- what is looked at now and then
 
-    async def look(self, now_s: float) -> None:
+    async def update(self, now_s: float) -> None:
         """Follow arming, calibrations and stillness; align when it is time to."""
         disarmed = self._vehicle.arm_state is ArmState.DISARMED
         # While nobody knows, what flight demands is right on the ground too; not so the other way round.

@@ -43,7 +43,7 @@ class Heading(Subsystem):
 
             self.attitude = AttitudeService(core, devices, arming.in_force, calibrating.alignment)
         self.pose = PoseNow(core, calibrating.alignment, None if self.attitude is None else self.attitude.pose)
-        devices.on_pose.add(self.pose.take)
+        devices.on_pose.add(self.pose.add)
 
     def commands(self) -> Mapping[str, Handler]:  # noqa: D102 - as in the base class
         return {"autopilot-setup": self._answer_setup}
@@ -108,14 +108,14 @@ class PoseNow:
         self._declination_deg: float | None = None
         self._looked_up_s = -math.inf
 
-    def take(self, sample: Sample) -> None:
+    def add(self, sample: Sample) -> None:
         """Take a reading of gradienter or compass."""
         if isinstance(sample, TiltSample):
             self._tilt = sample
         elif isinstance(sample, CompassSample):
             self._heading = sample
 
-    async def look(self) -> Object | None:
+    async def refresh(self) -> Object | None:
         """As `now`, with the declination of the place looked up when it is time to."""
         if self._compass is not None and self._compass.magnetic:
             await self._look_up(asyncio.get_running_loop().time())

@@ -61,7 +61,7 @@ class EffectWatch:
         self._profiles = {imu.name: imu.profile for imu in core.config.imu}
         self._look_s = min(LOOK_S, core.config.calibration.min_still_s)
 
-    async def look(
+    async def judge(
         self, plan: Plan, before: Window, go_on: Callable[[str], None], boots: int
     ) -> tuple[Verdicts | None, str]:
         """Verdicts by IMU, or why there were none to be had; a step that only just cannot be seen is looked at longer.

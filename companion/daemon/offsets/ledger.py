@@ -60,8 +60,8 @@ class Ledger:
         except StorageError as error:
             self.fault = f"{error}; nothing can be kept, so nothing is written; mend it and restart the companion"
         journal, undos = self._log.journal, self._log.undos()
-        self._open = journal.take()
-        kept = [file.take() for file in undos]
+        self._open = journal.load()
+        kept = [file.load() for file in undos]
         self.undoable = {each.system_id: each for each in kept if each is not None}
         self.unusable += tuple(file.unusable for file in (journal, *undos) if file.unusable is not None)
         self.lost_write |= journal.unusable is not None

@@ -145,7 +145,7 @@ class Pusher:
 
     async def _problems(self, plan: Plan, before: Window, draft: Draft, go_on: Callable[[str], None]) -> list[str]:
         """Why what was written must not stay."""
-        verdicts, why_not = await self._effect.look(plan, before, go_on, plan.boots)
+        verdicts, why_not = await self._effect.judge(plan, before, go_on, plan.boots)
         # What somebody has changed meanwhile explains what the telemetry shows, so it comes first.
         problems = await self._no_longer_in_force(plan)
         if verdicts is None and self._vehicle.boots != plan.boots:
@@ -348,7 +348,7 @@ class Conclusion:
                 for name, now in changed.items()
             )
             raise AutopilotError("; ".join(after))
-        verdicts, unseen = await self._effect.look(plan, before, go_on, self._vehicle.boots)
+        verdicts, unseen = await self._effect.judge(plan, before, go_on, self._vehicle.boots)
         found = (verdicts or {}).items()
         problems = [f"imu {name}: {in_short(verdict)}" for name, each in found for verdict in each if not verdict.ok]
         if problems:

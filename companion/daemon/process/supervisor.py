@@ -64,7 +64,7 @@ class Beats:
         self._last = {each.name: (each.who.turns, 0.0) for each in watched}
         """By name: turns when somebody looked last, and how long it has been the same turn."""
 
-    def look(self, since_last_look_s: float) -> dict[str, float]:
+    def update(self, since_last_look_s: float) -> dict[str, float]:
         """Let time pass; the tasks that are overdue, and for how many seconds they have not gone on."""
         for each in self._watched:
             turns, (before, age_s) = each.who.turns, self._last[each.name]
@@ -122,7 +122,7 @@ class Supervisor:
         before_s = loop.time()
         while True:
             # While the loop stood still nobody could report.
-            overdue = self.beats.look(min(loop.time() - before_s, 2.0 * period_s))
+            overdue = self.beats.update(min(loop.time() - before_s, 2.0 * period_s))
             before_s = loop.time()
             if self.stopping:
                 overdue = {}

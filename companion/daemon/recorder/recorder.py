@@ -67,7 +67,7 @@ class Surroundings:
         """What the autopilot takes off each of its IMUs; None where that is not known."""
         return {name: imu.calibration for name, imu in self._imus.items()}
 
-    def look(self, now_s: float) -> None:
+    def update(self, now_s: float) -> None:
         """Note what has changed."""
         offsets = self.read_offsets()
         if any(offsets[name] is not before for name, before in self._seen.items()):
@@ -201,12 +201,12 @@ class Recorder(Subsystem):
             self._begin()
         await asyncio.sleep(FLUSH_S)
         if self._journal.is_on:
-            self._around.look(asyncio.get_running_loop().time())
+            self._around.update(asyncio.get_running_loop().time())
         await self._flush()
 
     def _begin(self) -> None:
         now_s = asyncio.get_running_loop().time()
-        self._around.look(now_s)
+        self._around.update(now_s)
         self._journal.begin(now_s)
         self._taken_s = now_s
 
@@ -223,7 +223,7 @@ class Recorder(Subsystem):
                 self._taken_s, time.time() - (loop.time() - self._taken_s), versions(), self._config_json, self._past
             )
             self._taken_s = loop.time()
-            entries, part_ends, self._part_ends = journal.take(), self._part_ends, False
+            entries, part_ends, self._part_ends = journal.drain(), self._part_ends, False
             messages = await self._in_thread(self._past.messages, entries)
             await self._flush_ring(messages, beginning, part_ends=part_ends)
             if self._on_request is not None:

@@ -160,7 +160,7 @@ class MavlinkLink:
 
         A `transmit` that returns False has dropped the bytes because its buffer is full.
         """
-        self.together.take()  # what came over the transport before this one
+        self.together.drain()  # what came over the transport before this one
         self._transmit = transmit
         self._attached += 1
         self._forget_received()
@@ -197,7 +197,7 @@ class MavlinkLink:
             together.put(take, datagram, t_s)
             return
         if not (together.driven and _holds_only(datagram, AHEAD)):
-            together.take()
+            together.drain()
         take(datagram, t_s)
 
     def receive(self, data: bytes, t_s: float) -> None:

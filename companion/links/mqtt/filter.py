@@ -162,7 +162,7 @@ class MqttFilter:
             while True:
                 kind, body = await self._packet(reader)
                 cost, now_s, before_s = len(body) + PACKET_COST_BYTES, loop.time(), budget.exceeded_s
-                if not budget.take(cost, now_s):
+                if not budget.spend(cost, now_s):
                     if before_s is None or now_s - before_s > QUIET_S:
                         flood_since_s = now_s
                     elif now_s - flood_since_s > FLOOD_S:

@@ -283,7 +283,7 @@ class ByteLink:
             return False
         self.bytes_received += len(data)
         self.last_byte_s = now_s
-        if self.budget is not None and not self.budget.take(len(data), now_s):
+        if self.budget is not None and not self.budget.spend(len(data), now_s):
             self._pause()
         self._on_bytes(data, now_s)
         return True

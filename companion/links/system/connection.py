@@ -201,7 +201,7 @@ class Budget:
         gained = max(now_s - self._t_s, 0.0) * self._bytes_per_s
         return min(self._left + gained, self._burst_bytes)
 
-    def take(self, count: int, now_s: float) -> bool:
+    def spend(self, count: int, now_s: float) -> bool:
         """Take so many; False when there were not so many, which leaves a bucket that is empty and no more."""
         self._left, self._t_s = self.left(now_s) - count, now_s
         if self._left >= 0.0:

@@ -53,21 +53,21 @@ class Together:
         """The caller drives no longer."""
         self._drivers -= 1
         if self._drivers == 0:
-            self.take()
+            self.drain()
 
     def put(self, take: Take, data: bytes, t_s: float) -> None:
         """Let bytes that came at `t_s` wait for the next `take`; where nothing drives they are taken now."""
         self._waiting.append((take, data, t_s))
         if self._drivers == 0 or len(self._waiting) >= MOST_WAITING:
-            self.take()
+            self.drain()
 
     def turn(self, now_s: float) -> None:
         """A driver is about to read: take what waits when it is time to."""
         self._turns += 1
         if self._turns >= TURNS or now_s % 1.0 < SECOND_S:
-            self.take()
+            self.drain()
 
-    def take(self) -> None:
+    def drain(self) -> None:
         """Take all that waits, in its order."""
         if self._taking:
             return  # by what was taken; the rest is about to be

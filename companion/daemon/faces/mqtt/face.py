@@ -192,13 +192,13 @@ class MqttFace:
         running = asyncio.get_running_loop().create_task(link.run(), name="mqtt link")
         try:
             while self._base() == base:
-                await self._try_to_look(link, topics)
+                await self._try_to_publish(link, topics)
                 await asyncio.sleep(LOOK_S)
             logger.info("mqtt: the vehicle is %s, no longer %s", self._base(), base)
         finally:
             await self._requests.close(ANSWER_AT_END_S)
             if self._base() == base:
-                await self._try_to_look(link, topics)
+                await self._try_to_publish(link, topics)
                 link.outbox.keep(topics.status, OFFLINE)
             else:
                 for topic in topics.kept:
@@ -210,16 +210,16 @@ class MqttFace:
                 running.cancel()
                 await asyncio.wait([running], timeout=LOOK_S)
 
-    async def _try_to_look(self, link: MqttLink, topics: Topics) -> None:
+    async def _try_to_publish(self, link: MqttLink, topics: Topics) -> None:
         try:
-            await self._look(link, topics)
+            await self._publish_changes(link, topics)
             self._faulty = False
         except Exception:
             # A fault here must not cost the calibration; said once, not five times a second.
             logger.log(logging.DEBUG if self._faulty else logging.ERROR, "the state for MQTT", exc_info=True)
             self._faulty = True
 
-    async def _look(self, link: MqttLink, topics: Topics) -> None:
+    async def _publish_changes(self, link: MqttLink, topics: Topics) -> None:
         """Put what has changed into the outbox."""
         now_s = asyncio.get_running_loop().time()
         state = self._conductor.state.shown
@@ -232,7 +232,7 @@ class MqttFace:
         if progress != self._progress and (now_s - self._progress_s >= PROGRESS_S or not self._is_busy):
             link.outbox.pass_on(topics.progress, progress)
             self._progress, self._progress_s = progress, now_s
-        pose = await self._pose.look()
+        pose = await self._pose.refresh()
         if pose is not None:
             link.outbox.pass_on(topics.attitude, _json(pose))
 
@@ -276,7 +276,7 @@ class MqttFace:
             return
         command = self.topics.command_in(message.topic)
         if command is not None:
-            self._requests.take(command, message.payload, retained=message.retained)
+            self._requests.accept(command, message.payload, retained=message.retained)
 
     def _on_retained(self, command: str) -> None:
         if self.topics is not None:

@@ -154,7 +154,7 @@ class Requests:
         self._known: OrderedDict[tuple[str, Transaction], _Known] = OrderedDict()
         self._retained: set[str] = set()
 
-    def take(self, command: str, payload: bytes, *, retained: bool) -> None:
+    def accept(self, command: str, payload: bytes, *, retained: bool) -> None:
         """Take one request; its answer comes later."""
         if _COMMAND.fullmatch(command) is None:
             logger.debug("mqtt: a request %.60r is ignored", command)
