@@ -704,7 +704,7 @@ def test_a_fault_of_the_recorder_s_own_does_not_take_the_daemon_along(
         async with Rig(tmp_path, recordings_mb=16).running() as rig:
             running = asyncio.create_task(asked(rig, file=str(tmp_path / "mine.mcap")))
             await asyncio.sleep(2.0)
-            monkeypatch.setattr(rig.service.recorder._around, "look", lambda journal: 1 / 0)
+            monkeypatch.setattr(rig.service.recorder._around, "update", lambda journal: 1 / 0)
             await rig.ready()
             result, _ = await calibrated(rig)
             assert result.outcome == "done"
