@@ -15,7 +15,7 @@ unexport PYTHONDONTWRITEBYTECODE
 help:
 	@echo 'make demo    watch a virtual aircraft being calibrated (about a minute)'
 	@echo 'make quick   unit and property tests without real clock and processes (about a minute on two cores)'
-	@echo 'make test    all tests (about 7 minutes on two cores); DURATIONS=1 notes how long each takes'
+	@echo 'make test    all tests (seven to eight minutes on two cores); DURATIONS=1 notes how long each takes'
 	@echo 'make long    the whole of what make test plays a slice of, with new dice (half an hour and more)'
 	@echo 'make check   formatting, lint, types, import directions'
 	@echo 'make format  put the code into the one format'
