@@ -40,6 +40,8 @@ MAV_RESULT_CANCELLED = 6
 """In MAVLink's common messages; ArduPilot's dialect lacks the name."""
 ACK_PERIOD_S = 0.4
 """QGroundControl gives up 1.2 s after the last IN_PROGRESS, so that two may be lost in a row."""
+NOTHING_RAN: Final = 1
+"""`result_param2` of a cancel's ACK when there was nothing to cancel."""
 REMEMBER_FINAL_S = 3.0
 SAME_PACKET_S = 0.5
 _REMEMBERED = 32
@@ -103,6 +105,7 @@ class _Running(NamedTuple):
 
 class _Final(NamedTuple):
     result: int
+    detail: int
     at_s: float
     sent: bool
 
@@ -181,7 +184,7 @@ class CommandServer:
         final = self._finals.get(command.key)
         if command.confirmation > 0 and final is not None and now_s - final.at_s <= REMEMBER_FINAL_S:
             # Remembered anew: this copy of the ACK may be lost as well.
-            self._finally(command.key, final.result, now_s)
+            self._finally(command.key, final.result, now_s, final.detail)
             return
         self._obey(command.key, request, now_s)
 
@@ -256,7 +259,7 @@ class CommandServer:
             return
         if not was_running:
             self._say(Severity.INFO, "Nothing to cancel", Weight.NEWS)
-        self._finally(key, mavlink.MAV_RESULT_ACCEPTED, now_s)
+        self._finally(key, mavlink.MAV_RESULT_ACCEPTED, now_s, 0 if was_running else NOTHING_RAN)
 
     def _finish(self, running: _Running, now_s: float) -> None:
         """Acknowledge the end. Its words are the service's: it knows the ends of jobs that others asked for too."""
@@ -269,9 +272,9 @@ class CommandServer:
         self._say(severity, reason, Weight.REFUSAL)
         self._finally(key, result, now_s)
 
-    def _finally(self, key: requests.Key, result: int, now_s: float) -> None:
-        sent = self._acknowledge(key, result)
-        self._finals[key] = _Final(result, now_s, sent)
+    def _finally(self, key: requests.Key, result: int, now_s: float, detail: int = 0) -> None:
+        sent = self._acknowledge(key, result, detail=detail)
+        self._finals[key] = _Final(result, detail, now_s, sent)
         self._finals.move_to_end(key)
         if len(self._finals) > _REMEMBERED:
             self._finals.popitem(last=False)
@@ -283,7 +286,7 @@ class CommandServer:
         retry_s = math.inf
         for key, final in self._finals.items():
             if not final.sent and now_s - final.at_s <= REMEMBER_FINAL_S:
-                sent = self._link.connected and self._acknowledge(key, final.result)
+                sent = self._link.connected and self._acknowledge(key, final.result, detail=final.detail)
                 self._finals[key] = final._replace(sent=sent)
                 retry_s = retry_s if sent else now_s + _RETRY_S
         return retry_s
@@ -292,9 +295,9 @@ class CommandServer:
         progress = min(max(int(running.job.progress_percent), 0), 100)
         self._acknowledge(running.key, mavlink.MAV_RESULT_IN_PROGRESS, progress)
 
-    def _acknowledge(self, key: requests.Key, result: int, progress: int = 0) -> bool:
+    def _acknowledge(self, key: requests.Key, result: int, progress: int = 0, detail: int = 0) -> bool:
         return self._link.send(
-            mavlink.MAVLink_command_ack_message(key.command, result, progress, 0, key.system_id, key.component_id)
+            mavlink.MAVLink_command_ack_message(key.command, result, progress, detail, key.system_id, key.component_id)
         )
 
 

@@ -40,6 +40,8 @@ class Answer(NamedTuple):
     """MAV_RESULT_*; None: no final answer came."""
     begun: bool
     """Whether the companion has answered at all."""
+    detail: int = 0
+    """What the final answer says beside its result (`result_param2`)."""
 
 
 class Exchange:
@@ -67,6 +69,7 @@ class Exchange:
         self._busy, self._on_progress = busy, on_progress
         self._parameters = (*parameters, *(0.0,) * (7 - len(parameters)))
         self._result: int | None = None
+        self._detail = 0
         self._answered = asyncio.Event()
         self._heard_s = 0.0
         self._confirmation = 0
@@ -80,7 +83,7 @@ class Exchange:
                 return Answer(None, begun=False)
             while self._result is None and await self._follow():
                 pass
-            return Answer(self._result, begun=True)
+            return Answer(self._result, begun=True, detail=self._detail)
         finally:
             stop_watching()
 
@@ -125,7 +128,7 @@ class Exchange:
             return
         self._heard_s = asyncio.get_running_loop().time()
         if ack.result != mavlink.MAV_RESULT_IN_PROGRESS:
-            self._result = ack.result
+            self._result, self._detail = ack.result, ack.detail
         elif ack.progress <= 100:
             self.percent = max(self.percent, ack.progress)
         self._answered.set()

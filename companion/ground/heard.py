@@ -54,6 +54,8 @@ class Ack(NamedTuple):
     command: int
     result: int
     progress: int
+    detail: int
+    """`result_param2`."""
 
 
 class Vehicle(NamedTuple):

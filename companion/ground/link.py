@@ -198,7 +198,7 @@ class GroundLink:
             self.own.component_id,
         ):
             self._ack_handlers.tell(
-                Ack(source, fields.get("command", 0), fields.get("result", 0), fields.get("progress", 0))
+                Ack(source, *(fields.get(name, 0) for name in ("command", "result", "progress", "result_param2")))
             )
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.calibration.request import What
-from companion.component.commands import MAV_RESULT_CANCELLED
+from companion.component.commands import MAV_RESULT_CANCELLED, NOTHING_RAN
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity
 from companion.errors import ConfigError, NobodyHeardError
@@ -157,13 +157,13 @@ class Station:
         """
         loop = asyncio.get_running_loop()
         begun_s = loop.time()
-        was_busy = self._is_busy(begun_s - FRESH_S)
         answer = await self._exchange(CANCEL).run()
         if answer.result != mavlink.MAV_RESULT_ACCEPTED:
             return await self._judge(answer, begun_s)
-        if not was_busy:
+        if answer.detail == NOTHING_RAN:
             return self._ended("idle", "nothing was running", begun_s, good=True)
-        while self._is_busy(begun_s) is not False and loop.time() - begun_s < CANCELLED_WITHIN_S:
+        answered_s = loop.time()
+        while self._is_busy(answered_s) is not False and loop.time() - begun_s < CANCELLED_WITHIN_S:
             await asyncio.sleep(_POLL_S)
         last = await self._last_result()
         reason = f"the companion's last calibration: {last}" if last else "there was no calibration"

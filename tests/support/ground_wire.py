@@ -39,7 +39,7 @@ class StationOnTheWire(Ground):
             self.heard.update(message.get_type(), source, message.to_dict(), t_s)
             if isinstance(message, mavlink.MAVLink_command_ack_message):
                 for handler in [*self.handlers]:
-                    handler(Ack(source, message.command, message.result, message.progress))
+                    handler(Ack(source, message.command, message.result, message.progress, message.result_param2))
 
     def send_command(self, target: Target, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
         self.confirmations.append(confirmation)

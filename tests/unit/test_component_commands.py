@@ -202,7 +202,10 @@ class TestCancel:
             async with bench() as b:
                 b.ground.command(CANCEL, NAN, int_=int_)
                 await asyncio.sleep(2)
-                assert b.ground.acks(CANCEL) == [ACCEPTED]
+                b.ground.command(CANCEL, NAN, int_=int_, confirmation=1)
+                await asyncio.sleep(0.5)
+                acks = b.ground.ack_messages()
+                assert [(ack.result, ack.result_param2) for ack in acks] == [(ACCEPTED, 1)] * 2
 
         run_virtual(main())
 

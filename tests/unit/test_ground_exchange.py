@@ -193,7 +193,7 @@ def test_answers_to_others_and_of_others_are_not_ours() -> None:
                 (COMPANION, UNDO),
             ):
                 for handler in [*station.handlers]:
-                    handler(Ack(source, command, mavlink.MAV_RESULT_DENIED, 0))
+                    handler(Ack(source, command, mavlink.MAV_RESULT_DENIED, 0, 0))
             await asyncio.sleep(0.5)
             assert not asking.done()
             b.service.jobs[0].finish("done")

@@ -198,7 +198,33 @@ def test_a_cancel_that_came_too_late_says_so() -> None:
             b.service.mav_state = mavlink.MAV_STATE_STANDBY
             outcome = await asking
             assert (outcome.state, outcome.reason) == ("cancelled", "the companion's last calibration: done")
-            assert (await station.cancel()).reason == "nothing was running"
+
+    run_virtual(main())
+
+
+def test_a_cancel_right_after_the_start_is_no_cancel_of_nothing() -> None:
+    """Heartbeats come once a second: none has shown yet that the companion is at work."""
+
+    async def main() -> None:
+        wire = StationOnTheWire()
+        async with bench(ground=wire) as b:
+            station = station_on(wire)
+            await station.find(1, 5.0)
+            b.service.cancel = lambda requester: True  # type: ignore[method-assign]
+            assert (await station.cancel()).state == "cancelled"
+
+    run_virtual(main())
+
+
+def test_a_cancel_of_nothing_says_so_while_the_last_heartbeat_still_shows_work() -> None:
+    async def main() -> None:
+        wire = StationOnTheWire()
+        async with bench(ground=wire) as b:
+            b.service.mav_state = mavlink.MAV_STATE_CALIBRATING
+            station = station_on(wire)
+            await station.find(1, 5.0)
+            outcome = await station.cancel()
+            assert (outcome.state, outcome.reason) == ("idle", "nothing was running")
 
     run_virtual(main())
 
