@@ -188,7 +188,7 @@ class Calibrations:
         assert config is not None
         gradienter = aligned(models.gradienter_model(config.gradienter), self._alignment)
         compass = models.compass_model(config.compass)
-        return solve(window, local_earth(self.where), gradienter, compass, what)
+        return solve(window, local_earth(self.where), gradienter, compass, what, config.vehicle.platform)
 
     def _whole(self, found: ImuSolution) -> tuple[Array | None, Array | None]:
         calibration = self._solved_with.get(found.name)

@@ -40,6 +40,7 @@ from companion.calibration.request import What
 from companion.calibration.solution import magnetic
 from companion.calibration.solution.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site
 from companion.calibration.solution.site import LocalEarth, Uncertain
+from companion.config.sections import Platform
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, skew
 from companion.physics.gradienter import up_jacobian
@@ -48,6 +49,8 @@ from companion.samples import Triad
 
 # Without a gradienter the accelerometers level the Earth's rate; a 50 mg bias tilts it by 3 degrees (0.8 deg/h).
 LEVEL_BY_ACCELEROMETER_SIGMA_DEG: Final = 3.0
+
+_ON_DECK: Final = "on a deck gyros need a compass: without one a slow turn looks like a bias"
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -174,12 +177,13 @@ def solve(
     gradienter: GradienterModel | None,
     compass: CompassModel | None,
     what: What,
+    platform: Platform = "ground",
 ) -> Solution:
     """Work out the biases of every IMU of the window.
 
     Raises:
-        CalibrationRefusedError: the readings cannot be right together, or accelerometers were asked for without
-            a gradienter.
+        CalibrationRefusedError: the readings cannot be right together, accelerometers were asked for without
+            a gradienter, or gyros on a deck without a heading.
     """
     warnings = list(local.warnings)
     gradienter = gradienter if window.tilt is not None else None
@@ -197,19 +201,31 @@ def solve(
         )
     truth = truth_of(window, gradienter, compass, local, warnings)
     shared = _shared(truth, local, 0.0 if gradienter is None else gradienter.sigma_deg * DEG)
-    wanted: dict[Triad, bool] = {"gyro": what.gyros, "accel": what.accelerometers and gradienter is not None}
+    # A deck may turn, and a steady turn shows in nothing but the heading.
+    turn_unseen = platform == "deck" and what.gyros and truth.heading_rad is None
+    if turn_unseen:
+        if what is What.GYROS or gradienter is None:
+            raise CalibrationRefusedError(_ON_DECK)
+        warnings.append(f"{_ON_DECK}; not calibrated")
+    wanted: dict[Triad, bool] = {
+        "gyro": what.gyros and not turn_unseen,
+        "accel": what.accelerometers and gradienter is not None,
+    }
     asked = [triad for triad, is_wanted in wanted.items() if is_wanted]
     imus = tuple(_estimate(imu, truth, local, shared, asked) for imu in window.imus)
     if all(imu.gyro_rad_s is None and imu.accel_m_s2 is None for imu in imus):
         refusals = [words for imu in window.imus for words in _hidden(imu, asked)]
         if refusals:
             raise CalibrationRefusedError("; ".join(refusals))
+    unknown = [(imu.name, triad) for triad in asked for imu in window.imus if imu.refused(triad)]
+    if turn_unseen:
+        unknown += [(imu.name, "gyro") for imu in window.imus]
     return Solution(
         pose=_pose(truth),
         site=local.site,
         imus=imus,
         warnings=tuple(warnings),
-        unknown=tuple((imu.name, triad) for triad in asked for imu in window.imus if imu.refused(triad)),
+        unknown=tuple(unknown),
         magnetic=truth.magnetic,
         shared=shared,
         cross=dict.fromkeys(itertools.combinations((imu.name for imu in imus), 2), shared.covariance),

@@ -288,7 +288,10 @@ class InForce:
         try:
             where = models.whereabouts(self._config, self._vehicle)
             poses = self._alignment.model(), models.compass_model(self._config.compass)
-            solution: Solution = await self._offload(lambda: solve(window, local_earth(where), *poses, self.what))
+            platform = self._config.vehicle.platform
+            solution: Solution = await self._offload(
+                lambda: solve(window, local_earth(where), *poses, self.what, platform)
+            )
         except CalibrationRefusedError:
             self._forget()
             return True

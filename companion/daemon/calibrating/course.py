@@ -178,7 +178,8 @@ class Solving:
         config, offload, memory = self._core.config, self._core.offload, self._memory
         where = models.whereabouts(config, self._core.vehicle)
         poses = self._alignment.model(), models.compass_model(config.compass)
-        solution: Solution = await offload(lambda: solve(window, local_earth(where), *poses, job.what))
+        platform = config.vehicle.platform
+        solution: Solution = await offload(lambda: solve(window, local_earth(where), *poses, job.what, platform))
         draft.alignment, draft.solution = self._alignment.used, solution
         draft.measured_s = (measured.start_s, measured.end_s)
         unix_s = draft.started_at.timestamp()
