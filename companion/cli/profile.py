@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
+from companion.cli.replay_log import add_table_options
 from companion.cli.terminal import (
     DONE,
     FAILED,
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from companion.calibration.noise.allan import AllanModel, NoiseProfile
     from companion.calibration.profiling.coverage import Kept
     from companion.calibration.profiling.profile_fit import AxisFinding, Finding, Rests
-    from companion.replay.still_log import StillLog
+    from companion.replay.log import StillLog
 
 LEAST_SHARE: Final = 0.90
 """The least share of minutes within 2 sigma for a profile to be saved."""
@@ -65,7 +66,7 @@ def add_command(add: AddCommand) -> None:
     sub = add("profile", profile, "learn an IMU's noise from recordings of it at rest (docs/profiles.md)")
     sub.add_argument("files", nargs="+", type=Path, metavar="FILE", help="recordings (.mcap) or CSV logs")
     sub.add_argument("--imu", metavar="NAME", help="only this one; of CSV files: what theirs is called (default imu)")
-    sub.add_argument("--columns", metavar="NAMES", help="of CSV files without names, such as t_s,gx_deg_s,... ")
+    add_table_options(sub)
     sub.add_argument(
         "--profile", metavar="PART", help="to compare with, and for what the recordings do not tell (default: as used)"
     )
@@ -76,8 +77,8 @@ def add_command(add: AddCommand) -> None:
 
 async def profile(options: argparse.Namespace) -> int:
     """`companion profile`."""
-    from companion.replay.csv_log import NAME
-    from companion.replay.still_log import read_logs
+    from companion.replay.log import NAME
+    from companion.replay.log_files import read_logs
     from companion.storage.profiles import ProfileStore, check_name
 
     store = None
@@ -85,7 +86,7 @@ async def profile(options: argparse.Namespace) -> int:
         check_name(options.save)
         store = ProfileStore(options.storage or load_config(options).storage.path)
     compared = _compared(options)
-    logs = read_logs(options.files, options.columns, options.imu or NAME)
+    logs = read_logs(options.files, options.columns, options.rate, options.imu or NAME)
     results, refused = [], []
     for imu, own in _by_imu(logs, options.imu).items():
         try:

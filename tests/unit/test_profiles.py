@@ -21,7 +21,7 @@ from companion.recording import journal, topics
 from companion.recording.files import Beginning, RecordingFile, versions
 from companion.recording.journal import Entry
 from companion.recording.past import Past
-from companion.replay.still_log import read_logs
+from companion.replay.log_files import read_logs
 from companion.samples import ImuSample
 from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, check_name
 from companion.storage.state import sealed, unsealed
@@ -299,7 +299,7 @@ def test_a_profile_that_does_not_keep_its_word_is_not_saved(tmp_path: Path, caps
 @pytest.mark.parametrize(
     ("text", "more", "code", "words"),
     [
-        ("t_s,gx\n1,2\n", [], 1, "line 1: no column gx_rad_s"),
+        ("t_s,gx\n1,2\n", [], 1, "line 1: no column for gy, gz, ax, ay, az in t_s, gx"),
         ("", [], 1, "the file is empty"),
         (None, [], 1, "No such file"),
         (None, ["--save", "bmi088"], 1, "that name is the catalogue's"),

@@ -1,0 +1,137 @@
+"""`companion replay` of a log that is not one of ours: what to say of it, and what it gives."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from companion.cli import show
+from companion.cli.terminal import DONE, FAILED, print_json, print_lines, storage_path
+from companion.errors import ConfigError, StorageError
+
+if TYPE_CHECKING:
+    from companion.replay.estimate import Given, Used
+    from companion.replay.log import StillLog
+
+MOST_LINES = 12
+"""Of pieces that were not used, for people; --json has them all."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """What only a log needs."""
+    log = parser.add_argument_group("for a log (docs/recording.md)")
+    add_table_options(log)
+    log.add_argument("--imu", metavar="NAME", help="which one, where there are several")
+    for name, least, most, words in (
+        ("--pitch-deg", -84.0, 84.0, "nose up"),
+        ("--roll-deg", -180.0, 180.0, "right side down"),
+        ("--heading-deg", -360.0, 360.0, "clockwise from true north"),
+        ("--latitude-deg", -90.0, 90.0, "north is positive"),
+        ("--longitude-deg", -180.0, 180.0, "east is positive; for a magnetic heading"),
+        ("--height-m", -500.0, 9000.0, "above mean sea level"),
+    ):
+        log.add_argument(name, type=_number(least, most), metavar="M" if name.endswith("-m") else "DEG", help=words)
+    log.add_argument(
+        "--sigma-deg", type=_number(1e-4, 45.0), default=0.05, metavar="DEG", help="of pitch and roll (default 0.05)"
+    )
+    log.add_argument("--heading-sigma-deg", type=_number(1e-3, 180.0), default=3.0, metavar="DEG", help="default 3")
+    log.add_argument(
+        "--law", choices=("axis", "slope", "euler"), default="axis", help="of columns tilt_x, tilt_y (default axis)"
+    )
+    log.add_argument("--mounting", default="ROTATION_NONE", metavar="ROTATION", help="sensor to vehicle")
+    log.add_argument(
+        "--profile", metavar="PART", help="the sensor's model, such as icm42688p, or a saved profile's name or file"
+    )
+
+
+def add_table_options(parser: argparse._ActionsContainer) -> None:
+    """How a CSV file is to be read."""
+    parser.add_argument(
+        "--columns",
+        metavar="NAMES",
+        help="in place of the file's: t_s,gx_deg_s,gy_deg_s,gz_deg_s,ax_g,ay_g,az_g",
+    )
+    parser.add_argument(
+        "--rate", type=_number(4.0, 10000.0), metavar="HZ", help="of a log without times, or in their place"
+    )
+
+
+def _number(least: float, most: float) -> Callable[[str], float]:
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"found {text!r}; allowed: a number from {least:g} to {most:g}")
+        return value
+
+    return number
+
+
+def replay(options: argparse.Namespace) -> int:
+    """The biases that the estimator finds in it."""
+    from companion.replay.estimate import estimate
+
+    given = _given(options)
+    found = estimate(_log(options), given)
+    if getattr(options, "json", False):
+        print_json({**msgspec.to_builtins(found.record), "log": msgspec.to_builtins(found.used)})
+    else:
+        print_lines(*show.record_lines(msgspec.to_builtins(found.record)), *used_lines(found.used))
+    return DONE if found.record.state == "done" else FAILED
+
+
+def _log(options: argparse.Namespace) -> StillLog:
+    from companion.replay.log_files import read_logs
+
+    logs = read_logs([options.file], options.columns, options.rate)
+    named = [log for log in logs if options.imu in (None, log.imu)]
+    if len(named) == 1:
+        return named[0]
+    names = ", ".join(log.imu for log in logs)
+    if named or options.imu is None:
+        raise ConfigError(f"{options.file}: found IMUs {names}; allowed: one; say which with --imu")
+    raise StorageError(f"no IMU {options.imu!r} in these files; there are: {names}")
+
+
+def _given(options: argparse.Namespace) -> Given:
+    from companion.replay.estimate import Given
+    from companion.rotations import ROTATIONS_DEG
+    from companion.storage.profiles import given_profile
+
+    if options.mounting not in ROTATIONS_DEG:
+        raise ConfigError(f"--mounting: found {options.mounting}; allowed: a MAVLink rotation such as ROTATION_YAW_90")
+    if (options.pitch_deg is None) != (options.roll_deg is None):
+        raise ConfigError("found only one of --pitch-deg and --roll-deg; allowed: both or neither")
+    wanted = options.profile
+    return Given(
+        pitch_deg=options.pitch_deg,
+        roll_deg=options.roll_deg,
+        heading_deg=options.heading_deg,
+        sigma_deg=options.sigma_deg,
+        heading_sigma_deg=options.heading_sigma_deg,
+        latitude_deg=options.latitude_deg,
+        longitude_deg=options.longitude_deg,
+        height_m=options.height_m,
+        law=options.law,
+        mounting=options.mounting,
+        profile=None if wanted is None else given_profile(wanted, lambda: storage_path(options)),
+    )
+
+
+def used_lines(used: Used) -> list[str]:
+    """Which stretch it was, and why not the rest."""
+    lines = []
+    if used.from_s is not None and used.to_s is not None:
+        lines.append(
+            f"used: {used.from_s:.0f} to {used.to_s:.0f} s of {used.seconds:.1f} s; {used.still_s} s of it at rest"
+        )
+    lines += [f"not used: {each.from_s:.0f} to {each.to_s:.0f} s: {each.why}" for each in used.unused[:MOST_LINES]]
+    if len(used.unused) > MOST_LINES:
+        lines.append(f"... and {len(used.unused) - MOST_LINES} more (--json has them all)")
+    lines += [f"left out: {count} lines {why}" for why, count in used.left_out.items()]
+    return [*lines, *(f"note: {note}" for note in used.notes)]
