@@ -350,3 +350,98 @@ def test_which_stretch_was_used_and_why_not_the_rest(
     assert "used: 12 to " in said
     assert "not used: 0 to 7 s: at rest, but another stretch is longer" in said
     assert "not used: 7 to 12 s: gyro imu" in said
+
+
+def with_poses(still: tuple[Floats, ImuModel], columns: dict[str, Sequence[str]]) -> str:
+    """The IMU's columns in SI units, and others that are filled in every tenth line."""
+    names = HEADS["rad_s"].removesuffix(",lamp") + "".join(f",{name}" for name in columns)
+    rows = [
+        [*row, *(values[number % len(values)] if number % 10 == 0 else "" for values in columns.values())]
+        for number, row in enumerate(still[0].tolist())
+    ]
+    return names + "\n" + joined(rows)
+
+
+# The simulated aircraft's pose as a gradienter of the law "axis" shows it: right side down and nose up.
+TILT = {"tilt_x_deg": ["-2.9885", "-2.9885", "-2.9884"], "tilt_y_deg": ["5.0001", "4.9999"]}
+
+
+def field_ut() -> list[float]:
+    """Of the Earth at 40 N 116 E, some 54 uT 59 deg down and 7.5 deg west, in the vehicle's axes by three rotations."""
+    from scipy.spatial.transform import Rotation
+
+    strength, dip, west = 54.4, np.radians(58.9), np.radians(7.5)
+    ned = strength * np.array([np.cos(dip) * np.cos(west), -np.cos(dip) * np.sin(west), np.sin(dip)])
+    body = Rotation.from_euler("ZYX", [POSE.heading_deg, POSE.pitch_deg, POSE.roll_deg], degrees=True)
+    return [float(value) for value in body.inv().apply(ned)]
+
+
+PLACE = ["--latitude-deg", "40", "--longitude-deg", "116", "--height-m", "50"]
+
+
+@pytest.mark.parametrize(
+    ("columns", "more", "sigma_deg"),
+    [
+        ({"heading_deg": ["40.0", "40.1", "39.9"]}, [], 0.2),
+        ({"heading_magnetic_deg": ["47.5", "47.6", "47.4"]}, [], 1.0),
+        ({f"m{axis}_ut": [f"{value:.3f}"] for axis, value in zip("xyz", field_ut(), strict=True)}, [], 1.0),
+        ({f"mag_{axis}": [f"{value * 10:.2f}"] for axis, value in zip("xyz", field_ut(), strict=True)}, [], 1.0),
+    ],
+    ids=["true", "magnetic", "field", "field by size"],
+)
+def test_tilt_and_heading_of_the_log_take_the_place_of_the_options(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    still: tuple[Floats, ImuModel],
+    columns: dict[str, Sequence[str]],
+    more: list[str],
+    sigma_deg: float,
+) -> None:
+    path = written(tmp_path, with_poses(still, {**TILT, **columns}))
+    code, record = replay(capsys, path, *PLACE, *more, "--profile", "bmi088", "--heading-sigma-deg", "0.2")
+    assert (code, record["state"]) == (0, "done"), record["reason"]
+    pose = record["pose"]
+    assert pose["theta_deg"] == pytest.approx(POSE.pitch_deg, abs=0.01)
+    assert pose["gamma_deg"] == pytest.approx(POSE.roll_deg, abs=0.01)
+    assert pose["psi_deg"] == pytest.approx(POSE.heading_deg, abs=sigma_deg)
+    assert_near(record["imus"][0], still[1])
+    # With a tilt that was told, the field alone gives the heading as well.
+    if "mx_ut" in columns:
+        _, told = replay(capsys, path, *PLACE, "--pitch-deg", "5", "--roll-deg", "-3")
+        assert told["pose"]["psi_deg"] == pytest.approx(pose["psi_deg"], abs=0.05)
+        assert "tilt in the log left out: it is given on the command line" in told["log"]["notes"]
+
+
+def test_the_field_is_turned_by_the_mounting(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
+) -> None:
+    """The board's x points to the right, its y backward."""
+    data, model = still
+    turned = np.column_stack([data[:, 0], data[:, 2], -data[:, 1], data[:, 3], data[:, 5], -data[:, 4], data[:, 6]])
+    x, y, z = field_ut()
+    columns = {"mx_ut": [f"{y:.3f}"], "my_ut": [f"{-x:.3f}"], "mz_ut": [f"{z:.3f}"]}
+    path = written(tmp_path, with_poses((turned, model), {**TILT, **columns}))
+    code, record = replay(capsys, path, *PLACE, "--mounting", "ROTATION_YAW_90")
+    assert code == 0
+    assert record["pose"]["psi_deg"] == pytest.approx(POSE.heading_deg, abs=1.0)
+    assert_near(record["imus"][0], model)
+
+
+def test_a_field_without_a_tilt_is_said_to_be_of_no_use(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
+) -> None:
+    columns = {f"m{axis}_ut": [f"{value:.3f}"] for axis, value in zip("xyz", field_ut(), strict=True)}
+    code, record = replay(capsys, written(tmp_path, with_poses(still, columns)), *PLACE)
+    assert code == 0
+    assert record["pose"]["psi_deg"] is None
+    assert record["log"]["notes"] == ["magnetic field left out: without a tilt it tells no heading"]
+
+
+def test_a_tilt_that_moves_is_no_rest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
+) -> None:
+    swinging = [f"{-3.0 + np.sin(number / 50.0):.3f}" for number in range(len(still[0]))]
+    path = written(tmp_path, with_poses(still, {"tilt_x_deg": swinging, "tilt_y_deg": ["5.0"]}))
+    code, record = replay(capsys, path, *PLACE)
+    assert code == 1
+    assert "gradienter" in record["reason"]
