@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -11,10 +12,12 @@ import msgspec
 from companion.cli import show
 from companion.cli.terminal import DONE, FAILED, print_json, print_lines, storage_path
 from companion.errors import ConfigError, StorageError
+from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
     from companion.replay.estimate import Given, Used
     from companion.replay.log import StillLog
+    from companion.replay.windows import Windows
 
 MOST_LINES = 12
 """Of pieces that were not used, for people; --json has them all."""
@@ -44,6 +47,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     log.add_argument("--mounting", default="ROTATION_NONE", metavar="ROTATION", help="sensor to vehicle")
     log.add_argument(
         "--profile", metavar="PART", help="the sensor's model, such as icm42688p, or a saved profile's name or file"
+    )
+
+    log.add_argument(
+        "--windows",
+        type=_number(10.0, 3600.0),
+        metavar="S",
+        help="calibrate in every window of so many seconds, and hold sigma against what comes after",
     )
 
 
@@ -77,7 +87,10 @@ def replay(options: argparse.Namespace) -> int:
     from companion.replay.estimate import estimate
 
     given = _given(options)
-    found = estimate(_log(options), given)
+    log = _log(options)
+    if options.windows is not None:
+        return _windows(options, log, given)
+    found = estimate(log, given)
     if getattr(options, "json", False):
         print_json({**msgspec.to_builtins(found.record), "log": msgspec.to_builtins(found.used)})
     else:
@@ -121,6 +134,38 @@ def _given(options: argparse.Namespace) -> Given:
         mounting=options.mounting,
         profile=None if wanted is None else given_profile(wanted, lambda: storage_path(options)),
     )
+
+
+def _windows(options: argparse.Namespace, log: StillLog, given: Given) -> int:
+    from companion.replay.windows import windows
+
+    found = windows(log, given, options.windows)
+    reason = "" if found.axes else "no two windows in a row that can be calibrated"
+    state = "done" if found.axes else "failed"
+    if getattr(options, "json", False):
+        said = {"left_out": log.left_out, "notes": log.notes}
+        print_json({"state": state, "reason": reason, "windows": msgspec.to_builtins(found), "log": said})
+    else:
+        print_lines(*window_lines(found), *(f"note: {note}" for note in log.notes))
+    if reason:
+        print_lines(f"companion: {reason}", error=True)
+    return DONE if found.axes else FAILED
+
+
+def window_lines(found: Windows) -> list[str]:
+    """How often sigma kept its word, axis by axis."""
+    lines = [f"windows of {found.length_s:g} s: {found.count}, calibrated: {found.done}"]
+    lines += [f"not calibrated: {each.count}: {each.why}" for each in found.refused[:MOST_LINES]]
+    for next_s, axes in itertools.groupby(found.axes, key=lambda each: each.next_s):
+        rows = list(axes)
+        lines.append(f"against the next {next_s:g} s, {rows[0].pairs} pairs:")
+        lines.append(f"{'':16} {'sigma_use':>10} {'rms error':>10} {'over sigma':>10} {'2 sigma':>8}")
+        for each in rows:
+            unit, name = (DEG_H, "deg/h") if each.axis.startswith("gyro") else (MG, "mg")
+            digits = 1 if name == "deg/h" else 3
+            figures = f"{each.sigma_use / unit:>10.{digits}f} {each.rms / unit:>10.{digits}f} {each.ratio:>10.2f}"
+            lines.append(f"{f'{each.axis}, {name}':16} {figures} {each.share:>8.1%}")
+    return lines
 
 
 def used_lines(used: Used) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -352,7 +352,7 @@ def test_which_stretch_was_used_and_why_not_the_rest(
     assert "not used: 7 to 12 s: gyro imu" in said
 
 
-def with_poses(still: tuple[Floats, ImuModel], columns: dict[str, Sequence[str]]) -> str:
+def with_poses(still: tuple[Floats, ImuModel], columns: Mapping[str, Sequence[str]]) -> str:
     """The IMU's columns in SI units, and others that are filled in every tenth line."""
     names = HEADS["rad_s"].removesuffix(",lamp") + "".join(f",{name}" for name in columns)
     rows = [
@@ -393,7 +393,7 @@ def test_tilt_and_heading_of_the_log_take_the_place_of_the_options(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     still: tuple[Floats, ImuModel],
-    columns: dict[str, Sequence[str]],
+    columns: Mapping[str, Sequence[str]],
     more: list[str],
     sigma_deg: float,
 ) -> None:
