@@ -25,6 +25,7 @@ from companion.calibration.noise.allan import FLOOR_OF_FLICKER, AllanModel, Nois
 from companion.calibration.noise.allan_fit import AxisFit, Curve, curve, fit_axis
 from companion.calibration.seconds.batch import Batch, summary
 from companion.calibration.stillness.gates import ImuGate
+from companion.calibration.stillness.own_noise import OwnNoise
 from companion.calibration.stillness.stretch import Stretch
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Floats
@@ -82,7 +83,10 @@ def rests(t_s: Floats, readings: Floats, temperature_degc: Floats | None, name: 
         profile: noise that the gate allows for before it has learned.
     """
     batches = seconds_of(t_s, readings, temperature_degc)
-    gate, stretch = ImuGate(name, profile), Stretch(_MIN_GOOD, max(len(batches), 1))
+    own = OwnNoise()
+    for batch in batches:
+        own.add(batch)
+    gate, stretch = ImuGate(name, profile, own=own), Stretch(_MIN_GOOD, max(len(batches), 1))
     stretches: list[Rest] = []
     kept: list[Batch] = []
     obstacles: Counter[str] = Counter()

@@ -23,6 +23,7 @@ MAX_LEVELS: Final = 1024
 
 _EVEN: Final = 1.4999
 """Steps of a counter that are all within so much of each other are one step each, whatever the usual one is."""
+_LEAST_OF_A_PART: Final = 4
 _PINNED_SIGMAS: Final = 4.0
 _PINNED_SAMPLES: Final = 5
 _PINNED_DISTINCT: Final = 8
@@ -59,6 +60,8 @@ class Batch(msgspec.Struct, frozen=True):
     temperature_degc: float | None
     counts: Counts | None = None
     """Of a stream of integers; None for floats, and for a second that spans more than `MAX_LEVELS`."""
+    allan: Floats | None = None
+    """(k, c) Allan variances at averaging times of 1/2, 1/4, 1/8 ... of the second, down to some four samples."""
 
 
 def summary(
@@ -94,7 +97,24 @@ def summary(
         missing=None if stamps is None else missing_of(stamps),
         temperature_degc=temperature_degc,
         counts=None if steps is None else counts_of(rows, steps),
+        allan=_allan_within(off),
     )
+
+
+def _allan_within(off: Floats) -> Floats:
+    """Allan variances of (n, c) rows of one second, in halves, quarters and so on, of which each holds four or more."""
+    n = len(off)
+    depth = max(int(math.log2(n / _LEAST_OF_A_PART)), 0)
+    found = np.empty((depth, off.shape[1]))
+    if depth == 0:
+        return found
+    edges = np.arange((1 << depth) + 1) * n >> depth
+    means = np.add.reduceat(off, edges[:-1], axis=0) / (edges[1:] - edges[:-1])[:, None]
+    for rung in range(depth - 1, -1, -1):
+        step = means[1:] - means[:-1]
+        found[rung] = np.add.reduce(step * step, axis=0) / (2 * len(step))
+        means = (means[::2] + means[1::2]) / 2.0
+    return found
 
 
 def counts_of(rows: Floats, steps: Floats) -> Counts | None:

@@ -27,6 +27,8 @@ import numpy as np
 
 from companion.calibration.noise.allan import NoiseProfile
 from companion.calibration.seconds.batch import Batch
+from companion.calibration.stillness.coarse import Steps
+from companion.calibration.stillness.own_noise import OwnNoise
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, MG
 
@@ -154,10 +156,17 @@ def _lower_quartile(freedom: int) -> float:
 class ImuGate:
     """The gate of one IMU: six channels, gyro in rad/s, then accelerometer in m/s^2, in any fixed axes."""
 
-    def __init__(self, name: str, profile: NoiseProfile, steps: tuple[float, float] = (0.0, 0.0)) -> None:
+    def __init__(
+        self,
+        name: str,
+        profile: NoiseProfile,
+        steps: tuple[float, float] = (0.0, 0.0),
+        own: OwnNoise | None = None,
+    ) -> None:
         self._name = name
+        self._own = own or OwnNoise()
         self._white = np.repeat([profile.gyro.white, profile.accel.white], 3)
-        self._steps = np.repeat(np.asarray(steps, dtype=np.float64), 3)
+        self._steps = Steps([steps[0]] * 3 + [steps[1]] * 3)
         self._learned: deque[Floats] = deque(maxlen=_LEARN_FROM)
         self._noise: Floats | None = None
         self._rest: Floats | None = None
@@ -173,6 +182,7 @@ class ImuGate:
         """The readings are not comparable with earlier ones: an offset was written, the owner restarted."""
         self._rest = None
         self._off_level = 0
+        self._own.clear()
         self.new_stretch()
 
     def accept(self, batch: Batch, *, settled: bool) -> None:
@@ -186,7 +196,11 @@ class ImuGate:
 
     def judge(self, batch: Batch) -> Verdict:
         """Whether this second was still for this IMU; learns its noise on the way."""
-        return self._broken(batch) or self._moving(batch) or self._displaced(batch) or STILL
+        if (broken := self._broken(batch)) is not None:
+            return broken
+        self._steps.add(batch)
+        self._own.add(batch)
+        return self._moving(batch) or self._displaced(batch) or STILL
 
     def _broken(self, batch: Batch) -> Verdict | None:
         name = self._name
@@ -198,10 +212,10 @@ class ImuGate:
             return _fault(f"imu {name} hits the end of its range")
         distinct = batch.distinct.tolist()
         if batch.n >= STUCK_SAMPLES and 1 in distinct:
-            same = [count == 1 and step == 0.0 for count, step in zip(distinct, self._steps.tolist(), strict=True)]
-            if all(same[:3]) or all(same[3:]):
-                part = "gyro" if all(same[:3]) else "accel"
-                return _fault(f"{part} {name} is stuck: {batch.n} equal readings")
+            same = [count == 1 and step == 0.0 for count, step in zip(distinct, self._steps.told, strict=True)]
+            for number, (part, triad, *_) in enumerate(_TRIADS):
+                if all(same[triad]) and not self._steps.excuse(batch, number):
+                    return _fault(f"{part} {name} is stuck: {batch.n} equal readings")
         return None
 
     def _moving(self, batch: Batch) -> Verdict | None:
@@ -211,15 +225,17 @@ class ImuGate:
         sigma2 = self._sigma2(floor, n)
         self._noise = None if sigma2 is None else np.array(sigma2)
         variance, white = batch.variance.tolist(), batch.white.tolist()
-        for part, triad, motion, vibration, unit, unit_name in _TRIADS:
+        for (part, triad, motion, vibration, unit, unit_name), own in zip(_TRIADS, self._own.known, strict=True):
             noise = math.sqrt(floor[triad.start])
-            shaking = max(vibration, 1.5 * noise)
+            shaking = max(vibration, 1.5 * noise, 0.0 if own is None else 1.5 * own.rms)
             rest = (0.0, shaking**2)
             if sigma2 is not None:
                 known = _mean(sigma2[triad])
                 rest = (known, GLRT_RATIO * known)
             # A known noisy sensor behind a low-pass looks like slow motion, hence the profile's noise here too.
             found, allowed = _motion(variance[triad], white[triad], n, max(motion, noise), rest)
+            if own is not None:
+                allowed = max(allowed, math.sqrt(motion**2 + max(own.slow, 0.0) + _CHANCE * own.chance))
             if found > allowed:
                 return _words(f"{part} {name}", found / unit, allowed / unit, unit_name)
             found = math.sqrt(_mean(variance[triad]))
@@ -230,21 +246,24 @@ class ImuGate:
 
     def _sigma2(self, floor: list[float], n: int) -> list[float] | None:
         """Variance of one sample at rest, learned; None until there is enough to learn from."""
-        if len(self._learned) < _LEARNED_ENOUGH:
-            return None
-        ordered = np.sort(np.array(self._learned), axis=0)
-        below, share = divmod(0.25 * (len(ordered) - 1), 1.0)
-        low, high = ordered[int(below)], ordered[int(below) + 1]
-        quartile = (low + (high - low) * share) / _lower_quartile(n - 1)
-        # A truncated reading that toggles between two steps has up to a quarter of a step squared.
-        return [
-            max(learned, known + step * step / 4.0)
-            for learned, known, step in zip(quartile.tolist(), floor, self._steps.tolist(), strict=True)
-        ]
+        learned: list[float | None] = [None] * len(floor)
+        if len(self._learned) >= _LEARNED_ENOUGH:
+            ordered = np.sort(np.array(self._learned), axis=0)
+            below, share = divmod(0.25 * (len(ordered) - 1), 1.0)
+            low, high = ordered[int(below)], ordered[int(below) + 1]
+            learned[:] = ((low + (high - low) * share) / _lower_quartile(n - 1)).tolist()
+        for (_, triad, *_), own in zip(_TRIADS, self._own.known, strict=True):
+            if own is not None:
+                learned[triad] = own.variance.tolist()
+        # A reading that toggles between two steps has up to a quarter of a step squared.
+        least = [known + step * step / 4.0 for known, step in zip(floor, self._steps.sizes, strict=True)]
+        found = [max(each, bound) for each, bound in zip(learned, least, strict=True) if each is not None]
+        return found if len(found) == len(floor) else None
 
     def _likelihood(self, variance: list[float], n: int, sigma2: list[float]) -> Verdict | None:
         ratio = [found / known for found, known in zip(variance, sigma2, strict=True)]
-        allowed = GLRT_RATIO * (1.0 + _CHANCE * math.sqrt(2.0 / (6.0 * n)))
+        freedom = [n if own is None else min(own.freedom, n) for own in self._own.known]
+        allowed = GLRT_RATIO * (1.0 + _CHANCE * math.sqrt(sum(2.0 / each for each in freedom) / 12.0))
         # T / (6 (W - 1) / W), the variances having n - 1 in their denominators.
         if _mean(ratio) <= allowed:
             return None
@@ -268,7 +287,11 @@ class ImuGate:
         noise = batch.variance.tolist()
         if self._noise is not None:
             noise = list(map(max, noise, self._noise.tolist()))
-        chance = [_CHANCE * math.sqrt(each / batch.n) for each in noise]
+        scatter = [each / batch.n for each in noise]
+        for (_, triad, *_), own in zip(_TRIADS, self._own.known, strict=True):
+            if own is not None:
+                scatter[triad] = map(max, scatter[triad], own.density.tolist())
+        chance = [_CHANCE * math.sqrt(each) for each in scatter]
         if self._recent:
             found = _beyond(rate, self._recent, chance[:3])
             if found > GYRO_STEP_RAD_S:
