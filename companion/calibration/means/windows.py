@@ -92,7 +92,6 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     samples: int
     duration_s: float
-    """Good seconds that went into the means."""
     gyro_rad_s: Vector
     accel_m_s2: Vector
     gyro_sigma_stat_rad_s: Vector
@@ -104,9 +103,11 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     warnings: tuple[str, ...]
     hidden: dict[Triad, Hidden] = {}
     """By triad, where the noise spreads the integers too little for a mean."""
-
     dithered: bool = False
     """Its means come from a dither, in which the telemetry followed every step of the offsets."""
+    covariance: NDArray[np.float64] | None = None
+    by_earth: NDArray[np.float64] | None = None
+    """Of a deck: 6x6 of all axes; and 3x3, what the gyro means hold of the Earth's rate (ahead, right, down)."""
 
     def refused(self, part: Triad) -> str | None:
         """Why a triad's means are no measurement although they have a figure; None when they are one."""
@@ -124,6 +125,8 @@ class Window(msgspec.Struct, frozen=True, kw_only=True):
     heading: HeadingWindow | None
     field: FieldWindow | None = None
     """Of a compass that gives the field too; its seconds are those of the others, as far as it sent in them."""
+    turn_rad_s: Vector | None = None
+    """Of a deck's mean turn, its axis levelled by the gradienter's readings without an offset."""
 
 
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):

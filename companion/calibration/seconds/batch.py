@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from typing import Final
 
 import msgspec
@@ -224,6 +225,8 @@ class BatchSource:
         self._keep = keep
         self._circle = circle
         self.steps = steps
+        self.on_second: Callable[[Batch, Floats, Floats], None] | None = None
+        """Told of every second, its times (n,) and its rows (n, c), before those are dropped."""
         self._restart()
 
     def _restart(self) -> None:
@@ -343,7 +346,7 @@ class BatchSource:
         if stamps is not None:
             self.lost += missing_of(np.concatenate(((self._last_stamp,), stamps)))
             self._last_stamp = stamps[-1]
-        return summary(
+        batch = summary(
             slot,
             times,
             rows,
@@ -352,3 +355,6 @@ class BatchSource:
             circle=self._circle,
             steps=self.steps,
         )
+        if self.on_second is not None:
+            self.on_second(batch, times, rows)
+        return batch

@@ -43,7 +43,7 @@ from companion.calibration.solution.site import LocalEarth, Uncertain
 from companion.config.sections import Platform
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, skew
-from companion.physics.gradienter import up_jacobian
+from companion.physics.gradienter import up_in_sensor, up_jacobian
 from companion.physics.units import DEG
 from companion.samples import Triad
 
@@ -200,7 +200,8 @@ def solve(
             f"{local.remedies.no_heading}: the horizontal part of the Earth's rate is unknown, gyro sigma widened"
         )
     truth = truth_of(window, gradienter, compass, local, warnings)
-    shared = _shared(truth, local, 0.0 if gradienter is None else gradienter.sigma_deg * DEG)
+    turn = np.zeros(3) if window.turn_rad_s is None else np.array(window.turn_rad_s)
+    shared = _shared(truth, local, 0.0 if gradienter is None else gradienter.sigma_deg * DEG, turn)
     # A deck may turn, and a steady turn shows in nothing but the heading.
     turn_unseen = platform == "deck" and what.gyros and truth.heading_rad is None
     if turn_unseen:
@@ -212,7 +213,8 @@ def solve(
         "accel": what.accelerometers and gradienter is not None,
     }
     asked = [triad for triad, is_wanted in wanted.items() if is_wanted]
-    imus = tuple(_estimate(imu, truth, local, shared, asked) for imu in window.imus)
+    tipped = _tipped(window, gradienter, truth, turn)
+    imus = tuple(_estimate(imu, truth, local, shared, asked, tipped) for imu in window.imus)
     if all(imu.gyro_rad_s is None and imu.accel_m_s2 is None for imu in imus):
         refusals = [words for imu in window.imus for words in _hidden(imu, asked)]
         if refusals:
@@ -306,15 +308,15 @@ def _pose(truth: Truth) -> Pose:
     )
 
 
-def _shared(truth: Truth, local: LocalEarth, zero_sigma_rad: float) -> Shared:
-    """What one attitude, gravity and Earth's rate add to the errors of all; method section 2.1.
+def _shared(truth: Truth, local: LocalEarth, zero_sigma_rad: float, turn_rad_s: Array) -> Shared:
+    """What one attitude, gravity, Earth's rate and turn of the platform add to the errors of all; method section 2.1.
 
     An attitude error eps makes db_a = eps x f and db_g = eps x w = -[w x] eps; the cross term is kept, since one tilt
     error makes both. What remains unknown of the Earth's rate (latitude, or a heading never measured) comes in with
     its own covariance.
     """
     rate, up = truth.earth_rate(local), truth.up
-    jacobian = np.vstack([-skew(rate.mean), -skew(local.gravity_m_s2 * up)])
+    jacobian = np.vstack([-skew(rate.mean + turn_rad_s), -skew(local.gravity_m_s2 * up)])
     covariance = jacobian @ truth.attitude_covariance_rad2 @ jacobian.T
     covariance[:3, :3] += rate.covariance
     covariance[3:, 3:] += np.outer(up, up) * local.gravity_sigma_m_s2**2
@@ -328,13 +330,25 @@ def _shared(truth: Truth, local: LocalEarth, zero_sigma_rad: float) -> Shared:
     )
 
 
-def _estimate(imu: ImuWindow, truth: Truth, local: LocalEarth, shared: Shared, asked: Collection[Triad]) -> ImuSolution:
+def _tipped(window: Window, gradienter: GradienterModel | None, truth: Truth, turn_rad_s: Array) -> Array:
+    """What the gyro means of a deck hold of its turn because its axis is another one than the readings alone said."""
+    if window.turn_rad_s is None or window.tilt is None or gradienter is None:
+        return np.zeros(3)
+    said = gradienter.vehicle_from_sensor @ up_in_sensor(gradienter.law, window.tilt.x_deg, window.tilt.y_deg)
+    return np.cross(np.cross(said, truth.up), turn_rad_s)
+
+
+def _estimate(
+    imu: ImuWindow, truth: Truth, local: LocalEarth, shared: Shared, asked: Collection[Triad], tipped: Array
+) -> ImuSolution:
     gyro = accel = None
     if "gyro" in asked and imu.refused("gyro") is None:
-        gyro = gyro_bias(np.array(imu.gyro_rad_s), truth.earth_rate(local).mean)
+        gyro = gyro_bias(np.array(imu.gyro_rad_s), _earth_seen(imu, truth, local) + tipped)
     if "accel" in asked and imu.refused("accel") is None:
         accel = accelerometer_bias(np.array(imu.accel_m_s2), truth.up, local.gravity_m_s2)
-    own = np.square([*imu.gyro_sigma_use_rad_s, *imu.accel_sigma_use_m_s2])
+    own = imu.covariance
+    if own is None:
+        own = np.diag(np.square([*imu.gyro_sigma_use_rad_s, *imu.accel_sigma_use_m_s2]))
     return ImuSolution(
         name=imu.name,
         samples=imu.samples,
@@ -343,10 +357,19 @@ def _estimate(imu: ImuWindow, truth: Truth, local: LocalEarth, shared: Shared, a
         accel_m_s2=accel,
         gyro_sigma_stat_rad_s=np.array(imu.gyro_sigma_stat_rad_s),
         accel_sigma_stat_m_s2=np.array(imu.accel_sigma_stat_m_s2),
-        covariance=shared.covariance + np.diag(own),
+        covariance=shared.covariance + own,
         warnings=(*imu.warnings, *_hidden(imu, asked)),
         dithered=imu.dithered,
     )
+
+
+def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
+    """What the gyro means hold of the Earth's rate: all of it as the aircraft stood, or what turning left of it."""
+    if imu.by_earth is None or truth.heading_rad is None:
+        return truth.earth_rate(local).mean
+    c, s = math.cos(truth.heading_rad), math.sin(truth.heading_rad)
+    north, east, down = local.rate_ned_rad_s.tolist()
+    return np.asarray(imu.by_earth @ np.array([c * north + s * east, c * east - s * north, down]))
 
 
 def _hidden(imu: ImuWindow, asked: Collection[Triad]) -> list[str]:
