@@ -11,6 +11,8 @@ from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.deck.deck import Deck
+from companion.calibration.deck.stream import Surroundings
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
@@ -198,6 +200,20 @@ def field_by(config: Config) -> tuple[CompassModel, GradienterModel | None] | No
     """How a heading comes of the compass' field vector, if there is a compass."""
     compass = compass_model(config.compass)
     return None if compass is None else (compass, gradienter_model(config.gradienter))
+
+
+def deck(config: Config) -> Deck | None:
+    """What collects where the platform moves; None on the ground."""
+    if config.vehicle.platform != "deck":
+        return None
+    return Deck(
+        Surroundings(
+            gradienter=gradienter_model(config.gradienter),
+            gradienter_lag_s=lag("gradienter", config.gradienter).lag_s,
+            compass=compass_model(config.compass),
+            compass_lag_s=lag("compass", config.compass).lag_s,
+        )
+    )
 
 
 def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:

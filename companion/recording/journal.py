@@ -270,6 +270,7 @@ class RecordedCollector(RollingCollector):
             gradienter_lag=models.lag("gradienter", config.gradienter),
             compass_lag=models.lag("compass", config.compass),
             field_by=models.field_by(config),
+            deck=models.deck(config),
         )
 
     def number_of(self, window: Window) -> int | None:

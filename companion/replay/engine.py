@@ -240,6 +240,7 @@ class Replay:
             gradienter_lag=models.lag("gradienter", config.gradienter),
             compass_lag=models.lag("compass", config.compass),
             field_by=models.field_by(config),
+            deck=models.deck(config),
         )
         self._decoders = {
             device.name: device.info.decoder(device.settings.seconds_per_byte) for device in self._devices

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
@@ -9,10 +10,11 @@ from typing import Final, Literal
 
 import msgspec
 
+from companion.calibration.deck.deck import Deck
 from companion.calibration.means.pose import CompassModel, FieldHeading, GradienterModel
 from companion.calibration.means.windows import ImuInput, integer_steps
 from companion.calibration.seconds.batch import Batch, BatchSource
-from companion.calibration.stillness.gates import ImuGate, PoseGate, Verdict
+from companion.calibration.stillness.gates import STILL, ImuGate, PoseGate, Verdict
 from companion.calibration.stillness.stretch import Lag, Settling
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 
@@ -61,6 +63,8 @@ class Source:
         self.batches = batches
         self.gate = gate
         self.settling = settling
+        self.may_move = False
+        """Whether only faults count: on a deck."""
         self.verdict = Verdict(still=False)
         self.unsettled: deque[int] = deque(maxlen=keep)
         """Seconds in which its readings still followed a movement; good for the others, not for a mean of its own."""
@@ -92,7 +96,8 @@ class Source:
             words = f"{self.label} was silent for a second" if self.batches.batches else ""
             self.verdict = Verdict(still=False, words=words, fault=True)
         elif batch.slot == slot:
-            self.verdict = self.gate.judge(batch)
+            verdict = self.gate.judge(batch)
+            self.verdict = STILL if self.may_move and not verdict.fault else verdict
         return self.verdict.still
 
     def settled(self, slots: Sequence[int]) -> list[Batch]:
@@ -132,13 +137,6 @@ class Source:
         )
 
 
-def _pose_source(name: Literal["gradienter", "compass"], keep: int, lag: Lag) -> Source:
-    """A gradienter's two channels, or a compass' heading, in degrees."""
-    circle = name == "compass"
-    batches = BatchSource(_LIMITS_HEADING if circle else _LIMITS_TILT, keep, circle=circle)
-    return Source(name, name, batches, PoseGate(name), Settling(lag, circle=circle), keep)
-
-
 class Intake(ABC):
     """The streams, and what is known of each. Nothing that a sample holds makes it raise."""
 
@@ -150,13 +148,14 @@ class Intake(ABC):
         compass: bool,
         lags: tuple[Lag, Lag],
         field_by: tuple[CompassModel, GradienterModel | None] | None,
+        deck: Deck | None,
     ) -> None:
-        self._keep = keep
+        self._keep, self._deck = keep, deck
         self._inputs: dict[str, ImuInput] = {}
         self._imus: dict[str, Source] = {}
         self._lags = lags
-        self._tilt = _pose_source("gradienter", keep, lags[0]) if gradienter else None
-        self._heading = _pose_source("compass", keep, lags[1]) if compass else None
+        self._tilt = self._pose_source("gradienter") if gradienter else None
+        self._heading = self._pose_source("compass") if compass else None
         self._breaks: dict[str, int] = {}
         self._field = None if field_by is None else FieldHeading(*field_by, keep)
 
@@ -222,9 +221,13 @@ class Intake(ABC):
         self._inputs[imu.name] = imu
         gate = ImuGate(imu.name, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2))
         known = self._imus.get(imu.name)
+        if self._deck is not None:
+            self._deck.set_imu(imu)
         if known is None:
             batches = BatchSource(LIMITS_IMU, self._keep, steps=integer_steps(imu))
-            self._imus[imu.name] = Source("imu", imu.name, batches, gate)
+            self._imus[imu.name] = source = Source("imu", imu.name, batches, gate)
+            if self._deck is not None:
+                source.may_move, batches.on_second = True, functools.partial(self._deck.take_imu, imu.name)
             # It has no share in the seconds so far.
             self._break()
         else:
@@ -236,13 +239,25 @@ class Intake(ABC):
         """Change which pose sensors are waited for, for example when one is found dead; the IMUs' history stays."""
         added = (gradienter and self._tilt is None) or (compass and self._heading is None)
         if gradienter != (self._tilt is not None):
-            self._tilt = _pose_source("gradienter", self._keep, self._lags[0]) if gradienter else None
+            self._tilt = self._pose_source("gradienter") if gradienter else None
         if compass != (self._heading is not None):
-            self._heading = _pose_source("compass", self._keep, self._lags[1]) if compass else None
+            self._heading = self._pose_source("compass") if compass else None
         if added:
             self._break()
 
+    def _pose_source(self, name: Literal["gradienter", "compass"]) -> Source:
+        """A gradienter's two channels, or a compass' heading, in degrees."""
+        circle, lag = name == "compass", self._lags[name == "compass"]
+        batches = BatchSource(_LIMITS_HEADING if circle else _LIMITS_TILT, self._keep, circle=circle)
+        source = Source(name, name, batches, PoseGate(name), Settling(lag, circle=circle), self._keep)
+        if self._deck is not None:
+            source.may_move = True
+            batches.on_second = self._deck.take_heading if circle else self._deck.take_tilt
+        return source
+
     def _forget(self, imu: str | None) -> None:
+        if self._deck is not None:
+            self._deck.forget(imu)
         for source in self._sources():
             if imu is None or (source.kind == "imu" and source.name == imu):
                 source.batches.forget()

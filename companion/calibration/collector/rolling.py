@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
+from companion.calibration.collector.afloat import Afloat
 from companion.calibration.collector.intake import Intake, Source
 from companion.calibration.collector.measurement import Estimates, Found, Measurement, PoseSeconds, Work
 from companion.calibration.collector.outlook import (
@@ -23,6 +24,8 @@ from companion.calibration.collector.outlook import (
     is_enough,
 )
 from companion.calibration.collector.trace import Snapshot, TraceLog
+from companion.calibration.deck.deck import Deck
+from companion.calibration.deck.estimate import DeckWork
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.seconds.batch import Batch
@@ -59,6 +62,7 @@ class RollingCollector(Intake):
         gradienter_lag: Lag = AT_ONCE,
         compass_lag: Lag = AT_ONCE,
         field_by: tuple[CompassModel, GradienterModel | None] | None = None,
+        deck: Deck | None = None,
     ) -> None:
         if len({imu.name for imu in imus}) != len(imus):
             raise ValueError("two IMUs have one name")
@@ -71,7 +75,9 @@ class RollingCollector(Intake):
             compass=compass,
             lags=(gradienter_lag, compass_lag),
             field_by=field_by,
+            deck=deck,
         )
+        self._afloat = None if deck is None else Afloat(deck, settings.horizon_s)
         self._watch = HeadingWatch()
         self._stretch = Stretch(self._min_good, self._max_slots)
         self._next: int | None = None
@@ -99,6 +105,8 @@ class RollingCollector(Intake):
         The second under way is forgotten too. The stretch begins again; learned noise stays.
         """
         self._forget(imu)
+        if self._afloat is not None:
+            self._afloat.clear()
 
     def tick(self, now_s: float) -> None:
         """Let the seconds end that are over at `now_s` (the samples' clock), also of sources that say nothing.
@@ -117,31 +125,41 @@ class RollingCollector(Intake):
 
     def glance(self, now_s: float) -> Glance:
         """How still it is at `now_s`; costs a small part of what `status` does."""
+        if self._afloat is not None:
+            seconds = float(self._afloat.seconds)
+            return Glance(obstacle=self._obstacle(now_s), still_s=seconds, steady_s=seconds)
         return Glance(
             obstacle=self._obstacle(now_s),
             still_s=float(self._stretch.good),
             steady_s=float(self._stretch.steady),
         )
 
-    def pending(self, now_s: float, *, since_s: float | None = None) -> Work | None:
+    def pending(self, now_s: float, *, since_s: float | None = None) -> Work | DeckWork | None:
         """What `window` would have to work out now, for somebody who does it elsewhere; None when there is nothing.
 
         It takes milliseconds, more on small boards, and what must be answered at once shall not wait for it.
         """
         if self._obstacle(now_s) is not None:
             return None
+        if self._afloat is not None:
+            return self._afloat.pending(since_s)
         slots = self._slots(since_s)
         if not self._are_enough(slots, since_s) or self._estimates.known(slots[-1], since_s) is not None:
             return None
         return self._work(slots, since_s)
 
-    def accept(self, work: Work, found: Found) -> None:
-        """Take what a `Work` has found; too late, it is left."""
-        self._estimates.keep(work, found)
+    def accept(self, work: Work | DeckWork, found: Any) -> None:
+        """Take what such work has found; too late, it is left."""
+        if isinstance(work, Work):
+            self._estimates.keep(work, found)
+        elif self._afloat is not None:
+            self._afloat.accept(work, found)
 
     def status(self, now_s: float) -> Status:
         """Where it stands at `now_s` (the samples' clock). Its figures may be those of the second before."""
         sources = self._sources()
+        if self._afloat is not None:
+            return self._afloat_status(self._afloat, now_s, sources)
         waiting = self._waiting_for(now_s)
         enough = False
         progress = 0.0
@@ -161,6 +179,18 @@ class RollingCollector(Intake):
             enough=enough,
             progress=min(progress, 1.0 if enough else 0.99),
             sources=tuple(source.status(now_s) for source in sources),
+            measuring=f"still for {self._stretch.good} s, measuring",
+        )
+
+    def _afloat_status(self, afloat: Afloat, now_s: float, sources: list[Source]) -> Status:
+        obstacle, progress = self._obstacle(now_s), afloat.progress(self._settings)
+        return Status(
+            still_s=float(afloat.seconds),
+            obstacle=obstacle,
+            enough=progress.enough and obstacle is None,
+            progress=min(progress.share, 1.0 if progress.enough else 0.99),
+            sources=tuple(source.status(now_s) for source in sources),
+            measuring=progress.words,
         )
 
     def window(self, now_s: float, *, since_s: float | None = None) -> Window:
@@ -184,6 +214,8 @@ class RollingCollector(Intake):
         """
         if (reason := self._obstacle(now_s)) is not None:
             raise CalibrationRefusedError(reason.words)
+        if self._afloat is not None:
+            return self._afloat.measurement(since_s)
         slots = self._slots(since_s)
         if not self._are_enough(slots, since_s):
             needed = self._min_good if since_s is None else min(MIN_BATCHES, self._min_good)
@@ -292,6 +324,8 @@ class RollingCollector(Intake):
             return None
         said = [source.verdict for source in sources if source.verdict.words]
         moving = not any(verdict.fault for verdict in said)
+        if self._afloat is not None and moving:
+            return None
         if not said:
             return Obstacle(f"hold still {self._min_good} s", moving, self._min_good)
         words = said[0].words

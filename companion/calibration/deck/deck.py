@@ -79,7 +79,13 @@ class Deck:
         counts = [len(stream.seconds) for stream in self._streams.values()]
         return min(counts, default=0)
 
-    def work(self, slots: range, horizon_s: float, reference_deg: tuple[float, float] | None) -> DeckWork:
+    def work(
+        self,
+        slots: range,
+        horizon_s: float,
+        reference_deg: tuple[float, float] | None = None,
+        since_s: float | None = None,
+    ) -> DeckWork:
         """What is to be worked out of these seconds; holds nothing that changes later."""
         streams = self._streams.values()
         return DeckWork(
@@ -91,4 +97,5 @@ class Deck:
             around=self._around,
             horizon_s=horizon_s,
             reference_deg=reference_deg,
+            since_s=since_s,
         )

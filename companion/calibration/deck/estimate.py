@@ -74,6 +74,8 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
     horizon_s: float
     reference_deg: tuple[float, float] | None
     """The tilt to give the accelerometers' means at, as the gradienter reads it; None: the mean of the window."""
+    since_s: float | None
+    """The window's own beginning, where it is not that of all seconds."""
 
     def run(self) -> DeckFound | CalibrationRefusedError:
         """Work it out: a third of a second for ten minutes of one IMU on a desktop."""

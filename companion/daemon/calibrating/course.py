@@ -121,7 +121,7 @@ class Measuring:
                 )
                 self._check_imus(failures)
                 self.show(measuring=waiting_for is None)
-                words = waiting_for or f"still for {status.still_s:.0f} s, measuring"
+                words = waiting_for or status.measuring
                 job.progress(MEASURED_PERCENT * status.progress, words, hold_still_s)
                 if waiting_for is None and status.enough:
                     self._machine.on(Event.ENOUGH)
