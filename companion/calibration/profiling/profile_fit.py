@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import FLOOR_OF_FLICKER, AllanModel, NoiseProfile
 from companion.calibration.noise.allan_fit import AxisFit, Curve, curve, fit_axis
+from companion.calibration.noise.horizon_fit import within_horizon
 from companion.calibration.seconds.batch import Batch, summary
 from companion.calibration.stillness.gates import ImuGate
 from companion.calibration.stillness.own_noise import OwnNoise
@@ -215,7 +216,7 @@ def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Fin
     models, kept = [], []
     for triad, part in TRIADS:
         model, unknown = _triad(axes[part], fallback.gyro if triad == "gyro" else fallback.accel)
-        models.append(model)
+        models.append(within_horizon(model, [(rest.slots, rest.means[:, part]) for rest in rests]))
         kept += [f"{triad} {_NAMES[which]}" for which in unknown]
     return Finding(
         profile=NoiseProfile(name, models[0], models[1]), axes=tuple(axes), kept=tuple(kept), still_s=still_s
