@@ -32,7 +32,7 @@ def add_commands(add: AddCommand) -> None:
     recorder.add_argument("--seconds", type=seconds, metavar="S", help="end by itself (default: Ctrl-C or --stop)")
     recorder.add_argument("--stop", action="store_true", help="end a recording that runs")
     player = add("replay", replay, "run a recording, or anybody's log of an IMU at rest, through the same estimator")
-    player.add_argument("file", type=Path, metavar="FILE", help="a recording (.mcap), or a log: CSV")
+    player.add_argument("file", type=Path, metavar="FILE", help="a recording (.mcap), or a log (CSV; .ulg, .bin)")
     replay_log.add_options(player)
 
 
@@ -72,12 +72,13 @@ async def _end(options: argparse.Namespace, reply: Object) -> int:
 async def replay(options: argparse.Namespace) -> int:
     """`companion replay`."""
     from companion.recording.walk import is_text
+    from companion.replay.autopilot_logs import reader_of
 
     try:
-        text = is_text(options.file)
+        is_log = reader_of(options.file) is not None or is_text(options.file)
     except OSError as error:
         raise ConfigError(f"companion replay: {options.file}: {error.strerror or error}") from None
-    if text:
+    if is_log:
         return replay_log.replay(options)
     return _replay_recording(options)
 

@@ -259,12 +259,17 @@ class _Pass:
         first = math.ceil(_FIRST_S)
         full = len(slots) >= self._max_still_s
         elsewhere = "at rest, but the longest window is full" if full else "at rest, but another stretch is longer"
-        whys: list[tuple[int, str, str]] = []
-        for slot in range(first, max(math.floor(seconds + _FIRST_S), first)):
-            words, kind = self._verdicts.get(slot, ("no samples", "no samples"))
+        whys: list[tuple[int, int, str, str]] = []
+        next_slot = first
+        for slot, (words, kind) in sorted(self._verdicts.items()):
+            if not first <= slot < seconds + _FIRST_S - 1.0:
+                continue
+            if slot > next_slot:
+                whys.append((next_slot - first, slot - first, "no samples", "no samples"))
+            next_slot = slot + 1
             if not words and not (slots and slots[0] <= slot <= slots[-1]):
                 words = kind = elsewhere
-            whys.append((slot - first, words, kind))
+            whys.append((slot - first, next_slot - first, words, kind))
         return Used(
             files=self._log.files,
             seconds=seconds,
@@ -277,12 +282,12 @@ class _Pass:
         )
 
 
-def _in_rows(whys: Iterable[tuple[int, str, str]]) -> Iterator[Unused]:
+def _in_rows(whys: Iterable[tuple[int, int, str, str]]) -> Iterator[Unused]:
     """Seconds in a row that are out for reasons alike, in the words of the first."""
-    for kind, group in itertools.groupby(whys, key=lambda each: each[2]):
+    for kind, group in itertools.groupby(whys, key=lambda each: each[3]):
         some = list(group)
         if kind:
-            yield Unused(float(some[0][0]), some[-1][0] + 1.0, some[0][1])
+            yield Unused(float(some[0][0]), float(some[-1][1]), some[0][2])
 
 
 def _rows(log: StillLog, offset_s: float) -> Iterator[tuple[float, Vector, Vector, float | None]]:

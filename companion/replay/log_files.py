@@ -15,7 +15,7 @@ from companion.config.sections import Config, Noise
 from companion.errors import StorageError
 from companion.recording import topics
 from companion.recording.walk import Attachment, Message, Metadata, Recording, is_text
-from companion.replay import csv_log
+from companion.replay import autopilot_logs, csv_log
 from companion.replay.log import NAME, StillLog
 
 TRUNCATED: Final = frozenset(
@@ -49,10 +49,12 @@ def read_logs(
     found: list[StillLog] = []
     for path in paths:
         try:
-            text = is_text(path)
+            text, autopilots = is_text(path), autopilot_logs.reader_of(path)
         except OSError as error:
             raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
-        if text:
+        if autopilots is not None:
+            found += autopilots(path)
+        elif text:
             found.append(csv_log.read(path, columns, rate_hz, csv_name))
         else:
             found += _read_recording(path)

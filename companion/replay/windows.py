@@ -18,11 +18,14 @@ import numpy as np
 
 from companion.calibration.noise.robust import median
 from companion.calibration.solution.record import ImuRecord
+from companion.errors import StorageError
 from companion.physics.frames import Floats, roll_pitch_from_up, rotation_matrix
 from companion.physics.units import DEG
 from companion.replay.estimate import Given, estimate
 from companion.replay.log import StillLog
 
+MOST_WINDOWS: Final = 100_000
+"""Eleven days of the shortest; a clock that jumps makes more."""
 HORIZON_S: Final = 180.0
 """What sigma_use speaks of."""
 _AXES: Final = ("gyro x", "gyro y", "gyro z", "accel x", "accel y", "accel z")
@@ -82,6 +85,8 @@ def windows(log: StillLog, given: Given, length_s: float) -> Windows:
     whys: list[str] = []
     begin_s = float(log.t_s[0])
     count = math.floor((float(log.t_s[-1]) - begin_s) / length_s + 1e-6)
+    if count > MOST_WINDOWS:
+        raise StorageError(f"{log.files[0]}: {count} windows from its first to its last time; allowed: {MOST_WINDOWS}")
     edges = np.searchsorted(log.t_s, begin_s + length_s * np.arange(count + 1))
     for start, end in itertools.pairwise(edges.tolist()):
         if end - start < 2:
