@@ -18,11 +18,13 @@ import numpy as np
 
 from companion.errors import StorageError
 from companion.physics.frames import Floats
-from companion.replay.log import StillLog
+from companion.replay.log import LAST_S, StillLog
 
 _ULOG: Final = b"ULog\x01\x12\x35"
 _DATAFLASH: Final = b"\xa3\x95\x80"
 _US: Final = 1e-6
+_LARGEST: Final = 1e6
+"""What is larger is no reading, in SI units."""
 _CORRECTED: Final = (
     "the autopilot's offsets are taken off in it: what is found is what they leave, in the vehicle's axes"
 )
@@ -125,7 +127,7 @@ def read_dataflash(path: Path) -> list[StillLog]:
 
 def _log(path: Path, imu: str, t_s: Floats, readings: Floats, degc: Floats, note: str) -> StillLog | None:
     """Of what is whole, in order of time; None where nothing is."""
-    whole = np.isfinite(t_s) & np.isfinite(readings).all(axis=1)
+    whole = (np.abs(t_s) < LAST_S) & (np.abs(readings) < _LARGEST).all(axis=1)
     ahead = whole.copy()
     newest = np.maximum.accumulate(np.where(whole, t_s, -np.inf)) if len(t_s) else t_s
     ahead[1:] &= t_s[1:] > newest[:-1]

@@ -85,6 +85,11 @@ _UNIT_WORDS: Final = {
 }  # fmt: skip
 _FIELD_WORDS: Final = {"g": "gauss", "mg": "mgauss"}
 _NO_UNIT: Final = frozenset(("", "-", "1", "n/a", "none", "a.u.", "raw", "lsb", "counts"))
+_ODD_LETTERS: Final = (
+    ("²", "^2"), ("°", "deg"), ("µ", "u"), ("μ", "u"), ("·", ""), (" / ", "/"),
+    # The same in Latin-1, read as UTF-8 with surrogates.
+    ("\udcb2", "^2"), ("\udcb0", "deg"), ("\udcb5", "u"),
+)  # fmt: skip
 _BRACKETS: Final = re.compile(r"\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
 
 
@@ -187,7 +192,7 @@ def meaning(name: str, below: str = "") -> tuple[str, str | None] | None:
 
 def _plain(text: str) -> str:
     text = text.strip().strip('"').strip().lower()
-    for odd, usual in (("²", "^2"), ("°", "deg"), ("µ", "u"), ("μ", "u"), ("·", ""), (" / ", "/")):
+    for odd, usual in _ODD_LETTERS:
         text = text.replace(odd, usual)
     return text
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import datetime
 import itertools
@@ -35,7 +36,7 @@ from companion.replay.columns import (
     looks_like_units,
     meaning,
 )  # fmt: skip
-from companion.replay.log import NAME, Poses, StillLog
+from companion.replay.log import LAST_S, NAME, Poses, StillLog
 
 _LONGEST: Final = 1 << 14
 """The most characters of a line: a hundred columns have a tenth of that."""
@@ -45,6 +46,8 @@ _NO_NUMBER: Final = frozenset(("", "nan", "na", "n/a", "null", "none", "-", "--"
 _MOST_TEXTS: Final = 60
 """Lines of text before the numbers: a logger's preamble, the names, the units."""
 _AT_ONCE: Final = 4096
+_NUMBERS: Final = 1e20
+"""What is larger is none, in any unit: nanoseconds since 1970 are 2e18."""
 _WRAPS: Final = 2.0**32
 """A counter of 32 bits begins anew: an Arduino's micros() every 71.6 min."""
 _DECIMAL_COMMA: Final = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?")
@@ -88,9 +91,13 @@ def read(path: Path, columns: str | None = None, rate_hz: float | None = None, n
         StorageError: one line with the number of the line, what was found and what is allowed.
     """
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with path.open("rb") as file:
+            wide = file.read(2) in {codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE}
+        # Where it is Latin-1 instead, the degree sign still shows (`columns`).
+        encoding, errors = ("utf-16", "strict") if wide else ("utf-8-sig", "surrogateescape")
+        with path.open(encoding=encoding, errors=errors, newline="") as file:
             return _Table(path, file, columns, rate_hz).log(name)
-    except UnicodeDecodeError as error:
+    except UnicodeError as error:
         raise StorageError(f"{path}: cannot be read as text: {error}") from None
     except OSError as error:
         raise StorageError(f"{path}: cannot be read as text: {error.strerror or error}") from None
@@ -159,6 +166,7 @@ class _Table:
         order = [what for what in UNITS if what in self._columns.used]
         flat, numbers = array("d"), array("L")
         for lines, block in self._blocks([self._columns.used[what].place for what in order]):
+            block[~(np.abs(block) < _NUMBERS)] = math.nan
             flat.frombytes(np.ascontiguousarray(block).tobytes())
             numbers.extend(lines)
         if not flat:
@@ -262,6 +270,11 @@ class _Table:
         kept = np.flatnonzero(whole & timed)
         raw = _unwrapped(stamps[kept])
         t_s = raw * TIMES[self._time_unit(raw)]
+        if len(t_s) and np.abs(t_s).max() > LAST_S:
+            line = numbers[int(kept[np.abs(t_s).argmax()])]
+            raise StorageError(
+                f"{self._path}, line {line}: time {np.abs(t_s).max():.3g} s; allowed: up to {LAST_S:g} s"
+            )
         back = np.flatnonzero(np.diff(t_s) < 0.0)
         if len(back):
             line = numbers[int(kept[back[0] + 1])]

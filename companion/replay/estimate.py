@@ -257,8 +257,9 @@ class _Pass:
     def _used(self, measurement: Measurement | None, seconds: float) -> Used:
         slots = [] if measurement is None else measurement.slots
         first = math.ceil(_FIRST_S)
-        full = len(slots) >= self._max_still_s
-        elsewhere = "at rest, but the longest window is full" if full else "at rest, but another stretch is longer"
+        elsewhere = "at rest, but another stretch is longer" if slots else "at rest, but not for long enough"
+        if len(slots) >= self._max_still_s:
+            elsewhere = "at rest, but the longest window is full"
         whys: list[tuple[int, int, str, str]] = []
         next_slot = first
         for slot, (words, kind) in sorted(self._verdicts.items()):

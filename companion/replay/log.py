@@ -15,6 +15,9 @@ from companion.physics.frames import Floats
 NAME: Final = "imu"
 """What the IMU of a log that names none is called."""
 
+LAST_S: Final = 1e11
+"""The latest time, by any clock."""
+
 
 class Poses(msgspec.Struct, frozen=True, kw_only=True):
     """What else was logged beside an IMU, line by line; NaN where a line says nothing."""

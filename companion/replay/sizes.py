@@ -28,6 +28,8 @@ ACCEL_REST_M_S2: Final = 0.05
 GRAVITY_M_S2: Final = (7.0, 12.6)
 _FIELD_GAUSS: Final = (0.1, 1.5)
 """The Earth's is 0.22 to 0.67 gauss; iron in the vehicle adds to it."""
+MOST_COLOURED: Final = 8.0
+"""Scatter of means over that of as many independent samples: a sensor behind a low-pass of 1 Hz; sway has more."""
 _LEAST_PAIRS: Final = 5
 _QUARTILE: Final = 0.4506
 """Lower quartile of |difference of two means| over their sigma: 0.3186 sqrt(2)."""
@@ -106,8 +108,9 @@ def _rates(
     notes: list[str],
 ) -> dict[str, str]:
     t_s, readings, forces = log
-    noise, turn = _noise(t_s, readings), float(np.abs(np.array([median(each) for each in readings.T])).max())
-    still = _noise(t_s, forces) < ACCEL_REST_M_S2
+    noise, white = _noise(t_s, readings)
+    turn = float(np.abs(np.array([median(each) for each in readings.T])).max())
+    still = _noise(t_s, forces)[0] < ACCEL_REST_M_S2 and noise < MOST_COLOURED * white
     likely = [unit for unit, factor in RATES.items() if QUIETEST_RAD_S <= noise * factor <= LOUDEST_RAD_S]
     open_ = [what for what in IMU[:3] if named[what] is None]
     if open_:
@@ -160,20 +163,26 @@ def factors(units: Mapping[str, str]) -> Floats:
     return np.array([UNITS[what][units[what]] for what in IMU])
 
 
-def _noise(t_s: Floats, values: Floats) -> float:
-    """White noise of a second's mean on the noisiest axis, from the quieter seconds; infinite where there are few."""
+def _noise(t_s: Floats, values: Floats) -> tuple[float, float]:
+    """Scatter of a second's mean on the noisiest axis, in the quieter seconds, and what their white noise makes of it.
+
+    Infinite where there are few seconds.
+    """
     slots = np.floor(t_s - t_s[0]).astype(np.int64) if len(t_s) else np.zeros(0, dtype=np.int64)
     starts = np.flatnonzero(np.diff(slots, prepend=-1))
     if len(starts) < _LEAST_PAIRS + 2:
-        return math.inf
+        return math.inf, math.inf
     counts = np.diff(np.append(starts, len(slots)))[:, None]
+    means = np.add.reduceat(values, starts) / counts
+    off = values - np.repeat(means, counts[:, 0], axis=0)
+    variances = np.sort(np.add.reduceat(off * off, starts) / np.square(counts), axis=0)
     # The last second is cut.
-    means = (np.add.reduceat(values, starts) / counts)[:-1]
+    means = means[:-1]
     near = np.diff(slots[starts])[:-1] == 1
     steps = np.sort(np.abs(np.diff(means, axis=0))[near], axis=0)
     if len(steps) < _LEAST_PAIRS:
-        return math.inf
-    return float((steps[len(steps) // 4] / _QUARTILE).max())
+        return math.inf, math.inf
+    return float((steps[len(steps) // 4] / _QUARTILE).max()), math.sqrt(float(variances[len(variances) // 4].max()))
 
 
 def _within(value: float, limits: tuple[float, float]) -> bool:

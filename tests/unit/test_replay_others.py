@@ -445,3 +445,21 @@ def test_a_tilt_that_moves_is_no_rest(
     code, record = replay(capsys, path, *PLACE)
     assert code == 1
     assert "gradienter" in record["reason"]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+def test_letters_of_any_office_program_are_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel], encoding: str
+) -> None:
+    data, model = still
+    head = "t [s];gx [°/s];gy [°/s];gz [°/s];ax [m/s²];ay [m/s²];az [m/s²];T [°C];Größe\n"
+    rows = [[row[0], *(v * DEG for v in row[1:4]), *row[4:], 21.5, 1] for row in data.tolist()]
+    path = tmp_path / "log.csv"
+    path.write_bytes((head + joined(rows, ";")).encode(encoding))
+    code, record = replay(capsys, path, *WHERE, "--profile", "bmi088")
+    assert code == 0
+    assert_near(record["imus"][0], model)
+    # What a terminal cannot show does not stop it from saying so.
+    path.write_bytes((head.replace("gx", "Größe") + joined(rows, ";")).encode(encoding))
+    assert companion(["replay", str(path)]) == 1
+    assert "no column for gx in t [s]" in capsys.readouterr().err
