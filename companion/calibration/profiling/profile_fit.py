@@ -84,7 +84,7 @@ def rests(t_s: Floats, readings: Floats, temperature_degc: Floats | None, name: 
         profile: noise that the gate allows for before it has learned.
     """
     batches = seconds_of(t_s, readings, temperature_degc)
-    own = OwnNoise()
+    own = OwnNoise(at_rest=True)
     for batch in batches:
         own.add(batch)
     gate, stretch = ImuGate(name, profile, own=own), Stretch(_MIN_GOOD, max(len(batches), 1))

@@ -107,13 +107,13 @@ class Verdict(msgspec.Struct, frozen=True):
 STILL: Final = Verdict(still=True)
 
 
-def _words(what: str, found: float, allowed: float, unit: str) -> Verdict:
-    """'gyro fc 0.31 deg/s > 0.10', with as many digits as it takes to see the difference."""
+def _words(what: str, found: float, allowed: float, unit: str, hint: str = "") -> Verdict:
+    """'gyro fc 0.31 deg/s > 0.10' and a hint, with as many digits as it takes to see the difference."""
     for digits in (2, 3, 4):
         left, right = f"{found:.{digits}f}", f"{allowed:.{digits}f}"
         if left != right:
             break
-    return Verdict(still=False, words=f"{what} {left} {unit} > {right}", what=what)
+    return Verdict(still=False, words=f"{what} {left} {unit} > {right}{hint}", what=what)
 
 
 def _fault(words: str) -> Verdict:
@@ -164,7 +164,7 @@ class ImuGate:
         own: OwnNoise | None = None,
     ) -> None:
         self._name = name
-        self._own = own or OwnNoise()
+        self._own = own or OwnNoise((profile.gyro.white, profile.accel.white))
         self._white = np.repeat([profile.gyro.white, profile.accel.white], 3)
         self._steps = Steps([steps[0]] * 3 + [steps[1]] * 3)
         self._learned: deque[Floats] = deque(maxlen=_LEARN_FROM)
@@ -225,7 +225,8 @@ class ImuGate:
         sigma2 = self._sigma2(floor, n)
         self._noise = None if sigma2 is None else np.array(sigma2)
         variance, white = batch.variance.tolist(), batch.white.tolist()
-        for (part, triad, motion, vibration, unit, unit_name), own in zip(_TRIADS, self._own.known, strict=True):
+        for number, (part, triad, motion, vibration, unit, unit_name) in enumerate(_TRIADS):
+            own = self._own.known[number]
             noise = math.sqrt(floor[triad.start])
             shaking = max(vibration, 1.5 * noise, 0.0 if own is None else 1.5 * own.rms)
             rest = (0.0, shaking**2)
@@ -235,12 +236,13 @@ class ImuGate:
             # A known noisy sensor behind a low-pass looks like slow motion, hence the profile's noise here too.
             found, allowed = _motion(variance[triad], white[triad], n, max(motion, noise), rest)
             if own is not None:
-                allowed = max(allowed, math.sqrt(motion**2 + max(own.slow, 0.0) + _CHANCE * own.chance))
+                allowed = math.sqrt(motion**2 + max(own.slow, 0.0) + _CHANCE * own.chance)
+            hint = self._own.hint(number)
             if found > allowed:
-                return _words(f"{part} {name}", found / unit, allowed / unit, unit_name)
+                return _words(f"{part} {name}", found / unit, allowed / unit, unit_name, hint)
             found = math.sqrt(_mean(variance[triad]))
             if found > shaking:
-                return _words(f"{part} {name} shakes", found / unit, shaking / unit, unit_name)
+                return _words(f"{part} {name} shakes", found / unit, shaking / unit, unit_name, hint)
         self._learned.append(batch.variance)
         return None if sigma2 is None else self._likelihood(variance, n, sigma2)
 

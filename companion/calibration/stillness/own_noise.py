@@ -38,16 +38,25 @@ GYRO_MOST_RAD_S: Final = 0.07 * DEG
 """Largest density that is believed, times sqrt(s): 250 deg/h. The noisiest common part has 150."""
 ACCEL_MOST_M_S2: Final = 1.0 * MG
 """Likewise: three times the noisiest common part."""
-RED: Final = 3.0
-"""Density at averages of several seconds over that at one: flicker and warming up raise it, filters of 1 Hz too."""
+RED: Final = 2.0
+"""Density at averages of several seconds over that at one, and of one over half a one: flicker raises it, warming up,
+and a filter of 1 Hz. Slow rocking has 8 times as much at twice the time."""
+WHITE: Final = 0.8
+"""Share of the variance that successive differences show, from which noise is white: no filter to reckon with."""
 ROUND: Final = 40.0
 """Largest over smallest variance of a second's steps in any direction: axes three times as noisy as others, and
 chance."""
-_SIGMAS: Final = 3.0
+_SIGMAS: Final = 2.5
 _OUTLIER_SIGMAS: Final = 4.5
 _GAP: Final = 4
+_BEYOND: Final = 3.0
+"""What has more than so many times the largest density in one second is motion, not a noisier part."""
 _SPANS: Final = (1, 2, 4, 8)
-_MOST2: Final = np.repeat([GYRO_MOST_RAD_S**2, ACCEL_MOST_M_S2**2], 3)
+_NAMED: Final = 1.5
+"""Over the density of a part that somebody named."""
+_AT_REST: Final = 3.0
+_HINT_S: Final = 5
+"""So long without a motion beyond any noise, and it may be noise."""
 _SHARPEST: Final = 1.5
 """Relative variance of a second's variance, in v / N^2: 1 for white noise and one pole, 1.5 for two, 2 for a wall."""
 
@@ -84,11 +93,24 @@ class Known(msgspec.Struct, frozen=True):
 
 
 class OwnNoise:
-    """Learns the noise of one IMU from its seconds, moving or not; knows nothing until it is certain."""
+    """Learns the noise of one IMU from its seconds, moving or not; knows nothing until it is certain.
 
-    def __init__(self) -> None:
+    Args:
+        white: N of the profile, gyro and accelerometer: where somebody named a noisier part than is common.
+        at_rest: somebody says that it is: three times as much noise is believed.
+    """
+
+    def __init__(self, white: tuple[float, float] = (0.0, 0.0), *, at_rest: bool = False) -> None:
         self.known: list[Known | None] = [None, None]
         """Gyro, accelerometer; what was learned once stays, until something newer is."""
+        self._most2 = np.repeat(
+            [
+                max(_AT_REST * most if at_rest else most, _NAMED * named) ** 2
+                for most, named in zip((GYRO_MOST_RAD_S, ACCEL_MOST_M_S2), white, strict=True)
+            ],
+            3,
+        )
+        self._too_much = [False, False]
         self._seconds: deque[Batch] = deque(maxlen=KEPT_S)
         self._since = 0
 
@@ -96,11 +118,20 @@ class OwnNoise:
         """The readings are not comparable with earlier ones; what is known stays."""
         self._seconds.clear()
         self._since = 0
+        self._too_much = [False, False]
+
+    def hint(self, triad: int) -> str:
+        """What to add to the words that gyro (0) or accelerometer (1) moves: when it may be noise; else nothing."""
+        if self.known[triad] is not None or self._since < _HINT_S:
+            return ""
+        if self._too_much[triad]:
+            return " (steady as noise: name its part, or companion profile)"
+        return f" (motion or noise: known in {LEARN_S - self._since} s)" if self._since < LEARN_S else ""
 
     def add(self, batch: Batch) -> None:
         """Take the next second."""
         before = self._seconds[-1] if self._seconds else None
-        if batch.allan is None or not len(batch.allan) or _beyond_belief(batch, before):
+        if batch.allan is None or not len(batch.allan) or self._is_beyond_belief(batch, before):
             self.clear()
             return
         self._seconds.append(batch)
@@ -109,10 +140,28 @@ class OwnNoise:
             self._learn()
 
     def _learn(self) -> None:
-        seen = _Seen(list(self._seconds))
+        seconds = list(self._seconds)
+        # All, or the latest: the others may have something in them that is over.
+        seen = [_Seen(seconds), _Seen(seconds[-LEARN_S:])] if len(seconds) > LEARN_S else [_Seen(seconds)]
         for triad, part in enumerate((slice(0, 3), slice(3, 6))):
-            found = seen.noise(part, float(_MOST2[part][0]))
-            self.known[triad] = found or self.known[triad]
+            found = next(filter(None, (some.noise(part) for some in seen)), None)
+            self._too_much[triad] = found is not None and float(found.density.mean()) > float(self._most2[part][0])
+            if found is not None and not self._too_much[triad]:
+                self.known[triad] = found
+
+    def _is_beyond_belief(self, batch: Batch, before: Batch | None) -> bool:
+        """Whether a second alone has more than several times what any sensor's noise has."""
+        most2 = _BEYOND**2 * self._most2
+        if before is not None:
+            if not 0 < batch.slot - before.slot <= _GAP:
+                return True
+            step = np.square(batch.mean - before.mean) / (2.0 * most2)
+            if float(step.max()) > _OUTLIER_SIGMAS**2:
+                return True
+        rungs = _rungs(batch)
+        parts = _parts(len(rungs))
+        allowed = _upper(_freedom(parts), _OUTLIER_SIGMAS)
+        return bool((rungs / parts[:, None] > allowed[:, None] * most2).any())
 
 
 class _Seen:
@@ -138,24 +187,26 @@ class _Seen:
             for span, (variance, freedom) in ((span, allan_variance(self._slots, self._means, span)) for span in _SPANS)
         ]
 
-    def noise(self, part: slice, most: float) -> Known | None:
+    def noise(self, part: slice) -> Known | None:
         """What it is, if it is noise and nothing else."""
         variance, white = self._variances[:, part].mean(axis=0), self._white[part]
         density, freedom = float(self._long[0][0][part].mean()), 3.0 * self._long[0][1]
         if not (float(white.min()) > 0.0 and density > 0.0):
             return None
         share = np.maximum(variance / variance.mean(), white / white.mean())
-        found = Known(variance, white, density * share)
-        known = self._is_flat(part, density, freedom, most) and self._is_low(part, found.density, freedom)
+        is_white = float(white.mean()) > WHITE * float(variance.mean())
+        found = Known(variance, white, variance / self._samples if is_white else density * share)
+        known = self._is_flat(part, density, freedom) and self._is_low(part, density * share, freedom)
         return found if known and self._is_steady(part, found) and self._is_round(part) else None
 
-    def _is_flat(self, part: slice, density: float, freedom: float, most: float) -> bool:
+    def _is_flat(self, part: slice, density: float, freedom: float) -> bool:
         """Whether averages of more than a second have the density of a second's, or some more."""
         for values, many in self._long:
             longer, chance = float(values[part].mean()), _ratio(freedom, 3.0 * many)
-            if longer > most or longer > RED * density * chance or density > longer * chance:
+            if longer > RED * density * chance or density > longer * chance:
                 return False
-        return True
+        half, many = self._short[0]
+        return density <= RED * float(half[part].mean()) * _ratio(freedom, 3.0 * many)
 
     def _is_low(self, part: slice, density: Floats, freedom: float) -> bool:
         """Whether parts of a second have no more."""
@@ -197,20 +248,6 @@ def _freedom(parts: Floats) -> Floats:
 def _rungs(batch: Batch) -> Floats:
     assert batch.allan is not None
     return batch.allan
-
-
-def _beyond_belief(batch: Batch, before: Batch | None) -> bool:
-    """Whether a second alone has too much for any sensor's noise."""
-    if before is not None:
-        if not 0 < batch.slot - before.slot <= _GAP:
-            return True
-        step = np.square(batch.mean - before.mean) / (2.0 * _MOST2)
-        if float(step.max()) > _OUTLIER_SIGMAS**2:
-            return True
-    rungs = _rungs(batch)
-    parts = _parts(len(rungs))
-    allowed = _upper(_freedom(parts), _OUTLIER_SIGMAS)
-    return bool((rungs / parts[:, None] > allowed[:, None] * _MOST2).any())
 
 
 def _upper(freedom: NDArray[np.float64] | float, sigmas: float) -> Floats:
