@@ -44,6 +44,8 @@ class Means(msgspec.Struct, frozen=True):
     number: int
     wander_deg: float | None
     """How far the heading has wandered since the aircraft last moved, which may be before the recording."""
+    begun_s: dict[str, float] = {}
+    """By IMU, since when its stream has come, which may be likewise."""
 
 
 class Solved(msgspec.Struct, frozen=True, kw_only=True):
@@ -324,7 +326,7 @@ class RecordedCollector(RollingCollector):
             return super().window(now_s, since_s=since_s)
         self._windows_made += 1
         number = self._windows_made
-        self.journal.event(now_s, "window", Means(number, self.wander_deg))
+        self.journal.event(now_s, "window", Means(number, self.wander_deg, self.begun_s))
         window = super().window(now_s)
         self.windows.append((number, window))
         return window

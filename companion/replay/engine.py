@@ -301,7 +301,9 @@ class Replay:
                 except CalibrationRefusedError as error:
                     self._calibrations.measured(detail.number, error)
                 else:
-                    self._calibrations.measured(detail.number, measurement.with_wander(detail.wander_deg))
+                    self._calibrations.measured(
+                        detail.number, measurement.watched_longer(detail.wander_deg, detail.begun_s)
+                    )
             case "reset":
                 collector.reset(*detail)
             case "imu":

@@ -71,7 +71,8 @@ def test_the_biases_are_those_of_the_imu(
         ("accel_bias_m_s2", "accel_sigma_use_m_s2", true.accel_m_s2),
     ):
         assert (np.abs(np.subtract(imu[found], truth)) / imu[sigma]).max() < 3.5
-    assert max(imu["gyro_sigma_use_rad_s"]) < 40.0 * DEG_H
+    # No thermometer and no past: a warm-up that 60 s of this part do not show is in sigma.
+    assert max(imu["gyro_sigma_use_rad_s"]) < 60.0 * DEG_H
     # All but the millisecond in which the stream began and the second that its end cut.
     assert imu["samples"] >= 200 * 59
 

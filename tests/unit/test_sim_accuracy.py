@@ -16,9 +16,9 @@ from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
 from sim.accuracy import cli, experiments, paper, peers, tables
 from sim.accuracy.experiments import FloorRun, IntegerRun, WhiteRun, floors, integers, predicted, white
-from sim.accuracy.figures import Figure, beside, covered, rms
+from sim.accuracy.figures import Claim, Figure, beside, covered, rms
 from sim.accuracy.stand import EXACT, POSTURES, Stand, biases, collected, samples, sites, solved, stand
-from sim.accuracy.tables import Claim, report
+from sim.accuracy.tables import report
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.earth import Array
 from sim.imu_model import DEG_H, MG, PARTS, ImuModel

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
@@ -157,6 +158,7 @@ class Intake(ABC):
         self._tilt = self._pose_source("gradienter") if gradienter else None
         self._heading = self._pose_source("compass") if compass else None
         self._breaks: dict[str, int] = {}
+        self._restarted_s: dict[str, float] = {}
         self._field = None if field_by is None else FieldHeading(*field_by, keep)
 
     @abstractmethod
@@ -180,6 +182,7 @@ class Intake(ABC):
             return
         if sample.breaks != self._breaks.get(name, 0):
             self._breaks[name] = sample.breaks
+            self._restarted_s[name] = sample.t_s
             self._forget(name)
         stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
         row = sample.gyro_rad_s + sample.accel_m_s2
@@ -254,6 +257,15 @@ class Intake(ABC):
             source.may_move = True
             batches.on_second = self._deck.take_heading if circle else self._deck.take_tilt
         return source
+
+    @property
+    def begun_s(self) -> dict[str, float]:
+        """By IMU, since when its stream has come without a break: it has been switched on at least since then."""
+        return {
+            name: max(float(source.batches.begun), self._restarted_s.get(name, -math.inf))
+            for name, source in self._imus.items()
+            if source.batches.begun is not None
+        }
 
     def _forget(self, imu: str | None) -> None:
         if self._deck is not None:

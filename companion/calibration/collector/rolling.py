@@ -232,6 +232,7 @@ class RollingCollector(Intake):
                 wander_deg=self.wander_deg,
             ),
             field=self._field.window(slots) if self._field and self._heading else None,
+            begun_s=self.begun_s,
         )
 
     @property

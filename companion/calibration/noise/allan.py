@@ -25,6 +25,10 @@ _FLOOR_REACHED_S: Final = 1000.0
 """Catalogues give no random walk; K is taken such that it reaches the flicker floor here (method section 2.2)."""
 
 
+WARM_UP: Final = (20.0 * 54.0 * DEG_H, 20.0 * 0.2 * MG)
+"""Of a part that nobody has watched warming up: 20 K of a BMI088, the worse one of method section 2.1."""
+
+
 class AllanModel(msgspec.Struct, frozen=True):
     """White noise, flicker and random walk of one axis; rad/s or m/s^2 (times sqrt(s), 1, over sqrt(s))."""
 
@@ -44,6 +48,8 @@ class NoiseProfile(msgspec.Struct, frozen=True):
     name: str
     gyro: AllanModel
     accel: AllanModel
+    warm_up: tuple[float, float] = WARM_UP
+    """By how much the biases of gyro and accelerometer may move from cold to warm, two sigma."""
 
 
 def allan_model(white: float, floor: float) -> AllanModel:

@@ -197,6 +197,8 @@ _MAX_TIME_S: Final = 1e12
 _BACKWARD_SAMPLES: Final = 20
 """Samples in a row from the past that mean that the clock went back, not that some were late."""
 _BACKWARD_S: Final = 2.0
+_PAUSE_S: Final = 3.0
+"""A sensor that was silent for longer may have been switched off."""
 
 
 class BatchSource:
@@ -217,6 +219,8 @@ class BatchSource:
         self.closed_through: int | None = None
         """No batch of this slot or an earlier one will come any more."""
         self.last_s: float | None = None
+        self.begun: int | None = None
+        """The second since which it has come without a longer pause."""
         self.lost = 0
         """Samples that never came, by the device's counter or clock, since the beginning."""
         self.restarts = 0
@@ -236,6 +240,7 @@ class BatchSource:
         self._partial = True
         self._backward = 0
         self._last_stamp = math.nan
+        self._heard_s = -math.inf
         self._clear()
 
     def _clear(self) -> None:
@@ -316,6 +321,10 @@ class BatchSource:
         return True
 
     def _close(self) -> None:
+        if self._rows:
+            if self._times[0] - self._heard_s > _PAUSE_S:
+                self.begun = math.floor(self._times[0])
+            self._heard_s = self._times[-1]
         if self._slot is not None and self._rows and not self._partial:
             batch = self._summarise(self._slot)
             if batch is not None:

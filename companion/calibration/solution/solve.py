@@ -214,7 +214,9 @@ def solve(
     }
     asked = [triad for triad, is_wanted in wanted.items() if is_wanted]
     tipped = _tipped(window, gradienter, truth, turn)
-    imus = tuple(_estimate(imu, truth, local, shared, asked, tipped) for imu in window.imus)
+    imus = tuple(
+        _estimate(imu, truth, local, shared, asked, tipped, window.powered_s.get(imu.name, 0.0)) for imu in window.imus
+    )
     if all(imu.gyro_rad_s is None and imu.accel_m_s2 is None for imu in imus):
         refusals = [words for imu in window.imus for words in _hidden(imu, asked)]
         if refusals:
@@ -339,7 +341,13 @@ def _tipped(window: Window, gradienter: GradienterModel | None, truth: Truth, tu
 
 
 def _estimate(
-    imu: ImuWindow, truth: Truth, local: LocalEarth, shared: Shared, asked: Collection[Triad], tipped: Array
+    imu: ImuWindow,
+    truth: Truth,
+    local: LocalEarth,
+    shared: Shared,
+    asked: Collection[Triad],
+    tipped: Array,
+    powered_s: float,
 ) -> ImuSolution:
     gyro = accel = None
     if "gyro" in asked and imu.refused("gyro") is None:
@@ -349,6 +357,8 @@ def _estimate(
     own = imu.covariance
     if own is None:
         own = np.diag(np.square([*imu.gyro_sigma_use_rad_s, *imu.accel_sigma_use_m_s2]))
+    if imu.warming is not None:
+        own = own + np.diag(imu.warming.unseen(powered_s))
     return ImuSolution(
         name=imu.name,
         samples=imu.samples,

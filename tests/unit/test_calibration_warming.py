@@ -1,0 +1,135 @@
+"""What a warm-up may do unseen: thermometers, age, the window's own slope; against ramps that were put in."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from companion.calibration.means.warming import WARM_UP_K, Warming, likely_k_s, temperature_rate
+from companion.calibration.noise.allan import WARM_UP, AllanModel, NoiseProfile
+from companion.calibration.seconds.batch import Batch, BatchSource
+from companion.physics.units import DEG_H, MG
+from sim.accuracy import warmup_table
+from sim.accuracy.experiments import SPANS_S
+from sim.accuracy.figures import covered
+from sim.accuracy.warmup import Case, cases, warm
+from tests.support.still_aircraft import imu
+from tests.unit.test_calibration_windows import batches_of, window_of
+
+
+def with_temperatures(batches: list[Batch], degc: list[float]) -> list[Batch]:
+    return [msgspec.structs.replace(each, temperature_degc=one) for each, one in zip(batches, degc, strict=True)]
+
+
+def seconds(degc: list[float]) -> list[Batch]:
+    return with_temperatures(batches_of(np.zeros((len(degc), 6))), degc)
+
+
+def test_no_warm_up_is_steeper_than_a_curve_of_its_age_can_be() -> None:
+    for age_s in (0.0, 30.0, 60.0, 300.0, 3600.0):
+        time_constants = np.arange(60.0, 20000.0, 1.0)
+        steepest = float((WARM_UP_K / time_constants * np.exp(-age_s / time_constants)).max())
+        assert 2.0 * likely_k_s(age_s) == pytest.approx(steepest, rel=1e-4)
+
+
+def test_a_thermometers_rate_is_found_and_holds_what_it_says() -> None:
+    rng = np.random.default_rng(3)
+    inside = 0
+    for _ in range(200):
+        degc = 31.0 + 0.02 * np.arange(30.0) + rng.normal(0.0, 0.05, 30)
+        found = temperature_rate(seconds(degc.tolist()))
+        assert found is not None
+        inside += abs(found[0] - 0.02) < 2.0 * math.sqrt(found[1])
+    assert 0.90 < inside / 200 < 0.99
+    assert temperature_rate(batches_of(np.zeros((30, 6)))) is None
+    assert temperature_rate(seconds([25.0, 25.0])) is None
+
+
+@pytest.mark.parametrize("step", [1.0, 0.25, 0.01])
+def test_a_coarse_thermometer_that_stands_still_tells_no_more_than_its_step_allows(step: float) -> None:
+    """The fastest that a reading can go through T seconds without showing it is a step in T."""
+    found = temperature_rate(seconds([24.0 + step] * 20))
+    assert found is not None
+    assert found[0] == 0.0
+    assert step / 20.0 < 2.0 * math.sqrt(found[1]) < 3.0 * step / 20.0
+    rounded = np.rint((24.0 + 0.4 * step * np.arange(20.0) / 20.0) / step) * step
+    seen = temperature_rate(seconds(rounded.tolist()))
+    assert seen is not None
+    assert abs(seen[0] - 0.4 * step / 20.0) < 2.0 * math.sqrt(seen[1])
+
+
+def test_what_is_unseen_shrinks_with_age_and_with_a_steady_thermometer() -> None:
+    noise = AllanModel(150.0 * DEG_H, 1.0 * DEG_H, 0.1 * DEG_H), AllanModel(0.3 * MG, 0.01 * MG, 0.001 * MG)
+    source = imu("fc", NoiseProfile("noisy", *noise))
+    rng = np.random.default_rng(4)
+    means = np.concatenate([rng.normal(0.0, noise[0].white, (30, 3)), rng.normal(0.0, noise[1].white, (30, 3))], axis=1)
+    batches = batches_of(means)
+    blind = window_of(source, batches).warming
+    steady = window_of(source, with_temperatures(batches, (25.13 + rng.normal(0.0, 0.002, 30)).tolist())).warming
+    assert isinstance(blind, Warming)
+    assert isinstance(steady, Warming)
+    sizes = [np.sqrt(blind.unseen(age_s)).max() / DEG_H for age_s in (30.0, 600.0, 7200.0)]
+    assert sizes[0] > 80.0
+    assert sizes[0] > 5.0 * sizes[1] > 10.0 * sizes[2]
+    assert np.sqrt(steady.unseen(30.0)[:3]).max() < 1.0 * DEG_H
+    assert np.sqrt(steady.unseen(30.0)[3:]).max() < 0.01 * MG
+
+
+def test_a_part_whose_warm_up_was_learned_is_believed() -> None:
+    model = AllanModel(150.0 * DEG_H, 1.0 * DEG_H, 0.1 * DEG_H)
+    quick = NoiseProfile("quick", model, model)
+    calm = NoiseProfile("calm", model, model, warm_up=(WARM_UP[0] / 20.0, WARM_UP[1] / 20.0))
+    batches = batches_of(np.random.default_rng(5).normal(0.0, model.white, (10, 6)))
+    found = [window_of(imu("fc", profile), batches).warming for profile in (quick, calm)]
+    assert found[0] is not None
+    assert found[1] is not None
+    ratio = found[1].unseen(10.0)[:3] / found[0].unseen(10.0)[:3]
+    assert ratio == pytest.approx(1.0 / 400.0, rel=0.25)
+
+
+def test_a_stream_begins_anew_after_a_pause_and_after_its_clock_went_back() -> None:
+    source = BatchSource((1.0,), 20)
+    for t_s in np.arange(100.25, 110.0, 0.25):
+        source.add(float(t_s), (0.0,))
+    assert source.begun == 100
+    source.close_before(114.5)
+    source.add(114.6, (0.0,))
+    source.close_before(115.5)
+    assert source.begun == 114
+    for t_s in np.arange(50.0, 60.0, 0.25):
+        source.add(float(t_s), (0.0,))
+    assert source.begun is not None
+    assert 50 <= source.begun < 60
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        Case(False, ramp_deg_h_s=1.0),
+        Case(False, ramp_deg_h_s=3.0),
+        Case(True, ramp_deg_h_s=3.0),
+        Case(False, curve_s=300.0, late_s=5.0),
+        Case(True, curve_s=1200.0, late_s=120.0),
+    ],
+)
+def test_the_next_minute_of_a_part_that_warms_up_is_covered(case: Case) -> None:
+    assert case in cases()
+    runs = [warm("adis16405", case, 5, number) for number in range(8)]
+    error, sigma = np.array([run.error for run in runs]), np.array([run.sigma for run in runs])
+    for at in range(len(SPANS_S)):
+        found = covered(error[:, at, :3], sigma[:, at, :3], 2.0)
+        assert found.value > 0.9 - 3.0 * found.error
+
+
+def test_a_warm_part_whose_thermometer_says_so_pays_nothing() -> None:
+    sigma = np.array([warm("icm42688p", Case(True), 5, number).sigma for number in range(6)])
+    # V(T, 180 s) of method section 2.2, the table's figures for 10, 30 and 60 s.
+    assert np.median(sigma[:, :, :3], axis=(0, 2)) / DEG_H == pytest.approx([5.8, 5.0, 4.7], rel=0.12)
+
+
+def test_the_table_names_every_case_once() -> None:
+    rows = warmup_table._rows()
+    assert sorted(map(repr, (case for _, some in rows for case in some))) == sorted(map(repr, cases()))
