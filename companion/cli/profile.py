@@ -36,6 +36,8 @@ LEAST_SHARE: Final = 0.90
 LEAST_MINUTES: Final = 20.0
 """The least number of windows side by side: fewer say nothing about a share of 90 %."""
 SHORT_S: Final = 1200
+MOST_STRETCHES: Final = 6
+"""Shown of each recording; --json has them all."""
 _UNITS: Final = {"gyro": (DEG_H, "deg/h", 1), "accel": (1e-3 * MG, "ug", 0)}
 _AXES: Final = "xyz"
 
@@ -170,6 +172,25 @@ def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s
     return Result(imu, whole, found, finding, against, kept, _notes(finding, against, found, kept, obstacle))
 
 
+def _used(result: Result) -> Iterator[tuple[StillLog, list[tuple[float, float]], float]]:
+    """Of each recording the stretches that were learned from, in seconds from its beginning on, and how long it is."""
+    for log, found in zip(result.logs, result.rests, strict=True):
+        begin_s = float(log.t_s[0])
+        spans = [(float(rest.slots[0]) - begin_s, float(rest.slots[-1]) + 1.0 - begin_s) for rest in found.stretches]
+        yield log, spans, float(log.t_s[-1]) - begin_s
+
+
+def _used_lines(result: Result) -> list[str]:
+    lines = []
+    for log, spans, seconds_s in _used(result):
+        shown = ", ".join(f"{from_s:.0f} to {to_s:.0f} s" for from_s, to_s in spans[:MOST_STRETCHES])
+        more = f" and {len(spans) - MOST_STRETCHES} more" if len(spans) > MOST_STRETCHES else ""
+        lines.append(f"used of {', '.join(log.files)}: {shown}{more}, of {seconds_s:.0f} s")
+        lines += [f"left out: {count} lines {why}" for why, count in log.left_out.items()]
+        lines += [f"note: {note}" for note in log.notes]
+    return lines
+
+
 def _notes(
     finding: Finding, against: NoiseProfile, found: Sequence[Rests], kept: Sequence[Kept], obstacle: str
 ) -> list[str]:
@@ -250,6 +271,7 @@ def _lines(result: Result) -> list[str]:
             shares = [f"{share:.1%}" for share in (each.share, each.share_strict, each.share_naive)]
             over = f"{each.rms / each.sigma_use:.2f}"
             lines.append(_row(each.triad, (f"{each.mean_s}", *sizes, over, *shares), widths))
+    lines += _used_lines(result)
     lines += [f"note: {note}" for note in result.notes]
     return lines + [f"DO NOT USE: {words}" for words in result.broken]
 
@@ -317,6 +339,15 @@ def _object(result: Result) -> dict[str, Any]:
         "still_s": finding.still_s,
         "seconds": sum(each.seconds for each in result.rests),
         "recordings": [", ".join(log.files) for log in result.logs],
+        "used": [
+            {
+                "seconds": seconds_s,
+                "stretches": [{"from_s": from_s, "to_s": to_s} for from_s, to_s in spans],
+                "left_out": log.left_out,
+                "notes": log.notes,
+            }
+            for log, spans, seconds_s in _used(result)
+        ],
         "temperature_degc": _temperatures(result.logs),
         "profile": msgspec.to_builtins(finding.profile),
         "compared": msgspec.to_builtins(result.compared),

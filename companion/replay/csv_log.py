@@ -164,7 +164,7 @@ class _Table:
     def log(self, name: str) -> StillLog:
         """Read it to its end."""
         order = [what for what in UNITS if what in self._columns.used]
-        flat, numbers = array("d"), array("L")
+        flat, numbers = array("d"), array("I")
         for lines, block in self._blocks([self._columns.used[what].place for what in order]):
             block[~(np.abs(block) < _NUMBERS)] = math.nan
             flat.frombytes(np.ascontiguousarray(block).tobytes())

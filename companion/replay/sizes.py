@@ -36,6 +36,8 @@ _QUARTILE: Final = 0.4506
 _RATES_HZ: Final = (4.0, 4000.0)
 _USUAL_FORCES: Final = ("m_s2", "g", "mg")
 _SOME: Final = 20_000
+_MOST: Final = 1_000_000
+"""Lines that the noise is looked at in: more would only take memory."""
 
 
 def seconds_per(steps: Floats) -> str | None:
@@ -65,8 +67,9 @@ def units_of(columns: Columns, t_s: Floats, readings: Floats, where: str) -> tup
     named = {what: columns.used[what].unit for what in IMU}
     notes: list[str] = []
     forces = _forces(columns, named, readings[:, 3:], where, notes)
-    means = readings[:, 3:] * [FORCES[forces[what]] for what in IMU[3:]]
-    rates = _rates(columns, {**named, **forces}, (t_s, readings[:, :3], means), where, notes)
+    first = readings[:_MOST]
+    rest = first[:, 3:] * [FORCES[forces[what]] for what in IMU[3:]]
+    rates = _rates(columns, {**named, **forces}, (t_s[:_MOST], first[:, :3], rest), where, notes)
     return {**rates, **forces}, notes
 
 
