@@ -25,6 +25,7 @@ from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.solution.prior import Expectation
 from companion.calibration.solution.record import Record
 from companion.calibration.solution.site import Whereabouts
+from companion.calibration.turning.watch import Turn
 from companion.config.sections import Config
 from companion.configured import models
 from companion.links.system.listeners import Listeners
@@ -46,6 +47,8 @@ class Means(msgspec.Struct, frozen=True):
     """How far the heading has wandered since the aircraft last moved, which may be before the recording."""
     begun_s: dict[str, float] = {}
     """By IMU, since when its stream has come, which may be likewise."""
+    turn: Turn | None = None
+    """What was known of the platform's own rate, likewise; None: of an older version."""
 
 
 class Solved(msgspec.Struct, frozen=True, kw_only=True):
@@ -326,7 +329,7 @@ class RecordedCollector(RollingCollector):
             return super().window(now_s, since_s=since_s)
         self._windows_made += 1
         number = self._windows_made
-        self.journal.event(now_s, "window", Means(number, self.wander_deg, self.begun_s))
+        self.journal.event(now_s, "window", Means(number, self.wander_deg, self.begun_s, self.turn))
         window = super().window(now_s)
         self.windows.append((number, window))
         return window

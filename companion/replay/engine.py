@@ -302,7 +302,7 @@ class Replay:
                     self._calibrations.measured(detail.number, error)
                 else:
                     self._calibrations.measured(
-                        detail.number, measurement.watched_longer(detail.wander_deg, detail.begun_s)
+                        detail.number, measurement.watched_longer(detail.wander_deg, detail.begun_s, detail.turn)
                     )
             case "reset":
                 collector.reset(*detail)

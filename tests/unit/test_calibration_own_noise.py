@@ -32,7 +32,7 @@ def verdicts(t_s: Floats, readings: Floats) -> list[bool]:
     for batch in seconds_of(t_s, readings):
         verdict = gate.judge(batch)
         if verdict.still:
-            gate.accept(batch, settled=True)
+            gate.accept(batch)
         found.append(verdict.still)
     return found
 

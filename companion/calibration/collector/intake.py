@@ -17,6 +17,8 @@ from companion.calibration.means.windows import ImuInput, integer_steps
 from companion.calibration.seconds.batch import Batch, BatchSource
 from companion.calibration.stillness.gates import STILL, ImuGate, PoseGate, Verdict
 from companion.calibration.stillness.stretch import Lag, Settling
+from companion.calibration.turning.level import ImuKind
+from companion.calibration.turning.watch import Turn, TurnWatch
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 
 Kind = Literal["imu", "gradienter", "compass"]
@@ -150,6 +152,7 @@ class Intake(ABC):
         lags: tuple[Lag, Lag],
         field_by: tuple[CompassModel, GradienterModel | None] | None,
         deck: Deck | None,
+        span: int,
     ) -> None:
         self._keep, self._deck = keep, deck
         self._inputs: dict[str, ImuInput] = {}
@@ -160,6 +163,7 @@ class Intake(ABC):
         self._breaks: dict[str, int] = {}
         self._restarted_s: dict[str, float] = {}
         self._field = None if field_by is None else FieldHeading(*field_by, keep)
+        self._turns = TurnWatch(span)
 
     @abstractmethod
     def _evaluate(self) -> None:
@@ -223,6 +227,16 @@ class Intake(ABC):
         """Add an IMU, or say that its stream is another kind now: all that was learned of it is forgotten."""
         self._inputs[imu.name] = imu
         gate = ImuGate(imu.name, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2))
+        self._turns.set_imu(
+            ImuKind(
+                name=imu.name,
+                rotation=imu.rotation,
+                gyro=imu.profile.gyro,
+                accel=imu.profile.accel,
+                gyro_step_rad_s=imu.gyro_step_rad_s,
+                accel_step_m_s2=imu.accel_step_m_s2,
+            )
+        )
         known = self._imus.get(imu.name)
         if self._deck is not None:
             self._deck.set_imu(imu)
@@ -267,6 +281,23 @@ class Intake(ABC):
             if source.batches.begun is not None
         }
 
+    @property
+    def turn(self) -> Turn:
+        """What is known of the platform's own rate."""
+        return self._turns.turn
+
+    def _watch_turn(self, slot: int, *, good: bool) -> bool:
+        """Look for a turn in a second that has been judged; False where the still stretch ends with it."""
+        others = [source.verdict for source in self._sources() if source is not self._heading]
+        if self._deck is not None or any(verdict.fault for verdict in others):
+            return True
+        if not all(verdict.still for verdict in others):
+            self._turns.moved(slot)
+            return True
+        heading = None if self._heading is None else next(iter(self._heading.settled([slot])), None)
+        imus = {name: source.batches.batches[slot] for name, source in self._imus.items()}
+        return self._turns.add_second(slot, imus, heading, good=good)
+
     def _forget(self, imu: str | None) -> None:
         if self._deck is not None:
             self._deck.forget(imu)
@@ -276,6 +307,7 @@ class Intake(ABC):
                 source.verdict = Verdict(still=False)
                 if isinstance(source.gate, ImuGate):
                     source.gate.forget_level()
+        self._turns.forget(imu)
         self._break()
 
     def _sources(self) -> list[Source]:

@@ -29,7 +29,6 @@ from companion.calibration.deck.estimate import DeckWork
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.seconds.batch import Batch
-from companion.calibration.stillness.gates import ImuGate
 from companion.calibration.stillness.stretch import AT_ONCE, HeadingWatch, Lag, Stretch
 from companion.errors import CalibrationRefusedError
 
@@ -76,6 +75,7 @@ class RollingCollector(Intake):
             lags=(gradienter_lag, compass_lag),
             field_by=field_by,
             deck=deck,
+            span=self._max_slots,
         )
         self._afloat = None if deck is None else Afloat(deck, settings.horizon_s)
         self._watch = HeadingWatch()
@@ -233,6 +233,7 @@ class RollingCollector(Intake):
             ),
             field=self._field.window(slots) if self._field and self._heading else None,
             begun_s=self.begun_s,
+            turn=self.turn,
         )
 
     @property
@@ -255,6 +256,7 @@ class RollingCollector(Intake):
         self._stretch.clear()
         self._good.clear()
         self._estimates.clear()
+        self._turns.new_stretch()
         for source in self._sources():
             source.gate.new_stretch()
 
@@ -300,6 +302,8 @@ class RollingCollector(Intake):
         self._trace.add(slot, sources, good=good)
         if not self._stretch.add(slot, good=good):
             self._break()
+        if not self._watch_turn(slot, good=good):
+            self._break()
         if not good and self._stretch.start is None:
             return
         self._good[slot] = good
@@ -311,9 +315,7 @@ class RollingCollector(Intake):
             batch = source.batches.batches.get(slot)
             if batch is None:
                 continue
-            if isinstance(source.gate, ImuGate):
-                source.gate.accept(batch, settled=self._stretch.begun)
-            elif slot not in source.unsettled:
+            if source.kind == "imu" or slot not in source.unsettled:
                 source.gate.accept(batch)
 
     def _obstacle(self, now_s: float) -> Obstacle | None:
@@ -321,6 +323,9 @@ class RollingCollector(Intake):
         sources = self._sources()
         if (silence := next(filter(None, (source.silence(now_s) for source in sources)), None)) is not None:
             return Obstacle(silence)
+        others = any(source.verdict.words for source in sources if source is not self._heading)
+        if self._turns.words and not others:
+            return Obstacle(self._turns.words, moving=True)
         if self._stretch.good_now:
             return None
         said = [source.verdict for source in sources if source.verdict.words]

@@ -30,6 +30,7 @@ from companion.calibration.noise.allan import (
 )
 from companion.calibration.noise.robust import RAMP_BATCHES, huber_line, is_ramp, robust_mean
 from companion.calibration.seconds.batch import Batch
+from companion.calibration.turning.watch import Turn
 from companion.physics.frames import Floats, vector
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad, Vector
@@ -129,6 +130,8 @@ class Window(msgspec.Struct, frozen=True, kw_only=True):
     """Of a deck's mean turn, its axis levelled by the gradienter's readings without an offset."""
     powered_s: dict[str, float] = {}
     """By IMU, for how long it has been switched on at least, at the end."""
+    turn: Turn = Turn()
+    """What else was known of the platform's own rate, where it stands still."""
 
 
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):

@@ -108,7 +108,7 @@ def rests(t_s: Floats, readings: Floats, temperature_degc: Floats | None, name: 
         if not stretch.add(batch.slot, good=verdict.still):
             end()
         if verdict.still:
-            gate.accept(batch, settled=stretch.begun)
+            gate.accept(batch)
             kept.append(batch)
         else:
             obstacles[verdict.what] += 1

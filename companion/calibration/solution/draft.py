@@ -15,11 +15,12 @@ from companion.calibration.solution.record import (
     CrossCovariance,
     ImuRecord,
     Record,
+    Standing,
     WrittenParameter,
 )
 from companion.calibration.solution.solve import ImuSolution, Solution
 from companion.physics.frames import Array, Matrix, vector
-from companion.physics.units import DEG_H, MG
+from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import Triad, Vector
 
 
@@ -78,6 +79,7 @@ class Draft:
             system_id=self.system_id,
             magnetic=solution.magnetic if solution else None,
             alignment=self.alignment,
+            standing=_standing(solution) if solution else None,
             imus=tuple(self._imu(estimate) for estimate in solution.imus) if solution else (),
             cross_covariance=_cross(solution) if solution else (),
         )
@@ -109,6 +111,17 @@ class Draft:
 
 def _axes(values: Array | None) -> Vector | None:
     return None if values is None else vector(values)
+
+
+def _standing(solution: Solution) -> Standing:
+    turn = solution.turn
+    told = turn.by is not None
+    return Standing(
+        platform=solution.platform,
+        turn_deg_s=round(turn.rate_rad_s / DEG, 6) if told else None,
+        turn_sigma_deg_s=round(turn.sigma_rad_s / DEG, 6) if told else None,
+        told_by=turn.by,
+    )
 
 
 def _known(imu: ImuSolution) -> list[bool]:

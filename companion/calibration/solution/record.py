@@ -90,6 +90,19 @@ def _earths(expected: float | None, form: str) -> str:
     return "" if expected is None else f" (the Earth's {expected:{form}})"
 
 
+class Standing(msgspec.Struct, frozen=True, kw_only=True):
+    """What it stood on, and what was known of that one's own turn; the gyros' sigma allows for it."""
+
+    platform: Literal["ground", "deck"]
+    """As configured."""
+    turn_deg_s: float | None
+    """About the vertical, clockwise seen from above; not taken off. None: nothing told, and the ground was taken for
+    fixed to the Earth."""
+    turn_sigma_deg_s: float | None
+    told_by: Literal["compass", "gyros", "compass and gyros"] | None
+    """Gyros: by their level at an earlier rest."""
+
+
 class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):
     """One autopilot parameter: before, what was set, what came back.
 
@@ -242,6 +255,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     """UTC, ISO 8601: when what this calibration has written was put back on request."""
     magnetic: Magnetic | None = None
     """How good the heading can be; None without a compass."""
+    standing: Standing | None = None
+    """None: nothing was measured, or by an older version."""
     cross_covariance: tuple[CrossCovariance, ...] = ()
     """Of every two IMUs."""
     armings: tuple[Arming, ...] = ()

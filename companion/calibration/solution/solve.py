@@ -40,6 +40,7 @@ from companion.calibration.request import What
 from companion.calibration.solution import magnetic
 from companion.calibration.solution.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site
 from companion.calibration.solution.site import LocalEarth, Uncertain
+from companion.calibration.turning.watch import Turn
 from companion.config.sections import Platform
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, skew
@@ -144,6 +145,9 @@ class Solution:
     """IMUs and triads that were asked for and whose readings do not tell; the IMU's warnings say why."""
     magnetic: Magnetic | None = None
     """How good the heading can be; None without a compass."""
+    turn: Turn = dataclasses.field(default_factory=Turn)
+    """What was known of the platform's own rate."""
+    platform: Platform = "ground"
     cross: Mapping[tuple[str, str], Matrix] = dataclasses.field(default_factory=dict)
     """Cross-covariance (6x6) of every two IMUs, in their order."""
 
@@ -200,8 +204,8 @@ def solve(
             f"{local.remedies.no_heading}: the horizontal part of the Earth's rate is unknown, gyro sigma widened"
         )
     truth = truth_of(window, gradienter, compass, local, warnings)
-    turn = np.zeros(3) if window.turn_rad_s is None else np.array(window.turn_rad_s)
-    shared = _shared(truth, local, 0.0 if gradienter is None else gradienter.sigma_deg * DEG, turn)
+    sailing = np.zeros(3) if window.turn_rad_s is None else np.array(window.turn_rad_s)
+    shared = _shared(truth, local, window.turn, 0.0 if gradienter is None else gradienter.sigma_deg * DEG, sailing)
     # A deck may turn, and a steady turn shows in nothing but the heading.
     turn_unseen = platform == "deck" and what.gyros and truth.heading_rad is None
     if turn_unseen:
@@ -213,7 +217,7 @@ def solve(
         "accel": what.accelerometers and gradienter is not None,
     }
     asked = [triad for triad, is_wanted in wanted.items() if is_wanted]
-    tipped = _tipped(window, gradienter, truth, turn)
+    tipped = _tipped(window, gradienter, truth, sailing)
     imus = tuple(
         _estimate(imu, truth, local, shared, asked, tipped, window.powered_s.get(imu.name, 0.0)) for imu in window.imus
     )
@@ -232,6 +236,8 @@ def solve(
         unknown=tuple(unknown),
         magnetic=truth.magnetic,
         shared=shared,
+        turn=window.turn,
+        platform=platform,
         cross=dict.fromkeys(itertools.combinations((imu.name for imu in imus), 2), shared.covariance),
     )
 
@@ -264,7 +270,8 @@ def truth_of(
     if compass is None or window.heading is None:
         return without
     tilt_covariance = None if by_reading is None else up_covariance
-    found = magnetic.assess(window.heading, window.field, compass, local, up, tilt_covariance)
+    may_turn_deg = window.turn.at_most_rad_s / DEG * (window.end_s - window.start_s)
+    found = magnetic.assess(window.heading, window.field, compass, local, up, tilt_covariance, may_turn_deg)
     warnings += found.warnings
     if not found.is_usable:
         return dataclasses.replace(without, magnetic=found.magnetic)
@@ -310,17 +317,17 @@ def _pose(truth: Truth) -> Pose:
     )
 
 
-def _shared(truth: Truth, local: LocalEarth, zero_sigma_rad: float, turn_rad_s: Array) -> Shared:
+def _shared(truth: Truth, local: LocalEarth, turn: Turn, zero_sigma_rad: float, turn_rad_s: Array) -> Shared:
     """What one attitude, gravity, Earth's rate and turn of the platform add to the errors of all; method section 2.1.
 
     An attitude error eps makes db_a = eps x f and db_g = eps x w = -[w x] eps; the cross term is kept, since one tilt
     error makes both. What remains unknown of the Earth's rate (latitude, or a heading never measured) comes in with
-    its own covariance.
+    its own covariance, and so does what the platform may turn by itself.
     """
     rate, up = truth.earth_rate(local), truth.up
     jacobian = np.vstack([-skew(rate.mean + turn_rad_s), -skew(local.gravity_m_s2 * up)])
     covariance = jacobian @ truth.attitude_covariance_rad2 @ jacobian.T
-    covariance[:3, :3] += rate.covariance
+    covariance[:3, :3] += rate.covariance + turn.covariance(up)
     covariance[3:, 3:] += np.outer(up, up) * local.gravity_sigma_m_s2**2
     return Shared(
         up=up,

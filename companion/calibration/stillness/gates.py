@@ -3,7 +3,7 @@
 The detector is the generalised likelihood ratio test of Skog, Haendel, Nilsson and Rantakokko (IEEE Trans. Biomed.
 Eng. 57(11), 2010) in its centred form: T = mean(sum((a - abar)^2 / s_a^2 + (w - wbar)^2 / s_w^2)), 6 (W - 1) / W when
 at rest, because before a calibration the biases are unknown. What the centred form cannot see, a slow steady turn,
-is left to gates on the means. Method section 3.
+is left to gates on the means, and to `turning`. Method section 3.
 
 One set of constants serves all sensors; nothing here is tuned to a recording. Three ideas make that possible:
 
@@ -53,14 +53,6 @@ GYRO_STEP_RAD_S: Final = 0.05 * DEG
 
 ACCEL_STEP_M_S2: Final = 5.0 * MG
 """A second's mean against the start of the stretch: a tilt of 0.3 deg. Warming by 10 K moves consumer parts 2 mg."""
-
-GYRO_REST_RAD_S: Final = 0.5 * DEG
-"""Against the level of the last still stretch: a bias does not move that far within minutes, a steady turn that is
-slower needs twelve minutes for a circle."""
-
-REST_HELD_S: Final = 30
-"""So long a steady reading off the old level is believed to be a new bias: without this a shock to the sensor
-would lock the gate until a restart."""
 
 GYRO_BIAS_RAD_S: Final = 10.0 * DEG
 """Beyond any turn-on bias that a modern part specifies (typically 0.5 to 3 deg/s)."""
@@ -169,30 +161,23 @@ class ImuGate:
         self._steps = Steps([steps[0]] * 3 + [steps[1]] * 3)
         self._learned: deque[Floats] = deque(maxlen=_LEARN_FROM)
         self._noise: Floats | None = None
-        self._rest: Floats | None = None
-        self._off_level = 0
         self.new_stretch()
 
     def new_stretch(self) -> None:
-        """The still stretch has ended: references start again. Noise and rest level stay known."""
+        """The still stretch has ended: references start again. The noise stays known."""
         self._recent: deque[Floats] = deque(maxlen=_RECENT)
         self._start: list[Floats] = []
 
     def forget_level(self) -> None:
         """The readings are not comparable with earlier ones: an offset was written, the owner restarted."""
-        self._rest = None
-        self._off_level = 0
         self._own.clear()
         self.new_stretch()
 
-    def accept(self, batch: Batch, *, settled: bool) -> None:
-        """The second counts as still for all sources; `settled` when the stretch is long enough to be believed."""
+    def accept(self, batch: Batch) -> None:
+        """The second counts as still for all sources."""
         self._recent.append(batch.mean[:3])
         if len(self._start) < _REFERENCE:
             self._start.append(batch.mean[3:])
-        if settled:
-            self._rest = np.mean(self._recent, axis=0)
-            self._off_level = 0
 
     def judge(self, batch: Batch) -> Verdict:
         """Whether this second was still for this IMU; learns its noise on the way."""
@@ -301,21 +286,7 @@ class ImuGate:
             found = _beyond(force, self._start, chance[3:])
             if found > ACCEL_STEP_M_S2:
                 return _words(f"accel {name} tilted by", found / MG, ACCEL_STEP_M_S2 / MG, "mg")
-        return self._off_rest(rate)
-
-    def _off_rest(self, rate: list[float]) -> Verdict | None:
-        if self._rest is None:
-            return None
-        found = max(abs(each - rest) for each, rest in zip(rate, self._rest.tolist(), strict=True))
-        if found <= GYRO_REST_RAD_S:
-            self._off_level = 0
-            return None
-        self._off_level += 1
-        if self._off_level >= REST_HELD_S:
-            self._rest = None
-            self._off_level = 0
-            return None
-        return _words(f"gyro {self._name} turns by", found / DEG, GYRO_REST_RAD_S / DEG, "deg/s")
+        return None
 
 
 class PoseGate:
