@@ -182,7 +182,8 @@ def test_the_sigma_of_a_slope_covers_white_noise_and_wander() -> None:
         found = fit_slope(slots, values)
         covered = np.mean(np.abs(found.per_s) < 2.0 * np.sqrt(found.variance))
         assert least < covered <= 1.0
-    assert np.mean(np.sqrt(fit_slope(slots, white).variance)) == pytest.approx(math.sqrt(12.0 / 60**3), rel=0.2)
+    # What white noise alone leaves, and a little for the wander that could not be told from it.
+    assert np.median(np.sqrt(fit_slope(slots, white).variance)) == pytest.approx(math.sqrt(12.0 / 60**3), rel=0.25)
 
 
 @pytest.mark.parametrize("sigma", [0.2, 0.3, 0.5, 1.0])

@@ -249,10 +249,10 @@ class TurnWatch:
             and not self.turn.gyros_stay
             and _is_significant(longer.rate, math.sqrt(longer.variance), LEAST_RAD_S)
         )
-        if self.turn.is_significant and (self.turn.by != "gyros" or self._is_suspect):
-            self.words = self._turning(self.turn.rate_rad_s)
-        elif lasting and longer is not None and not self._contradicts(common, longer):
+        if lasting and longer is not None and not self._contradicts(common, longer):
             self.words = self._turning(longer.rate)
+        elif self.turn.is_significant and (self.turn.by != "gyros" or self._is_suspect):
+            self.words = self._turning(self.turn.rate_rad_s)
         elif self.turn.tilts:
             rate = math.hypot(*self.turn.tilting_rad_s) / DEG
             self.words = f"the aircraft tilts by {rate:.3f} deg/s"
