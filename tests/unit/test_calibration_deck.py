@@ -86,7 +86,7 @@ def test_whitened_waves_are_white_and_their_mean_is_known_better() -> None:
         times = np.arange(200.0)
         wave = sum(np.sin(2.0 * math.pi * f * times + p) for f, p in random.uniform([0.15, 0.0], [0.25, 6.3], (12, 2)))
         series = wave + 0.05 * random.normal(size=200)
-        white = whitened(np.column_stack([np.ones(200), series]), fit_waves([series - series.mean()]), 0.0)
+        white = whitened(np.column_stack([np.ones(200), series]), fit_waves([series - series.mean()]))
         information = white[:, 0] @ white[:, 0]
         assert information**-0.5 < 0.2 * series.std() / math.sqrt(200.0)
         off.append(white[:, 0] @ white[:, 1] / information * math.sqrt(information))

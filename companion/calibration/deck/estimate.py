@@ -18,7 +18,7 @@ from companion.calibration.deck.smoother import Believed, Found, smooth
 from companion.calibration.deck.stream import ImuSecond, Surroundings
 from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.calibration.means.windows import ImuInput, ImuWindow, Window
-from companion.calibration.noise.allan import PROFILES, AllanModel, floor_variance, slope_variance
+from companion.calibration.noise.allan import PROFILES, floor_variance, slope_variance
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Floats, Matrix, vector
 from companion.physics.gradienter import up_in_sensor, up_jacobian
@@ -38,9 +38,11 @@ _DITHERED: Final = 1.5
 _UNKNOWN_ACCEL_M_S2: Final = 50.0 * MG
 _LEAST_ACCEL_M_S2: Final = 0.1 * MG
 """Of the comparison with the gradienter; what its zero is wrong by turns everything alike and comes in `solve`."""
-_MIDDLE: Final = 1.1
-"""A slope is weighed like a parabola, most in the middle of the window: so much farther from the next minutes than a
-mean (random walk: 3 (9/5 - 2 + 4/7))."""
+_MIDDLE: Final = 0.37
+"""Of K^2 T: what a slope, weighed most in its middle, misses of a bias that walks; no averaging takes it away."""
+_FLICKER_TO_COME: Final = 0.75
+"""Of B^2: what flicker does in the next minutes that its past does not tell. With what it did in the window, as a
+random walk of B / sqrt(T), it is the flicker's part of V(T, H)."""
 _GRAVITY_M_S2: Final = 9.8
 _TEMPERATURE_WARNING_K: Final = 3.0
 
@@ -132,9 +134,13 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
         mean_rate = np.linalg.norm(_turn_rad_s(seconds, found))
         steps = _hidden_steps(imu, seconds)
         going_on = np.square(found.ramp_rad_s2 * self.horizon_s / 2.0) / 3.0
-        gyro_floor = _floor(imu.profile.gyro, span_s, self.horizon_s) + steps[:3] + going_on
-        gyro_floor = gyro_floor + (SCALE_SIGMA * mean_rate) ** 2
-        accel_floor = _floor(imu.profile.accel, span_s, self.horizon_s) + steps[3:]
+        gyro, accel = imu.profile.gyro, imu.profile.accel
+        to_come = _FLICKER_TO_COME * gyro.flicker**2 + gyro.walk**2 * self.horizon_s / 3.0
+        # A random walk can be followed and flicker cannot: never better than a mean at rest.
+        at_rest = float(floor_variance(gyro.flicker, gyro.walk, span_s, self.horizon_s))
+        gyro_floor = np.maximum(to_come, at_rest - np.diag(gyro_own))
+        gyro_floor = gyro_floor + steps[:3] + going_on + (SCALE_SIGMA * mean_rate) ** 2
+        accel_floor = steps[3:] + float(floor_variance(accel.flicker, accel.walk, span_s, self.horizon_s))
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = gyro_own + np.diag(gyro_floor)
         covariance[3:, 3:] = own + np.diag(accel_floor)
@@ -155,7 +161,8 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
             covariance=covariance,
             by_earth=found.by_earth @ _level_axes(found.body_to_ned[-1]),
         )
-        whites = float(np.diag(gyro_own).max()), float(np.diag(own).max())
+        wandered = _MIDDLE * believed.gyro_walk**2 * span_s
+        whites = max(float(np.diag(gyro_own).max()) - wandered, 0.0), float(np.diag(own).max())
         return window, Triads(float(use[:3].max() ** 2), whites[0], float(use[3:].max() ** 2), whites[1]), found
 
     def _believed(
@@ -176,13 +183,14 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
         white = model.white
         if imu.profile == PROFILES["unknown"]:
             white = max(white, math.sqrt(float(np.mean([one.white2 for one in seconds]))))
-        wander = slope_variance(np.array(model.flicker), np.array(model.walk), float(len(seconds)))
+        slope = slope_variance(np.array(model.flicker), np.array(model.walk), float(len(seconds)))
         return Believed(
             accel_m_s2=accel,
             accel_sigma_m_s2=accel_sigma,
             compass_sigma_rad=0.0 if compass is None else compass.sigma_deg * COMPASS_SHARE * DEG,
             gyro_white=white,
-            gyro_wander=math.sqrt(float(wander)),
+            gyro_walk=math.hypot(model.walk, model.flicker / math.sqrt(len(seconds))),
+            gyro_slope=math.sqrt(float(slope)),
             compass_lag_s=self.around.compass_lag_s,
         )
 
@@ -228,10 +236,6 @@ def _turn_rad_s(seconds: Sequence[ImuSecond], found: Found) -> Array:
     whole = np.sum([one.passage.turn for one in seconds], axis=0)
     turned = np.array([whole[2, 1] - whole[1, 2], whole[0, 2] - whole[2, 0], whole[1, 0] - whole[0, 1]]) / 2.0
     return turned / sum(one.passage.span_s for one in seconds) - found.gyro_rad_s
-
-
-def _floor(model: AllanModel, span_s: float, horizon_s: float) -> Array:
-    return np.full(3, _MIDDLE * float(floor_variance(model.flicker, model.walk, span_s, horizon_s)))
 
 
 def _hidden_steps(imu: ImuInput, seconds: Sequence[ImuSecond]) -> Array:

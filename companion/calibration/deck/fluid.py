@@ -109,8 +109,8 @@ def compare(levels: Sequence[Level]) -> Compared:
     for _ in range(2):
         rows = np.vstack(
             [
-                whitened(np.column_stack([one, nothing, -slope[:, 0], difference[:, 0]]), waves, 0.0),
-                whitened(np.column_stack([nothing, one, -slope[:, 1], difference[:, 1]]), waves, 0.0),
+                whitened(np.column_stack([one, nothing, -slope[:, 0], difference[:, 0]]), waves),
+                whitened(np.column_stack([nothing, one, -slope[:, 1], difference[:, 1]]), waves),
             ]
         )
         regressors = rows[:, :3]

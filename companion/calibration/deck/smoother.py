@@ -21,7 +21,7 @@ from typing import Final
 import numpy as np
 
 from companion.calibration.deck.passage import Passage, rotations, running_products
-from companion.calibration.deck.waves import Waves, fit_waves, whitened
+from companion.calibration.deck.waves import Wander, Waves, fit_waves, whitened
 from companion.physics.frames import Array, Floats, Matrix
 
 EARTH_RATE_NORTH_RAD_S: Final = 5.2e-5
@@ -45,8 +45,10 @@ class Believed:
     """Of the part of the compass' error that changes with the heading."""
     gyro_white: float
     """N of the gyros, rad/s * sqrt(s): the largest of the axes."""
-    gyro_wander: float
-    """Of the slope that flicker and random walk of the bias make where there is no ramp; rad/s^2."""
+    gyro_walk: float
+    """K of a random walk that wanders in such a window as the bias does, rad/s / sqrt(s)."""
+    gyro_slope: float
+    """One sigma of the slope that flicker and random walk of the bias make where there is no ramp; rad/s^2."""
     compass_lag_s: float
 
 
@@ -55,9 +57,9 @@ class Found:
     """Rates in the body's axes (FRD), attitudes in NED."""
 
     gyro_rad_s: Array
-    """(3,) bias, were there no rotation of the Earth; at the end of the window where there is a ramp."""
+    """(3,) bias at the end of the window, were there no rotation of the Earth."""
     gyro_covariance: Matrix
-    """(3, 3) of that, without what the bias itself wanders."""
+    """(3, 3) of that."""
     by_earth: Matrix
     """(3, 3): `gyro_rad_s` is the bias and this times the Earth's rate (NED)."""
     ramp_rad_s2: Array
@@ -145,7 +147,7 @@ def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: A
         bias = bias + answer.values[_GYRO]
     assert noise is not None
     ramping = system.solve(noise, believed, _UNKNOWNS)
-    chance = np.sqrt(np.diag(ramping.covariance)[_RAMP] + believed.gyro_wander**2)
+    chance = np.sqrt(np.diag(ramping.covariance)[_RAMP] + believed.gyro_slope**2)
     if (np.abs(ramping.values[_RAMP]) > RAMP_T * chance).any():
         ramping = system.solve(system.noise(ramping), believed, _UNKNOWNS)
         bias = bias + ramping.values[_GYRO]
@@ -211,14 +213,14 @@ class _System:
 
     def solve(self, noise: tuple[Waves, Waves] | None, believed: Believed, unknowns: int) -> _Answer:
         """Least squares, weighted by the noise; without it, by a guess."""
-        walk = believed.gyro_white**2 * self.step_s
+        wander = Wander(believed.gyro_white**2 * self.step_s, believed.gyro_walk**2 * self.step_s**3)
         level, heading = noise or (Waves(np.zeros(0), 0.02**2), Waves(np.zeros(0), 0.01**2))
         pairs = [
             np.column_stack([columns, readings]) for columns, readings in zip(self.columns, self.readings, strict=True)
         ]
         width = pairs[0].shape[1]
-        both = whitened(np.hstack(pairs[:2]), level, walk)
-        rows = np.vstack([both[:, :width], both[:, width:], whitened(pairs[2], heading, walk)])
+        both = whitened(np.hstack(pairs[:2]), level, wander)
+        rows = np.vstack([both[:, :width], both[:, width:], whitened(pairs[2], heading, wander)])
         rows = rows[~np.isnan(rows[:, -1])]
         regressors, earth = rows[:, :unknowns], rows[:, _UNKNOWNS:-1]
         information = regressors.T @ regressors
@@ -253,6 +255,6 @@ class _System:
 def _mean_up(up: Floats) -> tuple[float, float]:
     """The mean of a force that waves go through, and its sigma."""
     waves = fit_waves([up - up.mean()])
-    white = whitened(np.column_stack([np.ones(len(up)), up]), waves, 0.0)
+    white = whitened(np.column_stack([np.ones(len(up)), up]), waves)
     information = float(white[:, 0] @ white[:, 0])
     return float(white[:, 0] @ white[:, 1]) / information, 1.0 / math.sqrt(information)

@@ -57,35 +57,43 @@ def fit_waves(series: list[Floats], most: int = MOST_TERMS) -> Waves:
     return best
 
 
-def whitened(columns: Floats, waves: Waves, walk_variance: float) -> Floats:
-    """Columns (n, c) as series of unit white noise, were they made of such waves and a random walk from zero.
+class Wander(NamedTuple):
+    """What is not stationary, from one row to the next; both are zero at the last row."""
+
+    angle: float = 0.0
+    """Variance of the step of a random walk: the gyros' white noise."""
+    rate: float = 0.0
+    """Variance of the step of a random walk whose sum this is: their bias, which is asked for as it is at last."""
+
+
+def whitened(columns: Floats, waves: Waves, wander: Wander = Wander()) -> Floats:  # noqa: B008 - it never changes
+    """Columns (n, c) as series of unit white noise, were they made of such waves and of what has wandered.
 
     Args:
         columns: readings and regressors alike; a row of NaN is a gap.
         waves: what is stationary.
-        walk_variance: of the random walk's step from one row to the next.
+        wander: what is not.
     """
     order = max(len(waves.terms), 1)
-    terms = np.zeros(order)
-    terms[: len(waves.terms)] = waves.terms
-    size = order + 1
+    angle, rate, size = order, order + 1, order + 2
     move = np.zeros((size, size))
-    move[0, :order] = terms
+    move[0, : len(waves.terms)] = waves.terms
     move[1:order, : order - 1] = np.eye(order - 1)
-    move[order, order] = 1.0
+    move[angle, angle] = move[angle, rate] = move[rate, rate] = 1.0
     kick = np.zeros((size, size))
     kick[0, 0] = waves.variance
     covariance = np.zeros((size, size))
     covariance[:order, :order] = _stationary(move[:order, :order], kick[:order, :order])
-    kick[order, order] = walk_variance
+    kick[angle, angle], kick[rate, rate] = wander.angle, wander.rate
     state = np.zeros((size, columns.shape[1]))
     found = np.full_like(columns, math.nan)
     gaps = np.asarray(np.isnan(columns).any(axis=1)).tolist()
-    for row, (gap, values) in enumerate(zip(gaps, columns, strict=True)):
-        if not gap:
-            spread = covariance[:, 0] + covariance[:, order]
-            variance = float(spread[0] + spread[order])
-            off = values - state[0] - state[order]
+    # Backwards: what has wandered is nothing at the end.
+    for row in range(len(columns) - 1, -1, -1):
+        if not gaps[row]:
+            spread = covariance[:, 0] + covariance[:, angle]
+            variance = float(spread[0] + spread[angle])
+            off = columns[row] - state[0] - state[angle]
             found[row] = off / math.sqrt(variance)
             gain = spread / variance
             state += np.outer(gain, off)

@@ -28,6 +28,7 @@ from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.calibration.solution.solve import Solution, solve
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity
+from companion.config.sections import Platform
 from companion.configured import models
 from companion.daemon.calibrating import held_back
 from companion.daemon.calibrating.alignment import AlignmentInForce
@@ -46,6 +47,10 @@ logger = logging.getLogger(__name__)
 
 WRONG_IMU_ATTEMPTS: Final = 3
 """Of three IMUs two may have been taken for the one that is meant."""
+_STARTED: Final[dict[Platform, str]] = {
+    "ground": "Calibration started: keep the aircraft still",
+    "deck": "Calibration started: the deck may sway",
+}
 _WATCHING: Final = "watching the telemetry take the new offsets"
 POLL_S: Final = 0.2
 """A complete second is looked at when it is; this is how often for whatever else may change."""
@@ -252,7 +257,7 @@ class Course:
             JobCancelledError: cancelled; likewise.
         """
         if not job.automatic:
-            self._core.say(Severity.NOTICE, "Calibration started: keep the aircraft still")
+            self._core.say(Severity.NOTICE, _STARTED[self._core.config.vehicle.platform])
         self._measuring.begin()
         for left in reversed(range(WRONG_IMU_ATTEMPTS)):
             try:

@@ -1,0 +1,50 @@
+"""A calibration on a deck, from the request to offsets seen in the telemetry: the whole daemon on virtual time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.calibration.request import What
+from sim.imu_model import DEG_H, MG
+from sim.motions import SlowTurn
+from sim.sea import DAY_S, Sea, Wave
+from tests.e2e.test_calibration import started
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+DECK = '[vehicle]\nplatform = "deck"\n'
+BOAT = (Sea(start_s=-20.0, waves=(Wave(0.2, 5.0), Wave(0.05, 1.0)), seed=4),)
+TURNING = (*BOAT, SlowTurn(start_s=-20.0, duration_s=DAY_S, rate_deg_s=0.3))
+
+
+def boat(folder: Path, motions: Any = TURNING, more: str = DECK, **rest: Any) -> Rig:
+    rig = Rig(folder, more=more, imu_rate_hz=50.0, **rest)
+    for motion in motions:
+        rig.aircraft.add(motion)
+    return rig
+
+
+def test_a_boat_is_calibrated_while_it_sways_and_turns(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with boat(tmp_path).running() as rig:
+            await rig.ready()
+            rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=20 * DEG_H, target_accel_sigma_m_s2=0.5 * MG)
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", 900.0))
+            result = await job.finished
+            record = job.record
+            assert record is not None
+            assert result.outcome == "done", result
+            imu = record.imus[0]
+            assert {one.outcome for one in imu.written.values()} == {"verified"}
+            assert imu.gyro_sigma_use_rad_s is not None
+            assert max(imu.gyro_sigma_use_rad_s) <= 20 * DEG_H
+            left = rig.double.residual(1, rig.now_s)
+            assert np.abs(left.gyro_rad_s).max() < 40 * DEG_H
+            assert np.abs(left.accel_m_s2).max() < 1.0 * MG
+            # The firmware's own gyro calibration would have taken the deck's rate for the bias of every gyro.
+            assert rig.double.parameters.values["INS_GYR2OFFS_X"] == 0.0
+
+    run_virtual(main())
