@@ -19,6 +19,7 @@ from sim.motions import Motion, SlowTurn, Vibration, smooth_step
 COMPONENTS: Final = 16
 """Of one wave about one axis."""
 DAY_S: Final = 86400.0
+SURGE: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,7 @@ class Sea(Motion):
     start_s: float = 0.0
     duration_s: float = DAY_S
     waves: tuple[Wave, ...] = SWELL
-    surge: float = 0.3
+    surge: float = SURGE
     """Sideways acceleration over g times the slope; 1: a raft, on which no tilt is felt."""
     surge_lead_rad: float = 0.5
     """By how much that is ahead of the slope."""

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from sim.accuracy import paper, warmup_table
+from sim.accuracy import deck_tables, paper, warmup_table
 from sim.accuracy.experiments import (
     FIELD_HEADING_DEG,
     FIELD_TILT_DEG,
@@ -82,6 +82,10 @@ def report(
         found["integers"] = _integers(
             {noise: cut[each * index : each * (index + 1)] for index, noise in enumerate(NOISE_LSB)}
         )
+    if "deck" in only:
+        voyages, stands = max(runs // 10, 4), max(runs // 40, 4)
+        progress(f"deck: {voyages} voyages, {stands} stands")
+        found["deck"] = deck_tables.deck(voyages, stands, seed, jobs)
     if "paper" in only:
         found["paper"] = _paper(errata(seed, 400))
     return found

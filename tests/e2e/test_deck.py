@@ -48,3 +48,15 @@ def test_a_boat_is_calibrated_while_it_sways_and_turns(tmp_path: Path) -> None:
             assert rig.double.parameters.values["INS_GYR2OFFS_X"] == 0.0
 
     run_virtual(main())
+
+
+def test_where_the_ground_is_meant_the_words_name_the_deck(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with boat(tmp_path, BOAT, more="").running() as rig:
+            await rig.ready()
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", 60.0))
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "deck" in result.reason
+
+    run_virtual(main())

@@ -23,6 +23,7 @@ from companion.calibration.collector.outlook import (
     expected_s,
     is_enough,
 )
+from companion.calibration.collector.swell import Swell
 from companion.calibration.collector.trace import Snapshot, TraceLog
 from companion.calibration.deck.deck import Deck
 from companion.calibration.deck.estimate import DeckWork
@@ -86,6 +87,7 @@ class RollingCollector(Intake):
         self._estimates = Estimates()
         self._trace = TraceLog()
         self._restarts = 0
+        self._swell = Swell()
         for imu in imus:
             self.set_imu(imu)
 
@@ -300,6 +302,7 @@ class RollingCollector(Intake):
             others = [source.verdict for source in sources if source is not self._heading]
             self._watch.add_second(self._heading.batches.batches.get(slot), others)
         self._trace.add(slot, sources, good=good)
+        self._swell.add(next((each.batches.batches.get(slot) for each in self._imus.values()), None))
         if not self._stretch.add(slot, good=good):
             self._break()
         if not self._watch_turn(slot, good=good):
@@ -335,7 +338,7 @@ class RollingCollector(Intake):
         if not said:
             return Obstacle(f"hold still {self._min_good} s", moving, self._min_good)
         words = said[0].words
-        return Obstacle(words if said[0].fault else f"waiting for still: {words}", moving)
+        return Obstacle(words if said[0].fault else f"waiting for still: {words}{self._swell.hint}", moving)
 
     def _waiting_for(self, now_s: float) -> Obstacle | None:
         if (moves := self._obstacle(now_s)) is not None:
