@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from companion.calibration.request import What
+from companion.component.service import Refusal
+from companion.daemon.calibrating.align_steps import Plan
 from sim.imu_model import DEG_H, MG
 from sim.motions import SlowTurn
 from sim.sea import DAY_S, Sea, Wave
@@ -58,5 +60,16 @@ def test_where_the_ground_is_meant_the_words_name_the_deck(tmp_path: Path) -> No
             result = await job.finished
             assert result.outcome == "failed"
             assert "deck" in result.reason
+
+    run_virtual(main())
+
+
+def test_no_zero_of_a_gradienter_is_measured_on_a_deck(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with boat(tmp_path).running() as rig:
+            await rig.ready()
+            refused = rig.service.calibrating.conductor.start_alignment(Plan("zero"), "test", 60.0)
+            assert isinstance(refused, Refusal)
+            assert "ashore" in refused.reason
 
     run_virtual(main())

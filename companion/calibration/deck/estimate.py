@@ -145,10 +145,10 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
         covariance[:3, :3] = gyro_own + np.diag(gyro_floor)
         covariance[3:, 3:] = own + np.diag(accel_floor)
         use = np.sqrt(np.diag(covariance))
-        temperatures = [one.batch.temperature_degc for one in seconds if one.batch.temperature_degc is not None]
+        temperatures = [one.temperature_degc for one in seconds if one.temperature_degc is not None]
         window = ImuWindow(
             name=imu.name,
-            samples=sum(one.batch.n for one in seconds),
+            samples=sum(one.samples for one in seconds),
             duration_s=span_s,
             gyro_rad_s=vector(found.gyro_rad_s),
             accel_m_s2=vector(direction),
@@ -241,8 +241,8 @@ def _turn_rad_s(seconds: Sequence[ImuSecond], found: Found) -> Array:
 def _hidden_steps(imu: ImuInput, seconds: Sequence[ImuSecond]) -> Array:
     """(6,) variance of what integers hide that the swaying does not spread; vehicle axes."""
     steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
-    means = np.array([one.batch.mean for one in seconds])
-    spread = np.sqrt(means.var(axis=0) + np.mean([one.batch.variance for one in seconds], axis=0))
+    means = np.array([one.mean for one in seconds])
+    spread = np.sqrt(means.var(axis=0) + np.mean([one.variance for one in seconds], axis=0))
     hidden = np.where(spread < _DITHERED * steps, np.square(steps / 2.0), 0.0)
     turn = np.square(imu.rotation)
     return np.concatenate([turn @ hidden[:3], turn @ hidden[3:]])

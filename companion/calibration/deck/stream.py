@@ -40,7 +40,11 @@ class ImuSecond(msgspec.Struct, frozen=True):
 
     slot: int
     passage: Passage
-    batch: Batch
+    samples: int
+    mean: Floats
+    """(6,) of rates and forces in the sensor's axes."""
+    variance: Floats
+    temperature_degc: float | None
     white2: float
     """N^2 of the gyros, from second differences of neighbouring samples; the mean of the axes."""
 
@@ -86,7 +90,17 @@ class Stream:
         step_s = float(median(np.diff(whole[:, 0]).tolist()))
         second = rates[2:] - 2.0 * rates[1:-1] + rates[:-2]
         white2 = float(np.square(second).mean()) / 6.0 * step_s if len(second) else 0.0
-        self.seconds.append(ImuSecond(batch.slot, passage(whole[:, 0], rates, whole[:, 4:]), batch, white2))
+        self.seconds.append(
+            ImuSecond(
+                slot=batch.slot,
+                passage=passage(whole[:, 0], rates, whole[:, 4:]),
+                samples=batch.n,
+                mean=batch.mean,
+                variance=batch.variance,
+                temperature_degc=batch.temperature_degc,
+                white2=white2,
+            )
+        )
         while self.levels and next(iter(self.levels)) < self.seconds[0].slot:
             del self.levels[next(iter(self.levels))]
 
