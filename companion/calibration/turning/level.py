@@ -202,8 +202,8 @@ class ImuLevel:
         """The vertical by its accelerometers, (3,) vehicle FRD; good to some degrees, and enough here."""
         if not self._seconds:
             return None
-        force = np.mean([second.rows[3:] for second in self._seconds], axis=0)
-        return np.asarray(-force / np.linalg.norm(force))
+        force = sum((second.rows[3:] for second in self._seconds), np.zeros(3))
+        return np.asarray(-force / math.sqrt(force @ force))
 
     def look(self) -> Look | None:
         """Against its level, if there is one, and against gravity, over the seconds of this stretch."""

@@ -223,10 +223,9 @@ class TurnWatch:
             return False
         changes = {name: look.change for name, look in looks.items() if look.change is not None}
         common = common_change(list(changes.values()))
-        start = self._start
-        seen = (
-            None if start is None else self._slope([one for one, good in self._headings if good and one.slot >= start])
-        )
+        start, moved = self._start, self._moved
+        measured = [one for one, good in self._headings if good and start is not None and one.slot >= start]
+        seen = self._slope(measured)
         self.turn, changed = self._weigh(common, seen, changes)
         if looks:
             tilting = min((look.tilting for look in looks.values()), key=lambda one: one.variance)
@@ -241,8 +240,8 @@ class TurnWatch:
             self._is_suspect = False
         waits = self._believe(changes, changed)
         # A compass that turns breaks the stretch again and again, but not its memory.
-        moved = self._moved
-        longer = self._slope([one for one, _ in self._headings if moved is None or one.slot > moved])
+        since = [one for one, _ in self._headings if moved is None or one.slot > moved]
+        longer = seen if len(since) <= len(measured) else self._slope(since)
         lasting = (
             longer is not None
             and longer.is_even
