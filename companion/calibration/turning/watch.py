@@ -34,8 +34,8 @@ LEAST_RAD_S: Final = 0.005 * DEG
 """What is in nobody's way, but in sigma: a compass warms up and wanders by a few tenths of a degree in a minute."""
 LEAST_BY_GYROS_RAD_S: Final = 0.01 * DEG
 """Likewise where no compass says it too: a gyro that warms up unevenly may do the same."""
-LEAST_TILTING_RAD_S: Final = 0.02 * DEG
-"""Likewise of the tilt: an accelerometer that warms up drifts by some milli-g in a minute, and this is 20."""
+LEAST_TILTING_RAD_S: Final = 0.05 * DEG
+"""Likewise of the tilt: accelerometers drift, and what was just set down settles by a few hundredths of a degree."""
 STEADY_SIGMAS: Final = 2.5
 """Seconds whose level is farther off make no part of it: a slow turn would become the level."""
 EVEN: Final = 0.25
