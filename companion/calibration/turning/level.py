@@ -23,6 +23,8 @@ from companion.physics.units import DEG, DEG_H
 
 LEVEL_S: Final = 5
 """So many seconds at rest make a level."""
+RESTED_S: Final = 20
+"""So many before a step within a stretch: in its first seconds after switching on a gyro warms up as fast as a step."""
 TELLS_NOISE_S: Final = 20
 """So many seconds tell the white noise of their means; fewer are taken for as noisy as the stretch before."""
 PER_K_RAD_S: Final = 54.0 * DEG_H
@@ -77,7 +79,7 @@ class Step(msgspec.Struct, frozen=True, kw_only=True):
     sigmas: float
     """Of that difference, by the part's own noise."""
     beats_drift_by: float
-    """Chi square by which a step fits better than a parabola does, a warm-up."""
+    """Chi square by which a step fits better than a cubic does, a warm-up."""
     jump_rad_s: float
     off_rad_s: float
     """By how much the mean of the latest window is then off what was before."""
@@ -230,7 +232,7 @@ class ImuLevel:
             self._white = float(slope.white[:3].max())
         white = float(np.sqrt(np.square(down) @ np.square(slope.white[:3])))
         step = None
-        if kind.gyro_step_rad_s == 0.0 and len(slots) >= 2 * LEVEL_S:
+        if kind.gyro_step_rad_s == 0.0 and len(self._older) + len(slots) >= RESTED_S + LEVEL_S:
             before = [second.rows[:3] @ down for second in self._older]
             step = _step(
                 np.array([*(second.slot for second in self._older), *slots.tolist()], dtype=np.float64),
@@ -291,10 +293,10 @@ def _tilting(force: Floats, slope: Slope) -> Tilting:
 
 
 def _step(slots: Floats, values: Floats, white: float, model: AllanModel, window: int) -> Step:
-    """The likeliest step in (m,) means of a second, m >= 2 `LEVEL_S`, the last `window` of which are measured."""
+    """The likeliest step in (m,) means of a second, m >= `RESTED_S` + `LEVEL_S`; the last `window` are measured."""
     count = len(values)
     values = values - values.mean()
-    before = np.arange(LEVEL_S, count - LEVEL_S + 1)
+    before = np.arange(RESTED_S, count - LEVEL_S + 1)
     after = count - before
     sums = np.cumsum(values)[before - 1]
     jump = -sums * (1.0 / after + 1.0 / before)
@@ -303,7 +305,7 @@ def _step(slots: Floats, values: Floats, white: float, model: AllanModel, window
     first, last = float(before[best]), float(after[best])
     variance = chance[best] + floor_variance(model.flicker, model.walk, first, last)
     time = (slots - slots[0]) / (slots[-1] - slots[0])
-    basis, _ = np.linalg.qr(np.vander(time, 3))
+    basis, _ = np.linalg.qr(np.vander(time, 4))
     drift = float(np.square(values @ basis).sum())
     return Step(
         first=int(slots[before[best]]),
