@@ -11,10 +11,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from companion.autopilot.firmware.firmwares import read_calibration
 from companion.calibration.request import What
 from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
+from companion.daemon.offsets import plan
 from sim.ardupilot.double import offset_names
 from sim.imu_model import DEG_H, MG
 from tests.support.component import ACCEPTED, CALIBRATE, UNDO
@@ -197,6 +199,28 @@ def test_a_serial_imu_that_the_autopilot_consumes_gets_its_offsets_there_and_the
             written = [rig.double.parameter(name) for name in offset_names(2, "gyro")]
             np.testing.assert_allclose(written, own_record.gyro_bias_rad_s, atol=1e-9)
             assert {w.outcome for w in record.imus[0].written.values()} == {"verified"}
+
+    run_virtual(main())
+
+
+def test_writing_that_is_switched_off_while_the_plan_is_made_is_off_for_the_next_plan_not_for_half_of_this_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def main() -> None:
+        rig = Rig(tmp_path, own_imu=True)
+        own = msgspec.structs.replace(rig.config.imu[1], autopilot_instance=2)
+        rig.config = msgspec.structs.replace(rig.config, imu=[rig.config.imu[0], own])
+
+        async def switching(*arguments: Any) -> Any:
+            rig.service.core.wanted.switch(push=False)
+            return await read_calibration(*arguments)
+
+        monkeypatch.setattr(plan, "read_calibration", switching)
+        async with rig.running():
+            await rig.ready()
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            assert all(imu.written for imu in record.imus)
 
     run_virtual(main())
 

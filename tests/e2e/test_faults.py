@@ -6,6 +6,7 @@ import asyncio
 import os
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from companion.calibration.machine import State
 from companion.calibration.request import What
 from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
+from companion.errors import ParameterTimeoutError
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from sim.ardupilot.double import ArduPilotDouble, offset_names
 from sim.imu_model import DEG_H, MG
@@ -52,6 +54,29 @@ def test_an_autopilot_that_echoes_but_does_not_use_the_value(tmp_path: Path) -> 
     assert "does not use" in record.reason
     assert back
     assert outcomes(record) == {"rolled_back"}
+
+
+def test_what_somebody_changed_is_named_although_the_autopilot_falls_silent_right_after(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            seen: list[str] = []
+
+            async def falling_silent(name: str) -> float:
+                seen.append(name)
+                if len(seen) == 2:
+                    raise ParameterTimeoutError("silent")
+                return 0.25
+
+            monkeypatch.setattr(rig.service.offsets.pusher, "_parameters", SimpleNamespace(read=falling_silent))
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", None))
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert f"{seen[0]} is 0.25, somebody changed it right after the write; silent" in result.reason
+
+    run_virtual(main())
 
 
 def test_an_autopilot_that_refuses_one_parameter(tmp_path: Path) -> None:

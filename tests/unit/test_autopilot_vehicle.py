@@ -332,6 +332,30 @@ def test_a_restart_is_seen_and_its_arm_state_unknown_until_the_next_heartbeat() 
     run_virtual(main())
 
 
+def test_another_firmware_that_is_flashed_is_no_second_autopilot_though_it_streams_before_its_heartbeat() -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+
+        def stream(boot_s: float) -> None:
+            message = mavlink.MAVLink_system_time_message(0, int(boot_s * 1000))
+            link.receive(message.pack(codec), asyncio.get_running_loop().time())
+
+        heartbeat(link, autopilot=PX4)
+        stream(100.0)
+        await asyncio.sleep(20.0)
+        stream(3.0)
+        await asyncio.sleep(0.3)
+        heartbeat(link, autopilot=ARDUPILOT)
+        assert vehicle.firmware == "ardupilot"
+        assert vehicle.conflict is None
+        assert state(vehicle) is ArmState.DISARMED
+        vehicle.close()
+
+    run_virtual(main())
+
+
 def test_a_restart_leaves_the_state_unknown() -> None:
     async def main() -> None:
         link = MavlinkLink()
