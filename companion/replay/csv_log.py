@@ -80,14 +80,14 @@ class _Columns:
         values = []
         for column, factor in wanted:
             try:
-                value = float(fields[column].strip(_AROUND))
+                value = float(fields[column].strip(_AROUND)) * factor
             except ValueError:
                 value = math.nan
             if not math.isfinite(value):
                 raise StorageError(
                     f"{where}: found {fields[column]!r} in column {self.names[column]}; allowed: a number"
                 )
-            values.append(value * factor)
+            values.append(value)
         t_s, gx, gy, gz, ax, ay, az, *temperature = values
         return ImuSample(t_s, (gx, gy, gz), (ax, ay, az), temperature[0] if temperature else None)
 
