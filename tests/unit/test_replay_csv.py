@@ -162,7 +162,10 @@ GOOD = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n"
     [
         (GOOD + "0,0,0,0,0,0,-9.8\n0.01,0,0,x,0,0,-9.8\n", "line 3: found 'x' in column gz_rad_s; allowed: a number"),
         (GOOD + "0,0,0,0,0,0,nan\n", "line 2: found 'nan' in column az_m_s2; allowed: a number"),
-        (GOOD.replace("ax_m_s2", "ax_g") + "0,0,0,0,1e308,0,0\n", "line 2: found '1e308' in column ax_g; allowed: a number"),
+        (
+            GOOD.replace("ax_m_s2", "ax_g") + "0,0,0,0,1e308,0,0\n",
+            "line 2: found '1e308' in column ax_g; allowed: a number",
+        ),
         (GOOD + "\n# remark\n0,0,0\n", "line 4: found 3 fields; allowed: 7, as many as columns"),
         (GOOD + "1,0,0,0,0,0,-9.8\n0.5,0,0,0,0,0,-9.8\n", "line 3: time 0.500000 s after 1.000000 s"),
         ("t_s,gx_rad_s\n0,1\n", "line 1: no column gy_rad_s or gy_deg_s or gy_deg_h in t_s, gx_rad_s"),
