@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -120,24 +120,11 @@ async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -
         serial = [sensor for sensor in sick if sensor.is_serial]
         heard = await asyncio.gather(*(_try(sensor) for sensor in serial))
         tried = dict(zip((sensor.name for sensor in serial), heard, strict=True))
-    speaks = {sensor.name: _protocol_heard(sensor, devices[sensor.name], tried) for sensor in sick}
-    swapped = _swapped(sick, speaks)
-    found = [
-        Finding(
-            "ports",
-            good=False,
-            words=f"{a.name}'s port speaks {speaks[a.name]}, {b.name}'s port speaks {speaks[b.name]}: "
-            "swap the two port lines",
-            remedy=f'in {a.section} port = "{b.port}"; in {b.section} port = "{a.port}"',
-            port=a.port,
-        )
-        for a, b in swapped
+    return [
+        finding
+        for sensor in sick
+        for finding in _explain(sensor, devices[sensor.name], tried.get(sensor.name), may_listen=may_listen)
     ]
-    done = {sensor.name for pair in swapped for sensor in pair}
-    for sensor in sick:
-        if sensor.name not in done:
-            found += _explain(sensor, devices[sensor.name], tried.get(sensor.name), may_listen=may_listen)
-    return found
 
 
 async def _try(sensor: Configured) -> Heard | str:
@@ -145,23 +132,6 @@ async def _try(sensor: Configured) -> Heard | str:
         return await listen(sensor.port, [sensor.line])
     except LinkError as error:
         return str(error)
-
-
-def _protocol_heard(sensor: Configured, device: Object, tried: Mapping[str, Heard | str]) -> str | None:
-    heard = tried.get(sensor.name)
-    if isinstance(heard, Heard) and heard.candidate is not None:
-        return heard.candidate.protocol
-    speaks = device.get("speaks")
-    return speaks if isinstance(speaks, str) else None
-
-
-def _swapped(sick: Sequence[Configured], speaks: Mapping[str, str | None]) -> list[tuple[Configured, Configured]]:
-    return [
-        (a, b)
-        for number, a in enumerate(sick)
-        for b in sick[number + 1 :]
-        if a.protocol != b.protocol and speaks[a.name] == b.protocol and speaks[b.name] == a.protocol
-    ]
 
 
 def _explain(sensor: Configured, device: Object, heard: Heard | str | None, *, may_listen: bool) -> list[Finding]:
