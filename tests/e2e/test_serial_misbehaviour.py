@@ -136,23 +136,6 @@ def test_a_device_that_was_replaced_for_good_is_taken_after_a_while(
     asyncio.run(main())
 
 
-def test_a_slow_bridge_is_said_of_an_imu_when_it_is_opened(path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    async def main(kind: str, protocol: str) -> dict[str, int]:
-        frame = imu_frame if kind == "imu" else tilt_frame
-        async with Chatter(path, frame, rate_hz=50.0), listening(kind, protocol, path) as one:
-            await one.data()
-            await asyncio.sleep(0.6)
-            return one.counts
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(serial_port, "latency_timer_ms", lambda _: 16)
-        assert asyncio.run(main("imu", "imu_line")) == {"slow bridge": 1}
-        assert asyncio.run(main("gradienter", "inclinometer_xy")) == {}
-        assert len(said(caplog, "own", "collects bytes for 16 ms")) == 1
-        patch.setattr(serial_port, "latency_timer_ms", lambda _: 1)
-        assert asyncio.run(main("imu", "imu_line")) == {}
-
-
 def test_two_devices_swapped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     a, b = tmp_path / "a", tmp_path / "b"
 
