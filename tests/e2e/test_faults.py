@@ -186,6 +186,46 @@ def test_a_write_interrupted_by_a_power_cut_is_mended_at_the_next_start(tmp_path
     run_virtual(main())
 
 
+@pytest.mark.parametrize("after", [0.0025, None])
+def test_a_write_interrupted_on_another_aircraft_is_named_and_nothing_of_it_put_back_here(
+    tmp_path: Path, after: float | None
+) -> None:
+    names = offset_names(1, "gyro")
+    changes = tuple(Changed(name, before=0.0, after=after) for name in names)
+    ChangeLog(tmp_path).journal.write(ChangeSet(7, changes))
+
+    async def main() -> None:
+        async with Rig(tmp_path, parameters=dict.fromkeys(names, 0.0025)).running() as rig:
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
+            await asyncio.sleep(2.0)
+            assert rig.double.writes == []
+            assert any("Interrupted write on system 7" in text for text in rig.ground.texts())
+
+    run_virtual(main())
+
+
+def test_an_interrupted_write_waits_while_armed_without_trying(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = offset_names(1, "gyro")
+    changes = tuple(Changed(name, before=0.0, after=0.0025) for name in names)
+    ChangeLog(tmp_path).journal.write(ChangeSet(1, changes))
+
+    async def main() -> None:
+        rig = Rig(tmp_path, parameters=dict.fromkeys(names, 0.0025))
+        rig.double.arm()
+        async with rig.running():
+            await asyncio.sleep(15.0)
+            assert rig.double.writes == []
+            assert rig.service.offsets.ledger.pending
+            assert not any("trying again" in words for words in caplog.messages)
+            rig.double.disarm()
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 20.0)
+            assert [rig.double.parameter(name) for name in names] == [0.0, 0.0, 0.0]
+
+    run_virtual(main())
+
+
 def test_values_that_somebody_else_has_set_since_are_left_alone(tmp_path: Path) -> None:
     names = offset_names(1, "gyro")
     changes = tuple(Changed(name, before=0.0, after=0.25) for name in names)

@@ -44,7 +44,7 @@ GYRO_TURN_SIGMA_DEG: Final = 3.0
 SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
 
-ARMED: Final = "armed during the alignment; the one before stays in force"
+ARMED: Final = "armed during the alignment; the earlier one stays in force"
 
 
 def _changed(name: str) -> CalibrationRefusedError:

@@ -82,7 +82,7 @@ def where_it_may_be(config: Config, root: Path = ROOT) -> Finding | None:
     free = unnamed(list_ports(root), list(_ports(config).values()), root)
     if not free:
         return None
-    words = f"nobody names {', '.join(free)}: companion ports --listen tells who speaks there"
+    words = f"not in the configuration: {', '.join(free)}; companion ports --listen tells what is there"
     return Finding("ports", good=False, words=words, remedy="companion ports --listen")
 
 
@@ -149,11 +149,11 @@ def _explain(sensor: Configured, device: Object, heard: Heard | str | None, *, m
             return bad("it may be set to another speed or parity", STOP_FIRST)
         return []
     if heard.stranger is not None:
-        return bad(f"who speaks on {sensor.port} ({heard.line}) is {heard.stranger}", "another port, or unplug it")
+        return bad(f"no sensor on {sensor.port} ({heard.line}) but {heard.stranger}", "another port, or unplug it")
     if heard.candidate is None or heard.line is None:
         if not heard.bytes_heard:
             return []
-        return bad(f"{heard.bytes_heard} bytes came, and at no usual speed anything known", "wire, levels, protocol?")
+        return bad(f"{heard.bytes_heard} bytes came, nothing known at any usual speed", "wire, levels, protocol?")
     lines = _line_keys(sensor, heard.line)
     if heard.candidate.protocol == sensor.protocol:
         if not lines:
