@@ -63,7 +63,7 @@ def test_it_calibrates_at_the_first_opportunity_after_start_and_says_one_line(tm
 
 
 @pytest.mark.parametrize("more", [{"at_arm": "off"}, {"at_arm": "gate", "more": "[push]\nparameters = false\n"}])
-def test_nothing_happens_by_itself_with_at_arm_off_or_without_push(tmp_path: Path, more: dict[str, str]) -> None:
+def test_nothing_happens_by_itself_with_at_arm_off_or_without_push(tmp_path: Path, more: dict[str, Any]) -> None:
     async def main() -> None:
         async with Rig(tmp_path, **more, **SLOW).running() as rig:
             await asyncio.sleep(120.0)
