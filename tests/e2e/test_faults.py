@@ -13,9 +13,12 @@ import pytest
 
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.machine import State
+from companion.calibration.means.windows import Window
 from companion.calibration.request import What
 from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
+from companion.daemon.calibrating.course import Measuring
+from companion.daemon.job import Job
 from companion.errors import ParameterTimeoutError
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from sim.ardupilot.double import ArduPilotDouble, offset_names
@@ -236,6 +239,32 @@ def test_values_that_somebody_else_has_set_since_are_left_alone(tmp_path: Path) 
             await rig.until(lambda: not rig.service.offsets.ledger.pending, 20.0)
             assert rig.double.writes == []
             assert any("left alone" in text for text in rig.ground.texts())
+
+    run_virtual(main())
+
+
+def test_offsets_that_change_unheard_after_the_measurement_are_measured_under_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are read afresh before anything is written: what was measured under others would be off by the change."""
+
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            measure, windows = Measuring.measure, list[Window]()
+
+            async def changing(measuring: Measuring, job: Job) -> Window:
+                windows.append(await measure(measuring, job))
+                if len(windows) == 1:
+                    rig.double.set_parameter("INS_GYROFFS_X", rig.double.parameter("INS_GYROFFS_X") + 0.002)
+                return windows[-1]
+
+            monkeypatch.setattr(Measuring, "measure", changing)
+            result, _ = await calibrated(rig)
+            assert result.outcome == "done", result
+            assert len(windows) == 2
+            left = rig.double.residual(1, rig.now_s)
+            assert max(abs(each) for each in left.gyro_rad_s) < 60.0 * DEG_H
 
     run_virtual(main())
 
