@@ -6,7 +6,6 @@ import argparse
 import asyncio
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,17 @@ import msgspec
 
 from companion.cli import show
 from companion.cli.client import finish
-from companion.cli.terminal import DONE, FAILED, AddCommand, load_config, print_json, print_lines, seconds, storage_path
+from companion.cli.terminal import (
+    DONE,
+    FAILED,
+    AddCommand,
+    load_config,
+    print_json,
+    print_lines,
+    seconds,
+    storage_path,
+    within,
+)
 from companion.daemon.faces.control import ask
 from companion.errors import ConfigError
 
@@ -44,28 +53,15 @@ def add_commands(add: AddCommand) -> None:
         ("--latitude-deg", -90.0, 90.0, "north is positive"),
         ("--height-m", -500.0, 9000.0, "above mean sea level"),
     ):
-        csv.add_argument(name, type=_number(least, most), metavar="M" if name.endswith("-m") else "DEG", help=words)
+        csv.add_argument(name, type=within(least, most), metavar="M" if name.endswith("-m") else "DEG", help=words)
     csv.add_argument(
-        "--sigma-deg", type=_number(1e-4, 45.0), default=0.05, metavar="DEG", help="of pitch and roll (default 0.05)"
+        "--sigma-deg", type=within(1e-4, 45.0), default=0.05, metavar="DEG", help="of pitch and roll (default 0.05)"
     )
-    csv.add_argument("--heading-sigma-deg", type=_number(1e-3, 180.0), default=3.0, metavar="DEG", help="default 3")
+    csv.add_argument("--heading-sigma-deg", type=within(1e-3, 180.0), default=3.0, metavar="DEG", help="default 3")
     csv.add_argument("--mounting", default="ROTATION_NONE", metavar="ROTATION", help="sensor to vehicle")
     csv.add_argument(
         "--profile", metavar="PART", help="the sensor's model, such as icm42688p, or a saved profile's name or file"
     )
-
-
-def _number(least: float, most: float) -> Callable[[str], float]:
-    def number(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = float("nan")
-        if not least <= value <= most:
-            raise argparse.ArgumentTypeError(f"found {text!r}; allowed: a number from {least:g} to {most:g}")
-        return value
-
-    return number
 
 
 async def record(options: argparse.Namespace) -> int:
