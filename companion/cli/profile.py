@@ -236,16 +236,15 @@ def _lines(result: Result) -> list[str]:
             ]
             lines.append(f"{f'{triad}: {name}':24} {cells[0]:>16} {cells[1]:>16} {cells[2]:>16}")
     if result.kept:
-        against = f"by {result.compared.name}"
-        heads = ("T, s", "sigma_use", against, "rms error", "2 sigma", "strictly", "naive")
-        widths = (5, 11, max(11, len(against)), 11, 8, 9, 7)
+        heads = ("T, s", "sigma_use", "rms error", "2 sigma", "strictly", "naive")
+        widths = (5, 11, 11, 8, 9, 7)
         lines.append(
             "the minute after windows of T s, learned from other recordings or the other half; within 2 sigma:"
         )
         lines.append(_row("", heads, widths))
         for each in result.kept:
             unit, unit_name, digits = _UNITS[each.triad]
-            sizes = [f"{value / unit:.{digits}f} {unit_name}" for value in (each.sigma_use, each.sigma_other, each.rms)]
+            sizes = [f"{value / unit:.{digits}f} {unit_name}" for value in (each.sigma_use, each.rms)]
             shares = (each.share, each.share_strict, each.share_naive)
             lines.append(_row(each.triad, (f"{each.mean_s}", *sizes, *(f"{share:.1%}" for share in shares)), widths))
     lines += [f"note: {note}" for note in result.notes]
