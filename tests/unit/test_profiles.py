@@ -254,7 +254,6 @@ def test_the_table_says_what_it_found(capsys: pytest.CaptureFixture[str], half_h
         "imu imu: 0.48 h at rest in 1 recording",
         "gyro x, deg/h",
         "gyro: adis16405                     152.0             29.0",
-        "by adis16405",
         "note: too short to tell gyro K",
     ):
         assert words in said
