@@ -26,7 +26,6 @@ from companion.report.page import (
     moment,
     page,
     with_sigma,
-    written_count,
 )
 from companion.report.seconds import stillness
 from companion.samples import Triad
@@ -178,7 +177,7 @@ def _triad(imu: ImuRecord, triad: Triad) -> Markup:
 
 
 def _written(record: Record) -> Markup | None:
-    if not written_count(record):
+    if not any(imu.written for imu in record.imus):
         return None
     parts: list[Child] = [tag("h2", "Written to the autopilot")]
     seen: set[Outcome] = set()

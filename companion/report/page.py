@@ -181,8 +181,3 @@ def arming_items(armings: Sequence[Arming]) -> Markup:
             )
         )
     return tag("ul", *items)
-
-
-def written_count(record: Record) -> int:
-    """How many parameters a calibration has changed."""
-    return sum(len(imu.written) for imu in record.imus)
