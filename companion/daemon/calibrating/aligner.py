@@ -283,8 +283,6 @@ class Aligner:
 
     def _warnings(self, result: Alignment) -> list[str]:
         found = []
-        if not result.checked:
-            found.append("a spot that moved between the stands would not have been noticed (leave out --quick)")
         if result.slope_deg > SLOPE_WARNING_DEG:
             found.append(
                 f"the spot slopes by {result.slope_deg:.1f} deg, so that each degree of heading error counts: a flatter"
