@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.parameters.wire import integers_bytewise
 from companion.autopilot.vehicle.boot_clock import BootClock
+from companion.autopilot.vehicle.heartbeats import ArmingWatch
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.autopilot.vehicle.whereabouts import Position
 from companion.links.mavlink.link import MavlinkLink
@@ -453,3 +454,13 @@ def test_integers_are_bytes_by_the_capability_bits_and_else_on_px4_only(
 def test_boot_clock_an_autopilot_up_for_longer_than_we_heard_nothing_has_not_restarted() -> None:
     # ArduPilot calibrates its gyros, and the machine that simulates it is too busy: little simulated time, no messages.
     assert not any(feed(BootClock(), (60, 0), (60.2, 3.5), (60.5, 4.1), (61, 5.2)))
+
+
+def test_no_autopilot_restarts_twice_within_a_second() -> None:
+    """Two under one id, whose times since boot alternate, seem to."""
+    arming = ArmingWatch()
+    arming.restarted(10.0)
+    arming.restarted(11.0)
+    assert arming.conflict(11.0, 1) is None
+    arming.restarted(11.5)
+    assert arming.conflict(11.5, 1) == "two autopilots have system id 1"
