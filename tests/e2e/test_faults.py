@@ -82,6 +82,24 @@ def test_what_somebody_changed_is_named_although_the_autopilot_falls_silent_righ
     run_virtual(main())
 
 
+def test_a_restart_while_the_telemetry_is_watched_puts_the_old_values_back(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            before = values(rig.double)
+            conductor = rig.service.calibrating.conductor
+            job = started(conductor.start_calibration(What.BOTH, "test", None))
+            await rig.until(lambda: conductor.state is State.VERIFYING, 60.0)
+            rig.double.reboot()
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "the autopilot rebooted right after the write" in result.reason
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
+            assert values(rig.double) == before
+
+    run_virtual(main())
+
+
 def test_an_autopilot_that_refuses_one_parameter(tmp_path: Path) -> None:
     def fault(rig: Rig) -> None:
         rig.double.faults.refuse = {"INS_GYROFFS_Y"}
