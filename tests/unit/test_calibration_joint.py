@@ -151,7 +151,9 @@ def test_a_record_has_no_covariance_of_what_is_not_known() -> None:
     assert first is not None
     assert second is not None
     assert all(value is not None for row in first for value in row)
-    assert [[value is not None for value in row] for row in second] == [[True] * 3 + [False] * 3] * 3 + [[False] * 6] * 3
+    assert [[value is not None for value in row] for row in second] == [[True] * 3 + [False] * 3] * 3 + [
+        [False] * 6
+    ] * 3
     assert third is None
     assert [cross.imus for cross in record.cross_covariance] == [("imu0", "imu1")]
 
