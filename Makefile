@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 # Tests run in two processes: the boards and machines this is made for have at least two cores. Those of the real clock
 # wait more than they work: several at once.
 JOBS ?= 2
-WAITING ?= 6
+WAITING ?= 8
 # Where it is set, every process of every test compiles the whole program anew.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -15,7 +15,7 @@ unexport PYTHONDONTWRITEBYTECODE
 help:
 	@echo 'make demo    watch a virtual aircraft being calibrated (about a minute)'
 	@echo 'make quick   unit and property tests without real clock and processes (about a minute on two cores)'
-	@echo 'make test    all tests (seven to eight minutes on two cores); DURATIONS=1 notes how long each takes'
+	@echo 'make test    all tests (under seven minutes on two cores); DURATIONS=1 notes how long each takes'
 	@echo 'make long    the whole of what make test plays a slice of, with new dice (half an hour and more)'
 	@echo 'make check   formatting, lint, types, import directions'
 	@echo 'make format  put the code into the one format'

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from companion import __version__, config
 from companion.cli import logs
-from companion.cli.terminal import FAILED, NO_DAEMON, USAGE, Command, Parser, count, print_json, print_lines, seconds
+from companion.cli.terminal import FAILED, NO_DAEMON, USAGE, Command, Parser, print_json, print_lines, seconds, within
 from companion.errors import CompanionError, ConfigError, DaemonUnreachableError, NobodyHeardError
 
 
@@ -113,7 +113,9 @@ def _parser() -> Parser:
     )
     add("autopilot-setup", client.setup, "what the autopilot needs set to take in our heading")
     history = add("history", client.history, "list past calibrations")
-    history.add_argument("-n", "--limit", type=count, default=20, metavar="N", help="the latest N (default 20)")
+    history.add_argument(
+        "-n", "--limit", type=within(1, 1e6, int), default=20, metavar="N", help="the latest N (default 20)"
+    )
     add("monitor", monitor.monitor, "watch the daemon until Ctrl-C")
     add("web-token", local.web_token, "where the page is, and the token that its buttons need")
     recordings.add_commands(add)

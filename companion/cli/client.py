@@ -133,14 +133,13 @@ def add_command(add: AddCommand) -> None:
     parser.add_argument(
         "--headings", type=int, choices=(2, 4), default=2, help="zero: 2: there, turned, back; 4: every 90 deg"
     )
-    parser.add_argument("--quick", action="store_true", help="zero: leave out the way back, which checks the spot")
     parser.add_argument("--timeout", type=seconds, metavar="S", help="give up after so long (default 900)")
 
 
 async def align(options: argparse.Namespace) -> int:
     """`companion align`; Ctrl-C cancels it in the daemon too."""
     action = "show" if options.show else "forget" if options.forget else options.what
-    wanted = {"command": "align", "action": action, "headings": options.headings, "quick": options.quick}
+    wanted = {"command": "align", "action": action, "headings": options.headings}
     if options.timeout is not None:
         wanted["timeout_s"] = options.timeout
     reply = await request(options, wanted, {"command": "cancel"})

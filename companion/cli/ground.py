@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from companion.cli.terminal import DONE, FAILED, Parser, print_json, print_lines, seconds
+from companion.cli.terminal import DONE, FAILED, Parser, print_json, print_lines, seconds, within
 from companion.errors import ConfigError, LinkError, NobodyHeardError
 
 if TYPE_CHECKING:
@@ -32,8 +32,12 @@ def add_commands(commands: argparse._SubParsersAction[Parser], common: Parser) -
         type=_url,
         help=f"udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:PATH:BAUD (default {DEFAULT_URL})",
     )
-    link.add_argument("--system", type=_number, metavar="N", help="the vehicle's system id, where several are heard")
-    link.add_argument("--component", type=_number, metavar="N", help="the companion's component id (default 191)")
+    link.add_argument(
+        "--system", type=within(1, 255, int), metavar="N", help="the vehicle's system id, where several are heard"
+    )
+    link.add_argument(
+        "--component", type=within(1, 255, int), metavar="N", help="the companion's component id (default 191)"
+    )
     link.add_argument(
         "--within", type=seconds, metavar="S", help="how long to look for the companion on the link (default 5)"
     )
@@ -148,13 +152,6 @@ def _url(text: str) -> str:
     except LinkError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
     return text
-
-
-def _number(text: str) -> int:
-    value = int(text) if text.isdecimal() else 0
-    if not 1 <= value <= 255:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number from 1 to 255")
-    return value
 
 
 def _setting(text: str) -> tuple[str, float]:

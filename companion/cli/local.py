@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING
 
 from companion.cli import logs, show
 from companion.cli.terminal import DONE, FAILED, USAGE, AddCommand, config_path, load_config, print_json, print_lines
-from companion.errors import CompanionError, ConfigError, LinkError, StorageError
+from companion.errors import CompanionError, LinkError, StorageError
 
 if TYPE_CHECKING:
-    from companion.calibration.noise.allan import NoiseProfile
     from companion.installation.install import Step, Target
     from companion.links.serial.listening import Heard
     from companion.links.serial.ports import SerialPort
@@ -214,9 +213,10 @@ async def report(options: argparse.Namespace) -> int:
     if options.output == "-" and as_json:
         print_lines("companion report: -o - and --json both want stdout", error=True)
         return USAGE
-    directory, profiles = _where(options)
+    # A folder copied to another computer needs no configuration there.
+    directory = options.storage or load_config(options).storage.path
     try:
-        path, damaged = _make(options, directory, profiles)
+        path, damaged = _make(options, directory)
     except CompanionError as error:
         print_lines(f"companion: {error}", error=True)
         if as_json:
@@ -232,34 +232,13 @@ async def report(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _where(options: argparse.Namespace) -> tuple[Path, dict[str, NoiseProfile]]:
-    """The storage folder, and the noise profiles that the configuration names.
-
-    Raises:
-        ConfigError: there is no configuration to say where, and no --storage.
-    """
-    from companion.calibration.noise.allan import noise_profile
-
-    try:
-        config = load_config(options, profiles=True)
-    except ConfigError as error:
-        if options.storage is not None:
-            # A folder copied to another computer needs no configuration there.
-            return options.storage, {}
-        raise ConfigError(f"{error} (or name the folder with the records: --storage DIR)") from error
-    profiles = {imu.name: noise_profile(imu.profile) for imu in config.imu if imu.profile is not None}
-    return options.storage or config.storage.path, profiles
-
-
-def _make(
-    options: argparse.Namespace, directory: Path, profiles: dict[str, NoiseProfile]
-) -> tuple[Path | None, list[str]]:
+def _make(options: argparse.Namespace, directory: Path) -> tuple[Path | None, list[str]]:
     from companion.report.calibration_page import calibration_page
     from companion.report.source import material
     from companion.storage.state import write_atomically
 
     now = datetime.datetime.now(tz=datetime.UTC)
-    one = material(directory, options.record, profiles)
+    one = material(directory, options.record)
     content, damaged = calibration_page(one, now), list(one.damaged)
     name = f"companion-report-{one.number:06d}.html"
     if options.output == "-":

@@ -258,16 +258,15 @@ def _lines(result: Result) -> list[str]:
             ]
             lines.append(f"{f'{triad}: {name}':24} {cells[0]:>16} {cells[1]:>16} {cells[2]:>16}")
     if result.kept:
-        against = f"by {result.compared.name}"
-        heads = ("T, s", "sigma_use", against, "rms error", "over sigma", "2 sigma", "strictly", "naive")
-        widths = (5, 11, max(11, len(against)), 11, 10, 8, 9, 7)
+        heads = ("T, s", "sigma_use", "rms error", "over sigma", "2 sigma", "strictly", "naive")
+        widths = (5, 11, 11, 10, 8, 9, 7)
         lines.append(
             "the minute after windows of T s, learned from other recordings or the other half; within 2 sigma:"
         )
         lines.append(_row("", heads, widths))
         for each in result.kept:
             unit, unit_name, digits = _UNITS[each.triad]
-            sizes = [f"{value / unit:.{digits}f} {unit_name}" for value in (each.sigma_use, each.sigma_other, each.rms)]
+            sizes = [f"{value / unit:.{digits}f} {unit_name}" for value in (each.sigma_use, each.rms)]
             shares = [f"{share:.1%}" for share in (each.share, each.share_strict, each.share_naive)]
             over = f"{each.rms / each.sigma_use:.2f}"
             lines.append(_row(each.triad, (f"{each.mean_s}", *sizes, over, *shares), widths))

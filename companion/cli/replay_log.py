@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import msgspec
 
 from companion.cli import show
-from companion.cli.terminal import DONE, FAILED, print_json, print_lines, storage_path
+from companion.cli.terminal import DONE, FAILED, print_json, print_lines, storage_path, within
 from companion.errors import ConfigError, StorageError
 from companion.physics.units import DEG_H, MG
 
@@ -36,11 +35,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         ("--longitude-deg", -180.0, 180.0, "east is positive; for a magnetic heading"),
         ("--height-m", -500.0, 9000.0, "above mean sea level"),
     ):
-        log.add_argument(name, type=_number(least, most), metavar="M" if name.endswith("-m") else "DEG", help=words)
+        log.add_argument(name, type=within(least, most), metavar="M" if name.endswith("-m") else "DEG", help=words)
     log.add_argument(
-        "--sigma-deg", type=_number(1e-4, 45.0), default=0.05, metavar="DEG", help="of pitch and roll (default 0.05)"
+        "--sigma-deg", type=within(1e-4, 45.0), default=0.05, metavar="DEG", help="of pitch and roll (default 0.05)"
     )
-    log.add_argument("--heading-sigma-deg", type=_number(1e-3, 180.0), default=3.0, metavar="DEG", help="default 3")
+    log.add_argument("--heading-sigma-deg", type=within(1e-3, 180.0), default=3.0, metavar="DEG", help="default 3")
     log.add_argument(
         "--law", choices=("axis", "slope", "euler"), default="axis", help="of columns tilt_x, tilt_y (default axis)"
     )
@@ -51,7 +50,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
     log.add_argument(
         "--windows",
-        type=_number(10.0, 3600.0),
+        type=within(10.0, 3600.0),
         metavar="S",
         help="calibrate in every window of so many seconds, and hold sigma against what comes after",
     )
@@ -65,21 +64,8 @@ def add_table_options(parser: argparse._ActionsContainer) -> None:
         help="in place of the file's: t_s,gx_deg_s,gy_deg_s,gz_deg_s,ax_g,ay_g,az_g",
     )
     parser.add_argument(
-        "--rate", type=_number(4.0, 10000.0), metavar="HZ", help="of a log without times, or in their place"
+        "--rate", type=within(4.0, 10000.0), metavar="HZ", help="of a log without times, or in their place"
     )
-
-
-def _number(least: float, most: float) -> Callable[[str], float]:
-    def number(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = float("nan")
-        if not least <= value <= most:
-            raise argparse.ArgumentTypeError(f"found {text!r}; allowed: a number from {least:g} to {most:g}")
-        return value
-
-    return number
 
 
 def replay(options: argparse.Namespace) -> int:

@@ -272,7 +272,7 @@ def heard_lines(port: str, heard: Heard | str) -> list[str]:
             return [f"# {port} at {heard.line}: {heard.stranger}"]
         if not heard.bytes_heard:
             return [f"# {port}: silent (power? wiring? does it speak only when it is asked?)"]
-        return [f"# {port}: {heard.bytes_heard} bytes, at no usual speed anything known (levels? another protocol?)"]
+        return [f"# {port}: {heard.bytes_heard} bytes, nothing known at any usual speed (levels? another protocol?)"]
     lines = [f"# {port} at {heard.line}: {heard.candidate.protocol}, {heard.candidate.accepted} frames"]
     for number, kind in enumerate(heard.candidate.kinds):
         section = _section_lines(port, heard.candidate, kind, heard.line)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -86,31 +87,23 @@ class Parser(argparse.ArgumentParser):
         self.exit(USAGE)
 
 
-def seconds(text: str) -> float:
-    """An argument that is a time.
+def within(least: float, most: float, kind: type[float] = float) -> Callable[[str], float]:
+    """The type of an argument that is a number within these limits; with int a whole one."""
 
-    Raises:
-        argparse.ArgumentTypeError: it is none.
-    """
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a time in seconds above 0")
-    return value
+    def parsed(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"found {text!r}; allowed: a number from {least:g} to {most:g}")
+        return value
+
+    return parsed
 
 
-def count(text: str) -> int:
-    """An argument that is a number above 0.
-
-    Raises:
-        argparse.ArgumentTypeError: it is none.
-    """
-    value = int(text) if text.isdecimal() else 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
-    return value
+seconds: Final = within(1e-3, 1e6)
+"""The type of an argument that is a time in seconds."""
 
 
 def print_json(value: Any) -> None:

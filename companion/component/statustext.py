@@ -22,6 +22,7 @@ from typing import NamedTuple
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.links.mavlink.link import MavlinkLink
+from companion.links.system.connection import Budget
 
 CHUNK_BYTES = 50
 MAX_TEXT_BYTES = 4 * CHUNK_BYTES - 1
@@ -105,8 +106,7 @@ class StatusText:
         self._waiting: dict[Weight, deque[_Text]] = {weight: deque() for weight in reversed(Weight)}
         self._said_s: OrderedDict[tuple[Severity, str], float] = OrderedDict()
         self._sending: deque[mavlink.MAVLink_statustext_message] = deque()
-        self._tokens = BURST_LINES
-        self._refilled_s: float | None = None
+        self._lines = Budget(LINES_PER_S, BURST_LINES)
         self._next_id = 1
 
     def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
@@ -130,13 +130,10 @@ class StatusText:
 
     def step(self, now_s: float) -> float:
         """Send what the bucket allows; return when there is more to do (infinity: nothing waits)."""
-        if self._refilled_s is not None:
-            self._tokens = min(BURST_LINES, self._tokens + (now_s - self._refilled_s) * LINES_PER_S)
-        self._refilled_s = now_s
         if not self._link.connected:
             # Texts wait; the heartbeat, which is due as soon as there is a transport, brings us back here.
             return math.inf
-        while self._tokens >= 1.0 - 1e-9:
+        while self._lines.left(now_s) >= 1.0 - 1e-9:
             if not self._sending:
                 self._take_next(now_s)
             if not self._sending:
@@ -144,10 +141,10 @@ class StatusText:
             if not self._link.send(self._sending[0]):
                 return now_s + _FULL_RETRY_S
             self._sending.popleft()
-            self._tokens -= 1.0
+            self._lines.spend(1, now_s)
         if not self._sending and not any(self._waiting.values()):
             return math.inf
-        return now_s + (1.0 - self._tokens) / LINES_PER_S
+        return now_s + (1.0 - self._lines.left(now_s)) / LINES_PER_S
 
     def _take_next(self, now_s: float) -> None:
         for weight, waiting in self._waiting.items():

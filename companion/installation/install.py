@@ -22,8 +22,6 @@ from companion.storage.state import remove_durably, write_atomically
 
 EXECUTABLE: Final = "/opt/companion/bin/companion"
 """As the shipped unit names it."""
-SERIAL_GROUP: Final = "dialout"
-"""Likewise: who may open serial ports on Debian."""
 
 _STAMP: Final = "# Put here by `companion install-service`; sha256 of what follows: "
 _STAMPED: Final = re.compile(re.escape(_STAMP).encode() + rb"([0-9a-f]{64})\n")
@@ -61,7 +59,7 @@ def folder() -> Path:
     raise CompanionError(f"the files of the service are not beside {here}: the installation is not complete")
 
 
-def content(shipped: Shipped, *, executable: str = EXECUTABLE, serial_group: str = SERIAL_GROUP) -> bytes:
+def content(shipped: Shipped, *, executable: str = EXECUTABLE) -> bytes:
     """A shipped file as it is to be installed, without its stamp.
 
     Raises:
@@ -72,8 +70,6 @@ def content(shipped: Shipped, *, executable: str = EXECUTABLE, serial_group: str
         if not re.fullmatch(r"/[\w.+/@-]+", executable):
             raise CompanionError(f"{executable!r} cannot stand in a unit; allowed: an absolute path without spaces")
         text = text.replace(f"ExecStart={EXECUTABLE} ", f"ExecStart={executable} ")
-        text = text.replace(f"={SERIAL_GROUP}\n", f"={serial_group}\n")
-        text = text.replace(f"_GROUP={SERIAL_GROUP}\n", f"_GROUP={serial_group}\n")
     return text.encode()
 
 
@@ -99,8 +95,6 @@ MODE: Final = 0o644
 COMMAND_TIMEOUT_S: Final = 120.0
 HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - named, not used
 """What the unit hides from the service: ProtectHome and PrivateTmp."""
-SERIAL_GROUPS: Final = ("dialout", "uucp")
-"""Of Debian and Fedora; of Arch."""
 
 PACKAGED: Final = "packaged-by"
 """A file at the top of the environment that a Debian package brings: the service is then the package's."""
@@ -146,15 +140,6 @@ class Target:
         base = str(self.prefix).lstrip("/") if shipped.target.startswith("lib/") else "etc/companion"
         return self.root / base / shipped.target
 
-    def serial_group(self) -> str:
-        """Who may open serial ports there."""
-        try:
-            lines = (self.root / "etc/group").read_text(encoding="utf-8", errors="replace").splitlines()
-        except OSError:
-            lines = []
-        groups = {line.partition(":")[0] for line in lines}
-        return next((group for group in SERIAL_GROUPS if group in groups), SERIAL_GROUP)
-
 
 def own_executable() -> str:
     """The companion that is running, beside its Python."""
@@ -171,12 +156,11 @@ def install(target: Target, run: Run | None = None) -> Iterator[Step]:
         _check_not_packaged("sudo systemctl enable --now companion")
         _check_user(target, "install-service")
         _check_reach(target.executable)
-    group = target.serial_group()
     sample = content(CONFIGURATION)
     before = _read(target.path(SAMPLE))
     samples = [sample] if before is None else [sample, without_stamp(before)]
     for shipped in OURS:
-        wanted = stamped(content(shipped, executable=target.executable, serial_group=group))
+        wanted = stamped(content(shipped, executable=target.executable))
         yield _put(target, target.path(shipped), wanted)
     configuration = target.path(CONFIGURATION)
     found = _read(configuration)

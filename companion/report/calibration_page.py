@@ -9,7 +9,6 @@ from typing import Final
 import msgspec
 
 from companion.calibration.collector.trace import Trace
-from companion.calibration.noise.allan import AllanModel
 from companion.calibration.solution.record import Arming, ImuRecord, Outcome, Record
 from companion.report.markup import Child, Markup, join, number, tag
 from companion.report.page import (
@@ -19,7 +18,6 @@ from companion.report.page import (
     NAMES,
     TRIADS,
     UNITS,
-    Profiles,
     arming_items,
     card,
     damaged,
@@ -28,10 +26,9 @@ from companion.report.page import (
     moment,
     page,
     with_sigma,
-    written_count,
 )
 from companion.report.seconds import stillness
-from companion.samples import Triad, Vector
+from companion.samples import Triad
 
 MAX_WRITTEN: Final = 60
 
@@ -55,8 +52,6 @@ class Material(msgspec.Struct, frozen=True, kw_only=True):
     """Of the same aircraft, oldest first, this one last."""
     armings: Sequence[Arming]
     """While it was in force, oldest first."""
-    profiles: Profiles
-    """Of today's configuration, for records whose trace does not say."""
     damaged: Sequence[str]
 
 
@@ -70,7 +65,7 @@ def calibration_page(material: Material, now: datetime.datetime) -> str:
         _headline(material),
         damaged(material.damaged),
         _warnings(record),
-        *(_imu(imu, material) for imu in imus),
+        *map(_imu, imus),
         card("caution", f"{len(record.imus) - MAX_IMUS} more IMUs are not shown.")
         if len(record.imus) > MAX_IMUS
         else None,
@@ -125,18 +120,7 @@ def _warnings(record: Record) -> Markup | None:
 # ------------------------------------------------------------------------------------------------------- an IMU
 
 
-def noise_of(imu: str, triad: Triad, trace: Trace | None, profiles: Profiles) -> tuple[AllanModel | None, str]:
-    """The noise that a sensor is believed to have, and of which profile: the one used then, else today's."""
-    found = next((one for one in trace.imus if one.name == imu), None) if trace is not None else None
-    if found is not None:
-        return (found.gyro_noise if triad == "gyro" else found.accel_noise), found.profile
-    profile = profiles.get(imu)
-    if profile is None:
-        return None, ""
-    return (profile.gyro if triad == "gyro" else profile.accel), f"{profile.name}, by today's configuration"
-
-
-def _imu(imu: ImuRecord, material: Material) -> Markup:
+def _imu(imu: ImuRecord) -> Markup:
     temperature = "temperature unknown" if imu.temperature_degc is None else f"{imu.temperature_degc:.1f} degC"
     return join(
         tag("h2", f"IMU {imu.name}"),
@@ -149,11 +133,11 @@ def _imu(imu: ImuRecord, material: Material) -> Markup:
             else None,
             class_="soft",
         ),
-        tag("div", *(_triad(imu, triad, material) for triad in TRIADS), class_="pairs"),
+        tag("div", *(_triad(imu, triad) for triad in TRIADS), class_="pairs"),
     )
 
 
-def _triad(imu: ImuRecord, triad: Triad, material: Material) -> Markup:
+def _triad(imu: ImuRecord, triad: Triad) -> Markup:
     unit, unit_name = UNITS[triad]
     if triad == "gyro":
         bias, stat, use = imu.gyro_bias_rad_s, imu.gyro_sigma_stat_rad_s, imu.gyro_sigma_use_rad_s
@@ -164,7 +148,6 @@ def _triad(imu: ImuRecord, triad: Triad, material: Material) -> Markup:
     title = tag("h3", f"{NAMES[triad]}, {unit_name}")
     if bias is None or stat is None or use is None:
         return tag("div", title, card("caution", "Not determined: not asked for, or a warning above says why."))
-    model, profile = noise_of(imu.name, triad, material.trace, material.profiles)
     rows = []
     for k in range(3):
         value, sigma = with_sigma(bias[k], use[k], unit)
@@ -187,31 +170,14 @@ def _triad(imu: ImuRecord, triad: Triad, material: Material) -> Markup:
         title,
         held if triad in imu.held_back else None,
         tag("table", tag("tr", *(tag("th", words) for words in heads)), *rows),
-        tag("p", _against_the_floor(stat, use, model, unit, unit_name, profile)),
     )
-
-
-def _against_the_floor(
-    stat: Vector, use: Vector, model: AllanModel | None, unit: float, unit_name: str, profile: str
-) -> str:
-    if model is None:
-        return "What this sensor can hold is not known: neither the record nor the configuration names its profile."
-    floor = model.floor
-    words = f"The sensor's own floor is {floor / unit:.2g} {unit_name} ({profile}). "
-    if max(stat) < floor:
-        words += "Averaging has gone below it: measuring longer would gain little."
-    else:
-        words += f"Averaging left {max(stat) / unit:.2g}: measuring longer (min_still_s) would help."
-    if max(use) > 3.0 * max(floor, *stat):
-        words += " Most of sigma comes from elsewhere: the pose, the site, or a drift."
-    return words
 
 
 # ------------------------------------------------------------------------------------------------- what was written
 
 
 def _written(record: Record) -> Markup | None:
-    if not written_count(record):
+    if not any(imu.written for imu in record.imus):
         return None
     parts: list[Child] = [tag("h2", "Written to the autopilot")]
     seen: set[Outcome] = set()

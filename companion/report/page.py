@@ -12,7 +12,6 @@ from typing import Final
 import msgspec
 
 from companion import __version__
-from companion.calibration.noise.allan import NoiseProfile
 from companion.calibration.solution.record import Arming, Record
 from companion.physics.units import DEG_H, MG
 from companion.report import svg
@@ -31,9 +30,6 @@ _LATEST_S: Final = 230 * 365.25 * 86400
 MAX_WARNINGS: Final = 40
 MAX_IMUS: Final = 4
 """The most IMUs shown: three of an autopilot and our own. More are mentioned: a page stays below half a megabyte."""
-
-Profiles = Mapping[str, NoiseProfile]
-"""By the name of the IMU."""
 
 # No script, nothing fetched, nothing sent: what is not inline does not exist.
 _POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
@@ -185,8 +181,3 @@ def arming_items(armings: Sequence[Arming]) -> Markup:
             )
         )
     return tag("ul", *items)
-
-
-def written_count(record: Record) -> int:
-    """How many parameters a calibration has changed."""
-    return sum(len(imu.written) for imu in record.imus)

@@ -9,7 +9,6 @@ from typing import Final
 from companion.calibration.solution.record import Arming, Record
 from companion.errors import StorageError
 from companion.report.calibration_page import Material
-from companion.report.page import Profiles
 from companion.storage.records import Entry, RecordStore
 from companion.storage.state import BoundedList
 
@@ -17,13 +16,12 @@ MAX_EARLIER: Final = 60
 """The most calibrations in the drift plots of a page."""
 
 
-def material(directory: Path, wanted: str | None, profiles: Profiles) -> Material:
+def material(directory: Path, wanted: str | None) -> Material:
     """What the page of one calibration is made of, by its number or the beginning of its time; None: the latest.
 
     Args:
         directory: the storage folder.
         wanted: which calibration.
-        profiles: of today's configuration.
 
     Raises:
         StorageError: there is nothing to make a page of, none of that number or time, or it cannot be read.
@@ -67,7 +65,6 @@ def material(directory: Path, wanted: str | None, profiles: Profiles) -> Materia
         no_trace="" if trace is not None else why,
         earlier=earlier[-MAX_EARLIER:],
         armings=[arming for arming in armings if arming.calibration == record.started_at],
-        profiles=profiles,
         damaged=damaged,
     )
 

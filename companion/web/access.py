@@ -9,7 +9,6 @@ looking at the Host header: only addresses, "localhost" and the board's own name
 from __future__ import annotations
 
 import ipaddress
-import logging
 import re
 import secrets
 import socket
@@ -21,8 +20,6 @@ from companion.config.rules import is_address
 from companion.errors import StorageError
 from companion.storage.state import read_regular, write_atomically
 
-logger = logging.getLogger(__name__)
-
 TOKEN_HEADER: Final = "x-companion-token"  # noqa: S105 - a name
 TOKEN_FILE: Final = "web-token"  # noqa: S105 - a name
 # Without letters and digits that look alike on a phone in the sun; 12 of them are 59 bits.
@@ -30,9 +27,6 @@ _ALPHABET: Final = "23456789abcdefghjkmnpqrstuvwxyz"
 _GROUPS, _GROUP = 3, 4
 _LEAST_TOKEN: Final = _GROUPS * _GROUP
 """The least length of a token that somebody chose, without gaps and dashes."""
-FIRST_DELAY_S: Final = 0.25
-MOST_DELAY_S: Final = 5.0
-MOST_PEERS: Final = 256
 _MOST_TOKEN_BYTES: Final = 200
 _OWN_ENDINGS: Final = ("", ".local", ".lan", ".home.arpa", ".internal")
 """Endings of names that nobody can register: what a hotspot or a router makes of the board's name."""
@@ -87,32 +81,6 @@ def kept_token(directory: Path) -> str:
 def _bare(token: str) -> str:
     """As it counts: gaps, dashes and capitals are a matter of keyboards."""
     return re.sub(r"[\s-]", "", token).lower()
-
-
-class Guesses:
-    """Wrong tokens, by the address that they came from: each of an address is answered later than the one before."""
-
-    def __init__(self) -> None:
-        self.in_all = 0
-        self._named = 0
-        self._by_peer: dict[str, int] = {}
-
-    def wrong(self, peer: str) -> float:
-        """Count one, and log the first of an address; so many seconds its answer has to wait."""
-        before = self._by_peer.pop(peer, None)
-        if before is None and self._named < MOST_PEERS:
-            self._named += 1
-            logger.warning("page: wrong token from %s; more of them are only counted", peer)
-        if len(self._by_peer) >= MOST_PEERS:
-            del self._by_peer[next(iter(self._by_peer))]
-        self._by_peer[peer] = number = (before or 0) + 1
-        self.in_all += 1
-        return min(FIRST_DELAY_S * 2.0 ** min(number - 1, 10), MOST_DELAY_S)
-
-    def right(self, peer: str) -> None:
-        """Who has the token is no guesser, however often it was mistyped."""
-        if peer in self._by_peer:
-            self._by_peer[peer] = 0
 
 
 class Access:

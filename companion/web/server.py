@@ -26,7 +26,6 @@ from companion.links.system.connection import Backoff, Reconnection
 from companion.web.access import (
     TOKEN_HEADER,
     Access,
-    Guesses,
     is_loopback,
     kept_token,
     new_token,
@@ -48,6 +47,8 @@ LEAST_S: Final = 0.1
 """Between two events, whatever wakes them."""
 MAX_CONNECTIONS: Final = 48
 MAX_VIEWERS: Final = 16
+WRONG_TOKEN_S: Final = 2.0
+"""How long the answer to a wrong token is held back."""
 MAX_WAITING: Final = 16
 """The most answers to wrong tokens that are held back at a time."""
 MAX_WAITING_BYTES: Final = 128 * 1024
@@ -90,7 +91,7 @@ class Page:
         self._brief: dict[asyncio.Task[None], None] = {}
         """Those of them that do not look on, the oldest first."""
         self._viewers: set[Exchange] = set()
-        self._guesses, self._waiting = Guesses(), 0
+        self._wrong_tokens = self._waiting = 0
         self._wake = asyncio.Event()
         self._reconnection = Reconnection(
             "page", Backoff(first_s=1.0, cap_s=30.0), worth_s=WORTH_S, on_state=self._on_state
@@ -139,7 +140,7 @@ class Page:
             "summary": self.problem or self.url + ("" if self.local else " (buttons: companion web-token)"),
             "url": None if self.problem else self.url,
             "viewers": len(self._viewers),
-            "wrong_tokens": self._guesses.in_all,
+            "wrong_tokens": self._wrong_tokens,
         }
 
     # --- one connection
@@ -225,7 +226,6 @@ class Page:
             if not self.local and request.headers.get(TOKEN_HEADER):
                 await self._wait_after_guess(request.peer)
             return _refusal(403, why)
-        self._guesses.right(request.peer)
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             return _refusal(415, "an action is asked for in application/json")
         try:
@@ -246,11 +246,12 @@ class Page:
 
     async def _wait_after_guess(self, peer: str) -> None:
         """Answers that wait hold connections: beyond some, the others are not to suffer for it."""
-        delay_s = self._guesses.wrong(peer)
+        self._wrong_tokens += 1
+        logger.warning("page: wrong token from %s", peer)
         if self._waiting < MAX_WAITING:
             self._waiting += 1
             try:
-                await asyncio.sleep(delay_s)
+                await asyncio.sleep(WRONG_TOKEN_S)
             finally:
                 self._waiting -= 1
 

@@ -16,7 +16,10 @@ from tests.support.virtual_time import VirtualTimeLoop
 T = TypeVar("T")
 
 REAL_GRACE_S: Final = 0.002
-"""So long the kernel may take to carry bytes from one TCP socket of this process to another."""
+"""How long the kernel may take to carry bytes from one TCP socket of this process to another."""
+GRACE_EVERY_S: Final = 0.1
+"""Virtual time between two waits for the kernel: at every jump of the clock they would be a minute for three virtual
+ones. So much later a page is served at the most; its own time limits are seconds."""
 
 OWNER: contextvars.ContextVar[str] = contextvars.ContextVar("owner", default="stage")
 """Inherited by every task and callback: which daemon started it, directly or not."""
@@ -31,10 +34,14 @@ class CampaignLoop(VirtualTimeLoop):
         super().__init__()
         self.set_task_factory(_owned)
         self._real: weakref.WeakSet[asyncio.Transport] = weakref.WeakSet()
+        self._next_grace_s = 0.0
         self._jumping.grace_s = self._grace_s
 
     def _grace_s(self) -> float:
-        return REAL_GRACE_S if any(not transport.is_closing() for transport in self._real) else 0.0
+        if self.time() < self._next_grace_s or all(transport.is_closing() for transport in self._real):
+            return 0.0
+        self._next_grace_s = self.time() + GRACE_EVERY_S
+        return REAL_GRACE_S
 
     def run_in_executor(  # type: ignore[override]
         self, executor: Any, func: Callable[..., Any], *args: Any

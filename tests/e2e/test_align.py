@@ -33,7 +33,7 @@ TARGET_MG = 0.25
 
 
 def rig(folder: Path, *, seed: int = 1, placement_deg: float = 0.02, **more: Any) -> tuple[Rig, Hands]:
-    made = Rig(folder, pose=SPOT, seed=seed, **more)
+    made = Rig(folder, pose=SPOT, seed=seed, **({"imu_rate_hz": 10.0} | more))
     made.config = replaced(made.config, gradienter={"sigma_deg": 0.1})
     made.devices["gradienter"] = Gradienter(made.aircraft, seed=seed, law="slope", offset_deg=ZERO_DEG)
     made.devices["compass"] = HMR3300(made.aircraft, seed=seed, heading_error_deg=0.7)

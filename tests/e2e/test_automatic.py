@@ -17,6 +17,7 @@ from companion.daemon.job import Job
 from sim.imu_model import DEG_H, MG
 from tests.e2e.test_calibration import FC_PARAMETERS
 from tests.support.component import ACCEPTED, CALIBRATE, CANCEL, CANCELLED, UNDO
+from tests.support.extent import extent
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -62,9 +63,9 @@ def test_it_calibrates_at_the_first_opportunity_after_start_and_says_one_line(tm
 
 
 @pytest.mark.parametrize("more", [{"at_arm": "off"}, {"at_arm": "gate", "more": "[push]\nparameters = false\n"}])
-def test_nothing_happens_by_itself_with_at_arm_off_or_without_push(tmp_path: Path, more: dict[str, str]) -> None:
+def test_nothing_happens_by_itself_with_at_arm_off_or_without_push(tmp_path: Path, more: dict[str, Any]) -> None:
     async def main() -> None:
-        async with Rig(tmp_path, **more).running() as rig:  # type: ignore[arg-type]
+        async with Rig(tmp_path, **more, **SLOW).running() as rig:
             await asyncio.sleep(120.0)
             assert rig.double.writes == []
             assert rig.service.calibrating.store.history() == []
@@ -74,11 +75,11 @@ def test_nothing_happens_by_itself_with_at_arm_off_or_without_push(tmp_path: Pat
 
 def test_offsets_that_are_right_already_are_not_written_again_after_a_restart_of_the_companion(tmp_path: Path) -> None:
     async def main() -> None:
-        rig = Rig(tmp_path, at_arm="gate")
+        rig = Rig(tmp_path, at_arm="gate", **SLOW)
         async with rig.running():
             await calibrated_by_itself(rig)
         writes = len(rig.double.writes)
-        again = Rig(tmp_path / "again", at_arm="gate", parameters=values(rig))
+        again = Rig(tmp_path / "again", at_arm="gate", parameters=values(rig), **SLOW)
         async with again.running():
             await again.until(lambda: again.service.arming.readiness.answer().verdict == "accept", START_WITHIN_S)
             assert "offsets checked" in again.service.arming.readiness.answer().words
@@ -95,7 +96,7 @@ def test_a_quarter_of_an_hour_on_the_grass_keeps_the_gate_open_with_few_writes(t
         async with rig.running():
             await calibrated_by_itself(rig)
             closed = 0
-            for _ in range(900):
+            for _ in range(extent(whole=900, a_slice=450)):
                 await asyncio.sleep(1.0)
                 closed += rig.service.arming.readiness.answer().verdict != "accept"
             # 6 parameters a write; ICM-42688-P wanders by some 5 deg/h in minutes: below its own sigma, seldom above.
@@ -107,7 +108,7 @@ def test_a_quarter_of_an_hour_on_the_grass_keeps_the_gate_open_with_few_writes(t
 
 def test_a_boot_with_ins_gyr_cal_1_throws_the_values_away_and_they_are_pushed_again(tmp_path: Path) -> None:
     async def main() -> None:
-        async with Rig(tmp_path, at_arm="warn", parameters={"INS_GYR_CAL": 1.0}).running() as rig:
+        async with Rig(tmp_path, at_arm="warn", parameters={"INS_GYR_CAL": 1.0}, **SLOW).running() as rig:
             await calibrated_by_itself(rig)
             first = values(rig)
             rig.double.reboot()
@@ -128,7 +129,7 @@ def test_a_boot_with_ins_gyr_cal_1_throws_the_values_away_and_they_are_pushed_ag
 
 def test_a_boot_that_keeps_the_values_is_checked_and_nothing_is_written(tmp_path: Path) -> None:
     async def main() -> None:
-        async with Rig(tmp_path, at_arm="gate").running() as rig:
+        async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
             await calibrated_by_itself(rig)
             writes = len(rig.double.writes)
             await rig.until(lambda: rig.service.arming.readiness.answer().verdict == "accept", 20.0)
@@ -144,7 +145,7 @@ def test_a_boot_that_keeps_the_values_is_checked_and_nothing_is_written(tmp_path
 
 def test_values_changed_by_another_station_are_shown_and_not_overwritten(tmp_path: Path) -> None:
     async def main() -> None:
-        async with Rig(tmp_path, at_arm="gate").running() as rig:
+        async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
             await calibrated_by_itself(rig)
             await asyncio.sleep(2.0)
             rig.double.write_as_another_station("INS_GYROFFS_X", 0.01)
@@ -168,7 +169,7 @@ def test_values_changed_by_another_station_are_shown_and_not_overwritten(tmp_pat
 
 def test_a_change_that_nobody_announced_is_found_before_anything_is_written_over_it(tmp_path: Path) -> None:
     async def main() -> None:
-        async with Rig(tmp_path, at_arm="gate").running() as rig:
+        async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
             await rig.ready()
             await asyncio.sleep(5.0)
             rig.double.set_parameter("INS_ACCOFFS_X", 0.02)  # no PARAM_VALUE goes out
@@ -182,7 +183,7 @@ def test_a_change_that_nobody_announced_is_found_before_anything_is_written_over
 
 def test_after_an_undo_nothing_is_written_until_the_next_request(tmp_path: Path) -> None:
     async def main() -> None:
-        async with Rig(tmp_path, at_arm="gate").running() as rig:
+        async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
             before = values(rig)
             await calibrated_by_itself(rig)
             rig.ground.command(UNDO)
@@ -202,7 +203,7 @@ def test_after_an_undo_nothing_is_written_until_the_next_request(tmp_path: Path)
 
 def test_a_request_during_an_automatic_calibration_takes_it_over_and_gets_its_final(tmp_path: Path) -> None:
     async def main() -> None:
-        async with Rig(tmp_path, at_arm="gate").running() as rig:
+        async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
             job = await started_by_itself(rig)
             rig.ground.command(CALIBRATE, 0.0)
             await rig.until(lambda: rig.ground.finals(CALIBRATE) != [], 30.0)
@@ -219,7 +220,7 @@ def test_a_request_during_an_automatic_calibration_takes_it_over_and_gets_its_fi
 @pytest.mark.parametrize("state", [State.WRITING, State.VERIFYING])
 def test_an_undo_during_an_automatic_calibration_takes_that_one_back(tmp_path: Path, state: State) -> None:
     async def main() -> None:
-        async with Rig(tmp_path, at_arm="gate").running() as rig:
+        async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
             before = values(rig)
             await started_by_itself(rig, state)
             rig.ground.command(UNDO)
@@ -234,7 +235,7 @@ def test_an_undo_during_an_automatic_calibration_takes_that_one_back(tmp_path: P
 
 def test_cancelling_an_automatic_calibration_ends_it_for_good(tmp_path: Path) -> None:
     async def main() -> None:
-        async with Rig(tmp_path, at_arm="gate").running() as rig:
+        async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
             before = values(rig)
             await started_by_itself(rig)
             rig.ground.command(CANCEL)
@@ -278,7 +279,9 @@ def test_the_writes_of_a_day_are_bounded_also_over_restarts(tmp_path: Path, monk
 
     async def main() -> None:
         for expected in (1, 2, 2):
-            rig = Rig(tmp_path, at_arm="gate", max_s=12.0)  # an autopilot as it was: its offsets are wrong again
+            rig = Rig(
+                tmp_path, at_arm="gate", max_s=12.0, **SLOW
+            )  # an autopilot as it was: its offsets are wrong again
             async with rig.running():
                 await asyncio.sleep(40.0)
                 assert rig.service.arming.automatic.status()["writes_today"] == expected
@@ -320,7 +323,7 @@ def _creep(rig: Rig, by_rad_s: float) -> None:
 
 def test_only_the_conductor_starts_what_a_check_must_not(tmp_path: Path) -> None:
     async def main() -> None:
-        async with Rig(tmp_path, at_arm="gate").running() as rig:
+        async with Rig(tmp_path, at_arm="gate", **SLOW).running() as rig:
             rig.service.calibrating.conductor._only_listening = "only a check is running"
             await asyncio.sleep(60.0)
             assert rig.double.writes == []

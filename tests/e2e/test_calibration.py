@@ -11,10 +11,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from companion.autopilot.firmware.firmwares import read_calibration
 from companion.calibration.request import What
 from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
+from companion.daemon.offsets import plan
 from sim.ardupilot.double import offset_names
 from sim.imu_model import DEG_H, MG
 from tests.support.component import ACCEPTED, CALIBRATE, UNDO
@@ -22,6 +24,8 @@ from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
 FC_PARAMETERS = [*offset_names(1, "accel"), *offset_names(1, "gyro")]
+QUICK: dict[str, Any] = {"min_still_s": 3.0, "max_s": 6.0}
+"""For tests that look at what happens around a calibration, not at how good it is."""
 
 
 def started(answer: Job | Refusal) -> Job:
@@ -96,7 +100,7 @@ def test_a_ground_station_calibrates_and_undoes(tmp_path: Path, system_id: int) 
     vehicle = (system_id, 191)
 
     async def main() -> None:
-        async with Rig(tmp_path, system_id=system_id).running() as rig:
+        async with Rig(tmp_path, system_id=system_id, **QUICK).running() as rig:
             await rig.ready()
             before = {name: rig.double.parameter(name) for name in FC_PARAMETERS}
             await rig.until(lambda: rig.double.hears(191), 5.0)
@@ -135,7 +139,7 @@ def test_after_a_minute_of_rest_the_result_is_there_at_once_and_nothing_is_writt
 @pytest.mark.parametrize("what", [What.GYROS, What.ACCELEROMETERS])
 def test_only_what_was_asked_for_is_written(tmp_path: Path, what: What) -> None:
     async def main() -> None:
-        async with Rig(tmp_path).running() as rig:
+        async with Rig(tmp_path, **QUICK).running() as rig:
             await rig.ready()
             result, record = await calibrated(rig, what)
             assert result.outcome == "done"
@@ -182,7 +186,7 @@ def test_a_serial_imu_that_the_autopilot_consumes_gets_its_offsets_there_and_the
     tmp_path: Path,
 ) -> None:
     async def main() -> None:
-        rig = Rig(tmp_path, own_imu=True)
+        rig = Rig(tmp_path, own_imu=True, **QUICK)
         own = msgspec.structs.replace(rig.config.imu[1], autopilot_instance=2)
         rig.config = msgspec.structs.replace(rig.config, imu=[rig.config.imu[0], own])
         async with rig.running():
@@ -201,9 +205,31 @@ def test_a_serial_imu_that_the_autopilot_consumes_gets_its_offsets_there_and_the
     run_virtual(main())
 
 
+def test_writing_that_is_switched_off_while_the_plan_is_made_is_off_for_the_next_plan_not_for_half_of_this_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def main() -> None:
+        rig = Rig(tmp_path, own_imu=True, **QUICK)
+        own = msgspec.structs.replace(rig.config.imu[1], autopilot_instance=2)
+        rig.config = msgspec.structs.replace(rig.config, imu=[rig.config.imu[0], own])
+
+        async def switching(*arguments: Any) -> Any:
+            rig.service.core.wanted.switch(push=False)
+            return await read_calibration(*arguments)
+
+        monkeypatch.setattr(plan, "read_calibration", switching)
+        async with rig.running():
+            await rig.ready()
+            result, record = await calibrated(rig)
+            assert result.outcome == "done", result
+            assert all(imu.written for imu in record.imus)
+
+    run_virtual(main())
+
+
 def test_a_long_calibration_does_not_make_the_look_at_the_write_long(tmp_path: Path) -> None:
     async def main() -> None:
-        async with Rig(tmp_path, min_still_s=70.0, max_s=70.0, feed_s=0.2, imu_rate_hz=50.0).running() as rig:
+        async with Rig(tmp_path, min_still_s=70.0, max_s=70.0, feed_s=0.2, imu_rate_hz=10.0).running() as rig:
             await rig.ready()
             result, record = await calibrated(rig)
             assert result.outcome == "done", result
@@ -215,7 +241,7 @@ def test_a_long_calibration_does_not_make_the_look_at_the_write_long(tmp_path: P
 
 def test_done_is_a_hundred_per_cent_while_the_record_is_on_its_way_to_the_disk(tmp_path: Path) -> None:
     async def main() -> None:
-        rig = Rig(tmp_path, min_still_s=3.0, max_s=4.0)
+        rig = Rig(tmp_path, **QUICK)
         seen: set[tuple[str, int | None]] = set()
 
         async def looking(function: Callable[..., Any], *arguments: Any) -> Any:

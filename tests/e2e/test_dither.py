@@ -130,6 +130,18 @@ def test_an_undithered_second_imu_is_left_alone_with_the_way_out(tmp_path: Path)
     run_virtual(main())
 
 
+def test_who_has_switched_writing_off_gets_no_dither_either(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with second_imu_only(tmp_path, UNDITHERED, dither=True, max_s=12.0).running() as rig:
+            await ready(rig)
+            rig.service.core.wanted.switch(push=False)
+            result, _ = await calibrated(rig, What.GYROS)
+            assert result.outcome == "failed"
+            assert rig.double.writes == []
+
+    run_virtual(main())
+
+
 def test_with_push_dither_the_undithered_imu_comes_within_a_few_deg_h(tmp_path: Path) -> None:
     async def main() -> None:
         async with second_imu_only(tmp_path, UNDITHERED, dither=True).running() as rig:

@@ -6,15 +6,20 @@ import asyncio
 import os
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.machine import State
+from companion.calibration.means.windows import Window
 from companion.calibration.request import What
 from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
+from companion.daemon.calibrating.course import Measuring
+from companion.daemon.job import Job
+from companion.errors import ParameterTimeoutError
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from sim.ardupilot.double import ArduPilotDouble, offset_names
 from sim.imu_model import DEG_H, MG
@@ -52,6 +57,47 @@ def test_an_autopilot_that_echoes_but_does_not_use_the_value(tmp_path: Path) -> 
     assert "does not use" in record.reason
     assert back
     assert outcomes(record) == {"rolled_back"}
+
+
+def test_what_somebody_changed_is_named_although_the_autopilot_falls_silent_right_after(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            seen: list[str] = []
+
+            async def falling_silent(name: str) -> float:
+                seen.append(name)
+                if len(seen) == 2:
+                    raise ParameterTimeoutError("silent")
+                return 0.25
+
+            monkeypatch.setattr(rig.service.offsets.pusher, "_parameters", SimpleNamespace(read=falling_silent))
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", None))
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert f"{seen[0]} is 0.25, somebody changed it right after the write; silent" in result.reason
+
+    run_virtual(main())
+
+
+def test_a_restart_while_the_telemetry_is_watched_puts_the_old_values_back(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            before = values(rig.double)
+            conductor = rig.service.calibrating.conductor
+            job = started(conductor.start_calibration(What.BOTH, "test", None))
+            await rig.until(lambda: conductor.state is State.VERIFYING, 60.0)
+            rig.double.reboot()
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "the autopilot rebooted right after the write" in result.reason
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
+            assert values(rig.double) == before
+
+    run_virtual(main())
 
 
 def test_an_autopilot_that_refuses_one_parameter(tmp_path: Path) -> None:
@@ -161,6 +207,46 @@ def test_a_write_interrupted_by_a_power_cut_is_mended_at_the_next_start(tmp_path
     run_virtual(main())
 
 
+@pytest.mark.parametrize("after", [0.0025, None])
+def test_a_write_interrupted_on_another_aircraft_is_named_and_nothing_of_it_put_back_here(
+    tmp_path: Path, after: float | None
+) -> None:
+    names = offset_names(1, "gyro")
+    changes = tuple(Changed(name, before=0.0, after=after) for name in names)
+    ChangeLog(tmp_path).journal.write(ChangeSet(7, changes))
+
+    async def main() -> None:
+        async with Rig(tmp_path, parameters=dict.fromkeys(names, 0.0025)).running() as rig:
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 60.0)
+            await asyncio.sleep(2.0)
+            assert rig.double.writes == []
+            assert any("Interrupted write on system 7" in text for text in rig.ground.texts())
+
+    run_virtual(main())
+
+
+def test_an_interrupted_write_waits_while_armed_without_trying(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = offset_names(1, "gyro")
+    changes = tuple(Changed(name, before=0.0, after=0.0025) for name in names)
+    ChangeLog(tmp_path).journal.write(ChangeSet(1, changes))
+
+    async def main() -> None:
+        rig = Rig(tmp_path, parameters=dict.fromkeys(names, 0.0025))
+        rig.double.arm()
+        async with rig.running():
+            await asyncio.sleep(15.0)
+            assert rig.double.writes == []
+            assert rig.service.offsets.ledger.pending
+            assert not any("trying again" in words for words in caplog.messages)
+            rig.double.disarm()
+            await rig.until(lambda: not rig.service.offsets.ledger.pending, 20.0)
+            assert [rig.double.parameter(name) for name in names] == [0.0, 0.0, 0.0]
+
+    run_virtual(main())
+
+
 def test_values_that_somebody_else_has_set_since_are_left_alone(tmp_path: Path) -> None:
     names = offset_names(1, "gyro")
     changes = tuple(Changed(name, before=0.0, after=0.25) for name in names)
@@ -171,6 +257,32 @@ def test_values_that_somebody_else_has_set_since_are_left_alone(tmp_path: Path) 
             await rig.until(lambda: not rig.service.offsets.ledger.pending, 20.0)
             assert rig.double.writes == []
             assert any("left alone" in text for text in rig.ground.texts())
+
+    run_virtual(main())
+
+
+def test_offsets_that_change_unheard_after_the_measurement_are_measured_under_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are read afresh before anything is written: what was measured under others would be off by the change."""
+
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            measure, windows = Measuring.measure, list[Window]()
+
+            async def changing(measuring: Measuring, job: Job) -> Window:
+                windows.append(await measure(measuring, job))
+                if len(windows) == 1:
+                    rig.double.set_parameter("INS_GYROFFS_X", rig.double.parameter("INS_GYROFFS_X") + 0.002)
+                return windows[-1]
+
+            monkeypatch.setattr(Measuring, "measure", changing)
+            result, _ = await calibrated(rig)
+            assert result.outcome == "done", result
+            assert len(windows) == 2
+            left = rig.double.residual(1, rig.now_s)
+            assert max(abs(each) for each in left.gyro_rad_s) < 60.0 * DEG_H
 
     run_virtual(main())
 

@@ -136,23 +136,6 @@ def test_a_device_that_was_replaced_for_good_is_taken_after_a_while(
     asyncio.run(main())
 
 
-def test_a_slow_bridge_is_said_of_an_imu_when_it_is_opened(path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    async def main(kind: str, protocol: str) -> dict[str, int]:
-        frame = imu_frame if kind == "imu" else tilt_frame
-        async with Chatter(path, frame, rate_hz=50.0), listening(kind, protocol, path) as one:
-            await one.data()
-            await asyncio.sleep(0.6)
-            return one.counts
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(serial_port, "latency_timer_ms", lambda _: 16)
-        assert asyncio.run(main("imu", "imu_line")) == {"slow bridge": 1}
-        assert asyncio.run(main("gradienter", "inclinometer_xy")) == {}
-        assert len(said(caplog, "own", "collects bytes for 16 ms")) == 1
-        patch.setattr(serial_port, "latency_timer_ms", lambda _: 1)
-        assert asyncio.run(main("imu", "imu_line")) == {}
-
-
 def test_two_devices_swapped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     a, b = tmp_path / "a", tmp_path / "b"
 
@@ -386,18 +369,20 @@ def test_a_flood_holds_nobody_up(path: Path, caplog: pytest.LogCaptureFixture) -
             one.sensor.decoder.feed = counting  # type: ignore[method-assign]
             thread.start()
             turns = 0
-            while loop.time() - since_s < 3.0 or ("floods us" not in one.words and loop.time() - since_s < 60.0):
-                await asyncio.sleep(0.001)
-                turns += 1
-            spent_s = loop.time() - since_s
-            assert "floods us" in one.words
-            await one.until(lambda: one.counts.get("flood") == 1)
-            assert len(said(caplog, "gradienter", "floods us")) == 1
-            assert turns > 20, f"the others had {turns} turns in {spent_s:.1f} s"
-            assert decoded <= BYTES_PER_S * spent_s + BURST_BYTES + 4096 * spent_s / 0.05
-            assert one.sensor.link.bytes_received - received > 2 * decoded, "it was no flood"
-            ended.set()
-            await asyncio.to_thread(thread.join)
+            try:
+                while loop.time() - since_s < 3.0 or ("floods us" not in one.words and loop.time() - since_s < 60.0):
+                    await asyncio.sleep(0.001)
+                    turns += 1
+                spent_s = loop.time() - since_s
+                assert "floods us" in one.words
+                await one.until(lambda: one.counts.get("flood") == 1)
+                assert len(said(caplog, "gradienter", "floods us")) == 1
+                assert turns > 20, f"the others had {turns} turns in {spent_s:.1f} s"
+                assert decoded <= BYTES_PER_S * spent_s + BURST_BYTES + 4096 * spent_s / 0.05
+                assert one.sensor.link.bytes_received - received > decoded, "all of it was decoded"
+            finally:
+                ended.set()
+                await asyncio.to_thread(thread.join)
             device.muted = False
             await over(one, caplog)
 

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from tests.support.rig import ACCEL_BIAS_MG, Rig
 from tests.support.virtual_time import run_virtual
 
 Message = mavlink.MAVLink_message
+QUICK: dict[str, Any] = {"min_still_s": 5.0, "max_s": 10.0, "imu_rate_hz": 10.0}
 
 
 @contextlib.asynccontextmanager
@@ -63,7 +65,7 @@ def test_a_calibration_waits_while_the_place_jumps_and_says_why(
     tmp_path: Path, latitude_deg: float, height_m: float, words: str
 ) -> None:
     async def main() -> None:
-        async with Rig(tmp_path).running() as rig:
+        async with Rig(tmp_path, **QUICK).running() as rig:
             await rig.ready()
             await asyncio.sleep(8.0)
             async with spoofed(rig, 0.1, place(rig, latitude_deg, height_m)):
@@ -92,7 +94,7 @@ def test_a_place_in_the_configuration_is_not_doubted(tmp_path: Path) -> None:
     place_known = "[vehicle]\nlatitude_deg = 40.0\nlongitude_deg = 116.0\nheight_m = 50.0"
 
     async def main() -> None:
-        async with Rig(tmp_path, more=place_known).running() as rig:
+        async with Rig(tmp_path, more=place_known, **QUICK).running() as rig:
             await rig.ready()
             async with spoofed(rig, 0.1, place(rig, 0.001, 8000.0)):
                 job = calibrate(rig)
@@ -149,7 +151,7 @@ def test_nothing_that_is_forged_again_and_again_holds_a_calibration_up_for_ever(
     tmp_path: Path, every_s: float, what: tuple[Callable[[], Message], ...], words: str
 ) -> None:
     async def main() -> None:
-        async with Rig(tmp_path).running() as rig:
+        async with Rig(tmp_path, **QUICK).running() as rig:
             await rig.ready()
             async with spoofed(rig, every_s, *what):
                 job = calibrate(rig)
@@ -165,7 +167,7 @@ def test_nothing_that_is_forged_again_and_again_holds_a_calibration_up_for_ever(
 
 def test_an_arming_between_two_looks_ends_the_measurement(tmp_path: Path) -> None:
     async def main() -> None:
-        async with Rig(tmp_path).running() as rig:
+        async with Rig(tmp_path, **QUICK).running() as rig:
             await rig.ready()
             job = calibrate(rig)
             await asyncio.sleep(3.05)

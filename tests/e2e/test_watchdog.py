@@ -19,7 +19,7 @@ from tests.support.virtual_time import run_virtual
 @pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
 def test_nobody_is_accused_who_works(tmp_path: Path, firmware: Literal["ardupilot", "px4"]) -> None:
     async def main() -> dict[str, float]:
-        rig = Rig(tmp_path, firmware=firmware, min_still_s=4.0, max_s=8.0, loss=0.2, at_arm="gate")
+        rig = Rig(tmp_path, firmware=firmware, min_still_s=4.0, max_s=8.0, loss=0.2, at_arm="gate", imu_rate_hz=10.0)
         oldest: dict[str, float] = {}
         async with rig.running() as running:
             beats = Supervisor(running.service, ServiceManager(None)).beats

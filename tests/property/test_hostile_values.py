@@ -77,7 +77,7 @@ class Errors(logging.Handler):
 
 
 async def _survives(folder: Path, firmware: Literal["ardupilot", "px4"], seed: int) -> None:
-    rig = Rig(folder, seed=seed % 7, firmware=firmware, recordings_mb=16, at_arm="warn", more=MORE)
+    rig = Rig(folder, seed=seed % 7, firmware=firmware, recordings_mb=16, at_arm="warn", imu_rate_hz=10.0, more=MORE)
     hostile = Hostile(random.Random(seed))
     async with rig.running():
         await rig.ready()

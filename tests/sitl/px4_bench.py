@@ -18,8 +18,12 @@ from tests.sitl.craft import BINARIES, missing
 
 ITS_OWN = frozenset(
     {"_HASH_CHECK", "LND_FLIGHT_T_HI", "LND_FLIGHT_T_LO", "COM_FLIGHT_UUID", "SDLOG_MODE", "SDLOG_BACKEND"}
+    | {f"CAL_GYRO{slot}_PRIO" for slot in range(4)}
+    | {f"CAL_BARO{slot}_OFF" for slot in range(4)}
 )
-"""What PX4 itself may change meanwhile; those of the log are put back to their defaults by its start scripts."""
+"""What PX4 itself may change meanwhile; those of the log are put back to their defaults by its start scripts. A slot's
+priority is -1, which means 50, until PX4's background calibration saves the slot: it then writes the 50. The
+barometer's offset is calibrated by GNSS after a start (SENS_BARO_AUTOCAL)."""
 GYRO_DEG_H = (500.0, -700.0, 1000.0)
 """Case D: integers tell it without dither."""
 ACCEL_MG = (1.0, -2.0, 3.0)

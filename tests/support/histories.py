@@ -8,8 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from companion.calibration.collector.trace import ImuTrace, Trace, VerdictTrace
-from companion.calibration.noise.allan import noise_profile
+from companion.calibration.collector.trace import Trace, VerdictTrace
 from companion.calibration.solution.record import (
     Arming,
     ImuRecord,
@@ -121,10 +120,6 @@ def white_trace(
     shaken = [moved and k % 9 in (3, 4) for k in range(len(second))]
     words = tuple("gyro fc 0.31 deg/s > 0.10" if shake else None for shake in shaken)
     names = [imu.name for imu in of.imus] or ["fc", "own"]
-    profile = noise_profile("icm42688p")
-    imus = [
-        ImuTrace(name=name, profile=profile.name, gyro_noise=profile.gyro, accel_noise=profile.accel) for name in names
-    ]
     still: tuple[str | None, ...] = (None,) * len(second)
     silent = tuple("no data from gradienter for 3 s" if moved and 20 < k < 26 else None for k in range(len(second)))
     sources = [("imu", name, words if name == "fc" else still) for name in names]
@@ -144,7 +139,6 @@ def white_trace(
             )
             for kind, name, said in sources
         ),
-        imus=tuple(imus),
     )
 
 

@@ -25,6 +25,11 @@ def install(folder: Path, *, bytecode: bool = True) -> dict[str, str]:
     shutil.copytree(Path(companion.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
     kept = {name: value for name, value in os.environ.items() if name not in _WOULD_CHANGE_IT}
     kept |= {"PYTHONPATH": str(folder), "PYTHONSAFEPATH": "1"}  # not from where it is started: that may be a checkout
+    kept |= {
+        "MALLOC_ARENA_MAX": "1",
+        "MALLOC_MMAP_THRESHOLD_": "131072",
+        "MALLOC_TRIM_THRESHOLD_": "131072",
+    }  # the unit's
     if not bytecode:
         return {**kept, "PYTHONDONTWRITEBYTECODE": "1"}
     if not compileall.compile_dir(package, quiet=1):

@@ -51,10 +51,11 @@ class LossyLink:
 
     async def __aenter__(self) -> Self:
         loop = asyncio.get_running_loop()
-        self._front, _ = await loop.create_datagram_endpoint(lambda: _Face(self._from_firmware), local_addr=self.near)
         self._back, _ = await loop.create_datagram_endpoint(
             lambda: _Face(self._from_companion), local_addr=(LOOPBACK, 0)
         )
+        # Last: the firmware sends already, and what comes is passed on at once.
+        self._front, _ = await loop.create_datagram_endpoint(lambda: _Face(self._from_firmware), local_addr=self.near)
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:

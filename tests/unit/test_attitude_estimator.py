@@ -243,6 +243,28 @@ def test_a_compass_finds_true_north(site: Site, heading_deg: float) -> None:
     assert 0.8 * DEG < found.sigma_rad[2] < 1.3 * DEG
 
 
+def test_a_new_alignment_forgets_what_was_before_it() -> None:
+    """What an estimator has levelled by and what it has refused must not go into the next alignment."""
+    aircraft = VirtualAircraft(Pose(5.0, -3.0, 40.0), NORTH)
+    imu = ImuModel(aircraft, "perfect")
+    used, fresh = AttitudeEstimator(settings()), AttitudeEstimator(settings())
+    used.align(0.0, VirtualAircraft(Pose(20.0, 25.0, 200.0), NORTH).body_from_ned(0.0), SURE)
+    follow(used, imu, 30.0)
+    assert not used.add_heading(30.0, 100.0 * DEG, 1.0 * DEG)
+    for estimator in (used, fresh):
+        estimator.align(30.0, aircraft.body_from_ned(30.0), SURE)
+        for batch in samples(imu, 40.0, since_s=30.0):
+            estimator.update(batch, phase="flight")
+    assert used.compass.refused_for_s(40.0) == 0.0
+    for estimator in (used, fresh):
+        assert estimator.add_heading(40.0, 41.0 * DEG, 1.0 * DEG)
+    now, expected = used.attitude(), fresh.attitude()
+    assert now is not None
+    assert expected is not None
+    assert now.quaternion == pytest.approx(expected.quaternion, abs=1e-9)
+    assert now.sigma_rad == pytest.approx(expected.sigma_rad, rel=1e-6)
+
+
 def test_a_heading_from_a_wild_compass_is_refused_and_named() -> None:
     aircraft = VirtualAircraft(Pose(0.0, 0.0, 350.0), NORTH)
     estimator = AttitudeEstimator(settings())

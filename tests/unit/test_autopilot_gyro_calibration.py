@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.firmware.gyro_calibration import TIMEOUT_S, GyroParameters, calibrate_gyros
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import ArmState
+from companion.errors import NotDisarmedError
 from tests.support.virtual_time import run_virtual
 
 OFFSETS = {f"INS_GYROFFS_{axis}": 0.01 for axis in "XYZ"}
@@ -22,17 +23,17 @@ class _Autopilot:
 
     name = "ArduPilot, system 1"
     boots = 1
-    arm_state = ArmState.DISARMED
 
-    def __init__(self, result: int) -> None:
+    def __init__(self, result: int, arm_state: ArmState = ArmState.DISARMED) -> None:
         self.vehicle = self.commands = self
-        self.result = result
-        self.looks = 0
+        self.result, self.arm_state = result, arm_state
+        self.looks = self.sent = 0
 
     async def fresh_heartbeat(self) -> None:
         pass
 
     def send(self, command: int, *parameters: float, timeout_s: float) -> asyncio.Future[int | None]:
+        self.sent += 1
         answer: asyncio.Future[int | None] = asyncio.get_running_loop().create_future()
         answer.set_result(self.result)
         return answer
@@ -54,3 +55,12 @@ def test_offsets_that_stay_at_zero_after_the_answer_are_looked_at_four_times_a_s
 
     assert TIMEOUT_S <= run_virtual(main()) < TIMEOUT_S + 2.0
     assert autopilot.looks <= 4.0 * TIMEOUT_S + 10
+
+
+@pytest.mark.parametrize("arm_state", [ArmState.ARMED, ArmState.UNKNOWN])
+def test_it_is_not_asked_for_unless_the_aircraft_is_surely_disarmed(arm_state: ArmState) -> None:
+    autopilot = _Autopilot(mavlink.MAV_RESULT_ACCEPTED, arm_state)
+    before = GyroParameters(OFFSETS, gyros=(1,), tcal=())
+    with pytest.raises(NotDisarmedError, match="not started: the aircraft is not surely disarmed"):
+        run_virtual(calibrate_gyros(cast("ParameterClient", autopilot), before, lambda words: None))
+    assert autopilot.sent == 0

@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.parameters.wire import integers_bytewise
 from companion.autopilot.vehicle.boot_clock import BootClock
+from companion.autopilot.vehicle.heartbeats import ArmingWatch
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.autopilot.vehicle.whereabouts import Position
 from companion.links.mavlink.link import MavlinkLink
@@ -332,6 +333,30 @@ def test_a_restart_is_seen_and_its_arm_state_unknown_until_the_next_heartbeat() 
     run_virtual(main())
 
 
+def test_another_firmware_that_is_flashed_is_no_second_autopilot_though_it_streams_before_its_heartbeat() -> None:
+    async def main() -> None:
+        link = MavlinkLink()
+        vehicle = Vehicle(link)
+        codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+
+        def stream(boot_s: float) -> None:
+            message = mavlink.MAVLink_system_time_message(0, int(boot_s * 1000))
+            link.receive(message.pack(codec), asyncio.get_running_loop().time())
+
+        heartbeat(link, autopilot=PX4)
+        stream(100.0)
+        await asyncio.sleep(20.0)
+        stream(3.0)
+        await asyncio.sleep(0.3)
+        heartbeat(link, autopilot=ARDUPILOT)
+        assert vehicle.firmware == "ardupilot"
+        assert vehicle.conflict is None
+        assert state(vehicle) is ArmState.DISARMED
+        vehicle.close()
+
+    run_virtual(main())
+
+
 def test_a_restart_leaves_the_state_unknown() -> None:
     async def main() -> None:
         link = MavlinkLink()
@@ -429,3 +454,13 @@ def test_integers_are_bytes_by_the_capability_bits_and_else_on_px4_only(
 def test_boot_clock_an_autopilot_up_for_longer_than_we_heard_nothing_has_not_restarted() -> None:
     # ArduPilot calibrates its gyros, and the machine that simulates it is too busy: little simulated time, no messages.
     assert not any(feed(BootClock(), (60, 0), (60.2, 3.5), (60.5, 4.1), (61, 5.2)))
+
+
+def test_no_autopilot_restarts_twice_within_a_second() -> None:
+    """Two under one id, whose times since boot alternate, seem to."""
+    arming = ArmingWatch()
+    arming.restarted(10.0)
+    arming.restarted(11.0)
+    assert arming.conflict(11.0, 1) is None
+    arming.restarted(11.5)
+    assert arming.conflict(11.5, 1) == "two autopilots have system id 1"

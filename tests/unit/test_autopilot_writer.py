@@ -247,6 +247,26 @@ def test_a_restart_in_the_middle_is_named_and_what_persisted_is_put_back() -> No
     run_virtual(main())
 
 
+def test_a_restart_so_short_that_no_answer_is_missed_is_found_before_the_write_counts_as_stored() -> None:
+    async def main() -> None:
+        autopilot = ScriptedAutopilot(parameters=BEFORE)
+        tasks: list[asyncio.Task[None]] = []
+
+        def restart(name: str, value: float) -> float:
+            tasks.append(asyncio.ensure_future(autopilot.reboot(0.1)))
+            return value
+
+        on_nth_set(autopilot, 3, restart)
+        async with aboard(autopilot) as (writer, vehicle, _):
+            with pytest.raises(WriteFailedError, match="before all was read back") as caught:
+                await writer.apply(CHANGES)
+            assert caught.value.kind == "rebooted in the middle"
+            assert vehicle.boots == 1
+            assert autopilot.parameters == rounded(BEFORE)
+
+    run_virtual(main())
+
+
 def test_what_the_autopilot_calibrated_itself_at_a_restart_is_left_and_named() -> None:
     async def main() -> None:
         autopilot = ScriptedAutopilot(parameters=BEFORE)

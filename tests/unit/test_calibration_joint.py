@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import datetime
 import itertools
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -14,6 +16,7 @@ from scipy import linalg
 
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.request import What
+from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.history import PowerUp
 from companion.calibration.solution.joint import Weighed, Whole, points, weigh
 from companion.calibration.solution.prior import Expectation, Expected, ExpectedImu
@@ -135,6 +138,24 @@ def test_gyros_are_weighed_each_for_itself() -> None:
     np.testing.assert_allclose(found.imus[0].gyro_sigma_use_rad_s, 20.0 * DEG_H / np.sqrt(2.0))
     np.testing.assert_allclose(gyro_of(found.imus[1]), 0.0)
     assert found.imus[1].prior is None
+
+
+def test_a_record_has_no_covariance_of_what_is_not_known() -> None:
+    shared = shared_errors(0.0)
+    whole, gyros, none = imus([np.zeros(3)] * 3, shared)
+    gyros = dataclasses.replace(gyros, accel_m_s2=None)
+    none = dataclasses.replace(none, gyro_rad_s=None, accel_m_s2=None)
+    began = datetime.datetime(2026, 5, 1, tzinfo=datetime.UTC)
+    record = Draft(began, solution=solution([whole, gyros, none], shared)).record("done", "", 1.0)
+    first, second, third = (imu.covariance for imu in record.imus)
+    assert first is not None
+    assert second is not None
+    assert all(value is not None for row in first for value in row)
+    assert [[value is not None for value in row] for row in second] == [[True] * 3 + [False] * 3] * 3 + [
+        [False] * 6
+    ] * 3
+    assert third is None
+    assert [cross.imus for cross in record.cross_covariance] == [("imu0", "imu1")]
 
 
 def test_what_two_imus_have_in_common_does_not_count_in_their_difference() -> None:

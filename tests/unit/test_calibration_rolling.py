@@ -205,6 +205,21 @@ def test_the_window_is_at_most_max_s_long_and_memory_is_bounded() -> None:
     assert len(feed.collector._good) <= 30
 
 
+def test_a_warm_up_is_taken_where_the_last_second_ends() -> None:
+    feed = feeder()
+    slope = 2e-5
+    quiet = np.random.default_rng(2)
+
+    def warming(_name: str, times: Floats, rows: Floats) -> Floats:
+        rows[:, :3] = BIAS + slope * times[:, None] + quiet.normal(0.0, 1e-6, (len(times), 3))
+        return rows
+
+    feed.change = warming
+    feed.run(25.0)
+    window = feed.collector.window(feed.now_s)
+    assert window.imus[0].gyro_rad_s == pytest.approx(BIAS + slope * window.end_s, abs=0.1 * slope)
+
+
 def test_since_takes_only_whole_seconds_after_it() -> None:
     feed = feeder(SILENT)
     feed.run(20.0)

@@ -18,6 +18,8 @@ from companion.calibration.stillness.gates import (
 )
 from companion.calibration.stillness.stretch import Stretch
 from companion.physics.units import DEG, MG
+from tests.support.still_aircraft import QUIET
+from tests.unit.test_calibration_windows import batches_of
 
 Floats = NDArray[np.float64]
 REST = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -9.8])
@@ -225,3 +227,20 @@ def test_steady_seconds_are_those_since_the_last_bad_one() -> None:
         flags = list(stretch.flags)
         bad = [place for place, good in enumerate(flags) if not good]
         assert stretch.steady == len(flags) - 1 - (bad[-1] if bad else -1)
+
+
+def test_what_is_learned_is_the_lower_quartile_of_the_seconds() -> None:
+    """Of variances 1, 3 and 3 it is 2: twice that, and some chance, is still rest; thrice is not."""
+    unit = 0.01 * DEG
+
+    def second(variance: float) -> Batch:
+        (batch,) = batches_of(REST[None], spread=unit * math.sqrt(variance), n=1000)
+        return batch
+
+    def learned() -> ImuGate:
+        gate = ImuGate("fc", QUIET)
+        assert all(gate.judge(second(variance)).still for variance in (1.0, 3.0, 3.0))
+        return gate
+
+    assert learned().judge(second(4.0)).still
+    assert not learned().judge(second(5.0)).still

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import pytest
 from companion.calibration.collector import trace as traces
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.collector.trace import MAX_SECONDS, Trace
-from tests.support.still_aircraft import Feeder, imu, settings
+from tests.support.still_aircraft import BIAS, GYRO_NOISE, RATE_HZ, Feeder, imu, settings
 
 YAW_90 = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -40,7 +42,16 @@ def test_every_second_of_the_window_has_the_verdict_of_every_source() -> None:
         ("imu", "fc"), ("imu", "own"), ("gradienter", "gradienter"), ("compass", "compass"),
     }  # fmt: skip
     assert all(words is None for one in trace.verdicts for words in one.words)
-    assert [found.name for found in trace.imus] == ["fc", "own"]
+
+
+def test_rates_are_in_the_vehicles_axes_second_by_second() -> None:
+    feed = _feeder()
+    feed.run(12.0)
+    rates = feed.collector.snapshot(1004.0, None).rates_rad_s("own")
+    assert list(rates) == list(range(1004, 1012))
+    x, y, z = BIAS
+    for rate in rates.values():
+        assert rate == pytest.approx([-y, x, z], abs=6.0 * GYRO_NOISE / math.sqrt(RATE_HZ))
 
 
 def test_a_movement_is_kept_in_the_words_of_its_gate_although_the_stretch_is_forgotten() -> None:

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.calibration.means.pose import heading_window, tilt_window
-from companion.calibration.means.windows import ImuInput, imu_estimates
+from companion.calibration.means.windows import ImuInput, estimates, imu_estimates
 from companion.calibration.noise.allan import AllanModel, NoiseProfile, noise_profile, slope_variance
 from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import rotation_matrix
@@ -130,6 +130,19 @@ def test_a_ramp_is_taken_at_the_end_of_the_window_and_flagged() -> None:
     assert window.gyro_sigma_stat_rad_s[0] == pytest.approx(2.0 * window.gyro_sigma_stat_rad_s[1], rel=0.35)
     assert window.gyro_sigma_use_rad_s[0] > slope * 90.0 / math.sqrt(3.0)
     assert window.gyro_rad_s[1] == pytest.approx(0.0, abs=3.0 * DEG_H)
+
+
+def test_a_ramp_is_neither_white_noise_nor_flicker() -> None:
+    noise = np.random.default_rng(6).normal(0.0, 1.0, (60, 6))
+    warming = noise + 2.0 * np.arange(60.0)[:, None]
+    model = AllanModel(0.5, 0.05, 0.0)
+    source = imu("fc", NoiseProfile("made", model, model))
+    (calm, _), (steep, _) = (
+        estimates([source], [batches_of(values)], end_s=160.0, horizon_s=180.0)[0] for values in (noise, warming)
+    )
+    assert steep.ramp_per_s == pytest.approx([2.0] * 3, abs=0.05)
+    assert steep.white == pytest.approx(calm.white, rel=0.05)
+    assert steep.flicker == pytest.approx(calm.flicker, abs=0.2)
 
 
 def test_no_ramp_is_flagged_in_white_noise() -> None:

@@ -23,7 +23,6 @@ LEVEL = stands(350.0, 0.4, -0.3)
     ("plan", "total", "on_spot"),
     [
         (Plan("zero"), 3, 3),
-        (Plan("zero", quick=True), 2, 2),
         (Plan("zero", headings=4), 4, 4),
         (Plan("tilts"), 8, 4),
     ],

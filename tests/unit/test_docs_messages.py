@@ -28,8 +28,8 @@ NOT_MESSAGES = {
     "MAVLink component", "MAVLink connection", "automatic calibration", "the state for MQTT",
     # When a rival acts, and whether a rival does: keys, not words for people.
     "at a start", "while still", "after a flight",
-    # Keys of `counts` in `status --json`: their words have rows.
-    "slow bridge", "clock back",
+    # A key of `counts` in `status --json`: its words have a row.
+    "clock back",
     # Lines of a configuration, which `companion ports --listen` prints.
     'name = "own"', 'source = "serial"',
     # What an error of the operating system is recognised by.

@@ -92,16 +92,6 @@ def test_a_dry_run_tells_and_changes_nothing(tmp_path: Path) -> None:
     assert tree(tmp_path) == before
 
 
-def test_the_group_of_the_serial_ports_is_that_of_the_machine(tmp_path: Path) -> None:
-    (tmp_path / "etc").mkdir()
-    (tmp_path / "etc/group").write_text("root:x:0:\nuucp:x:14:me\n")
-    list(install(target(tmp_path)))
-    unit = (tmp_path / UNIT).read_text()
-    assert "\nSupplementaryGroups=uucp\n" in unit
-    assert "\nEnvironment=COMPANION_CONTROL_GROUP=uucp\n" in unit
-    assert "dialout" not in unit
-
-
 def test_a_path_that_cannot_stand_in_a_unit_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CompanionError, match="allowed: an absolute path without spaces"):
         list(install(target(tmp_path, executable="/opt/my companion/bin/companion")))

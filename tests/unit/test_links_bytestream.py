@@ -310,7 +310,7 @@ def test_what_waits_is_taken_with_a_stream_that_is_collected_and_is_not_lost_whe
                         while is_driven(together):
                             await asyncio.sleep(0.001)
             assert not is_driven(together)
-            assert together.waiting == 0
+            assert len(together._waiting) == 0
 
     asyncio.run(main())
 

@@ -41,7 +41,7 @@ class TestWaiting:
     def test_without_a_stream_everything_is_taken_at_once(self) -> None:
         together, taker = Together(), Taker()
         together.put(taker, b"a", 1.0)
-        assert (taker.got, together.waiting, together.driven) == ([(b"a", 1.0)], 0, False)
+        assert (taker.got, len(together._waiting), together.driven) == ([(b"a", 1.0)], 0, False)
 
     def test_waits_for_one_of_the_next_reads_in_its_order_with_its_own_time(self) -> None:
         together, taker = Together(), Taker()
@@ -68,7 +68,7 @@ class TestWaiting:
         most = 0
         for number in range(1000):
             together.put(taker, b"", float(number))
-            most = max(most, together.waiting)
+            most = max(most, len(together._waiting))
         assert most == MOST_WAITING - 1
         together.drain()
         assert [t_s for _, t_s in taker.got] == [float(number) for number in range(1000)]
@@ -175,7 +175,7 @@ class TestMavlink:
         link = MavlinkLink()
         link.together.drive()
         link.arrived(data, 5.0, link.receive)
-        assert link.together.waiting == 0
+        assert len(link.together._waiting) == 0
 
     def test_without_a_fast_stream_nothing_waits(self) -> None:
         link = MavlinkLink()

@@ -257,7 +257,6 @@ def test_the_table_says_what_it_found(capsys: pytest.CaptureFixture[str], half_h
         "imu imu: 0.48 h at rest in 1 recording",
         "gyro x, deg/h",
         "gyro: adis16405                     152.0             29.0",
-        "by adis16405",
         "used of half_hour.csv: ",
         "note: too short to tell gyro K",
     ):

@@ -181,7 +181,7 @@ def test_old_records_make_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def _trace(record: Record) -> Trace:
     return Trace(
-        started_at=record.started_at, second=(-1, 0), good=(True, False), measured=None, cut=False, verdicts=(), imus=()
+        started_at=record.started_at, second=(-1, 0), good=(True, False), measured=None, cut=False, verdicts=()
     )
 
 

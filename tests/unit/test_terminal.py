@@ -223,6 +223,7 @@ def test_what_the_check_finds(
     assert clean(said) == f"the autopilot says {SHOWN}\n"
 
 
+@pytest.mark.real_clock
 @pytest.mark.parametrize("form", [[], ["--json"]])
 @pytest.mark.parametrize("words", [["status"], ["params"], ["params", "CMP_X=1"]])
 def test_what_is_heard_on_the_ground(

@@ -611,31 +611,10 @@ def test_a_token_that_somebody_chose_has_twelve_characters(tmp_path: Path, capsy
     assert capsys.readouterr().out.startswith("token: twelve - chars!\n")
 
 
-def test_a_wrong_token_is_answered_later_each_time_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
-    guesses = access.Guesses()
-    delays = [guesses.wrong("10.0.0.7") for _ in range(7)]
-    assert delays == [0.25, 0.5, 1.0, 2.0, 4.0, 5.0, 5.0]
-    assert guesses.wrong("10.0.0.8") == 0.25, "the others do not wait for it"
-    guesses.right("10.0.0.7")
-    assert guesses.wrong("10.0.0.7") == 0.25
-    assert guesses.in_all == 9
-    said = [record.getMessage() for record in caplog.records]
-    assert said == [f"page: wrong token from 10.0.0.{k}; more of them are only counted" for k in (7, 8)]
-
-
-def test_strangers_fill_neither_the_memory_nor_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    guesses = access.Guesses()
-    for number in range(5000):
-        guesses.wrong(f"2001:db8::{number:x}")
-    assert guesses.in_all == 5000
-    assert len(guesses._by_peer) == len(caplog.records) == access.MOST_PEERS
-
-
 def test_who_has_the_token_is_let_in_whoever_guesses_meanwhile(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(access, "FIRST_DELAY_S", 3600.0)
-    monkeypatch.setattr(access, "MOST_DELAY_S", 7200.0)
+    monkeypatch.setattr(server, "WRONG_TOKEN_S", 3600.0)
 
     async def visit(served: Page, daemon: Daemon) -> None:
         def guess() -> asyncio.Task[Said]:
@@ -655,14 +634,13 @@ def test_who_has_the_token_is_let_in_whoever_guesses_meanwhile(
         right = await ask(served, "POST", "/cancel", b"{}", **good_headers(served))
         assert right.status == 200
         assert daemon.asked[-1][0] == {"command": "cancel"}
-        assert served._guesses.wrong("127.0.0.1") == access.FIRST_DELAY_S, "and what was mistyped before is forgotten"
-        assert served.status()["wrong_tokens"] == server.MAX_WAITING + 2
+        assert served.status()["wrong_tokens"] == server.MAX_WAITING + 1
         for task in waiting:
             task.cancel()
         await asyncio.gather(*waiting, return_exceptions=True)
 
     run(tmp_path, visit, bind="0.0.0.0:0")
-    assert caplog.text.count("wrong token from 127.0.0.1") == 1
+    assert caplog.text.count("wrong token from 127.0.0.1") == server.MAX_WAITING + 1
     assert "2" * 12 not in caplog.text
 
 

@@ -66,6 +66,10 @@ class ArmingWatch:
             self.two_seen(t_s)
         self._restarted_s = t_s
 
+    def flashed(self) -> None:
+        """Another firmware runs there now; its restart may have been seen before its first heartbeat."""
+        self._restarted_s = -math.inf
+
     def armed(self, t_s: float) -> bool | None:
         """Whether it is armed; None before the first heartbeat."""
         if t_s - self._armed_s < ARMED_HOLDS_S:

@@ -274,6 +274,7 @@ class Vehicle:
         # Another firmware has been flashed while we heard nothing.
         self.firmware = firmware
         self.boot.begin_anew()
+        self._arming.flashed()
         self._restarted()
         return True
 

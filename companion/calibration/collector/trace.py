@@ -17,12 +17,12 @@ import numpy as np
 from companion import formats
 from companion.calibration.collector.intake import Kind, Source
 from companion.calibration.means.windows import ImuInput
-from companion.calibration.noise.allan import AllanModel
 from companion.calibration.seconds.batch import Batch
 from companion.calibration.stillness.gates import Verdict
 from companion.physics.frames import Floats
 
-FORMAT_VERSION: Final = 1
+FORMAT_VERSION: Final = 2
+"""Of 1 it leaves out the noise of each IMU."""
 
 MAX_SECONDS: Final = 600
 """Kept; the oldest go first. Ten times the longest usual window;
@@ -30,18 +30,6 @@ some 1 MB in memory, 100 kB on disk with three IMUs."""
 
 MAX_WORDS: Final = 100
 _FARTHEST: Final = 100_000_000
-
-
-class ImuTrace(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU."""
-
-    name: str
-    profile: str
-    """Whose noise was assumed."""
-    gyro_noise: AllanModel
-    """Of that profile, rad/s."""
-    accel_noise: AllanModel
-    """m/s^2."""
 
 
 class VerdictTrace(msgspec.Struct, frozen=True, kw_only=True):
@@ -70,7 +58,6 @@ class Trace(msgspec.Struct, frozen=True, kw_only=True):
     cut: bool
     """The calibration took longer than what is kept: its beginning is missing."""
     verdicts: tuple[VerdictTrace, ...]
-    imus: tuple[ImuTrace, ...]
 
 
 def to_json(trace: Trace) -> bytes:
@@ -141,15 +128,6 @@ class Snapshot(msgspec.Struct, frozen=True):
                     fault=tuple(one is not None and one.verdict.fault for one in column),
                 )
                 for (kind, name), column in columns.items()
-            ),
-            imus=tuple(
-                ImuTrace(
-                    name=imu.name,
-                    profile=imu.profile.name,
-                    gyro_noise=imu.profile.gyro,
-                    accel_noise=imu.profile.accel,
-                )
-                for imu in self.inputs.values()
             ),
         )
 

@@ -40,8 +40,6 @@ class Kept(msgspec.Struct, frozen=True, kw_only=True):
     """Of the misses, rad/s or m/s^2."""
     sigma_use: float
     """Median of sqrt(V(T, H))."""
-    sigma_other: float
-    """Likewise, were the noise that of the profile it is compared with."""
     share: float
     """Within 2 sigma of the bias; that the minute's own white noise is in what is seen of it is allowed for."""
     share_strict: float
@@ -55,7 +53,6 @@ class _Misses(msgspec.Struct):
 
     miss: list[Floats]
     use: list[Floats]
-    other: list[Floats]
     seen: list[Floats]
     """Variance of what is seen of the next minute, about its bias."""
     naive: list[Floats]
@@ -76,20 +73,19 @@ def coverage(recordings: Sequence[Sequence[Rest]], fallback: NoiseProfile) -> li
         others = [rest for index, each in enumerate(parts) if index != number for rest in each]
         if sum(len(rest.slots) for rest in others) >= LEAST_STILL_S:
             tests.append((part, fit_profile("test", others, fallback).profile))
-    return keeps(tests, fallback)
+    return keeps(tests)
 
 
 def keeps(
     tests: Sequence[tuple[Sequence[Rest], NoiseProfile]],
-    other: NoiseProfile,
     means_s: Sequence[int] = MEANS_S,
     next_s: int = NEXT_S,
 ) -> list[Kept]:
     """How often the seconds after a window came out as profiles say."""
-    found = {mean_s: _Misses([], [], [], [], []) for mean_s in means_s}
+    found = {mean_s: _Misses([], [], [], []) for mean_s in means_s}
     for rests, profile in tests:
         for mean_s, misses in found.items():
-            _predict(rests, profile, other, (mean_s, next_s), misses)
+            _predict(rests, profile, (mean_s, next_s), misses)
     return [
         _summary(triad, columns, mean_s, misses)
         for triad, columns in TRIADS
@@ -126,9 +122,7 @@ def _starts(rests: Sequence[Rest], mean_s: int, next_s: int) -> tuple[list[tuple
     return places, sum(len(rest.slots) // length for rest in rests) if places else 0.0
 
 
-def _predict(
-    rests: Sequence[Rest], profile: NoiseProfile, other: NoiseProfile, lengths_s: tuple[int, int], misses: _Misses
-) -> None:
+def _predict(rests: Sequence[Rest], profile: NoiseProfile, lengths_s: tuple[int, int], misses: _Misses) -> None:
     mean_s, next_s = lengths_s
     places, minutes = _starts(rests, mean_s, next_s)
     misses.minutes += minutes
@@ -140,7 +134,6 @@ def _predict(
         white = allan_variance(np.arange(next_s), coming.reshape(next_s, -1), 1)[0].reshape(-1, CHANNELS)
         misses.miss.append(mean - coming.mean(axis=0))
         misses.use.append(use)
-        misses.other.append(_estimated(past, other, next_s)[1])
         misses.seen.append(white / next_s)
         misses.naive.append(np.array([_naive(window) for window in past]))
 
@@ -168,9 +161,7 @@ def _naive(window: Sequence[Batch]) -> Floats:
 
 def _summary(triad: Triad, columns: slice, mean_s: int, misses: _Misses) -> Kept:
     miss = np.square(np.concatenate(misses.miss)[:, columns])
-    use, other, seen, naive = (
-        np.concatenate(each)[:, columns] for each in (misses.use, misses.other, misses.seen, misses.naive)
-    )
+    use, seen, naive = (np.concatenate(each)[:, columns] for each in (misses.use, misses.seen, misses.naive))
 
     def share(variance: Floats) -> float:
         return float((miss <= SIGMAS**2 * variance).mean())
@@ -182,7 +173,6 @@ def _summary(triad: Triad, columns: slice, mean_s: int, misses: _Misses) -> Kept
         minutes=misses.minutes,
         rms=float(np.sqrt(miss.mean())),
         sigma_use=float(np.sqrt(median(np.ravel(use)))),
-        sigma_other=float(np.sqrt(median(np.ravel(other)))),
         share=share(use + seen),
         share_strict=share(use),
         share_naive=share(naive),

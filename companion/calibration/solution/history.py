@@ -36,7 +36,8 @@ class PowerUp(msgspec.Struct, frozen=True, kw_only=True):
 
     def is_same(self, other: PowerUp) -> bool:
         """Whether nothing says that the power was off in between."""
-        if self.host == other.host:
+        # Earlier versions kept the dashes of the kernel's boot id.
+        if self.host.replace("-", "") == other.host.replace("-", ""):
             return True
         mine, theirs = self.since_unix_s, other.since_unix_s
         return mine is not None and theirs is not None and abs(mine - theirs) < SAME_START_S

@@ -152,7 +152,7 @@ def judge(
         change = temperature_degc - held.temperature_degc
         if abs(change) > limits.max_temperature_change_k:
             warmer = "warmer" if change > 0 else "colder"
-            found.append(Finding(Why.TEMPERATURE, f"imu {name} is {abs(change):.0f} K {warmer} than then"))
+            found.append(Finding(Why.TEMPERATURE, f"imu {name}: {abs(change):.0f} K {warmer} than calibrated"))
     limit_s = min(limits.max_age_s, age_limit_s(model, held.sigma_use, held.averaged_s))
     if (age_s := now_s - held.confirmed_s) > limit_s:
         found.append(Finding(Why.OLD, f"calibrated {age_s / 60:.0f} min ago, limit {limit_s / 60:.0f}"))

@@ -24,8 +24,8 @@ logger = logging.getLogger(__name__)
 class _Known(msgspec.Struct, frozen=True):
     """The offsets that the autopilot had when they were looked at last."""
 
-    offsets: dict[str, float]
-    """By parameter."""
+    offsets: tuple[float, ...]
+    """Gyro offsets first; not by name, since what is learned of PX4's slots gives the same IMU other names."""
     boots: int
 
 
@@ -70,7 +70,7 @@ class OffsetWatch:
             calibration = imu.calibration
             if calibration is None:
                 continue
-            now = _Known(calibration.offsets, self._vehicle.boots)
+            now = _Known(tuple(calibration.offsets.values()), self._vehicle.boots)
             known = self._known.get(name)
             self._known[name] = now
             if known is None:

@@ -33,15 +33,11 @@ class Plan:
     kind: Kind
     headings: int = 2
     """2: there, turned by 180 degrees, and back; 4: every quarter turn."""
-    quick: bool = False
-    """Without the way back: a spot that moves goes unnoticed."""
 
     @property
     def on_spot(self) -> int:
         """How many stands share the spot."""
-        if self.kind == "tilts" or self.headings == HEADINGS:
-            return HEADINGS
-        return 2 if self.quick else 3
+        return HEADINGS if self.kind == "tilts" or self.headings == HEADINGS else 3
 
     @property
     def total(self) -> int:

@@ -44,7 +44,7 @@ GYRO_TURN_SIGMA_DEG: Final = 3.0
 SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
 
-ARMED: Final = "armed during the alignment; the one before stays in force"
+ARMED: Final = "armed during the alignment; the earlier one stays in force"
 
 
 def _changed(name: str) -> CalibrationRefusedError:
@@ -283,8 +283,6 @@ class Aligner:
 
     def _warnings(self, result: Alignment) -> list[str]:
         found = []
-        if not result.checked:
-            found.append("a spot that moved between the stands would not have been noticed (leave out --quick)")
         if result.slope_deg > SLOPE_WARNING_DEG:
             found.append(
                 f"the spot slopes by {result.slope_deg:.1f} deg, so that each degree of heading error counts: a flatter"

@@ -152,8 +152,7 @@ class Calibrating(Subsystem):
         timeout_s = ALIGN_TIMEOUT_S if timeout_s is None else timeout_s
         if action not in ("zero", "tilts") or headings not in (2, HEADINGS) or not is_time_limit(timeout_s):
             raise CalibrationRefusedError(f"align: {request} is not understood")
-        plan = Plan(action, headings, quick=request.get("quick") is True)
-        return _accepted(self.conductor.start_alignment(plan, f"{face} align", float(timeout_s)))
+        return _accepted(self.conductor.start_alignment(Plan(action, headings), f"{face} align", float(timeout_s)))
 
     async def _progress(self, job: Job) -> AsyncIterator[Object]:
         while job.is_running:

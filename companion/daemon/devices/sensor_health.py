@@ -29,8 +29,8 @@ AGAIN_S: Final = 60.0
 class SensorHealth:
     """What is wrong with one sensor now, and how often what has been; `polled`: it speaks only when it is asked."""
 
-    def __init__(self, link: ByteLink, kind: str, protocol: str, decoder: Decoder, *, polled: bool) -> None:
-        self.link, self.kind, self.protocol = link, kind, protocol
+    def __init__(self, link: ByteLink, protocol: str, decoder: Decoder, *, polled: bool) -> None:
+        self.link, self.protocol = link, protocol
         self.stream = StreamHealth(protocol, decoder)
         self.counts: Counter[str] = Counter()
         """How often each trouble has begun, and each event happened."""
@@ -54,10 +54,6 @@ class SensorHealth:
             self._grace_since_s = self._opened_s
         self._renewed = False
         self.stream.opened()
-        timer_ms = self.link.latency_timer_ms
-        if self.kind == "imu" and timer_ms is not None and timer_ms > 1:
-            words = f"its FTDI bridge collects bytes for {timer_ms} ms, samples come in bunches (companion check)"
-            self.stream.events.append(Trouble("slow bridge", words))
 
     def trouble(self, now_s: float) -> Trouble | None:
         """What is wrong with it, worst first; None while good samples come."""

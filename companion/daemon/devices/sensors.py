@@ -129,9 +129,7 @@ class SerialSensor:
             on_gap=self._on_gap,
         )
         self._together = Together() if together is None else together
-        self.health = SensorHealth(
-            self.link, device.roles[0].kind, self.protocol, self.decoder, polled=self.dialogue is not None
-        )
+        self.health = SensorHealth(self.link, self.protocol, self.decoder, polled=self.dialogue is not None)
         self.on_bytes: Listeners[str, bytes | None, float] = Listeners()
         """Told (name, bytes, time) before they are decoded; without bytes: some are missing."""
         self.on_samples: Listeners[Sequence[Sample], float] = Listeners()

@@ -24,7 +24,7 @@ from companion.samples import CompassSample, Sample, TiltSample
 if TYPE_CHECKING:
     from companion.daemon.heading.attitude_service import AttitudeService
 
-REBOOT: Final = "restart the autopilot then: until that it goes on as before"
+REBOOT: Final = "then restart the autopilot: they act from then on"
 OLDEST_S: Final = 1.0
 """A reading older than this is none."""
 DECLINATION_EVERY_S: Final = 60.0
@@ -62,7 +62,7 @@ class Heading(Subsystem):
             todo = ", ".join(f"{change.parameter} {change.after:g}" for change in changes)
             reason = f"set {todo}; {REBOOT}"
         elif self._core.config.push.attitude == "off":
-            reason = 'the autopilot is set up, but push.attitude is "off": the heading never comes'
+            reason = 'the autopilot is set up, but push.attitude is "off": no heading is sent'
         else:
             reason = "the autopilot is set up"
         yield {

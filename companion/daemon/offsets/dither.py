@@ -234,7 +234,7 @@ class Ditherer:
             if not self._ledger.pending:
                 return "old offsets put back"
             await asyncio.sleep(POLL_S)
-        return "old offsets NOT back yet: will be once disarmed and heard"
+        return "old offsets NOT back yet: disarm, keep it connected"
 
 
 def _offsets(calibration: ImuCalibration, shift: Array) -> dict[str, float]:

@@ -202,7 +202,7 @@ class Recovery:
         strange = self.ledger.strange_to(self._vehicle.firmware, open_set)
         if strange or open_set.system_id != self._vehicle.system_id:
             names = ", ".join(open_set.names)
-            words = f"An interrupted write on system {open_set.system_id} is not this aircraft's; there check: {names}"
+            words = f"Interrupted write on system {open_set.system_id}, not on this aircraft: check there {names}"
             logger.warning("%s", words)
             self._say(Severity.WARNING, words, Weight.REFUSAL)
             await self.ledger.undone()

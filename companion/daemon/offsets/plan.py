@@ -104,6 +104,7 @@ class Planner:
             CalibrationRefusedError: what was found is no bias.
         """
         targets: list[Target] = []
+        push = self._wanted.push  # may be switched while parameters are read: for all IMUs or for none
         for found in solution.imus:
             imu, source = self._imus.get(found.name), self._sources[found.name]
             whole, found = found, _to_be_written(found, draft)
@@ -121,7 +122,7 @@ class Planner:
             changes = changes_for(
                 calibration, None if gyro is None else vector(gyro), None if accel is None else vector(accel)
             )
-            if self._wanted.push:
+            if push:
                 coarse_mg = float(found.accel_sigma_use_m_s2.max()) / MG if accel is not None else 0.0
                 if coarse_mg > COARSE_ACCEL_MG:
                     draft.warn(

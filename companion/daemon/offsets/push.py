@@ -185,11 +185,13 @@ class Pusher:
 
     async def _no_longer_in_force(self, plan: Plan) -> list[str]:
         """What somebody has changed while we looked at the telemetry."""
+        changed: list[str] = []
         try:
-            now = await not_as_written(self._parameters.read, plan.changes)
+            async for name, now in not_as_written(self._parameters.read, plan.changes):
+                changed.append(f"{name} is {now:.6g}, somebody changed it right after the write")
         except AutopilotError as error:
-            return [str(error)]
-        return [f"{name} is {value:.6g}, somebody changed it right after the write" for name, value in now.items()]
+            changed.append(str(error))
+        return changed
 
     def _changing(self, plan: Plan, *, everything: bool) -> contextlib.AbstractContextManager[None]:
         """While offsets change: those of the plan's IMUs, or of all."""
@@ -212,10 +214,14 @@ async def _heartbeat(vehicle: Vehicle, within_s: float) -> None:
                 await asyncio.sleep(POLL_S)
 
 
-async def not_as_written(read: Callable[[str], Awaitable[float]], changes: Sequence[Change]) -> dict[str, float]:
-    """What is no longer as it was written, by name, and what it is now."""
-    found = {change.parameter: (await read(change.parameter), change.after) for change in changes}
-    return {name: now for name, (now, after) in found.items() if not same_float32(now, after)}
+async def not_as_written(
+    read: Callable[[str], Awaitable[float]], changes: Sequence[Change]
+) -> AsyncIterator[tuple[str, float]]:
+    """Name and present value of what is no longer as it was written, each as soon as it is read."""
+    for change in changes:
+        now = await read(change.parameter)
+        if not same_float32(now, change.after):
+            yield change.parameter, now
 
 
 def _note_verdicts(plan: Plan, target: Target, verdicts: list[Verdict], draft: Draft) -> list[str]:
@@ -329,7 +335,7 @@ class Conclusion:
             AutopilotError: it is not, or the autopilot does not come back.
         """
         await _heartbeat(self._vehicle, BACK_WITHIN_S)
-        changed = await not_as_written(self._read, plan.changes)
+        changed = {name: now async for name, now in not_as_written(self._read, plan.changes)}
         if changed:
             plan.mark(draft, changed, "failed")
             raise AutopilotError(f"the autopilot restarted and replaced {', '.join(changed)}: calibrate again")
@@ -340,7 +346,7 @@ class Conclusion:
         if harm is not None:
             raise NotRebootedError(harm)
         await self._reboot(go_on)
-        changed = await not_as_written(self._read, plan.changes)
+        changed = {name: now async for name, now in not_as_written(self._read, plan.changes)}
         if changed:
             stored = {change.parameter: change.after for change in plan.changes}
             after = (

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -82,7 +82,7 @@ def where_it_may_be(config: Config, root: Path = ROOT) -> Finding | None:
     free = unnamed(list_ports(root), list(_ports(config).values()), root)
     if not free:
         return None
-    words = f"nobody names {', '.join(free)}: companion ports --listen tells who speaks there"
+    words = f"not in the configuration: {', '.join(free)}; companion ports --listen tells what is there"
     return Finding("ports", good=False, words=words, remedy="companion ports --listen")
 
 
@@ -120,24 +120,11 @@ async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -
         serial = [sensor for sensor in sick if sensor.is_serial]
         heard = await asyncio.gather(*(_try(sensor) for sensor in serial))
         tried = dict(zip((sensor.name for sensor in serial), heard, strict=True))
-    speaks = {sensor.name: _protocol_heard(sensor, devices[sensor.name], tried) for sensor in sick}
-    swapped = _swapped(sick, speaks)
-    found = [
-        Finding(
-            "ports",
-            good=False,
-            words=f"{a.name}'s port speaks {speaks[a.name]}, {b.name}'s port speaks {speaks[b.name]}: "
-            "swap the two port lines",
-            remedy=f'in {a.section} port = "{b.port}"; in {b.section} port = "{a.port}"',
-            port=a.port,
-        )
-        for a, b in swapped
+    return [
+        finding
+        for sensor in sick
+        for finding in _explain(sensor, devices[sensor.name], tried.get(sensor.name), may_listen=may_listen)
     ]
-    done = {sensor.name for pair in swapped for sensor in pair}
-    for sensor in sick:
-        if sensor.name not in done:
-            found += _explain(sensor, devices[sensor.name], tried.get(sensor.name), may_listen=may_listen)
-    return found
 
 
 async def _try(sensor: Configured) -> Heard | str:
@@ -145,23 +132,6 @@ async def _try(sensor: Configured) -> Heard | str:
         return await listen(sensor.port, [sensor.line])
     except LinkError as error:
         return str(error)
-
-
-def _protocol_heard(sensor: Configured, device: Object, tried: Mapping[str, Heard | str]) -> str | None:
-    heard = tried.get(sensor.name)
-    if isinstance(heard, Heard) and heard.candidate is not None:
-        return heard.candidate.protocol
-    speaks = device.get("speaks")
-    return speaks if isinstance(speaks, str) else None
-
-
-def _swapped(sick: Sequence[Configured], speaks: Mapping[str, str | None]) -> list[tuple[Configured, Configured]]:
-    return [
-        (a, b)
-        for number, a in enumerate(sick)
-        for b in sick[number + 1 :]
-        if a.protocol != b.protocol and speaks[a.name] == b.protocol and speaks[b.name] == a.protocol
-    ]
 
 
 def _explain(sensor: Configured, device: Object, heard: Heard | str | None, *, may_listen: bool) -> list[Finding]:
@@ -179,11 +149,11 @@ def _explain(sensor: Configured, device: Object, heard: Heard | str | None, *, m
             return bad("it may be set to another speed or parity", STOP_FIRST)
         return []
     if heard.stranger is not None:
-        return bad(f"who speaks on {sensor.port} ({heard.line}) is {heard.stranger}", "another port, or unplug it")
+        return bad(f"no sensor on {sensor.port} ({heard.line}) but {heard.stranger}", "another port, or unplug it")
     if heard.candidate is None or heard.line is None:
         if not heard.bytes_heard:
             return []
-        return bad(f"{heard.bytes_heard} bytes came, and at no usual speed anything known", "wire, levels, protocol?")
+        return bad(f"{heard.bytes_heard} bytes came, nothing known at any usual speed", "wire, levels, protocol?")
     lines = _line_keys(sensor, heard.line)
     if heard.candidate.protocol == sensor.protocol:
         if not lines:

@@ -8,14 +8,6 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
-from typing import Final
-
-# glibc's malloc.h.
-_M_TRIM_THRESHOLD: Final = -1
-_M_MMAP_THRESHOLD: Final = -3
-_M_ARENA_MAX: Final = -8
-_THRESHOLD_BYTES: Final = 128 * 1024
-"""glibc's own beginning; left alone it grows to that of the largest piece ever freed, which stays in the process."""
 
 
 def prepare() -> None:
@@ -23,7 +15,6 @@ def prepare() -> None:
     # Three hundred classes and two hundred modules are made to stay. Looking among them for garbage, again and again
     # while they are made, costs a tenth of the start.
     gc.disable()
-    _allocate_sparingly()
     # A thread for every processor, with its own buffers, for matrices of 6 by 6.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -39,13 +30,3 @@ def settle() -> None:
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
-
-
-def _allocate_sparingly() -> None:
-    """One arena for all threads: they take turns at the interpreter's lock anyway. Not every C library knows these."""
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is None:
-        return
-    mallopt(_M_ARENA_MAX, 1)
-    mallopt(_M_MMAP_THRESHOLD, _THRESHOLD_BYTES)
-    mallopt(_M_TRIM_THRESHOLD, _THRESHOLD_BYTES)

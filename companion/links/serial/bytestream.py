@@ -151,11 +151,6 @@ class ByteLink:
         """Whether it is read at intervals, since its every byte would wake the loop."""
         return self._collecting is not None
 
-    @property
-    def latency_timer_ms(self) -> int | None:
-        """For how long an FTDI bridge collects bytes before it hands them on; None for other ports."""
-        return self._opener.latency_timer_ms
-
     async def run(self) -> None:
         """Keep the port open until cancelled; a loss is an event to report, never an exception."""
         try:

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 from companion.errors import LinkError
-from companion.links.serial.ports import find_holders, lasting_name, latency_timer_ms
+from companion.links.serial.ports import find_holders, lasting_name
 
 Parity = Literal["none", "even", "odd"]
 
@@ -153,8 +153,6 @@ class SerialOpener:
     def __init__(self, path: str, baud: int, parity: Parity) -> None:
         self._path, self._baud, self._parity = path, baud, parity
         self._thread: threading.Thread | None = None
-        self.latency_timer_ms: int | None = None
-        """Of an FTDI bridge, as it was read back after the last opening; None for other ports."""
         self._known: str | None = None
         self._seen: str | None = None
         self._since_s: float | None = None
@@ -206,14 +204,13 @@ class SerialOpener:
             # Cancelled between the thread's word and our turn: it is nobody's otherwise.
             if found is None and opened.done() and not opened.cancelled() and opened.exception() is None:
                 close_serial(opened.result().descriptor)
-        self._seen, self.latency_timer_ms = found.lasting_name, found.latency_timer_ms
+        self._seen = found.lasting_name
         return found.descriptor
 
 
 class _Opened(NamedTuple):
     descriptor: int
     lasting_name: str | None
-    latency_timer_ms: int | None
 
 
 def _attempt(
@@ -223,7 +220,7 @@ def _attempt(
     found: _Opened | LinkError
     try:
         descriptor = open_serial(path, baud, parity)
-        found = _Opened(descriptor, lasting_name(path), latency_timer_ms(path))
+        found = _Opened(descriptor, lasting_name(path))
     except LinkError as error:
         found = error
     except Exception as error:  # noqa: BLE001 - a thread that died silently would leave its caller waiting

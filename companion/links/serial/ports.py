@@ -95,11 +95,6 @@ def _best_first(by_id: tuple[str, ...], by_path: tuple[str, ...], serial_number:
     return by_id + by_path if serial_number else by_path + by_id
 
 
-def latency_timer_ms(device: str, root: Path = ROOT) -> int | None:
-    """For how long the FTDI bridge behind a name collects bytes; None for other ports. `device` may be a link."""
-    return _number(_hardware(root, resolve(root, device)) / "latency_timer", 10)
-
-
 def _hardware(root: Path, device: str) -> Path:
     return (root / "sys/class/tty" / device.rpartition("/")[2] / "device").resolve()
 

@@ -40,11 +40,6 @@ class Together:
         """Whether what waits is taken again and again."""
         return self._drivers > 0
 
-    @property
-    def waiting(self) -> int:
-        """Chunks that wait."""
-        return len(self._waiting)
-
     def drive(self) -> None:
         """From here on the caller calls `turn` at short intervals, until it says `rest`."""
         self._drivers += 1
