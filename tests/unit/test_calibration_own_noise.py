@@ -150,7 +150,7 @@ def test_more_than_any_part_has_is_never_learned_but_by_whoever_says_that_it_is_
 def test_handling_gives_no_hint_of_noise() -> None:
     rng = np.random.default_rng(12)
     t_s, readings = filtered(60, 100, ICM42688P, 1e6, 1, 13)
-    readings[:, :3] += 3.0 * DEG * rng.normal(size=(60, 1, 3)).repeat(100, axis=1).reshape(-1, 3)
+    readings[:, :3] += 0.7 * DEG * rng.normal(size=(60, 1, 3)).repeat(100, axis=1).reshape(-1, 3)
     gate = ImuGate("own", UNKNOWN)
     words = [gate.judge(batch).words for batch in seconds_of(t_s, readings)]
     assert not any("noise" in each for each in words)

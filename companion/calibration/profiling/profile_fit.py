@@ -26,7 +26,7 @@ from companion.calibration.noise.allan_fit import AxisFit, Curve, curve, fit_axi
 from companion.calibration.noise.horizon_fit import within_horizon
 from companion.calibration.seconds.batch import Batch, summary
 from companion.calibration.stillness.gates import ImuGate
-from companion.calibration.stillness.own_noise import OwnNoise
+from companion.calibration.stillness.own_noise import learned_of
 from companion.calibration.stillness.stretch import Stretch
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Floats
@@ -84,9 +84,7 @@ def rests(t_s: Floats, readings: Floats, temperature_degc: Floats | None, name: 
         profile: noise that the gate allows for before it has learned.
     """
     batches = seconds_of(t_s, readings, temperature_degc)
-    own = OwnNoise(at_rest=True)
-    for batch in batches:
-        own.add(batch)
+    own = learned_of(batches, at_rest=True)
     gate, stretch = ImuGate(name, profile, own=own), Stretch(_MIN_GOOD, max(len(batches), 1))
     stretches: list[Rest] = []
     kept: list[Batch] = []

@@ -25,6 +25,8 @@ MAX_LEVELS: Final = 1024
 _EVEN: Final = 1.4999
 """Steps of a counter that are all within so much of each other are one step each, whatever the usual one is."""
 _LEAST_OF_A_PART: Final = 4
+_FINEST: Final = 5
+"""Halvings of a second: 1/32 s; what is faster is vibration."""
 _PINNED_SIGMAS: Final = 4.0
 _PINNED_SAMPLES: Final = 5
 _PINNED_DISTINCT: Final = 8
@@ -62,7 +64,7 @@ class Batch(msgspec.Struct, frozen=True):
     counts: Counts | None = None
     """Of a stream of integers; None for floats, and for a second that spans more than `MAX_LEVELS`."""
     allan: Floats | None = None
-    """(k, c) Allan variances at averaging times of 1/2, 1/4, 1/8 ... of the second, down to some four samples."""
+    """(k, c) Allan variances at averaging times of 1/2, 1/4 ... 1/32 of the second, each of four samples or more."""
 
 
 def summary(
@@ -105,7 +107,7 @@ def summary(
 def _allan_within(off: Floats) -> Floats:
     """Allan variances of (n, c) rows of one second, in halves, quarters and so on, of which each holds four or more."""
     n = len(off)
-    depth = max(int(math.log2(n / _LEAST_OF_A_PART)), 0)
+    depth = min(max(int(math.log2(n / _LEAST_OF_A_PART)), 0), _FINEST)
     found = np.empty((depth, off.shape[1]))
     if depth == 0:
         return found

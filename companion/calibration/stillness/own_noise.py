@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterable
 from typing import Final
 
 import msgspec
@@ -34,6 +35,8 @@ LEARN_S: Final = 30
 KEPT_S: Final = 60
 EVERY_S: Final = 5
 """Looked at anew so often."""
+KNOWN_EVERY_S: Final = 30
+"""Once it is known."""
 GYRO_MOST_RAD_S: Final = 0.07 * DEG
 """Largest density that is believed, times sqrt(s): 250 deg/h. The noisiest common part has 150."""
 ACCEL_MOST_M_S2: Final = 1.0 * MG
@@ -49,6 +52,8 @@ chance."""
 _SIGMAS: Final = 2.5
 _OUTLIER_SIGMAS: Final = 4.5
 _GAP: Final = 4
+_CALM: Final = 1.6
+"""What has no more than so many times it may be noise: said while that is being found out."""
 _BEYOND: Final = 3.0
 """What has more than so many times the largest density in one second is motion, not a noisier part."""
 _SPANS: Final = (1, 2, 4, 8)
@@ -111,32 +116,37 @@ class OwnNoise:
             3,
         )
         self._too_much = [False, False]
+        self._calm = 0
+        """Seconds in a row that any common part's noise may look like."""
         self._seconds: deque[Batch] = deque(maxlen=KEPT_S)
         self._since = 0
 
     def clear(self) -> None:
         """The readings are not comparable with earlier ones; what is known stays."""
         self._seconds.clear()
-        self._since = 0
+        self._since = self._calm = 0
         self._too_much = [False, False]
 
     def hint(self, triad: int) -> str:
         """What to add to the words that gyro (0) or accelerometer (1) moves: when it may be noise; else nothing."""
-        if self.known[triad] is not None or self._since < _HINT_S:
+        if self.known[triad] is not None:
             return ""
         if self._too_much[triad]:
             return " (steady as noise: name its part, or companion profile)"
-        return f" (motion or noise: known in {LEARN_S - self._since} s)" if self._since < LEARN_S else ""
+        left_s = LEARN_S - self._since
+        return f" (motion or noise: known in {left_s} s)" if self._calm >= _HINT_S and left_s > 0 else ""
 
     def add(self, batch: Batch) -> None:
         """Take the next second."""
         before = self._seconds[-1] if self._seconds else None
-        if batch.allan is None or not len(batch.allan) or self._is_beyond_belief(batch, before):
+        if batch.allan is None or not len(batch.allan) or self._is_beyond(batch, before, _BEYOND):
             self.clear()
             return
+        self._calm = 0 if self._since < LEARN_S and self._is_beyond(batch, before, _CALM) else self._calm + 1
         self._seconds.append(batch)
         self._since += 1
-        if self._since >= LEARN_S and (self._since - LEARN_S) % EVERY_S == 0:
+        every_s = EVERY_S if None in self.known else KNOWN_EVERY_S
+        if self._since >= LEARN_S and (self._since - LEARN_S) % every_s == 0:
             self._learn()
 
     def _learn(self) -> None:
@@ -149,9 +159,9 @@ class OwnNoise:
             if found is not None and not self._too_much[triad]:
                 self.known[triad] = found
 
-    def _is_beyond_belief(self, batch: Batch, before: Batch | None) -> bool:
-        """Whether a second alone has more than several times what any sensor's noise has."""
-        most2 = _BEYOND**2 * self._most2
+    def _is_beyond(self, batch: Batch, before: Batch | None, times: float) -> bool:
+        """Whether a second alone has more than so many times what any sensor's noise has."""
+        most2 = times**2 * self._most2
         if before is not None:
             if not 0 < batch.slot - before.slot <= _GAP:
                 return True
@@ -162,6 +172,14 @@ class OwnNoise:
         parts = _parts(len(rungs))
         allowed = _upper(_freedom(parts), _OUTLIER_SIGMAS)
         return bool((rungs / parts[:, None] > allowed[:, None] * most2).any())
+
+
+def learned_of(batches: Iterable[Batch], *, at_rest: bool = False) -> OwnNoise:
+    """What the seconds of a whole recording tell."""
+    own = OwnNoise(at_rest=at_rest)
+    for batch in batches:
+        own.add(batch)
+    return own
 
 
 class _Seen:
