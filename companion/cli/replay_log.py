@@ -44,6 +44,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--law", choices=("axis", "slope", "euler"), default="axis", help="of columns tilt_x, tilt_y (default axis)"
     )
     log.add_argument("--mounting", default="ROTATION_NONE", metavar="ROTATION", help="sensor to vehicle")
+    log.add_argument("--any-bias", action="store_true", help="take biases beyond what any part has (30 deg/s, 0.3 g)")
     log.add_argument(
         "--profile", metavar="PART", help="the sensor's model, such as icm42688p, or a saved profile's name or file"
     )
@@ -119,6 +120,7 @@ def _given(options: argparse.Namespace) -> Given:
         law=options.law,
         mounting=options.mounting,
         profile=None if wanted is None else given_profile(wanted, lambda: storage_path(options)),
+        any_bias=options.any_bias,
     )
 
 

@@ -205,6 +205,8 @@ class Calibration(Section, frozen=True):
     """How far the temperature may be from the one at which it was seen to be right (the same)."""
     prior: bool = True
     """Whether earlier calibrations guard new ones, and weigh in where that betters them (docs/calibration.md)."""
+    any_bias: bool = False
+    """Whether to take biases beyond what any part has, and readings along other axes than the tilt says."""
 
 
 class Push(Section, frozen=True):

@@ -33,7 +33,13 @@ MIN_STILL_S: Final = 5.0
 MAX_STILL_S: Final = 3600.0
 # The collector drops the second in which a stream begins: here that is its first millisecond.
 _FIRST_S: Final = 999.999
-_REMEDIES: Final = Remedies("say --latitude-deg", "say --height-m", no_heading="no --heading-deg")
+_REMEDIES: Final = Remedies(
+    "say --latitude-deg",
+    "say --height-m",
+    no_heading="no --heading-deg",
+    mounting="--mounting {}",
+    any_bias="--any-bias takes it",
+)
 _LONGER: Final = 1.02
 """A window is chosen again when the stretch has grown by so much."""
 _AT_ONCE: Final = 4096
@@ -60,6 +66,8 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
     """IMU to vehicle FRD."""
     profile: str | Noise | None = None
     """The IMU's model, or figures learned, for its Allan figures."""
+    any_bias: bool = False
+    """Whether biases beyond what any part has are taken."""
 
 
 class Unused(msgspec.Struct, frozen=True):
@@ -247,7 +255,8 @@ class _Pass:
         what = What.GYROS if streams.gradienter is None else What.BOTH
         try:
             earth = local_earth(where, _REMEDIES)
-            draft.solution = solve(_posed(window, given), earth, streams.gradienter, streams.compass, what)
+            posed, poses = _posed(window, given), (streams.gradienter, streams.compass)
+            draft.solution = solve(posed, earth, *poses, what, any_bias=given.any_bias)
         except CalibrationRefusedError as error:
             return draft.record("failed", str(error), seconds)
         return draft.record("done", in_words(draft.solution), seconds)

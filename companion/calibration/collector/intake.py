@@ -298,6 +298,15 @@ class Intake(ABC):
         imus = {name: source.batches.batches[slot] for name, source in self._imus.items()}
         return self._turns.add_second(slot, imus, heading, good=good)
 
+    def imu_seconds(self) -> dict[str, Batch]:
+        """The last whole second of each IMU that has one, still or not."""
+        newest = {name: next(reversed(source.batches.batches.values()), None) for name, source in self._imus.items()}
+        return {name: batch for name, batch in newest.items() if batch is not None}
+
+    def tilt_second(self) -> Batch | None:
+        """The same of the gradienter."""
+        return None if self._tilt is None else next(reversed(self._tilt.batches.batches.values()), None)
+
     def _forget(self, imu: str | None) -> None:
         if self._deck is not None:
             self._deck.forget(imu)

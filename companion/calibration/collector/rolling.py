@@ -29,7 +29,6 @@ from companion.calibration.deck.deck import Deck
 from companion.calibration.deck.estimate import DeckWork
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput, Window
-from companion.calibration.seconds.batch import Batch
 from companion.calibration.stillness.stretch import AT_ONCE, HeadingWatch, Lag, Stretch
 from companion.errors import CalibrationRefusedError
 
@@ -242,11 +241,6 @@ class RollingCollector(Intake):
     def wander_deg(self) -> float | None:
         """How far the heading has wandered since the aircraft last moved; None until that is known."""
         return self._watch.wander_deg
-
-    def imu_seconds(self) -> dict[str, Batch]:
-        """The last whole second of each IMU that has one, still or not."""
-        newest = {name: next(reversed(source.batches.batches.values()), None) for name, source in self._imus.items()}
-        return {name: batch for name, batch in newest.items() if batch is not None}
 
     def snapshot(self, started_s: float, measured_s: tuple[float, float] | None) -> Snapshot:
         """What was seen since `started_s`, or since the window `measured_s` (start, end) began; cheap."""

@@ -107,6 +107,8 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     covariance: NDArray[np.float64] | None = None
     by_earth: NDArray[np.float64] | None = None
     """Of a deck: 6x6 of all axes; and 3x3, what the gyro means hold of the Earth's rate (ahead, right, down)."""
+    mounting: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    """Rows of the rotation from the sensor's axes."""
     warming: Warming | None = None
     """What may be hidden of a warm-up; None: nothing."""
 
@@ -327,6 +329,7 @@ def _imu_estimate(
         temperature_degc=float(np.mean(temperatures)) if temperatures else None,
         warnings=tuple(_warnings(imu, batches, gyro, accel, temperatures, rejected)),
         hidden=_hidden(imu, gyro, accel),
+        mounting=(vector(rotation[0]), vector(rotation[1]), vector(rotation[2])),
         warming=warming(
             rotation,
             (gyro.slope_per_s, accel.slope_per_s),

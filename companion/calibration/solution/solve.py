@@ -38,6 +38,7 @@ from companion.calibration.means.pose import (
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.request import What
 from companion.calibration.solution import magnetic
+from companion.calibration.solution.believable import believable
 from companion.calibration.solution.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site
 from companion.calibration.solution.site import LocalEarth, Uncertain
 from companion.calibration.turning.watch import Turn
@@ -182,8 +183,10 @@ def solve(
     compass: CompassModel | None,
     what: What,
     platform: Platform = "ground",
+    *,
+    any_bias: bool = False,
 ) -> Solution:
-    """Work out the biases of every IMU of the window.
+    """Work out the biases of every IMU of the window; with `any_bias` also such as no part has.
 
     Raises:
         CalibrationRefusedError: the readings cannot be right together, accelerometers were asked for without
@@ -204,6 +207,7 @@ def solve(
             f"{local.remedies.no_heading}: the horizontal part of the Earth's rate is unknown, gyro sigma widened"
         )
     truth = truth_of(window, gradienter, compass, local, warnings)
+    believed = window.imus if any_bias else believable(window.imus, truth.up, local)
     sailing = np.zeros(3) if window.turn_rad_s is None else np.array(window.turn_rad_s)
     shared = _shared(truth, local, window.turn, 0.0 if gradienter is None else gradienter.sigma_deg * DEG, sailing)
     # A deck may turn, and a steady turn shows in nothing but the heading.
@@ -219,13 +223,13 @@ def solve(
     asked = [triad for triad, is_wanted in wanted.items() if is_wanted]
     tipped = _tipped(window, gradienter, truth, sailing)
     imus = tuple(
-        _estimate(imu, truth, local, shared, asked, tipped, window.powered_s.get(imu.name, 0.0)) for imu in window.imus
+        _estimate(imu, truth, local, shared, asked, tipped, window.powered_s.get(imu.name, 0.0)) for imu in believed
     )
     if all(imu.gyro_rad_s is None and imu.accel_m_s2 is None for imu in imus):
-        refusals = [words for imu in window.imus for words in _hidden(imu, asked)]
+        refusals = dict.fromkeys(words for imu in believed for words in _hidden(imu, asked))
         if refusals:
             raise CalibrationRefusedError("; ".join(refusals))
-    unknown = [(imu.name, triad) for triad in asked for imu in window.imus if imu.refused(triad)]
+    unknown = [(imu.name, triad) for triad in asked for imu in believed if imu.refused(triad)]
     if turn_unseen:
         unknown += [(imu.name, "gyro") for imu in window.imus]
     return Solution(
@@ -391,4 +395,4 @@ def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
 
 def _hidden(imu: ImuWindow, asked: Collection[Triad]) -> list[str]:
     """What this IMU's readings do not tell, or not well, of what is asked for."""
-    return [hidden.words for triad, hidden in imu.hidden.items() if triad in asked]
+    return list(dict.fromkeys(hidden.words for triad, hidden in imu.hidden.items() if triad in asked))

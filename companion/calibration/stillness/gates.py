@@ -29,6 +29,7 @@ from companion.calibration.noise.allan import NoiseProfile
 from companion.calibration.seconds.batch import Batch
 from companion.calibration.stillness.coarse import Steps
 from companion.calibration.stillness.own_noise import OwnNoise
+from companion.calibration.stillness.plausible import MOST_GYRO_RAD_S, unit_of_force
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, MG
 
@@ -266,8 +267,11 @@ class ImuGate:
         rate, force = mean[:3], mean[3:]
         size = math.sqrt(sum(each * each for each in force))
         if not abs(size - GRAVITY_M_S2) <= GRAVITY_GATE_M_S2:
-            return _fault(f"accel {name} reads {size:.1f} m/s^2, not gravity")
+            unit = unit_of_force(size)
+            return _fault(f"accel {name} reads {size:.1f} m/s^2, not gravity{f': in {unit}?' if unit else ''}")
         found = max(map(abs, rate))
+        if found > MOST_GYRO_RAD_S:
+            return _fault(f"gyro {name} reads {found / DEG:.0f} deg/s and nothing moves: deg/s for rad/s?")
         if found > GYRO_BIAS_RAD_S:
             return _words(f"gyro {name} turns or is biased by", found / DEG, GYRO_BIAS_RAD_S / DEG, "deg/s")
         # A few samples say little about their own scatter; what was learned says more.

@@ -288,9 +288,9 @@ class InForce:
         try:
             where = models.whereabouts(self._config, self._vehicle)
             poses = self._alignment.model(), models.compass_model(self._config.compass)
-            platform = self._config.vehicle.platform
+            platform, any_bias = self._config.vehicle.platform, self._config.calibration.any_bias
             solution: Solution = await self._offload(
-                lambda: solve(window, local_earth(where), *poses, self.what, platform)
+                lambda: solve(window, local_earth(where), *poses, self.what, platform, any_bias=any_bias)
             )
         except CalibrationRefusedError:
             self._forget()

@@ -184,7 +184,10 @@ class Solving:
         where = models.whereabouts(config, self._core.vehicle)
         poses = self._alignment.model(), models.compass_model(config.compass)
         platform = config.vehicle.platform
-        solution: Solution = await offload(lambda: solve(window, local_earth(where), *poses, job.what, platform))
+        any_bias = config.calibration.any_bias
+        solution: Solution = await offload(
+            lambda: solve(window, local_earth(where), *poses, job.what, platform, any_bias=any_bias)
+        )
         draft.alignment, draft.solution = self._alignment.used, solution
         draft.measured_s = (measured.start_s, measured.end_s)
         unix_s = draft.started_at.timestamp()
