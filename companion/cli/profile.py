@@ -72,6 +72,14 @@ def add_command(add: AddCommand) -> None:
     sub.add_argument(
         "--profile", metavar="PART", help="to compare with, and for what the recordings do not tell (default: as used)"
     )
+    sub.add_argument(
+        "--warm-up",
+        nargs="+",
+        type=Path,
+        default=(),
+        metavar="FILE",
+        help="recordings that begin when it was switched on, cold: by how much its biases move",
+    )
     sub.add_argument("--skip", type=seconds, default=0.0, metavar="S", help="leave out so much at each beginning")
     sub.add_argument("--save", metavar="NAME", help='keep it: profile = "NAME" in [[imu]] then takes it')
     sub.add_argument("--storage", type=Path, metavar="DIR", help="where to (default: as in the configuration)")
@@ -88,11 +96,14 @@ async def profile(options: argparse.Namespace) -> int:
         check_name(options.save)
         store = ProfileStore(options.storage or load_config(options).storage.path)
     compared = _compared(options)
-    logs = read_logs(options.files, options.columns, options.rate, options.imu or NAME)
+    logs, cold = (
+        read_logs(files, options.columns, options.rate, options.imu or NAME) if files else []
+        for files in (options.files, options.warm_up)
+    )
     results, refused = [], []
     for imu, own in _by_imu(logs, options.imu).items():
         try:
-            results.append(_learn(imu, own, compared, options.skip))
+            results.append(_learn(imu, own, compared, options.skip, [log for log in cold if log.imu == imu]))
         except CalibrationRefusedError as error:
             refused.append(f"imu {imu}: {error}")
     for words in refused:
@@ -141,7 +152,9 @@ def _by_imu(logs: Sequence[StillLog], wanted: str | None) -> dict[str, list[Stil
     return {wanted: found[wanted]}
 
 
-def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float) -> Result:
+def _learn(
+    imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float, cold: Sequence[StillLog] = ()
+) -> Result:
     """All of one IMU.
 
     Raises:
@@ -150,6 +163,7 @@ def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s
     from companion.calibration.noise.allan import noise_profile
     from companion.calibration.profiling.coverage import coverage
     from companion.calibration.profiling.profile_fit import fit_profile, joined, rests
+    from companion.calibration.profiling.warm_up import learn_warm_up
 
     whole = [log for log in logs if not log.truncated]
     if not whole:
@@ -168,8 +182,19 @@ def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s
         finding = fit_profile(imu, stretches, against)
     except CalibrationRefusedError as error:
         raise CalibrationRefusedError(f"{error}{f' (in the way: {obstacle})' if obstacle else ''}") from None
+    if cold:
+        seen = [rests(log.t_s, log.readings, log.temperature_degc, imu, against).stretches for log in cold]
+        finding = msgspec.structs.replace(
+            finding, profile=msgspec.structs.replace(finding.profile, warm_up=learn_warm_up(seen))
+        )
     kept = coverage([each.stretches for each in found], against)
-    return Result(imu, whole, found, finding, against, kept, _notes(finding, against, found, kept, obstacle))
+    notes = _notes(finding, against, found, kept, obstacle)
+    if cold:
+        gyro, accel = finding.profile.warm_up[0] / DEG_H, finding.profile.warm_up[1] / MG
+        notes.append(
+            f"warming up moves gyros by {gyro:.3g} deg/h, accelerometers by {accel:.3g} mg: sigma allows for it"
+        )
+    return Result(imu, whole, found, finding, against, kept, notes)
 
 
 def _used(result: Result) -> Iterator[tuple[StillLog, list[tuple[float, float]], float]]:
@@ -305,6 +330,7 @@ def _temperatures(logs: Sequence[StillLog]) -> tuple[float, float] | None:
 
 
 def _to_save(result: Result, name: str) -> Any:
+    from companion.calibration.noise.allan import WARM_UP
     from companion.storage.profiles import FORMAT_VERSION, SavedProfile, Source
 
     finding = result.finding
@@ -328,6 +354,7 @@ def _to_save(result: Result, name: str) -> Any:
             for log, rests in zip(result.logs, result.rests, strict=True)
         ),
         notes=tuple(result.notes),
+        warm_up=finding.profile.warm_up if finding.profile.warm_up != WARM_UP else None,
     )
 
 

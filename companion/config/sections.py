@@ -133,6 +133,8 @@ class Noise(Section, frozen=True):
     accel: tuple[float, float, float]
     """Likewise in m/s^2."""
     origin: str = ""
+    warm_up: tuple[float, float] | None = None
+    """By how much a warm-up moves the biases, rad/s and m/s^2; None: nobody has watched one."""
 
 
 class Imu(Section, frozen=True):

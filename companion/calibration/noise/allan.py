@@ -90,7 +90,8 @@ def noise_profile(profile: str | Noise | None) -> NoiseProfile:
         ConfigError: no such profile.
     """
     if isinstance(profile, Noise):
-        return NoiseProfile(profile.name, AllanModel(*profile.gyro), AllanModel(*profile.accel))
+        models = AllanModel(*profile.gyro), AllanModel(*profile.accel)
+        return NoiseProfile(profile.name, *models, warm_up=profile.warm_up or WARM_UP)
     if profile is not None and profile not in PROFILES:
         raise ConfigError(f"no noise profile {profile!r} (known: {', '.join(PROFILES)})")
     return PROFILES[profile or "unknown"]
