@@ -31,7 +31,7 @@ def deck(voyages: int, stands: int, seed: int, jobs: int) -> Section:
     sea = many(sail, [(Voyage(), SPANS_S, 10_000 * seed + number) for number in range(voyages)], jobs)
     still = many(sail, [(STILL, STILL_S, 10_000 * seed + 5_000 + number) for number in range(stands)], jobs)
     lines = [
-        "rms error against the mean bias of the next 180 s; bound: the sea's true spectrum, and what nobody can know",
+        "rms error against the mean bias of the next 180 s; bound: by the sea's true spectrum",
         "",
         "                                        bound     rms    +-   sigma   2 sigma covers",
     ]
