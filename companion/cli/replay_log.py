@@ -48,7 +48,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     log.add_argument(
         "--profile", metavar="PART", help="the sensor's model, such as icm42688p, or a saved profile's name or file"
     )
-
+    log.add_argument(
+        "--powered",
+        type=within(0.0, 1e6),
+        default=0.0,
+        metavar="S",
+        help="for so long it had been switched on when the log began (default 0): what it may still warm up",
+    )
     log.add_argument(
         "--windows",
         type=within(10.0, 3600.0),
@@ -118,6 +124,7 @@ def _given(options: argparse.Namespace) -> Given:
         longitude_deg=options.longitude_deg,
         height_m=options.height_m,
         law=options.law,
+        powered_s=options.powered,
         mounting=options.mounting,
         profile=None if wanted is None else given_profile(wanted, lambda: storage_path(options)),
         any_bias=options.any_bias,

@@ -60,6 +60,8 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
     latitude_deg: float | None = None
     longitude_deg: float | None = None
     height_m: float | None = None
+    powered_s: float = 0.0
+    """For so long the IMU had been switched on when the log began, at least."""
     law: Law = "axis"
     """Of a tilt in the log."""
     mounting: Mounting = "ROTATION_NONE"
@@ -235,7 +237,7 @@ class _Pass:
         if glance.obstacle is not None:
             self._obstacle = glance.obstacle.words
         elif glance.still_s >= MIN_STILL_S and glance.still_s > self._still_s * (1.0 if last else _LONGER):
-            self._found.append(collector.measurement(now_s))
+            self._found.append(self._aged(collector.measurement(now_s)))
             self._still_s = glance.still_s
         if last or now_s - self._verdicts_from_s >= _LOOK_S:
             for slot, good, seen in collector.snapshot(self._verdicts_from_s, None).seconds:
@@ -244,6 +246,13 @@ class _Pass:
                 kind = words if said is None or said.fault else "moving"
                 self._verdicts[slot] = ("", "") if good else (words, kind)
             self._verdicts_from_s = now_s - 5.0
+
+    def _aged(self, measurement: Measurement) -> Measurement:
+        """With what is known of the time before the log, where nothing was silent since."""
+        begun_s = measurement.begun_s.get(self._log.imu, math.inf)
+        if not self._given.powered_s or begun_s > math.ceil(_FIRST_S):
+            return measurement
+        return msgspec.structs.replace(measurement, begun_s={self._log.imu: begun_s - self._given.powered_s})
 
     def _solved(self, draft: Draft, window: Window, seconds: float) -> Record:
         given, streams = self._given, self._streams

@@ -26,6 +26,8 @@ from companion.replay.log import StillLog
 
 MOST_WINDOWS: Final = 100_000
 """Eleven days of the shortest; a clock that jumps makes more."""
+PAUSE_S: Final = 3.0
+"""A sensor that was silent for longer may have been switched off."""
 HORIZON_S: Final = 180.0
 """What sigma_use speaks of."""
 _AXES: Final = ("gyro x", "gyro y", "gyro z", "accel x", "accel y", "accel z")
@@ -84,6 +86,7 @@ def windows(log: StillLog, given: Given, length_s: float) -> Windows:
     found: list[_Found | None] = []
     whys: list[str] = []
     begin_s = float(log.t_s[0])
+    starts_s = np.concatenate(([begin_s], log.t_s[1:][np.diff(log.t_s) > PAUSE_S]))
     count = math.floor((float(log.t_s[-1]) - begin_s) / length_s + 1e-6)
     if count > MOST_WINDOWS:
         raise StorageError(f"{log.files[0]}: {count} windows from its first to its last time; allowed: {MOST_WINDOWS}")
@@ -97,7 +100,10 @@ def windows(log: StillLog, given: Given, length_s: float) -> Windows:
             log, t_s=log.t_s[start:end], readings=log.readings[start:end],
             temperature_degc=log.temperature_degc[start:end], poses=None,
         )  # fmt: skip
-        record = estimate(part, posed, max_still_s=length_s).record
+        # What was switched on before the window says how far a warm-up may still go.
+        at = int(np.searchsorted(starts_s, log.t_s[start], side="right")) - 1
+        powered_s = float(log.t_s[start] - starts_s[at]) + (posed.powered_s if at == 0 else 0.0)
+        record = estimate(part, msgspec.structs.replace(posed, powered_s=powered_s), max_still_s=length_s).record
         imu = record.imus[0] if record.imus else None
         one = None if imu is None else _found(imu)
         found.append(one)

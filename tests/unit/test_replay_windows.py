@@ -107,6 +107,22 @@ def test_how_it_lay_and_was_mounted_does_not_matter(
         assert other["sigma_use"] == pytest.approx(one["sigma_use"], rel=1e-3)
 
 
+def test_what_was_switched_on_long_before_warms_up_no_more(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], hour: tuple[Floats, Floats]
+) -> None:
+    """Five minutes: so young a sensor may still warm up; a pause in the log may have been a switch."""
+    path = write_csv(tmp_path / "a.csv", hour[0][:3000], hour[1][:3000])
+    young = by_axis(run(capsys, path, "--profile", "adis16405")[1], 60.0)
+    old = by_axis(run(capsys, path, "--profile", "adis16405", "--powered", "7200")[1], 60.0)
+    # The windows after the pause are two of the three that foretell one.
+    kept = (hour[0][:3000] < 55.0) | (hour[0][:3000] > 65.0)
+    paused = write_csv(tmp_path / "b.csv", hour[0][:3000][kept], hour[1][:3000][kept])
+    _, answer = run(capsys, paused, "--profile", "adis16405", "--powered", "7200")
+    for axis in ("gyro x", "gyro y", "gyro z"):
+        assert old[axis]["sigma_use"] < 0.9 * young[axis]["sigma_use"]
+        assert old[axis]["sigma_use"] < by_axis(answer, 60.0)[axis]["sigma_use"]
+
+
 def test_a_log_that_is_too_short_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], hour: tuple[Floats, Floats]
 ) -> None:
