@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from companion.cli import logs, show
 from companion.cli.terminal import DONE, FAILED, USAGE, AddCommand, config_path, load_config, print_json, print_lines
-from companion.errors import CompanionError, LinkError, StorageError
+from companion.errors import CompanionError, ConfigError, LinkError, StorageError
 
 if TYPE_CHECKING:
     from companion.installation.install import Step, Target
@@ -213,8 +213,7 @@ async def report(options: argparse.Namespace) -> int:
     if options.output == "-" and as_json:
         print_lines("companion report: -o - and --json both want stdout", error=True)
         return USAGE
-    # A folder copied to another computer needs no configuration there.
-    directory = options.storage or load_config(options).storage.path
+    directory = _storage(options)
     try:
         path, damaged = _make(options, directory)
     except CompanionError as error:
@@ -230,6 +229,21 @@ async def report(options: argparse.Namespace) -> int:
     elif path is not None:
         print_lines(path)
     return DONE
+
+
+def _storage(options: argparse.Namespace) -> Path:
+    """The storage folder; one that was copied to another computer needs no configuration there.
+
+    Raises:
+        ConfigError: there is no configuration to say where, and no --storage.
+    """
+    if options.storage is not None:
+        named: Path = options.storage
+        return named
+    try:
+        return load_config(options).storage.path
+    except ConfigError as error:
+        raise ConfigError(f"{error} (or name the folder with the records: --storage DIR)") from error
 
 
 def _make(options: argparse.Namespace, directory: Path) -> tuple[Path | None, list[str]]:

@@ -87,7 +87,7 @@ class Parser(argparse.ArgumentParser):
         self.exit(USAGE)
 
 
-def within(least: float, most: float, kind: type[float] = float) -> Callable[[str], float]:
+def within(least: float, most: float, kind: type[float] = float, unit: str = "") -> Callable[[str], float]:
     """The type of an argument that is a number within these limits; with int a whole one."""
 
     def parsed(text: str) -> float:
@@ -96,13 +96,13 @@ def within(least: float, most: float, kind: type[float] = float) -> Callable[[st
         except ValueError:
             value = math.nan
         if not least <= value <= most:
-            raise argparse.ArgumentTypeError(f"found {text!r}; allowed: a number from {least:g} to {most:g}")
+            raise argparse.ArgumentTypeError(f"found {text!r}; allowed: a number from {least:g} to {most:g}{unit}")
         return value
 
     return parsed
 
 
-seconds: Final = within(1e-3, 1e6)
+seconds: Final = within(1e-3, 1e6, unit=" s")
 """The type of an argument that is a time in seconds."""
 
 

@@ -10,7 +10,8 @@ from companion.protocols.registry import PROTOCOLS, Kind
 MIP_BYTES: Final = 4 + 255 + 2
 XSENS_BYTES: Final = 6 + 1024 + 1
 STIM300_BYTES: Final = 70
-VECTORNAV_BYTES: Final = 300
+VECTORNAV_BYTES: Final = 6 + 198 + 112 + 2
+"""Header, all fields of groups 1 and 3 (UM001), CRC."""
 
 
 def make_decoder(kind: Kind, name: str, seconds_per_byte: float = 0.0) -> Decoder:

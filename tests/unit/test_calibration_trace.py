@@ -102,6 +102,14 @@ def test_it_is_bounded_and_says_what_it_lost() -> None:
     assert len(traces.to_json(trace)) < 400_000
 
 
+def test_one_of_the_version_before_is_read_without_its_noise() -> None:
+    feed = _feeder()
+    feed.run(15.0)
+    trace = _trace(feed, 1000.5, (1003.0, 1013.0))
+    before = msgspec.json.decode(traces.to_json(trace)) | {"format_version": 1, "imus": [{"name": "fc"}]}
+    assert traces.from_json(msgspec.json.encode(before)).good == trace.good
+
+
 def test_it_comes_back_whole_and_ragged_ones_are_refused() -> None:
     feed = _feeder()
     feed.run(15.0)

@@ -30,6 +30,7 @@ from tests.support.component import (
     command_message,
 )
 from tests.support.virtual_time import run_virtual
+from tests.support.wire import Wire
 
 NAN = math.nan
 
@@ -206,6 +207,19 @@ class TestCancel:
                 await asyncio.sleep(0.5)
                 acks = b.ground.ack_messages()
                 assert [(ack.result, ack.result_param2) for ack in acks] == [(ACCEPTED, 1)] * 2
+
+        run_virtual(main())
+
+    def test_of_nothing_says_so_also_when_the_transport_was_full_at_first(self) -> None:
+        async def main() -> None:
+            async with bench() as b:
+                b.link.attach(lambda data: False)
+                b.link.receive(b.ground.pack(command_message(CANCEL)), asyncio.get_running_loop().time())
+                await asyncio.sleep(0.5)
+                assert b.ground.acks(CANCEL) == []
+                Wire(b.link, b.ground)
+                await asyncio.sleep(0.5)
+                assert [(ack.result, ack.result_param2) for ack in b.ground.ack_messages()] == [(ACCEPTED, 1)]
 
         run_virtual(main())
 
