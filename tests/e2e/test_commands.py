@@ -89,11 +89,15 @@ async def _end(process: asyncio.subprocess.Process) -> None:
 
 
 async def _until_disarmed(config: Path) -> None:
+    await _until(config, "disarmed")
+
+
+async def _until(config: Path, armed: str) -> None:
     for _ in range(40):
         said = await companion("-c", str(config), "status", "--json")
-        if said.code == DONE and said.json["vehicle"]["armed"] == "disarmed":
+        if said.code == DONE and said.json["vehicle"]["armed"] == armed:
             return
-    raise AssertionError(f"the daemon did not come up: {said}")
+    raise AssertionError(f"the daemon never said {armed}: {said}")
 
 
 def test_a_day_at_the_flight_line(tmp_path: Path) -> None:
@@ -143,21 +147,6 @@ def test_a_day_at_the_flight_line(tmp_path: Path) -> None:
             assert "alibration 1" in told.out
             assert "profile fc: " in (await companion("status", "-c", config)).out
 
-            value = autopilot.parameter("INS_GYROFFS_X")
-            begun = await companion("-c", config, "calibrate", "--json")
-            assert begun.code == DONE
-            assert begun.json["state"] == "waiting"
-            busy = await companion("-c", config, "calibrate", "--json")
-            assert busy.code == FAILED
-            assert "running" in busy.json["reason"]
-            cancelled = await companion("-c", config, "cancel", "--json")
-            assert cancelled.code == DONE
-            assert cancelled.json["state"] == "cancelled"
-            assert autopilot.parameter("INS_GYROFFS_X") == value
-            idle = await companion("-c", config, "cancel", "--json")
-            assert idle.code == DONE
-            assert "nothing was running" in idle.json["reason"]
-
             check = await companion("-c", config, "check", "--json")
             assert check.code == DONE, check.out
             assert {finding["name"] for finding in check.json["findings"]} >= {
@@ -180,7 +169,7 @@ def test_a_day_at_the_flight_line(tmp_path: Path) -> None:
             autopilot.faults.echo_without_effect = False
 
             autopilot.arm()
-            await asyncio.sleep(1.5)
+            await _until(line.config, "armed")
             armed = await companion("-c", config, "calibrate", "--wait", "--json")
             assert armed.code == FAILED
             assert "armed" in armed.json["reason"]
@@ -196,6 +185,28 @@ def test_a_day_at_the_flight_line(tmp_path: Path) -> None:
             assert gone.code == NO_DAEMON
             assert "no daemon answers" in gone.json["reason"]
             assert gone.err.count("\n") == 1
+
+    asyncio.run(main())
+
+
+def test_a_running_calibration_is_busy_until_it_is_cancelled(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with flight_line(tmp_path, still_s=(600.0, 600.0)) as line:  # longer than the slowest machine takes here
+            config = str(line.config)
+            before = line.scenario.autopilot.parameter("INS_GYROFFS_X")
+            begun = await companion("-c", config, "calibrate", "--json")
+            assert begun.code == DONE
+            assert begun.json["state"] == "waiting"
+            busy = await companion("-c", config, "calibrate", "--json")
+            assert busy.code == FAILED
+            assert "running" in busy.json["reason"]
+            cancelled = await companion("-c", config, "cancel", "--json")
+            assert cancelled.code == DONE
+            assert cancelled.json["state"] == "cancelled"
+            assert line.scenario.autopilot.parameter("INS_GYROFFS_X") == before
+            idle = await companion("-c", config, "cancel", "--json")
+            assert idle.code == DONE
+            assert "nothing was running" in idle.json["reason"]
 
     asyncio.run(main())
 
