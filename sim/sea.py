@@ -102,10 +102,11 @@ class Sea(Motion):
         return np.zeros(3)
 
 
+TURN_DEG_S: Final = 0.3
 MOTIONS: Final = ("still", "turn", "sea", "engine")
 
 
-def motions_of(name: str, *, seed: int = 0, turn_deg_s: float = 0.3) -> tuple[Motion, ...]:
+def motions_of(name: str, *, seed: int = 0, turn_deg_s: float = TURN_DEG_S) -> tuple[Motion, ...]:
     """What happens all day long, by its name: `MOTIONS`."""
     turn = SlowTurn(start_s=0.0, duration_s=DAY_S, rate_deg_s=turn_deg_s)
     engine = Vibration(start_s=0.0, duration_s=DAY_S)

@@ -22,7 +22,7 @@ from sim.hands import HELP, Hands, take_lines
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.pty_device import PtyDevice
 from sim.scenario import DEMO_DEVICES, DEMO_POSE, GRADIENTER_OFFSET_DEG, Scenario, demo
-from sim.sea import MOTIONS, motions_of
+from sim.sea import MOTIONS, TURN_DEG_S, motions_of
 from sim.udp import open_udp
 
 DEFAULT_UDP = "127.0.0.1:14550"
@@ -77,10 +77,6 @@ def parser() -> argparse.ArgumentParser:
             command.add_argument(
                 "--gyr-cal", action="store_true", help="INS_GYR_CAL = 1: ArduPilot calibrates its gyros at boot"
             )
-        command.add_argument(
-            "--motion", choices=MOTIONS, default="still",
-            help="what happens to it all the time: a slow turn; a sea with that turn; a running engine with both",
-        )  # fmt: skip
         command.add_argument("--hands", action="store_true", help=f"move the aircraft by lines typed here: {HELP}")
         command.add_argument(
             "--zero", type=float, nargs=2, metavar=("X", "Y"), default=GRADIENTER_OFFSET_DEG,
@@ -98,7 +94,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def add_world_options(command: argparse.ArgumentParser) -> None:
-    """--pose, --seed and --law."""
+    """--pose, --seed, --law, --motion and --turn."""
     command.add_argument(
         "--pose",
         type=float,
@@ -113,6 +109,17 @@ def add_world_options(command: argparse.ArgumentParser) -> None:
         choices=("axis", "slope", "euler"),
         default="axis",
         help="what the gradienter's two readings mean (default axis)",
+    )
+    command.add_argument(
+        "--motion", choices=MOTIONS, default="still",
+        help="what happens to it all the time: a slow turn; a sea with that turn; a running engine with both",
+    )  # fmt: skip
+    command.add_argument(
+        "--turn",
+        type=float,
+        metavar="DEG_S",
+        default=TURN_DEG_S,
+        help=f"how fast that turn is (default {TURN_DEG_S:g})",
     )
 
 
@@ -234,7 +241,7 @@ def main(argv: Sequence[str]) -> int:
         pose=Pose(pitch, roll, heading),
         seed=arguments.seed,
         unix_s=time.time(),
-        motions=motions_of(arguments.motion, seed=arguments.seed),
+        motions=motions_of(arguments.motion, seed=arguments.seed, turn_deg_s=arguments.turn),
         law=arguments.law,
         gradienter_offset_deg=(arguments.zero[0], arguments.zero[1]),
         gyr_cal_at_boot=autopilot and arguments.gyr_cal,
