@@ -198,10 +198,8 @@ def test_what_steps_hide_is_what_rounding_does(sigma: float) -> None:
 
 
 def test_words_have_as_many_digits_as_it_takes() -> None:
-    from companion.calibration.turning.watch import in_words
-
-    assert in_words(0.01234 * DEG) == "turns 0.012 deg/s to the right"
-    assert in_words(-1.98 * DEG) == "turns 2.0 deg/s to the left"
+    assert Turn(rate_rad_s=0.01234 * DEG).in_words == "turns 0.012 deg/s to the right"
+    assert Turn(rate_rad_s=-1.98 * DEG).in_words == "turns 2.0 deg/s to the left"
     assert Turn().variance == 0.0
 
 

@@ -71,7 +71,7 @@ class Draft:
         return Record(
             state=state,
             reason=reason,
-            warnings=(*(solution.warnings if solution else ()), *self.warnings),
+            warnings=(*(solution.warnings if solution else ()), *unseen_turn(solution), *self.warnings),
             started_at=self.started_at.isoformat(timespec="milliseconds"),
             duration_s=round(duration_s, 3),
             pose=solution.pose if solution else None,
@@ -114,14 +114,25 @@ def _axes(values: Array | None) -> Vector | None:
 
 
 def _standing(solution: Solution) -> Standing:
-    turn = solution.turn
-    told = turn.by is not None
+    turn, told = solution.turn, solution.turn.is_told
     return Standing(
         platform=solution.platform,
         turn_deg_s=round(turn.rate_rad_s / DEG, 6) if told else None,
         turn_sigma_deg_s=round(turn.sigma_rad_s / DEG, 6) if told else None,
-        told_by=turn.by,
+        told_by=turn.by if told else None,
     )
+
+
+def unseen_turn(solution: Solution | None) -> tuple[str, ...]:
+    """What a pilot without a compass should know: a platform that has turned from the start looks still."""
+    if solution is None or solution.platform == "deck" or all(imu.gyro_rad_s is None for imu in solution.imus):
+        return ()
+    turn = solution.turn
+    if not turn.is_told:
+        return ("assumed Earth-fixed: nothing saw whether the ground turns",)
+    if turn.by == "earlier calibrations" and not turn.is_chance:
+        return (f"the aircraft {turn.in_words}, or its gyros are unlike in earlier power-ups: sigma widened",)
+    return ()
 
 
 def _known(imu: ImuSolution) -> list[bool]:

@@ -99,8 +99,8 @@ class Standing(msgspec.Struct, frozen=True, kw_only=True):
     """About the vertical, clockwise seen from above; not taken off. None: nothing told, and the ground was taken for
     fixed to the Earth."""
     turn_sigma_deg_s: float | None
-    told_by: Literal["compass", "gyros", "compass and gyros"] | None
-    """Gyros: by their level at an earlier rest."""
+    told_by: Literal["compass", "gyros", "compass and gyros", "earlier calibrations"] | None
+    """Gyros: by their level at an earlier rest; earlier calibrations: by the biases that they have led to expect."""
 
 
 class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):

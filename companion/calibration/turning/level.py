@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -65,10 +65,21 @@ class Change(msgspec.Struct, frozen=True, kw_only=True):
     variance: float
     noise: float
     """The part of it that is no warm-up, and was not before."""
+    is_vouched: bool
+    """Somebody else has seen that nothing turned when the level was measured."""
     is_across: bool
     """It has a part across the vertical that no turn of the ground has: the sensor has changed."""
     largest_rad_s: float
     """Of any axis."""
+
+
+class Common(NamedTuple):
+    """What all gyros show alike about the vertical."""
+
+    rate: float
+    variance: float
+    noise: float
+    is_vouched: bool
 
 
 class Step(msgspec.Struct, frozen=True, kw_only=True):
@@ -118,8 +129,8 @@ class _Level(msgspec.Struct):
     slot: float
     weight: float
     temperature_degc: float | None
-    turn_variance: float
-    """What was not known of the platform's own turn at the time."""
+    turn_variance: float | None
+    """What was not known of the platform's own turn at the time; None: nobody but the level itself told."""
 
 
 class ImuLevel:
@@ -185,13 +196,13 @@ class ImuLevel:
 
     def _with(self, second: _Second, turn_variance: float | None) -> _Level:
         level = self._level
-        if level is None:
-            return _Level(second.rows, float(second.slot), 1.0, second.temperature_degc, turn_variance or 0.0)
+        if level is None or (level.turn_variance is None and turn_variance is not None):
+            return _Level(second.rows, float(second.slot), 1.0, second.temperature_degc, turn_variance)
         level.weight = min(level.weight, self._memory / _REMEMBERED - 1.0) + 1.0
         share = 1.0 / level.weight
         level.rows = level.rows + share * (second.rows - level.rows)
         level.slot += share * (second.slot - level.slot)
-        if turn_variance is not None:
+        if turn_variance is not None and level.turn_variance is not None:
             level.turn_variance += share * (turn_variance - level.turn_variance)
         if level.temperature_degc is None or second.temperature_degc is None:
             level.temperature_degc = None
@@ -253,7 +264,8 @@ class ImuLevel:
         gap_s = max(middle - (count + level.weight) / 2.0, 0.0)
         variance = np.square(white) * (1.0 / count + 1.0 / level.weight)
         variance = variance + floor_variance(kind.gyro.flicker, kind.gyro.walk, level.weight, count + 2.0 * gap_s)
-        noise = float(np.square(down) @ variance) + level.turn_variance
+        unseen = level.turn_variance or 0.0
+        noise = float(np.square(down) @ variance) + unseen
         # Warming up: as fast as the readings show, or as the thermometer says.
         ramp = np.abs(slope.per_s[:3])
         ramp = np.where(ramp > _RAMP_SIGMAS * np.sqrt(slope.variance[:3]), ramp, 0.0)
@@ -270,7 +282,7 @@ class ImuLevel:
         felt = (PER_G_RAD_S + EARTH_RAD_S) * leaned
         variance = variance + warmed**2 + hidden**2 + felt**2
         along = float(off @ down)
-        of_down = float(np.square(down) @ variance) + level.turn_variance
+        of_down = float(np.square(down) @ variance) + unseen
         across = off - along * down
         # The heading may be another one: the Earth's rate is somewhere else in the level plane.
         limit = ACROSS_SIGMAS * np.sqrt(variance + EARTH_RAD_S**2) + ACROSS_SHARE * abs(along)
@@ -278,6 +290,7 @@ class ImuLevel:
             down_rad_s=along,
             variance=of_down,
             noise=noise,
+            is_vouched=level.turn_variance is not None,
             is_across=bool((np.abs(across) > limit).any()),
             largest_rad_s=float(np.abs(off).max()),
         )
@@ -316,8 +329,8 @@ def _step(slots: Floats, values: Floats, white: float, model: AllanModel, window
     )
 
 
-def common_change(changes: list[Change]) -> tuple[float, float, float] | None:
-    """What all gyros show alike about the vertical: rate, variance, and that of noise alone; None: nobody says.
+def common_change(changes: list[Change]) -> Common | None:
+    """What all gyros show alike about the vertical; None: nobody says.
 
     Of several that do not agree those that are at their level speak for the platform, and the others of themselves.
     """
@@ -329,5 +342,6 @@ def common_change(changes: list[Change]) -> tuple[float, float, float] | None:
         weight = sum(1.0 / one.variance for one in group)
         rate = sum(one.down_rad_s / one.variance for one in group) / weight
         if all(abs(one.down_rad_s - rate) <= ACROSS_SIGMAS * math.sqrt(one.variance) for one in group):
-            return rate, 1.0 / weight, 1.0 / sum(1.0 / one.noise for one in group)
+            noise = 1.0 / sum(1.0 / one.noise for one in group)
+            return Common(rate, 1.0 / weight, noise, any(one.is_vouched for one in group))
     return None

@@ -23,7 +23,7 @@ import numpy as np
 from companion.calibration.noise.slope import FEWEST, fit_slope, hidden_by_steps, plain_slope
 from companion.calibration.seconds.batch import Batch
 from companion.calibration.seconds.resolution import few_distinct, step
-from companion.calibration.turning.level import Change, ImuKind, ImuLevel, Look, Step, common_change
+from companion.calibration.turning.level import Change, Common, ImuKind, ImuLevel, Look, Step, common_change
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG
 from companion.samples import Vector
@@ -36,6 +36,7 @@ LEAST_BY_GYROS_RAD_S: Final = 0.01 * DEG
 """Likewise where no compass says it too: a gyro that warms up unevenly may do the same."""
 LEAST_TILTING_RAD_S: Final = 0.05 * DEG
 """Likewise of the tilt: accelerometers drift, and what was just set down settles by a few hundredths of a degree."""
+CHANCE_SIGMAS: Final = 2.0
 STEADY_SIGMAS: Final = 2.5
 """Seconds whose level is farther off make no part of it: a slow turn would become the level."""
 EVEN: Final = 0.25
@@ -54,7 +55,7 @@ CHANGED_RAD_S: Final = 0.5 * DEG
 CHANGED_HELD_S: Final = 30
 """A gyro that is so far off its level by itself, by a shock, is believed after so long."""
 
-Witness = Literal["compass", "gyros", "compass and gyros"]
+Witness = Literal["compass", "gyros", "compass and gyros", "earlier calibrations"]
 
 
 class Turn(msgspec.Struct, frozen=True, kw_only=True):
@@ -74,6 +75,8 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
     """The heading does not jump."""
     step_rad_s: float = 0.0
     """A turn that may have begun within the window makes its mean wrong by so much; zero where nothing hints at one."""
+    is_vouched: bool = True
+    """The level of the gyros is one at rest as somebody else saw it; else as fixed as the ground is taken for."""
     gyros_stay: bool = False
     """The compass moves and the gyros do not: it is the field that turns."""
 
@@ -87,6 +90,23 @@ class Turn(msgspec.Struct, frozen=True, kw_only=True):
     def tilts(self) -> bool:
         """Whether it turns about a level axis."""
         return _is_significant(math.hypot(*self.tilting_rad_s), self.tilting_sigma_rad_s, LEAST_TILTING_RAD_S)
+
+    @property
+    def in_words(self) -> str:
+        """'turns 0.15 deg/s to the left'."""
+        size = abs(self.rate_rad_s) / DEG
+        digits = max(1, 1 - math.floor(math.log10(size))) if size > 0.0 else 2
+        return f"turns {size:.{digits}f} deg/s to the {'right' if self.rate_rad_s > 0.0 else 'left'}"
+
+    @property
+    def is_chance(self) -> bool:
+        """Whether a platform that does not turn may well show that much."""
+        return abs(self.rate_rad_s) <= CHANCE_SIGMAS * self.sigma_rad_s
+
+    @property
+    def is_told(self) -> bool:
+        """Whether anybody has seen how fast it turns; else the ground is taken for fixed to the Earth."""
+        return self.by is not None and self.is_vouched
 
     @property
     def at_most_rad_s(self) -> float:
@@ -115,6 +135,17 @@ def _is_significant(rate: float, sigma: float, least: float) -> bool:
     return abs(rate) > max(SIGNIFICANT * sigma, least)
 
 
+def _by_gyros(common: Common, *, gyros_stay: bool = False) -> Turn:
+    return Turn(
+        rate_rad_s=common.rate,
+        sigma_rad_s=math.sqrt(common.variance),
+        noise_rad_s=math.sqrt(common.noise),
+        by="gyros",
+        is_vouched=common.is_vouched,
+        gyros_stay=gyros_stay,
+    )
+
+
 class _Seen(msgspec.Struct, frozen=True):
     """The slope of the heading."""
 
@@ -122,13 +153,6 @@ class _Seen(msgspec.Struct, frozen=True):
     variance: float
     is_even: bool
     """It goes on from beginning to end, as a turn does and no jump."""
-
-
-def in_words(rate_rad_s: float) -> str:
-    """'turns 0.15 deg/s to the left'."""
-    size = abs(rate_rad_s) / DEG
-    digits = max(1, 1 - math.floor(math.log10(size))) if size > 0.0 else 2
-    return f"turns {size:.{digits}f} deg/s to the {'right' if rate_rad_s > 0.0 else 'left'}"
 
 
 class TurnWatch:
@@ -273,7 +297,7 @@ class TurnWatch:
         return min(looks.values(), key=lambda look: look.white).step if looks else None
 
     def _turning(self, rate_rad_s: float) -> str:
-        words = f"the aircraft {in_words(rate_rad_s)}"
+        words = f"the aircraft {Turn(rate_rad_s=rate_rad_s).in_words}"
         if self.turn.by == "gyros" and len(self._levels) == 1:
             (name,) = self._levels
             return f"{words}, or gyro {name} has changed: if it stands still, restart the companion"
@@ -299,52 +323,39 @@ class TurnWatch:
         return _Seen(rate * DEG, float(found.variance[0]) * DEG**2, is_even)
 
     @staticmethod
-    def _contradicts(common: tuple[float, float, float] | None, seen: _Seen) -> bool:
-        return common is not None and abs(common[0] - seen.rate) > SIGNIFICANT * math.sqrt(common[1] + seen.variance)
+    def _contradicts(common: Common | None, seen: _Seen) -> bool:
+        if common is None or not common.is_vouched:
+            return False
+        return abs(common.rate - seen.rate) > SIGNIFICANT * math.sqrt(common.variance + seen.variance)
 
-    def _weigh(
-        self, common: tuple[float, float, float] | None, seen: _Seen | None, changes: Mapping[str, Change]
-    ) -> tuple[Turn, set[str]]:
+    def _weigh(self, common: Common | None, seen: _Seen | None, changes: Mapping[str, Change]) -> tuple[Turn, set[str]]:
         """The turn by both witnesses, and the IMUs that have changed by themselves."""
         changed = {name for name, change in changes.items() if change.is_across}
         if common is not None:
             changed |= {
                 name
                 for name, change in changes.items()
-                if abs(change.down_rad_s - common[0]) > SIGNIFICANT * math.sqrt(change.variance + common[1])
+                if abs(change.down_rad_s - common.rate) > SIGNIFICANT * math.sqrt(change.variance + common.variance)
             }
         elif changes:
             changed = set(changes)
-        if seen is None and common is None:
-            return Turn(), changed
-        if seen is None and common is not None:
-            rate, variance, noise = common
-            turn = Turn(rate_rad_s=rate, sigma_rad_s=math.sqrt(variance), noise_rad_s=math.sqrt(noise), by="gyros")
-            return turn, changed
-        assert seen is not None
+        if seen is None:
+            return (Turn() if common is None else _by_gyros(common)), changed
         by_compass = Turn(
             rate_rad_s=seen.rate, sigma_rad_s=math.sqrt(seen.variance), by="compass", is_even=seen.is_even
         )
-        if common is None:
+        if common is None or not common.is_vouched:
             return by_compass, changed
         if self._contradicts(common, seen):
-            rate, variance, noise = common
-            if abs(rate) <= SIGNIFICANT * math.sqrt(variance):
-                by_gyros = Turn(
-                    rate_rad_s=rate,
-                    sigma_rad_s=math.sqrt(variance),
-                    noise_rad_s=math.sqrt(noise),
-                    by="gyros",
-                    gyros_stay=True,
-                )
-                return by_gyros, changed
+            if abs(common.rate) <= SIGNIFICANT * math.sqrt(common.variance):
+                return _by_gyros(common, gyros_stay=True), changed
             if abs(seen.rate) <= SIGNIFICANT * math.sqrt(seen.variance):
                 changed = set(changes)
             return by_compass, changed
-        share = seen.variance / (common[1] + seen.variance)
+        share = seen.variance / (common.variance + seen.variance)
         both = Turn(
-            rate_rad_s=share * common[0] + (1.0 - share) * seen.rate,
-            sigma_rad_s=math.sqrt(share * common[1]),
+            rate_rad_s=share * common.rate + (1.0 - share) * seen.rate,
+            sigma_rad_s=math.sqrt(share * common.variance),
             by="compass and gyros",
         )
         return both, changed

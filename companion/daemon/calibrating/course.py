@@ -20,7 +20,7 @@ from companion.calibration.collector.outlook import Settings, Status
 from companion.calibration.machine import Event, State
 from companion.calibration.means.windows import Window
 from companion.calibration.request import What
-from companion.calibration.solution.draft import Draft
+from companion.calibration.solution.draft import Draft, unseen_turn
 from companion.calibration.solution.history import Point
 from companion.calibration.solution.joint import Weighed, weigh
 from companion.calibration.solution.prior import Expectation
@@ -206,6 +206,9 @@ class Solving:
         draft.points = _less(memory.measured(solution, whole, weighed.doubts, started_at, unix_s), draft.held_back)
         for doubt in weighed.doubts:
             self._core.say(Severity.WARNING, doubt.words)
+        if not job.automatic:
+            for words in unseen_turn(weighed.solution):
+                self._core.say(Severity.NOTICE, words)
         if draft.held_back:
             what = held_back.in_words(draft.held_back)
             self._core.say(Severity.WARNING, f"Held back: {what}; calibrate on request to write it all the same")
@@ -215,8 +218,10 @@ class Solving:
         """The calibration has come to a good end."""
         points = draft.points
         if self._core.wanted.push and not job.automatic:
-            # Who has asked was told of every contradiction, and has what was measured in force: that is true now.
-            points = {name: point.as_chosen() for name, point in points.items()}
+            # Who has asked was told of every contradiction, and has what was measured in force: that is true now. But
+            # gyros that may have turned are no new ones.
+            told = draft.solution is not None and draft.solution.turn.by != "earlier calibrations"
+            points = {name: point.as_chosen(gyro=told) for name, point in points.items()}
         await self._memory.keep(points)
         if draft.held_back:
             draft.notes.append(f"{held_back.in_words(draft.held_back)} held back")
