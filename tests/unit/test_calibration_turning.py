@@ -10,8 +10,12 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.means.pose import CompassModel
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.noise.slope import fit_slope, hidden_by_steps
+from companion.calibration.request import What
+from companion.calibration.solution.site import Whereabouts, local_earth
+from companion.calibration.solution.solve import solve
 from companion.calibration.turning.watch import Turn
 from companion.physics.units import DEG, DEG_H
 from sim.experiments import turning
@@ -46,6 +50,12 @@ class Stand:
         self.heading = lambda t: from_deg + rate_deg_s * (t - since_s)
         self.add((0.0, 0.0, rate_deg_s))
 
+    def warnings(self) -> tuple[str, ...]:
+        """Those of a calibration now."""
+        model = CompassModel(magnetic=False, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=1.0)
+        window = self.collector.window(self.feed.now_s)
+        return solve(window, local_earth(Whereabouts(45.0)), None, model, What.GYROS).warnings
+
     def says(self, seconds: float) -> str:
         """What is in the way after so long."""
         self.feed.run(seconds)
@@ -68,7 +78,7 @@ def test_a_turn_from_the_start_is_named_and_never_ready(rate_deg_s: float) -> No
     for _ in range(60):
         line = stand.says(1.0)
         assert line.startswith("the aircraft turns ")
-        assert line.endswith("to the right" if rate_deg_s > 0.0 else "to the left")
+        assert ("to the right" if rate_deg_s > 0.0 else "to the left") in line
         assert float(line.split()[3]) == pytest.approx(abs(rate_deg_s), rel=0.15)
 
 
@@ -138,6 +148,30 @@ def test_a_field_that_turns_while_the_gyros_do_not_is_in_nobodys_way() -> None:
     turn = stand.collector.turn
     assert turn.gyros_stay
     assert turn.variance < (0.005 * DEG) ** 2
+    assert any(words.endswith("gyros do not: iron or current near it?") for words in stand.warnings())
+
+
+def test_gyros_and_compass_that_turn_together_are_the_aircraft() -> None:
+    stand = Stand(compass=True)
+    stand.feed.run(80.0)
+    stand.turn(-0.15)
+    stand.feed.run(30.0)
+    said = [stand.says(2.0) for _ in range(20)]
+    assert all(line.startswith("the aircraft turns 0.1") for line in said)
+    # But for the first seconds after each of the compass' own breaks.
+    assert sum(line.endswith("deg/s to the left: gyros and compass turn together") for line in said) > 15
+
+
+def test_a_level_that_nobody_saw_at_rest_makes_no_iron_of_a_turn() -> None:
+    stand = Stand()
+    stand.turn(0.15)
+    assert not stand.says(100.0)
+    assert not stand.collector.turn.is_told
+    stand.collector.expect(gradienter=False, compass=True)
+    stand.feed.heading = stand.heading
+    stand.feed.run(40.0)
+    for _ in range(20):
+        assert stand.says(3.0).startswith("the aircraft turns 0.15")
 
 
 def test_a_coarse_compass_may_hide_a_turn_and_sigma_says_so() -> None:

@@ -225,11 +225,11 @@ def _unchecked(field: FieldWindow | None, up_covariance: Matrix | None) -> list[
 def _unsteady(window: HeadingWindow, difference: float | None, may_turn_deg: float) -> list[str]:
     warnings = []
     if window.wander_deg is not None and window.wander_deg > WANDER_WARNING_DEG:
-        turned = f"compass turned by {window.wander_deg:.1f} deg"
+        moves = f"compass moves by {window.wander_deg:.1f} deg"
         if window.wander_deg > may_turn_deg:
-            warnings.append(f"{turned} while nothing else moved: iron or current near it?")
+            warnings.append(f"{moves}, gyros do not: iron or current near it?")
         else:
-            warnings.append(f"{turned}: iron or current near it, or the aircraft turned slowly")
+            warnings.append(f"{moves}: iron or current near it, or the aircraft turns slowly")
     if difference is not None and abs(difference) > DEVICE_WARNING_DEG:
         warnings.append(
             f"compass' own heading is {abs(difference):.0f} deg off the one from its field and the gradienter:"

@@ -298,6 +298,8 @@ class TurnWatch:
 
     def _turning(self, rate_rad_s: float) -> str:
         words = f"the aircraft {Turn(rate_rad_s=rate_rad_s).in_words}"
+        if self.turn.by == "compass and gyros":
+            return f"{words}: gyros and compass turn together"
         if self.turn.by == "gyros" and len(self._levels) == 1:
             (name,) = self._levels
             return f"{words}, or gyro {name} has changed: if it stands still, restart the companion"
