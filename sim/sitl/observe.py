@@ -87,21 +87,20 @@ async def _residual_on_the_move(vehicle: SitlVehicle, ground: GroundStation, ins
     rows = np.array([imu_row(message) for _, message in heard])
     if not floats:  # they move by many digits, so that half a digit towards zero is what was cut off
         rows += np.sign(rows) * STEP / 2.0
+    times = vehicle.samples.aircraft_times(np.array([_own_s(message) for _, message in heard]))
     arrived_s = np.array([vehicle.aircraft.time_at(t_s) for t_s, _ in heard])
-    return excess(vehicle.aircraft, rows, np.array([_own_s(message) for _, message in heard]), arrived_s)
+    # The firmware's clock may have begun some time before our physics.
+    return excess(vehicle.aircraft, rows, times + float(np.median(arrived_s - times)))
 
 
-def excess(aircraft: VirtualAircraft, rows: Array, own_s: Array, arrived_s: Array) -> Array:
+def excess(aircraft: VirtualAircraft, rows: Array, times: Array) -> Array:
     """What readings of a swaying aircraft are too large by (6); how late they are is found beside it.
 
     Args:
         aircraft: the truth.
         rows: readings (n, 6): rad/s, m/s^2.
-        own_s: when they were made, by the firmware's clock (n).
-        arrived_s: when they were heard, aircraft time (n).
+        times: when they were made, aircraft time, and the same for all too late (n).
     """
-    # A line through the arrivals: their jitter times the motion would be noise.
-    times = np.polynomial.Polynomial.fit(own_s, arrived_s, 1)(own_s)
     found = []
     for sensor in range(2):
         shown, late_s, more = rows[:, 3 * sensor : 3 * sensor + 3], 0.0, np.zeros(3)

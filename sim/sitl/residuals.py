@@ -22,7 +22,7 @@ from sim.udp import open_udp
 
 SETTLE_S = 40.0
 """After a start: the estimator has its position and the first transients are over."""
-OWN_CALIBRATION_S = 35.0
+OWN_CALIBRATION_S = 60.0
 """ArduPilot's gyro calibration gives up after about 30 s; it must not be asked twice (autopilots 9.3.1)."""
 QUIET_S = 3.0
 GYROS, QUICK, LEVEL = (1.0,), (0.0, 0.0, 0.0, 0.0, 4.0), (0.0, 0.0, 0.0, 0.0, 2.0)

@@ -12,7 +12,7 @@ from sim.imu_model import DEG_H, MG
 from sim.sea import motions_of
 from sim.sitl.daemon import companion_daemon, instances_of
 from sim.sitl.observe import residual
-from sim.sitl.residuals import ground_station
+from sim.sitl.residuals import Row, ground_station
 from tests.sitl.craft import BINARIES, binary_vehicle, missing
 
 DECK = '[vehicle]\nplatform = "deck"\n[calibration]\ntarget_gyro_sigma_deg_h = 500\ntarget_accel_sigma_mg = 5\n'
@@ -47,6 +47,7 @@ def test_a_boat_is_calibrated_as_a_deck_and_refused_as_ground(kind: str, tmp_pat
             assert record["state"] == "done", record["reason"]
             for instance in instances_of(vehicle):
                 left = await residual(vehicle, ground, instance, OBSERVE_S)
+                print(Row("companion, after a minute of waves", instance, left))
                 assert np.abs(left[:3]).max() < LEFT_DEG_H * DEG_H, left
                 assert np.abs(left[3:]).max() < LEFT_MG * MG, left
 
