@@ -7,11 +7,11 @@ in them is what is left, in the vehicle's axes.
 from __future__ import annotations
 
 import contextlib
-import io
+import os
 from array import array
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 import msgspec
 import numpy as np
@@ -25,6 +25,11 @@ _DATAFLASH: Final = b"\xa3\x95\x80"
 _US: Final = 1e-6
 _LARGEST: Final = 1e6
 """What is larger is no reading, in SI units."""
+_READ_TIMES: Final = 16
+"""A log is read through once or twice; where it is damaged, its readers look for what is whole again and again."""
+_READ_LEAST: Final = 1 << 24
+_MOST_FIELDS: Final = 10_000
+"""Of a message: the largest of PX4 have some hundreds."""
 _CORRECTED: Final = (
     "the autopilot's offsets are taken off in it: what is found is what they leave, in the vehicle's axes"
 )
@@ -54,9 +59,22 @@ def read_ulog(path: Path) -> list[StillLog]:
         from pyulog import ULog
     except ImportError:
         raise StorageError(f"{path}: it needs more than is installed: pip install 'companion[logs]'") from None
+
+    class Bounded(ULog):  # type: ignore[misc]
+        """Formats of formats of formats are no end of fields."""
+
+        class _MessageAddLogged(ULog._MessageAddLogged):  # type: ignore[misc]  # noqa: SLF001
+            fields = 0
+
+            def _parse_nested_type(self, prefix_str: str, type_name: str, message_formats: dict[str, Any]) -> None:
+                self.fields += sum(max(size, 1) for _, size, _ in message_formats[type_name].fields) + 1
+                if self.fields > _MOST_FIELDS:
+                    raise _EndlessError
+                super()._parse_nested_type(prefix_str, type_name, message_formats)
+
     topics = ["sensor_combined", "sensor_gyro", "sensor_accel"]
     with _quietly(path), path.open("rb") as file:
-        found = ULog(file, topics)
+        found = Bounded(_Finite(file), topics)
         data = {(each.name, int(each.multi_id)): each.data for each in found.data_list}
         dropouts = len(found.dropouts)
         logs = [log for log in _ulog_imus(path, data) if log is not None]
@@ -88,6 +106,8 @@ def _ulog_imus(path: Path, data: dict[tuple[str, int], dict[str, Any]]) -> Itera
 
 _KINDS: Final = {"IMU": 0, "IMU2": 1, "IMU3": 2}
 """Messages and their instances; newer firmware has one kind, with the instance in it."""
+_HEAD: Final = 3
+"""Bytes before every message's body."""
 _FIELDS: Final = ("GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ")
 
 
@@ -102,8 +122,14 @@ def read_dataflash(path: Path) -> list[StillLog]:
     tables: dict[int, array[float]] = {}
     with _quietly(path):
         log: Any = DFReader_binary.__new__(DFReader_binary)
-        # The fast one, in C, says what it skips on the terminal, which nobody can catch; it is some 3 s of a gigabyte.
-        log.init_arrays_fast = log.init_arrays
+
+        def index(progress_callback: Any = None) -> None:
+            # The fast one, in C, says what it skips on the terminal, which nobody can catch; it is some 3 s of a
+            # gigabyte.
+            log.formats = _Formats(log.formats)
+            log.init_arrays(progress_callback)
+
+        log.init_arrays_fast = index
         try:
             log.__init__(str(path))  # where this fails it leaves the file open
             while (message := log.recv_match(type=list(_KINDS))) is not None:
@@ -146,6 +172,39 @@ def _log(path: Path, imu: str, t_s: Floats, readings: Floats, degc: Floats, note
     )
 
 
+class _EndlessError(Exception):
+    """Reading it would take no end of time or memory."""
+
+    def __init__(self) -> None:
+        super().__init__("reading it comes to no end")
+
+
+class _Finite:
+    """A file that can be read some times over, but not for ever: at the end of a damaged one pyulog goes back."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._left = _READ_TIMES * os.fstat(file.fileno()).st_size + _READ_LEAST
+        self._file = file
+        self.seek, self.tell, self.close = file.seek, file.tell, file.close
+
+    def read(self, size: int) -> bytes:
+        """As any file; an empty read counts, too."""
+        data = self._file.read(size)
+        self._left -= max(len(data), 1)
+        if self._left < 0:
+            raise _EndlessError
+        return data
+
+
+class _Formats(dict[int, Any]):
+    """Formats by number; a message of no length would be read at the same place for ever."""
+
+    def __setitem__(self, number: int, found: Any) -> None:
+        if found.len < _HEAD:
+            raise _EndlessError
+        super().__setitem__(number, found)
+
+
 def _with_note(log: StillLog, note: str) -> StillLog:
     return msgspec.structs.replace(log, notes=(*log.notes, note))
 
@@ -154,7 +213,8 @@ def _with_note(log: StillLog, note: str) -> StillLog:
 def _quietly(path: Path) -> Iterator[None]:
     """What a library prints is nobody's business here, and what it stumbles over is one line."""
     try:
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        # They may say a line about every byte.
+        with open(os.devnull, "w") as nobody, contextlib.redirect_stdout(nobody), contextlib.redirect_stderr(nobody):
             yield
     except StorageError:
         raise

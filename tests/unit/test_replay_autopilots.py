@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import resource
+import struct
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -177,3 +180,49 @@ def test_nothing_but_a_beginning_is_one_line(tmp_path: Path, capsys: pytest.Capt
     assert said.err.count("\n") == 1
     assert str(path) in said.err
     assert said.out == ""
+
+
+@pytest.fixture
+def little_memory() -> Iterator[None]:
+    """A gigabyte more than there is now: what takes memory without end fails, before the machine does."""
+    now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (now + (1 << 30), limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, limits)
+
+
+def ulog_message(kind: bytes, body: bytes) -> bytes:
+    return struct.pack("<Hc", len(body), kind) + body
+
+
+def circling() -> bytes:
+    """A message that says that it is longer than the file: its reader goes back by that, and comes by again."""
+    said = ulog_message(b"M", b"\x00\x0cchar[9000] a" + bytes(9000))
+    head = b"ULog\x01\x12\x35\x01" + bytes(8) + ulog_message(b"B", bytes(40))
+    end = len(said) + 3 + 5000
+    return head + said + struct.pack("<Hc", end - 2, b"?") + bytes(5000)
+
+
+def nested() -> bytes:
+    formats = [b"sensor_combined:a[60000] x;", b"a:b[60000] x;", b"b:float[60000] x;"]
+    parts = [ulog_message(b"F", each) for each in formats]
+    added = ulog_message(b"A", struct.pack("<BH", 0, 0) + b"sensor_combined")
+    return b"".join([b"ULog\x01\x12\x35\x01", bytes(8), ulog_message(b"B", bytes(40)), *parts, added, bytes(100)])
+
+
+def without_length() -> bytes:
+    def named(number: int, length: int, name: bytes) -> bytes:
+        return b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", number, length, name, b"BBnNZ", b"Type,Length,Name")
+
+    return named(0x80, 89, b"FMT") + named(0x81, 0, b"IMU") + b"\xa3\x95\x81" + bytes(2000)
+
+
+@pytest.mark.parametrize("data", [circling(), nested(), without_length()], ids=["circling", "nested", "no length"])
+@pytest.mark.usefixtures("little_memory")
+def test_a_log_without_end_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], data: bytes) -> None:
+    path = tmp_path / "log"
+    path.write_bytes(data)
+    assert companion(["replay", str(path)]) == 1
+    said = capsys.readouterr()
+    assert said.err == f"companion: {path}: damaged, or not of its kind: reading it comes to no end\n"
