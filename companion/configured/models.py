@@ -148,6 +148,7 @@ def imu_input(imu: Imu, kind: StreamKind | None, grid: tuple[float, float] = (0.
         truncates=integers,
         gyro_grid_rad_s=grid[0] if integers else 0.0,
         accel_grid_m_s2=grid[1] if integers else 0.0,
+        clock_from_start=imu.protocol is None or PROTOCOLS["imu"][imu.protocol].decoder.clock_from_start,
     )
 
 

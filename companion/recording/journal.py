@@ -46,7 +46,7 @@ class Means(msgspec.Struct, frozen=True):
     wander_deg: float | None
     """How far the heading has wandered since the aircraft last moved, which may be before the recording."""
     begun_s: dict[str, float] = {}
-    """By IMU, since when its stream has come, which may be likewise."""
+    """By IMU, since when it has been on, which may be likewise."""
     turn: Turn | None = None
     """What was known of the platform's own rate, likewise; None: of an older version."""
 

@@ -293,4 +293,4 @@ def sigmas_stat(found: ImuSolution) -> Array:
 
 def sigmas_use(found: ImuSolution) -> Array:
     """(6,) sigma_use."""
-    return np.sqrt(np.diag(found.covariance))
+    return np.sqrt(np.diag(found.use_covariance))

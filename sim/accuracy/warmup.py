@@ -82,10 +82,11 @@ def cases() -> tuple[Case, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WarmRun:
-    """Errors against the mean bias of the next minute, and sigma_use; (spans, 6)."""
+    """Errors against the mean bias of the next minute, sigma_use, and the warm-up's part of that; (spans, 6)."""
 
     error: Array
     sigma: Array
+    warm_up: Array
 
 
 def warm(part: str, case: Case, seed: int, number: int) -> WarmRun:
@@ -105,16 +106,18 @@ def warm(part: str, case: Case, seed: int, number: int) -> WarmRun:
     references = References.drawn(FIELD_TILT_DEG, FIELD_HEADING_DEG, standing.random)
     error: list[Array] = []
     sigma: list[Array] = []
+    warm_up: list[Array] = []
     for window in _windows(standing, taken, times, rows, thermometer=case.thermometer):
         if window is None:
-            for each in (error, sigma):
+            for each in (error, sigma, warm_up):
                 each.append(np.full(6, np.nan))
             continue
         on = {name: age_s + case.on_s for name, age_s in window.powered_s.items()}
         imu = solved(standing, msgspec.structs.replace(window, powered_s=on), references).imus[0]
         error.append(biases(imu) - standing.bias(window.end_s, window.end_s + NEXT_MINUTE_S))
         sigma.append(sigmas_use(imu))
-    return WarmRun(np.array(error), np.array(sigma))
+        warm_up.append(np.sqrt(imu.warm_up_variance))
+    return WarmRun(np.array(error), np.array(sigma), np.array(warm_up))
 
 
 def _windows(standing: Stand, taken: ImuInput, times: Array, rows: Array, *, thermometer: bool) -> list[Window | None]:

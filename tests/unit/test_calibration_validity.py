@@ -31,6 +31,7 @@ HELD = Held(
     confirmed_s=0.0,
     temperature_degc=25.0,
     sigma_use=SIGMA,
+    sigma=SIGMA,
     expected=(0.0, 0.0, 0.0),
     seen=True,
     averaged_s=30.0,
@@ -45,7 +46,7 @@ def whys(
 
 
 def output(x_deg_h: float) -> Present:
-    return Present(residual=(x_deg_h * DEG_H, 0.0, 0.0), sigma_use=SIGMA)
+    return Present(residual=(x_deg_h * DEG_H, 0.0, 0.0), sigma_use=SIGMA, sigma=SIGMA)
 
 
 def test_a_fresh_verified_calibration_has_nothing_against_it() -> None:

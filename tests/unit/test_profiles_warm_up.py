@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.calibration.means.warming import WARM_UP_K
-from companion.calibration.noise.allan import WARM_UP, noise_profile
+from companion.calibration.noise.allan import WARM_UP, WARM_UP_K, noise_profile
 from companion.cli import main as companion
 from companion.storage.profiles import ProfileStore
 from sim.aircraft import VirtualAircraft, warming
@@ -54,12 +53,13 @@ def test_a_warm_up_is_learned_saved_and_in_sigma(
     assert saved.warm_up[1] == pytest.approx(1.5 * MG * times, rel=0.2)
     assert any(note.startswith("warming up moves gyros by") for note in answer["imus"][0]["notes"])
     short = log(tmp_path / "short.csv", 20.0, 0.0, 3, thermometer=False)
-    mine = str(ProfileStore(tmp_path).path("mine"))
+    assert run(capsys, "profile", warm, "--save", "plain", "--storage", tmp_path)[0] == 0
+    plain, mine = (str(ProfileStore(tmp_path).path(name)) for name in ("plain", "mine"))
     sigmas = []
-    for profile in ("icm42688p", mine):
+    for profile in (plain, mine):
         code, record = run(capsys, "replay", short, "--latitude-deg", "45", "--heading-deg", "0", "--profile", profile)
         assert code == 0
-        sigmas.append(max(record["imus"][0]["gyro_sigma_use_rad_s"]))
+        sigmas.append(max(record["imus"][0]["gyro_sigma_warm_up_rad_s"]))
     assert noise_profile(saved.noise).warm_up == saved.warm_up
     assert saved.warm_up[0] < WARM_UP[0]
     assert sigmas[1] < sigmas[0]

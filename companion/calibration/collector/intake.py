@@ -24,6 +24,8 @@ from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 Kind = Literal["imu", "gradienter", "compass"]
 
 _SILENT_S: Final = 2.5
+_LONGEST_UP_S: Final = 3e8
+"""A clock that says more counts from somewhere else: UTC, say."""
 _CARRY: Final = 2
 """Seconds for which a slow gradienter's or compass' last reading stands."""
 LIMITS_IMU: Final = (1e3,) * 3 + (1e4,) * 3
@@ -162,6 +164,8 @@ class Intake(ABC):
         self._heading = self._pose_source("compass") if compass else None
         self._breaks: dict[str, int] = {}
         self._restarted_s: dict[str, float] = {}
+        self._up: dict[str, tuple[float, float]] = {}
+        """By IMU whose device tells: a time, and for how long it had been on by then."""
         self._field = None if field_by is None else FieldHeading(*field_by, keep)
         self._turns = TurnWatch(span)
 
@@ -191,7 +195,13 @@ class Intake(ABC):
         stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
         row = sample.gyro_rad_s + sample.accel_m_s2
         if source.batches.add(sample.t_s, row, sample.temperature_degc, stamp):
+            self._note_up(name, sample)
             self._evaluate()
+
+    def _note_up(self, name: str, sample: ImuSample) -> None:
+        up_s = sample.t_device_s
+        if self._inputs[name].clock_from_start and up_s is not None and 0.0 <= up_s < _LONGEST_UP_S:
+            self._up[name] = (sample.t_s, up_s)
 
     def add_tilt(self, sample: TiltSample) -> None:
         """Take one reading of the gradienter; dropped when none is expected."""
@@ -274,12 +284,17 @@ class Intake(ABC):
 
     @property
     def begun_s(self) -> dict[str, float]:
-        """By IMU, since when its stream has come without a break: it has been switched on at least since then."""
-        return {
+        """By IMU, since when it has been switched on: by its device's clock, else as long as its stream has come."""
+        heard = {
             name: max(float(source.batches.begun), self._restarted_s.get(name, -math.inf))
             for name, source in self._imus.items()
             if source.batches.begun is not None
         }
+        return heard | {name: t_s - up_s for name, (t_s, up_s) in self._up.items() if name in heard}
+
+    def up_s(self, name: str) -> float | None:
+        """For how long the device of an IMU had been on when that was heard last; None where it does not tell."""
+        return self._up[name][1] if name in self._up else None
 
     @property
     def turn(self) -> Turn:

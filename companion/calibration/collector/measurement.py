@@ -99,7 +99,7 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
     heading: PoseSeconds | None
     field: FieldWindow | None
     begun_s: dict[str, float] = {}
-    """By IMU, since when it has been switched on at least."""
+    """By IMU, since when it has been switched on, as far as that is known."""
     turn: Turn = Turn()
 
     def window(self) -> Window:

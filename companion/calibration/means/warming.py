@@ -16,16 +16,18 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from companion.calibration.noise.allan import WARM_UP_K
 from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats, Matrix, vector
+from companion.physics.units import DEG_H
 from companion.samples import Vector
 
-WARM_UP_K: Final = 20.0
-"""A board with its processor and radio, from cold to warm; two sigma."""
 QUICKEST_S: Final = 60.0
 """The shortest time constant of a warm-up: boards take 1 to 20 min."""
 NEXT_S: Final = 60.0
 """So far ahead an unseen slope is believed to go on."""
+_LATER_S: Final = (120.0, 600.0, 3600.0)
+"""Ages at which to say what sigma will be."""
 _FEWEST: Final = 3
 _NOTHING: Final = 1.0
 """Variance of a slope of which the window tells nothing, (rad/s^2)^2 or (m/s^3)^2: beyond every warm-up."""
@@ -66,6 +68,26 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
         share = prior / np.maximum(prior + variance, np.finfo(float).tiny)
         return np.asarray((np.square(share * slope) + share * variance) * self.lever_s**2)
 
+    def in_words(self, name: str, powered_s: float, other_variance: Floats) -> str:
+        """Why the gyros' sigma is wide, where that is for the warm-up above all; else empty.
+
+        Args:
+            name: of the IMU.
+            powered_s: as above.
+            other_variance: (6,), what is in sigma besides.
+        """
+        unseen = self.unseen(powered_s)[:3]
+        if unseen.max() <= other_variance[:3].max():
+            return ""
+        if self.k_s is not None and abs(self.k_s) > 2.0 * math.sqrt(self.k_s_variance):
+            return f"gyro {name}: its temperature moves by {abs(self.k_s) * 60.0:.1f} K a minute, sigma allows for that"
+        words = f"gyro {name}: on for {_age(powered_s)}, may still be warming, sigma allows for that"
+        later = next((at_s for at_s in _LATER_S if at_s >= 2.0 * powered_s), None)
+        if later is None:
+            return words
+        sigma = math.sqrt((self.unseen(later)[:3] + other_variance[:3]).max())
+        return f"{words}; after {later / 60.0:.0f} min about {sigma / DEG_H:.0f} deg/h"
+
     def _kelvin(self, powered_s: float) -> float:
         """Mean square of the rate, K/s, by age and thermometer."""
         prior = likely_k_s(powered_s) ** 2
@@ -73,6 +95,10 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
             return prior
         share = prior / (prior + self.k_s_variance)
         return (share * self.k_s) ** 2 + share * self.k_s_variance
+
+
+def _age(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"
 
 
 def likely_k_s(powered_s: float) -> float:

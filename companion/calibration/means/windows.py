@@ -60,6 +60,8 @@ class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
     gyro_grid_rad_s: float = 0.0
     """Steps of its own that the sensor's readings had before they became integers of the stream; 0: much finer."""
     accel_grid_m_s2: float = 0.0
+    clock_from_start: bool = False
+    """Whether the time in its samples (`t_device_s`) counts from when its device was switched on."""
 
 
 def integer_steps(imu: ImuInput) -> Floats | None:

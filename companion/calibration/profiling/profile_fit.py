@@ -217,7 +217,10 @@ def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Fin
         models.append(within_horizon(model, [(rest.slots, rest.means[:, part]) for rest in rests]))
         kept += [f"{triad} {_NAMES[which]}" for which in unknown]
     return Finding(
-        profile=NoiseProfile(name, models[0], models[1]), axes=tuple(axes), kept=tuple(kept), still_s=still_s
+        profile=NoiseProfile(name, models[0], models[1], fallback.warm_up),
+        axes=tuple(axes),
+        kept=tuple(kept),
+        still_s=still_s,
     )
 
 

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.means.warming import WARM_UP_K
+from companion.calibration.noise.allan import WARM_UP_K
 from companion.calibration.profiling.profile_fit import Rest
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Floats

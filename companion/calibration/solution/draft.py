@@ -98,7 +98,9 @@ class Draft:
             accel_bias_m_s2=_axes(accel),
             accel_sigma_stat_m_s2=_axes(estimate.accel_sigma_stat_m_s2 if has_accel else None),
             accel_sigma_use_m_s2=_axes(estimate.accel_sigma_use_m_s2 if has_accel else None),
-            covariance=_where_known(estimate.covariance, _known(estimate), _known(estimate)),
+            covariance=_where_known(estimate.use_covariance, _known(estimate), _known(estimate)),
+            gyro_sigma_warm_up_rad_s=_axes(np.sqrt(estimate.warm_up_variance[:3]) if has_gyro else None),
+            accel_sigma_warm_up_m_s2=_axes(np.sqrt(estimate.warm_up_variance[3:]) if has_accel else None),
             residual_gyro_rad_s=_axes(estimate.gyro_rad_s if owner_corrects else None),
             residual_accel_m_s2=_axes(estimate.accel_m_s2 if owner_corrects else None),
             warnings=(*estimate.warnings, *self.imu_warnings.get(estimate.name, ())),
@@ -159,8 +161,15 @@ def in_words(solution: Solution | None) -> str:
     gyros = [imu.gyro_sigma_use_rad_s for imu in solution.imus if imu.gyro_rad_s is not None]
     accels = [imu.accel_sigma_use_m_s2 for imu in solution.imus if imu.accel_m_s2 is not None]
     if gyros:
-        parts.append(f"{np.max(gyros) / DEG_H:.1f} deg/h")
+        parts.append(f"{np.max(gyros) / DEG_H:.1f} deg/h{' (warming?)' if _warms(solution) else ''}")
     if accels:
         parts.append(f"{np.max(accels) / MG:.2f} mg")
     unknown = ", ".join(f"{triad} {name}" for name, triad in solution.unknown)
     return f"sigma {', '.join(parts)}{f'; not known: {unknown}' if unknown else ''}"
+
+
+def _warms(solution: Solution) -> bool:
+    """Whether the gyros' sigma is that of a warm-up above all."""
+    gyros = [imu for imu in solution.imus if imu.gyro_rad_s is not None]
+    worst = max(gyros, key=lambda imu: float(imu.gyro_sigma_use_rad_s.max()))
+    return bool(worst.warm_up_variance[:3].max() > np.diag(worst.covariance)[:3].max())

@@ -6,12 +6,13 @@ and never zero. All axes are the vehicle's FRD.
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import msgspec
 
 from companion import formats
-from companion.samples import Vector
+from companion.samples import Triad, Vector
 
 FORMAT_VERSION = 1
 
@@ -200,6 +201,21 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     """None where the accelerometers were not determined."""
     held_back: tuple[Literal["gyro", "accel"], ...] = ()
     """Measured and not written, since it contradicts earlier ones and nobody had asked: the offsets are as before."""
+    gyro_sigma_warm_up_rad_s: Vector | None = None
+    """The part of sigma_use for a warm-up too small to see, which only time takes away."""
+    accel_sigma_warm_up_m_s2: Vector | None = None
+
+    def settled_sigma(self, triad: Triad) -> Vector | None:
+        """sigma_use without that part, which moves old and new offsets alike."""
+        whole, part = (
+            (self.gyro_sigma_use_rad_s, self.gyro_sigma_warm_up_rad_s)
+            if triad == "gyro"
+            else (self.accel_sigma_use_m_s2, self.accel_sigma_warm_up_m_s2)
+        )
+        if whole is None or part is None:
+            return whole
+        x, y, z = (math.sqrt(max(use**2 - of**2, 0.0)) for use, of in zip(whole, part, strict=True))
+        return x, y, z
 
 
 class Arming(msgspec.Struct, frozen=True, kw_only=True):

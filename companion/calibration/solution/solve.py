@@ -38,7 +38,7 @@ from companion.calibration.means.pose import (
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.request import What
 from companion.calibration.solution import magnetic
-from companion.calibration.solution.believable import believable
+from companion.calibration.solution.believable import believable, untold, widened
 from companion.calibration.solution.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site
 from companion.calibration.solution.site import LocalEarth, Uncertain
 from companion.calibration.turning.watch import Turn
@@ -59,8 +59,8 @@ _ON_DECK: Final = "on a deck gyros need a compass: without one a slow turn looks
 class ImuSolution:
     """What is left in one IMU's output: mean minus truth, in vehicle FRD, shape (3,); None: not asked for or unknown.
 
-    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of the estimate as a prediction of the next
-    minutes: sigma_use is the root of its diagonal.
+    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of a prediction of the next minutes, without what a
+    warm-up may do in them: that moves the bias under old and new offsets alike, and no comparison must count it.
     """
 
     name: str
@@ -72,6 +72,7 @@ class ImuSolution:
     accel_sigma_stat_m_s2: Array
     covariance: Matrix
     warnings: tuple[str, ...]
+    warm_up_variance: Array = dataclasses.field(default_factory=lambda: np.zeros(6))
     dithered: bool = False
     """The telemetry was seen to follow this IMU's offsets step by step."""
     prior: Prior | None = None
@@ -82,12 +83,17 @@ class ImuSolution:
     @property
     def gyro_sigma_use_rad_s(self) -> Array:
         """One sigma per axis, shape (3,)."""
-        return np.sqrt(np.diag(self.covariance)[:3])
+        return np.sqrt(np.diag(self.use_covariance)[:3])
 
     @property
     def accel_sigma_use_m_s2(self) -> Array:
         """One sigma per axis, shape (3,)."""
-        return np.sqrt(np.diag(self.covariance)[3:])
+        return np.sqrt(np.diag(self.use_covariance)[3:])
+
+    @property
+    def use_covariance(self) -> Matrix:
+        """The warm-up in it: sigma_use is the root of its diagonal."""
+        return self.covariance + np.diag(self.warm_up_variance)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -226,7 +232,7 @@ def solve(
         _estimate(imu, truth, local, shared, asked, tipped, window.powered_s.get(imu.name, 0.0)) for imu in believed
     )
     if all(imu.gyro_rad_s is None and imu.accel_m_s2 is None for imu in imus):
-        refusals = dict.fromkeys(words for imu in believed for words in _hidden(imu, asked))
+        refusals = dict.fromkeys(words for imu in believed for words in untold(imu, asked))
         if refusals:
             raise CalibrationRefusedError("; ".join(refusals))
     unknown = [(imu.name, triad) for triad in asked for imu in believed if imu.refused(triad)]
@@ -368,8 +374,8 @@ def _estimate(
     own = imu.covariance
     if own is None:
         own = np.diag(np.square([*imu.gyro_sigma_use_rad_s, *imu.accel_sigma_use_m_s2]))
-    if imu.warming is not None:
-        own = own + np.diag(imu.warming.unseen(powered_s))
+    covariance = shared.covariance + own
+    unseen = np.zeros(6) if imu.warming is None else imu.warming.unseen(powered_s)
     return ImuSolution(
         name=imu.name,
         samples=imu.samples,
@@ -378,8 +384,9 @@ def _estimate(
         accel_m_s2=accel,
         gyro_sigma_stat_rad_s=np.array(imu.gyro_sigma_stat_rad_s),
         accel_sigma_stat_m_s2=np.array(imu.accel_sigma_stat_m_s2),
-        covariance=shared.covariance + own,
-        warnings=(*imu.warnings, *_hidden(imu, asked)),
+        covariance=covariance,
+        warm_up_variance=unseen,
+        warnings=(*imu.warnings, *untold(imu, asked), *widened(imu, asked, powered_s, np.diag(covariance))),
         dithered=imu.dithered,
     )
 
@@ -391,8 +398,3 @@ def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
     c, s = math.cos(truth.heading_rad), math.sin(truth.heading_rad)
     north, east, down = local.rate_ned_rad_s.tolist()
     return np.asarray(imu.by_earth @ np.array([c * north + s * east, c * east - s * north, down]))
-
-
-def _hidden(imu: ImuWindow, asked: Collection[Triad]) -> list[str]:
-    """What this IMU's readings do not tell, or not well, of what is asked for."""
-    return list(dict.fromkeys(hidden.words for triad, hidden in imu.hidden.items() if triad in asked))
