@@ -56,6 +56,8 @@ class Voyage:
     compass_sigma_deg: float = COMPASS_SIGMA_DEG
     gyro_axes_sigma: float = 0.0029
     """Scale and cross-axis errors of the gyros, one sigma: 0.5 % at the most, each as likely."""
+    gyro_bias_rad_s: float = GYRO_BIAS_RAD_S
+    """One sigma."""
 
     def motions(self, seed: int) -> list[Motion]:
         """From before the beginning on, for all day."""
@@ -87,7 +89,7 @@ def sail(voyage: Voyage, spans_s: Sequence[int], seed: int) -> DeckRun:
         aircraft,
         voyage.part,
         seed=int(random.integers(2**62)),
-        gyro_bias_rad_s=(random.normal(size=3) * GYRO_BIAS_RAD_S).tolist(),
+        gyro_bias_rad_s=(random.normal(size=3) * voyage.gyro_bias_rad_s).tolist(),
         accel_bias_m_s2=(random.normal(size=3) * ACCEL_BIAS_M_S2).tolist(),
         gyro_scale=axes[:3].tolist(),
         gyro_misalignment_rad=axes[3:].tolist(),

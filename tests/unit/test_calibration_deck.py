@@ -151,3 +151,10 @@ def test_a_turn_is_of_the_deck_and_not_of_the_gyros() -> None:
     assert slow.euler_rad(np.array([100.0]))[1][0, 2] == pytest.approx(math.radians(0.05))
     found = sail(Voyage(waves=(Wave(0.2, 1.0),), turn_deg_s=0.05), [120], 5)
     assert abs(found.error[0][2]) < 0.2 * math.radians(0.05)
+
+
+def test_what_a_firmwares_own_calibration_leaves_on_a_boat_is_found_as_well_as_a_small_bias() -> None:
+    large, small = (sail(voyage, (60,), 3) for voyage in (Voyage(gyro_bias_rad_s=math.radians(3.0)), Voyage()))
+    np.testing.assert_allclose(large.error / UNITS, small.error / UNITS, atol=3.0)
+    np.testing.assert_allclose(large.error[:, 3:] / MG, small.error[:, 3:] / MG, atol=0.15)
+    np.testing.assert_allclose(large.sigma, small.sigma, rtol=0.2)

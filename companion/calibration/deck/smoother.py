@@ -106,7 +106,9 @@ class _Stretch:
 
     def forces(self, attitudes: Floats, gyro: Array, accel: Array) -> Floats:
         """(n, 3) mean specific force of every passage, NED."""
-        felt = self.velocity + self.by_bias @ gyro - self.turned @ accel
+        # The second order in the bias of gravity's own part: 0.6 mg at 3 deg/s.
+        bent = np.cross(gyro, np.cross(gyro, self.velocity)) * np.square(self.spans[:, None]) / 6.0
+        felt = self.velocity + self.by_bias @ gyro + bent - self.turned @ accel
         return np.asarray(np.einsum("nij,nj->ni", attitudes[:-1], felt) / self.spans[:, None])
 
 
@@ -134,7 +136,7 @@ def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: A
     start = level_attitude(
         stretch.velocity[: len(passages) // 4 + 1].sum(axis=0), float(known[0]) if len(known) else 0.0
     )
-    bias, ramp = np.zeros(3), np.zeros(3)
+    bias, ramp = _coarse_bias(stretch, start, headings_rad), np.zeros(3)
     noise: tuple[Waves, Waves] | None = None
     for _ in range(_ROUNDS):
         attitudes = stretch.attitudes(start, bias)
@@ -165,6 +167,21 @@ def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: A
         body_to_ned=attitudes,
         heading_sigma_rad=math.sqrt(noise[1].variance / max(len(known), 1)),
     )
+
+
+def _coarse_bias(stretch: _Stretch, start: Matrix, headings_rad: Floats) -> Array:
+    """(3,) near enough for what is linear only near by: swaying comes back, and how far it turns the compass says.
+
+    A firmware's own calibration on a boat leaves degrees a second.
+    """
+    skew = stretch.turn.sum(axis=0)
+    rate = np.array([skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]]) / 2.0
+    rate /= stretch.spans.sum()
+    known = np.isfinite(headings_rad)
+    if known.sum() < 2:
+        return rate
+    turn = np.polyfit(stretch.ends[1:][known], np.unwrap(headings_rad[known]), 1)[0]
+    return np.asarray(rate - turn * start[2])
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
