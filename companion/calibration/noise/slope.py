@@ -25,8 +25,10 @@ from companion.physics.frames import Floats
 FEWEST: Final = 3
 """Seconds: two always lie on a line."""
 _SPANS: Final = 5
-_OF_STEPS: Final = math.sqrt(3.0)
-"""One sigma of a slope over T by an error that is at most A either way: its largest is 3 A / T."""
+_WALKS: Final = 1.5
+"""So many times the Allan variance that white noise has: then the readings walk, and do not only flicker."""
+_LINE_TAKES: Final = 1.6
+"""So many times the Allan variance at T/5 had a random walk before the line was taken off."""
 
 
 class Slope(msgspec.Struct, frozen=True):
@@ -64,11 +66,12 @@ def fit_slope(
     slope = time @ centred / spread
     left = centred - np.outer(time, slope)
     noise = np.maximum(white_noise(slots, left), white)
-    wander = np.maximum(wandering(slots, left, noise), flicker)
+    flickers, walks = wandering(slots, left, noise)
     variance = (
         np.square(noise) / spread
-        + slope_variance(wander, np.asarray(walk), length_s)
-        + np.square(_OF_STEPS * np.asarray(hidden) / length_s)
+        + slope_variance(np.maximum(flickers, flicker), np.maximum(walks, walk), length_s)
+        # An error of at most A either way turns a line by at most 3 A / T, and by A / (2 T) to A / T (rms).
+        + np.square(np.asarray(hidden) / length_s)
     )
     return Slope(slope, np.asarray(variance), noise)
 
@@ -79,15 +82,22 @@ def plain_slope(times: NDArray[np.int64], values: Floats) -> float:
     return float(time @ values / (time @ time))
 
 
-def wandering(slots: NDArray[np.int64], values: Floats, white: Floats) -> Floats:
-    """B of every column as far as the Allan deviation at T/5 shows more than white noise; widened for few spans."""
+def wandering(slots: NDArray[np.int64], left: Floats, white: Floats) -> tuple[Floats, Floats]:
+    """B and K of every column of what a line left, as far as the Allan deviation at T/5 shows more than white noise.
+
+    One of the two, widened for few spans. A walk that does not show in one window is in no sigma: 0.1 N a root second
+    doubles the error of a minute's slope, and its Allan variance is half of the white noise's.
+    """
     span = int(slots[-1] - slots[0] + 1) // _SPANS
     if span < 2:
-        return np.zeros(values.shape[1])
-    variance, freedom = allan_variance(slots, values, span)
-    explained = np.square(white) / span
+        return np.zeros(left.shape[1]), np.zeros(left.shape[1])
+    variance, freedom = allan_variance(slots, left, span)
+    explained, widened = np.square(white) / span, student_ratio(freedom)
+    walks = variance > _WALKS * explained
     # All of it, significant or not: a line takes the slowest wander with it, and what is left shows too little.
-    return np.asarray(np.sqrt(np.maximum(variance - explained, 0.0)) / FLOOR_OF_FLICKER * student_ratio(freedom))
+    flicker = np.sqrt(np.maximum(variance - explained, 0.0)) / FLOOR_OF_FLICKER * widened
+    walk = np.sqrt(3.0 * _LINE_TAKES * variance / span) * widened
+    return np.where(walks, 0.0, flicker), np.where(walks, walk, 0.0)
 
 
 def hidden_by_steps(step: float, variance: float, *, dithered: bool = True) -> float:

@@ -9,9 +9,9 @@ gradienter's zero is the same in all IMUs, and where the earlier calibrations we
 well, so that nothing averages it away. Where they were made with other zeros, several IMUs together tell today's tilt.
 
 A sigma_use that is too cautious would hand the estimate to the prior. So K counts as e_d only what is *known* to be
-noise: what averaging has left (sigma_stat), the gradienter's scatter, and the sigma of its zero if somebody vouches
-for it. K is then smaller than the best one, and with any K between zero and twice that the estimate is no worse than
-without a prior. The covariance is that of the K used, with the whole S_d.
+noise: what averaging has left (sigma_stat), the gradienter's scatter, what is not known of the platform's turn, and
+the sigma of the zero if somebody vouches for it. K is then smaller than the best one, and with any K between zero and
+twice that the estimate is no worse than without a prior. The covariance is that of the K used, with the whole S_d.
 """
 
 from __future__ import annotations
@@ -288,7 +288,9 @@ def _estimate(solution: Solution, used: Sequence[_Known], *, zero_is_known: bool
         [np.concatenate([imu.gyro_sigma_stat_rad_s, imu.accel_sigma_stat_m_s2]) for imu in solution.imus]
     )
     known = np.diag(np.minimum(np.square(stat), np.diag(s_d))) + noise_in_d @ noise_in_d.T
-    sure = known[:, index]
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = solution.turn.covariance(shared.up)
+    sure = (known + np.kron(np.ones((count, count)), turn))[:, index]
     if zero_is_known:
         sure = sure + zero_in_d @ zero_in_d[index].T - both
     gain = np.linalg.solve(of_difference, sure.T).T

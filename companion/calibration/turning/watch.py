@@ -266,14 +266,12 @@ class TurnWatch:
         # A compass that turns breaks the stretch again and again, but not its memory.
         since = [one for one, _ in self._headings if moved is None or one.slot > moved]
         longer = seen if len(since) <= len(measured) else self._slope(since)
-        lasting = (
-            longer is not None
-            and longer.is_even
-            and not self.turn.gyros_stay
-            and _is_significant(longer.rate, math.sqrt(longer.variance), LEAST_RAD_S)
-        )
-        if lasting and longer is not None and not self._contradicts(common, longer):
-            self.words = self._turning(longer.rate)
+        if longer is None or not longer.is_even or self.turn.gyros_stay or self._contradicts(common, longer):
+            lasting = Turn()
+        else:
+            lasting, _ = self._weigh(common, longer, {})
+        if lasting.is_significant:
+            self.words = self._turning(lasting.rate_rad_s)
         elif self.turn.is_significant and (self.turn.by != "gyros" or self._is_suspect):
             self.words = self._turning(self.turn.rate_rad_s)
         elif self.turn.tilts:
