@@ -93,7 +93,7 @@ class Recording:
                 if not head:
                     raise StorageError(f"{path}: the file is empty")
                 if not MAGIC.startswith(head):
-                    raise StorageError(f"{path}: not a recording (MCAP)")
+                    raise StorageError(f"{path}: not a recording (MCAP), nor any log that is known")
                 self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         except (OSError, ValueError) as error:
             raise StorageError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None

@@ -196,7 +196,7 @@ class _Pass:
         self._collector = self._streams.collector(settings, imu)
         self._found: list[Measurement] = []
         self._still_s = 0.0
-        self._obstacle = "no samples"
+        self._obstacle = ""
         self._verdicts: dict[int, tuple[str, str]] = {}
         """By second, why it was not still, and without the figures of a movement; empty where it was."""
         self._verdicts_from_s = 0.0
@@ -223,9 +223,8 @@ class _Pass:
         best, refused = _latest(self._found)
         seconds = end_s - _FIRST_S
         if best is None:
-            record = draft.record(
-                "failed", refused or f"no {MIN_STILL_S:.0f} s at rest in it: {self._obstacle}", seconds
-            )
+            why = self._obstacle or self._unusable(seconds)
+            record = draft.record("failed", refused or f"no {MIN_STILL_S:.0f} s at rest in it: {why}", seconds)
             return Estimated(record, self._used(None, seconds))
         record = self._solved(draft, best[1], seconds)
         return Estimated(record, self._used(best[0], seconds))
@@ -235,7 +234,8 @@ class _Pass:
         collector = self._collector
         glance = collector.glance(now_s)
         if glance.obstacle is not None:
-            self._obstacle = glance.obstacle.words
+            if glance.obstacle.hold_still_s is None:
+                self._obstacle = glance.obstacle.words
         elif glance.still_s >= MIN_STILL_S and glance.still_s > self._still_s * (1.0 if last else _LONGER):
             self._found.append(self._aged(collector.measurement(now_s)))
             self._still_s = glance.still_s
@@ -246,6 +246,12 @@ class _Pass:
                 kind = words if said is None or said.fault else "moving"
                 self._verdicts[slot] = ("", "") if good else (words, kind)
             self._verdicts_from_s = now_s - 5.0
+
+    def _unusable(self, seconds: float) -> str:
+        """What is in the way where no second of it could be judged."""
+        (imu, *_) = self._collector.status(seconds + _FIRST_S).sources
+        worst = max(imu.dropped, key=lambda why: imu.dropped[why], default="")
+        return f"{imu.dropped[worst]} samples dropped: {worst}" if worst else f"it is {seconds:.1f} s long"
 
     def _aged(self, measurement: Measurement) -> Measurement:
         """With what is known of the time before the log, where nothing was silent since."""

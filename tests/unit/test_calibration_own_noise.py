@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
+import datetime
 import math
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.profiling.profile_fit import fit_profile, rests, seconds_of
+from companion.calibration.request import What
 from companion.calibration.seconds.batch import summary
+from companion.calibration.solution.site import Whereabouts, local_earth
+from companion.calibration.solution.solve import solve
 from companion.calibration.stillness.gates import ImuGate
 from companion.calibration.stillness.own_noise import OwnNoise
+from companion.errors import CalibrationRefusedError
 from tests.support.extent import extent
 from tests.support.made_noise import DEG, DEG_H, MG, filtered
 from tests.support.recordings import shared
+from tests.support.still_aircraft import RATE_HZ, Feeder, imu, settings
 
 Floats = NDArray[np.float64]
 UNKNOWN = noise_profile(None)
 ADIS16405 = (147.0 * DEG_H, 0.34 * MG)
 MPU6050 = (12.7 * DEG_H, 0.28 * MG)
 ICM42688P = (7.1 * DEG_H, 0.05 * MG)
+EARTH_RAD_S = 7.292e-5
 STEPS = np.repeat([0.05 * DEG, 1.0 * MG], 3)
 
 
@@ -112,6 +120,40 @@ def test_rocking_is_never_learned_as_noise(
     found = verdicts(t_s, readings)
     longest = max((len(run) for run in "".join("x."[each] for each in found).split("x")), default=0)
     assert longest < 10  # no stretch begins
+
+
+@pytest.mark.parametrize(
+    ("white", "rms_deg_s", "hz"),
+    extent(
+        whole=[
+            (white, rms_deg_s, hz)
+            for white in (ADIS16405, MPU6050, ICM42688P)
+            for rms_deg_s in (0.02, 0.05, 0.1, 0.15, 0.25)
+            for hz in (0.01, 0.03, 0.07, 0.1, 0.2, 0.4)
+        ],
+        a_slice=[(ADIS16405, 0.1, 0.01), (ADIS16405, 0.05, 0.03), (ADIS16405, 0.1, 0.2), (ICM42688P, 0.02, 0.01)],
+    ),
+)
+def test_rocking_that_is_taken_for_still_is_in_sigma(white: tuple[float, float], rms_deg_s: float, hz: float) -> None:
+    """What nobody can tell from noise within a second may move the mean; then gravity says so, or sigma does."""
+    t_s, readings = filtered(150, RATE_HZ, white, 5.0, 1, 21)
+    readings += rocking(t_s, rms_deg_s, hz)
+    readings[:, 0] += EARTH_RAD_S  # on the equator, heading north
+    profile = noise_profile("icm42688p") if white is ICM42688P else UNKNOWN
+    feeder = Feeder(RollingCollector(settings(), [imu(profile=profile)], gradienter=False, compass=False))
+    feeder.change = lambda _name, _t, rows: readings[: len(rows)]
+    earth = local_earth(Whereabouts(0.0, 0.0, 0.0, "test", datetime.date(2026, 1, 1)))
+    bias = np.array([0.3, -0.2, 0.1]) * DEG
+    for _ in range(150):
+        feeder.run(1.0)
+        readings = readings[RATE_HZ:]
+        try:
+            solution = solve(feeder.collector.window(feeder.now_s), earth, None, None, What.GYROS)
+        except CalibrationRefusedError:
+            continue
+        (found,) = solution.imus
+        assert found.gyro_rad_s is not None
+        assert (np.abs(found.gyro_rad_s - bias) < 3.0 * found.gyro_sigma_use_rad_s).all()
 
 
 def test_a_quiet_sensor_gains_nothing_for_random_rocking() -> None:

@@ -203,6 +203,27 @@ def test_equal_times_are_spread_and_repeated_lines_left_out(
     assert_near(record["imus"][0], model)
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda data: data * [1e-9, *[1.0] * 6], "it is 0.0 s long"),
+        (
+            lambda data: np.where([1, 0, 0, 0, 1, 1, 1], data, 1e9),
+            "2999 samples dropped: not a believable number",
+        ),
+    ],
+)
+def test_a_log_of_which_nothing_can_be_judged_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel],
+    change: Callable[[Floats], Floats], said: str,
+) -> None:  # fmt: skip
+    head = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n"
+    text = head + joined([[f"{value:.17g}" for value in row] for row in change(still[0])])
+    code, record = replay(capsys, written(tmp_path, text))
+    assert code == 1
+    assert record["reason"] == f"no 5 s at rest in it: {said}"
+
+
 def test_a_counter_of_32_bits_goes_on_behind_its_end(tmp_path: Path, still: tuple[Floats, ImuModel]) -> None:
     data, _ = still
     stamps = (np.round(data[:, 0] * 1e6).astype(np.int64) + 2**32 - 15_000_000) % 2**32

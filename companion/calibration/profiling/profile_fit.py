@@ -58,7 +58,7 @@ class Rests(msgspec.Struct, frozen=True):
     seconds: int
     """Whole seconds in the recording."""
     obstacle: str
-    """What kept most of the others from counting; empty where all counted."""
+    """What kept most of the others from counting, in the words of the first; empty where all counted."""
 
     @property
     def still_s(self) -> int:
@@ -89,6 +89,7 @@ def rests(t_s: Floats, readings: Floats, temperature_degc: Floats | None, name: 
     stretches: list[Rest] = []
     kept: list[Batch] = []
     obstacles: Counter[str] = Counter()
+    words: dict[str, str] = {}
     before: int | None = None
 
     def end() -> None:
@@ -110,10 +111,11 @@ def rests(t_s: Floats, readings: Floats, temperature_degc: Floats | None, name: 
             kept.append(batch)
         else:
             obstacles[verdict.what] += 1
+            words.setdefault(verdict.what, verdict.words)
             if stretch.start is None:
                 end()
     end()
-    obstacle = obstacles.most_common(1)[0][0] if obstacles else ""
+    obstacle = words[obstacles.most_common(1)[0][0]] if obstacles else ""
     return Rests(tuple(stretches), len(batches), obstacle)
 
 
