@@ -13,6 +13,7 @@ from companion.daemon.calibrating.align_steps import Plan
 from sim.imu_model import DEG_H, MG
 from sim.motions import SlowTurn
 from sim.sea import DAY_S, Sea, Wave
+from tests.e2e.test_arm_gate import AUTHORISED_BY_US, texts, try_to_arm
 from tests.e2e.test_calibration import started
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
@@ -48,6 +49,68 @@ def test_a_boat_is_calibrated_while_it_sways_and_turns(tmp_path: Path) -> None:
             assert np.abs(left.accel_m_s2).max() < 1.0 * MG
             # The firmware's own gyro calibration would have taken the deck's rate for the bias of every gyro.
             assert rig.double.parameters.values["INS_GYR2OFFS_X"] == 0.0
+
+    run_virtual(main())
+
+
+def test_px4_on_a_boat_is_calibrated_by_itself_and_then_arms(tmp_path: Path) -> None:
+    async def main() -> None:
+        # Its own gyro calibration would take the boat's turn for a bias.
+        parameters = {**AUTHORISED_BY_US, "IMU_GYRO_CAL_EN": 0.0}
+        async with boat(tmp_path, firmware="px4", at_arm="gate", parameters=parameters).running() as rig:
+            await rig.ready()
+            rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=20 * DEG_H, target_accel_sigma_m_s2=0.5 * MG)
+            readiness = rig.service.arming.readiness
+            said: set[str] = set()
+
+            def accepts() -> bool:
+                answer = readiness.answer()
+                said.add(answer.words)
+                return answer.verdict == "accept"
+
+            await rig.until(lambda: readiness.answer().words.startswith("wait: measured"), 30.0)
+            assert await try_to_arm(rig) == 1
+            assert "Not armed: wait: measured" in texts(rig)
+            await rig.until(accepts, 200.0)
+            # Nobody can hold a boat still, and a sway that turns back is no end of a range.
+            assert not any("still" in words or "range" in words for words in said), said
+            left = rig.px4.residual(1, rig.now_s)
+            assert np.abs(left.gyro_rad_s).max() < 40 * DEG_H
+            assert np.abs(left.accel_m_s2).max() < 1.0 * MG
+            assert await try_to_arm(rig) == 0
+            assert "Armed: calibrated" in texts(rig)
+
+    run_virtual(main())
+
+
+SECOND = """
+[[imu]]
+name = "fc2"
+source = "autopilot"
+instance = 2
+profile = "icm42688p"
+"""
+
+
+def test_three_imus_on_a_boat_are_each_calibrated(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with boat(tmp_path, more=DECK + SECOND, own_imu=True).running() as rig:
+            await rig.ready()
+            rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=25 * DEG_H, target_accel_sigma_m_s2=0.5 * MG)
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", 900.0))
+            result = await job.finished
+            assert result.outcome == "done", result
+            assert job.record is not None
+            models = {"fc": rig.models[0], "fc2": rig.models[1], "own": rig.own_model}
+            assert {imu.name for imu in job.record.imus} == set(models)
+            for imu in job.record.imus:
+                truth = models[imu.name].mean_bias(
+                    rig.aircraft.time_at(rig.now_s) - 60.0, rig.aircraft.time_at(rig.now_s)
+                )
+                assert imu.gyro_bias_rad_s is not None
+                assert imu.accel_bias_m_s2 is not None
+                assert np.abs(np.subtract(imu.gyro_bias_rad_s, truth.gyro_rad_s)).max() < 60 * DEG_H
+                assert np.abs(np.subtract(imu.accel_bias_m_s2, truth.accel_m_s2)).max() < 1.0 * MG
 
     run_virtual(main())
 

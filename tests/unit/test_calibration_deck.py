@@ -7,24 +7,32 @@ import math
 import numpy as np
 import pytest
 
-from companion.calibration.deck.deck import EVERY_S, Deck
-from companion.calibration.deck.fluid import Fluid, readings_deg
+from companion.calibration.deck.deck import Deck
+from companion.calibration.deck.estimate import DeckFound
+from companion.calibration.deck.fluid import Fluid, Level, readings_deg
 from companion.calibration.deck.passage import passage, rotations, running_products
 from companion.calibration.deck.stream import Surroundings
 from companion.calibration.deck.waves import fit_waves, whitened
-from companion.calibration.means.pose import GradienterModel
+from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import PROFILES
 from companion.calibration.seconds.batch import summary
+from companion.errors import CalibrationRefusedError
 from companion.physics.gradienter import Law, readings_from_up
-from sim.accuracy.deck import Voyage, sail
+from sim.accuracy.deck import Voyage, feed, sail
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.earth import Array, body_from_ned
-from sim.imu_model import DEG_H, MG
+from sim.imu_model import DEG_H, MG, ImuModel
 from sim.motions import SlowTurn
 from sim.sea import DAY_S, Sea, Wave
 
 UNITS = np.array([DEG_H] * 3 + [MG] * 3)
+AROUND = Surroundings(
+    gradienter=GradienterModel("axis", np.eye(3), (0.0, 0.0), 0.01),
+    gradienter_lag_s=0.4,
+    compass=CompassModel(magnetic=True, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=1.0),
+    compass_lag_s=0.0,
+)
 
 
 def attitude(aircraft: VirtualAircraft, t_s: float) -> Array:
@@ -112,6 +120,51 @@ def test_two_minutes_give_biases_within_what_is_claimed(voyage: Voyage, gyro_deg
         assert sigma[:3].max() < gyro_deg_h
 
 
+def test_what_goes_up_comes_down_and_the_vertical_accelerometer_is_known_by_it() -> None:
+    found = [sail(Voyage(), [120], seed) for seed in range(20, 26)]
+    error, sigma = (np.array([getattr(one, name)[0][5] for one in found]) / MG for name in ("error", "sigma"))
+    assert sigma.max() < 0.06
+    assert 0.25 < np.sqrt(np.square(error / sigma).mean()) < 1.6
+
+
+@pytest.mark.parametrize("stuck", ["gradienter", "compass"])
+def test_a_sensor_that_repeats_itself_on_a_swaying_deck_is_named(stuck: str) -> None:
+    deck = Deck(AROUND)
+    deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["icm42688p"]))
+    aircraft = VirtualAircraft(Pose(), Site(latitude_deg=45.0), motions=Voyage().motions(8))
+    imu = ImuModel(aircraft, "icm42688p", seed=8)
+    feed(deck, imu, 91, np.random.default_rng(8), 1.0)
+    assert isinstance(deck.work(range(1, 91), 180.0).run(), DeckFound)
+    for slot in range(65, 91):
+        if stuck == "compass":
+            deck._headings[slot] = deck._headings[65]
+        else:
+            level = deck._streams["imu"].levels[slot]
+            first = deck._streams["imu"].levels[65].reading
+            off = level.difference + first - level.reading
+            deck._streams["imu"].levels[slot] = Level(first, off, level.slope)
+    found = deck.work(range(1, 91), 180.0).run()
+    assert isinstance(found, CalibrationRefusedError)
+    assert str(found) == f"{stuck} is stuck: the same for 26 s while it sways"
+
+
+def test_windows_end_the_more_rarely_the_longer_they_are() -> None:
+    deck = Deck(Surroundings(gradienter=None, gradienter_lag_s=0.0, compass=None, compass_lag_s=0.0))
+    deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["unknown"]))
+    ends = []
+    for slot in range(1500):
+        times = slot + np.arange(4) / 4.0
+        rows = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -9.8], (4, 1))
+        deck.take_imu("imu", summary(slot, times, rows), times, rows)
+        slots = deck.slots()
+        assert len(slots) <= 1200
+        ends.append(slots.stop)
+    assert sorted(ends[20:]) == ends[20:]
+    steps = np.diff(sorted(set(ends[20:])))
+    assert steps[:10].max() == 10
+    assert steps[-10:].min() == 60
+
+
 def quiet_second(slot: int, begin: float = 0.0) -> tuple[Array, Array]:
     times = slot + begin + np.arange(round((1.0 - begin) * 100)) / 100.0
     rows = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -9.8], (len(times), 1))
@@ -124,7 +177,7 @@ def test_a_gap_begins_the_seconds_anew() -> None:
     for slot in range(25):
         times, rows = quiet_second(slot)
         deck.take_imu("imu", summary(slot, times, rows), times, rows)
-    assert deck.slots() == range(1, 25 // EVERY_S * EVERY_S)
+    assert deck.slots() == range(1, 20)
     times, rows = quiet_second(25, begin=0.7)
     deck.take_imu("imu", summary(25, times, rows), times, rows)
     assert deck.seconds == 0

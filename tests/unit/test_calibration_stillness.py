@@ -183,6 +183,20 @@ def test_a_broken_sensor_is_named(spoil: object, words: str) -> None:
     assert words in verdict.words
 
 
+def test_a_sway_that_turns_back_is_no_end_of_a_range() -> None:
+    times = np.arange(200) / 200.0 - 0.5
+    sway = np.outer(np.cos(1.2 * times), [0.0504, 0, 0, 0, 0, 0])
+    rows = np.round((np.tile(REST, (200, 1)) + sway) / 1e-3) * 1e-3
+    batch = batch_of(rows)
+    assert batch.clipped
+    assert "range" in ImuGate("fc", noise_profile(None), (1e-3, 1e-3)).judge(batch).words
+    assert not ImuGate("fc", noise_profile(None), (1e-3, 1e-3), sways=True).judge(batch).fault
+    # 2 g is an end, on a deck too.
+    shaken = np.tile(REST, (50, 1)) + np.random.default_rng(4).normal(0.0, 12.0, (50, 6)) * [0, 0, 0, 1, 1, 1]
+    verdict = ImuGate("fc", noise_profile(None), sways=True).judge(batch_of(np.clip(shaken, -19.6, 19.6)))
+    assert "hits the end of its range" in verdict.words
+
+
 def test_a_quantised_constant_stream_is_not_stuck() -> None:
     gate = ImuGate("fc", noise_profile(None), (1e-3, 9.80665e-3))
     batch = batch_of(np.tile(REST, (50, 1)))

@@ -236,7 +236,8 @@ class Intake(ABC):
     def set_imu(self, imu: ImuInput) -> None:
         """Add an IMU, or say that its stream is another kind now: all that was learned of it is forgotten."""
         self._inputs[imu.name] = imu
-        gate = ImuGate(imu.name, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2))
+        steps = (imu.gyro_step_rad_s, imu.accel_step_m_s2)
+        gate = ImuGate(imu.name, imu.profile, steps, sways=self._deck is not None)
         self._turns.set_imu(
             ImuKind(
                 name=imu.name,

@@ -12,8 +12,10 @@ from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
 from companion.physics.units import DEG
 
-EVERY_S: Final = 10
-"""Windows end with a whole number of so many seconds: an estimate costs a third of a second."""
+EVERY_S: Final = {180: 10, 600: 30, MAX_S: 60}
+"""By how many seconds there are at most, how often a window ends: an estimate of more costs more, and tells less that
+is new."""
+_KEPT_S: Final = MAX_S + 2 * max(EVERY_S.values())
 
 
 class Deck:
@@ -27,7 +29,7 @@ class Deck:
 
     def set_imu(self, imu: ImuInput) -> None:
         """Add an IMU, or begin anew with one whose stream is another now."""
-        self._streams[imu.name] = Stream(imu, self._around, MAX_S + 2 * EVERY_S)
+        self._streams[imu.name] = Stream(imu, self._around, _KEPT_S)
 
     def forget(self, imu: str | None) -> None:
         """Drop what was measured, of one IMU or of all."""
@@ -55,11 +57,11 @@ class Deck:
     def take_heading(self, batch: Batch, times: Floats, rows: Floats) -> None:
         """The headings (n, 1) of one second, degrees."""
         self._headings[batch.slot] = float(batch.mean[0]) * DEG
-        while len(self._headings) > MAX_S + 2 * EVERY_S:
+        while len(self._headings) > _KEPT_S:
             del self._headings[next(iter(self._headings))]
 
     def slots(self, since_s: float | None = None) -> range:
-        """The seconds that all IMUs have in common, up to a whole number of `EVERY_S`, at most `MAX_S`.
+        """The seconds that all IMUs have in common, up to the last end by `EVERY_S`, at most `MAX_S`.
 
         Args:
             since_s: only those that begin after it.
@@ -67,10 +69,12 @@ class Deck:
         ends = [(one.seconds[0].slot, one.seconds[-1].slot) for one in self._streams.values() if one.seconds]
         if not ends or len(ends) < len(self._streams):
             return range(0)
-        end = (min(last for _, last in ends) + 1) // EVERY_S * EVERY_S
-        first = max(end - MAX_S, *(first for first, _ in ends))
+        begin, now = max(first for first, _ in ends), min(last for _, last in ends) + 1
         if since_s is not None:
-            first = max(first, math.ceil(since_s))
+            begin = max(begin, math.ceil(since_s))
+        end = max(min(now, begin + length) // every * every for length, every in EVERY_S.items() if length < MAX_S)
+        end = max(end, now // EVERY_S[MAX_S] * EVERY_S[MAX_S])
+        first = max(end - MAX_S, begin)
         return range(first, max(end, first))
 
     @property
@@ -91,7 +95,7 @@ class Deck:
         return DeckWork(
             imus=[stream.imu for stream in streams],
             seconds=[[one for one in stream.seconds if one.slot in slots] for stream in streams],
-            levels=[[one for slot, one in stream.levels.items() if slot in slots] for stream in streams],
+            levels=[{slot: one for slot, one in stream.levels.items() if slot in slots} for stream in streams],
             headings={slot: heading for slot, heading in self._headings.items() if slot in slots},
             slots=slots,
             around=self._around,

@@ -33,6 +33,11 @@ SCALE_SIGMA: Final = 0.003
 """Scale and cross-axis errors of common gyros (0.5 % at the most): so much of a steady turn may pass for a bias."""
 COMPASS_SHARE: Final = math.sqrt(0.5)
 """Of a compass' sigma, the part that changes with the heading; the other part is the same on all headings."""
+FROZEN_S: Final = 20
+"""No sensor that is swayed says exactly the same for so long."""
+_SWAYS_RAD_S: Final = 0.3 * DEG
+"""Of roll and pitch, over such a while."""
+_SAME: Final = 1e-9
 _DITHERED: Final = 1.5
 """Integers spread over so many steps by the swaying hide nothing."""
 _UNKNOWN_ACCEL_M_S2: Final = 50.0 * MG
@@ -69,7 +74,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
 
     imus: Sequence[ImuInput]
     seconds: Sequence[Sequence[ImuSecond]]
-    levels: Sequence[Sequence[Level]]
+    levels: Sequence[Mapping[int, Level]]
     headings: Mapping[int, float]
     slots: range
     around: Surroundings
@@ -88,17 +93,21 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
 
     def _run(self) -> DeckFound:
         around = self.around
-        headings = np.array([self.headings.get(slot, math.nan) for slot in self.slots])
+        readings = {slot: level.reading for levels in self.levels[:1] for slot, level in levels.items()}
+        frozen = self._frozen("gradienter", readings)
+        all_levels = [[one for slot, one in levels.items() if slot not in frozen] for levels in self.levels]
+        frozen = self._frozen("compass", {slot: np.array([heading]) for slot, heading in self.headings.items()})
+        headings = np.array([math.nan if slot in frozen else self.headings.get(slot, math.nan) for slot in self.slots])
         reference = self.reference_deg
         if around.gradienter is not None:
-            if any(len(levels) < MIN_LOOK_S // 2 for levels in self.levels):
+            if any(len(levels) < MIN_LOOK_S // 2 for levels in all_levels):
                 raise CalibrationRefusedError(f"no reading from gradienter in {len(self.slots)} s")
             if reference is None:
-                x, y = np.mean([one.reading for one in self.levels[0]], axis=0).tolist()
+                x, y = np.mean([one.reading for one in all_levels[0]], axis=0).tolist()
                 reference = (x, y)
         found = [
             self._imu(imu, seconds, levels, headings, reference)
-            for imu, seconds, levels in zip(self.imus, self.seconds, self.levels, strict=True)
+            for imu, seconds, levels in zip(self.imus, self.seconds, all_levels, strict=True)
         ]
         last = found[0][2] if found else None
         window = Window(
@@ -114,6 +123,25 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
             turn_rad_s=None if last is None else vector(_turn_rad_s(self.seconds[0], last)),
         )
         return DeckFound(window, tuple(triads for _, triads, _ in found))
+
+    def _frozen(self, name: str, readings: Mapping[int, Floats]) -> set[int]:
+        """Seconds in which a sensor said the same over and over while it was swayed.
+
+        Raises:
+            CalibrationRefusedError: so it does still.
+        """
+        if not self.imus:
+            return set()
+        rates = {one.slot: one.mean[:3] @ self.imus[0].rotation.T for one in self.seconds[0]}
+        found: set[int] = set()
+        for run in _runs(readings):
+            swayed = [rates[slot][:2] for slot in run if slot in rates]
+            if len(run) < FROZEN_S or not swayed or np.std(swayed, axis=0).max() < _SWAYS_RAD_S:
+                continue
+            if run[-1] >= self.slots[-1] - 1:
+                raise CalibrationRefusedError(f"{name} is stuck: the same for {len(run)} s while it sways")
+            found.update(run)
+        return found
 
     def _imu(
         self,
@@ -192,6 +220,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
             gyro_walk=math.hypot(model.walk, model.flicker / math.sqrt(len(seconds))),
             gyro_slope=math.sqrt(float(slope)),
             compass_lag_s=self.around.compass_lag_s,
+            accel_white=imu.profile.accel.white,
         )
 
     def _heading(self, found: Found, compass: CompassModel) -> HeadingWindow | None:
@@ -201,6 +230,18 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
         return HeadingWindow(
             heading_deg=math.atan2(pointing[1], pointing[0]) / DEG % 360.0, sigma_deg=found.heading_sigma_rad / DEG
         )
+
+
+def _runs(readings: Mapping[int, Floats]) -> list[list[int]]:
+    """Seconds one after another with the same reading."""
+    found: list[list[int]] = []
+    last: Floats | None = None
+    for slot, reading in readings.items():
+        if last is None or np.abs(reading - last).max() > _SAME:
+            found.append([])
+        found[-1].append(slot)
+        last = reading
+    return found
 
 
 def _felt(

@@ -28,7 +28,9 @@ EARTH_RATE_NORTH_RAD_S: Final = 5.2e-5
 """W cos L halfway between the equator and 65 degrees: what is left of it, once the latitude is known, is linear."""
 RAMP_T: Final = 5.0
 """A ramp is believed from so many of its sigmas on, as at rest (`noise.robust`)."""
-_ROUNDS: Final = 4
+_ROUNDS: Final = 7
+_NEAR: Final = 0.1
+"""A round that moves the biases by less, in sigmas, is the last."""
 _START, _GYRO, _ACCEL, _COMPASS, _RAMP = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11), slice(11, 14)
 _UNKNOWNS: Final = 14
 _NO_RAMP: Final = 11
@@ -50,6 +52,8 @@ class Believed:
     gyro_slope: float
     """One sigma of the slope that flicker and random walk of the bias make where there is no ramp; rad/s^2."""
     compass_lag_s: float
+    accel_white: float
+    """N of the accelerometers, m/s^2 * sqrt(s)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -144,9 +148,10 @@ def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: A
         system = _System.of(stretch, attitudes, forces, (headings_rad, compass_forward), believed.compass_lag_s)
         answer = system.solve(noise, believed, _NO_RAMP)
         noise = system.noise(answer)
-        answer = system.solve(noise, believed, _NO_RAMP)
         start = rotations(answer.values[None, _START])[0] @ start
         bias = bias + answer.values[_GYRO]
+        if (np.square(answer.values[_GYRO]) < _NEAR**2 * np.diag(answer.covariance)[_GYRO]).all():
+            break
     assert noise is not None
     ramping = system.solve(noise, believed, _UNKNOWNS)
     chance = np.sqrt(np.diag(ramping.covariance)[_RAMP] + believed.gyro_slope**2)
@@ -154,7 +159,7 @@ def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: A
         ramping = system.solve(system.noise(ramping), believed, _UNKNOWNS)
         bias = bias + ramping.values[_GYRO]
         answer, ramp = ramping, ramping.values[_RAMP]
-    up, up_sigma = _mean_up(-forces[:, 2])
+    up, up_sigma = _mean_up(-forces[:, 2], stretch.spans, believed.accel_white)
     # What the Earth was taken to do beforehand is put back: `by_earth` is of all of it.
     bias = bias + answer.by_earth[_GYRO] @ np.array([EARTH_RATE_NORTH_RAD_S, 0.0, 0.0])
     return Found(
@@ -269,9 +274,17 @@ class _System:
         return fit_waves([one - one.mean() for one in left[:2]]), fit_waves([heading - heading.mean()])
 
 
-def _mean_up(up: Floats) -> tuple[float, float]:
-    """The mean of a force that waves go through, and its sigma."""
-    waves = fit_waves([up - up.mean()])
-    white = whitened(np.column_stack([np.ones(len(up)), up]), waves)
-    information = float(white[:, 0] @ white[:, 0])
-    return float(white[:, 0] @ white[:, 1]) / information, 1.0 / math.sqrt(information)
+def _mean_up(up: Floats, spans: Floats, white: float) -> tuple[float, float]:
+    """The mean of a force that waves go through, and its sigma.
+
+    What goes up comes down: not the acceleration of the waves but their height is a stationary series, and the mean
+    force is the bend of a parabola through it. Taken by itself the acceleration would have a power at zero frequency
+    that no sea has.
+    """
+    step, ends = float(spans.mean()), np.cumsum(spans) - spans.sum()
+    height = np.cumsum(np.cumsum(up * spans)) * step
+    line = np.column_stack([np.ones(len(ends)), ends, ends * ends / 2.0])
+    left = height - line @ np.linalg.lstsq(line, height, rcond=None)[0]
+    rows = whitened(np.column_stack([line, height]), fit_waves([left]), Wander(rate=white**2 * step**3))
+    covariance = np.linalg.inv(rows[:, :3].T @ rows[:, :3])
+    return float(covariance[2] @ (rows[:, :3].T @ rows[:, 3])), math.sqrt(covariance[2, 2])

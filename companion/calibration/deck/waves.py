@@ -87,6 +87,7 @@ def whitened(columns: Floats, waves: Waves, wander: Wander = Wander()) -> Floats
     kick[angle, angle], kick[rate, rate] = wander.angle, wander.rate
     state = np.zeros((size, columns.shape[1]))
     found = np.full_like(columns, math.nan)
+    turned = np.ascontiguousarray(move.T)
     gaps = np.asarray(np.isnan(columns).any(axis=1)).tolist()
     # Backwards: what has wandered is nothing at the end.
     for row in range(len(columns) - 1, -1, -1):
@@ -95,11 +96,11 @@ def whitened(columns: Floats, waves: Waves, wander: Wander = Wander()) -> Floats
             variance = float(spread[0] + spread[angle])
             off = columns[row] - state[0] - state[angle]
             found[row] = off / math.sqrt(variance)
-            gain = spread / variance
-            state += np.outer(gain, off)
-            covariance -= np.outer(gain, spread)
+            gain = (spread / variance)[:, None]
+            state += gain * off
+            covariance -= gain * spread
         state = move @ state
-        covariance = move @ covariance @ move.T + kick
+        covariance = move @ covariance @ turned + kick
     return found
 
 

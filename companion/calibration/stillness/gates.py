@@ -72,6 +72,8 @@ HEADING_STEP_DEG: Final = 3.0
 
 MIN_IMU_SAMPLES: Final = 4
 MAX_IMU_GAP_S: Final = 0.5
+_NO_END: Final = (60.0 * DEG,) * 3 + (14.0,) * 3
+"""No part's range ends below: readings of integers that pile up there are those of a sway that turns back."""
 STUCK_SAMPLES: Final = 10
 """Fewer may well be equal by chance on a quiet sensor with coarse steps."""
 
@@ -140,6 +142,10 @@ def _beyond(values: list[float], reference: Sequence[Floats], chance: list[float
     return max(abs(value - other) - scatter * alone for value, other, alone in zip(values, others, chance, strict=True))
 
 
+def _is_within(batch: Batch) -> bool:
+    return bool((np.maximum(np.abs(batch.low), np.abs(batch.high)) < _NO_END).all())
+
+
 def _lower_quartile(freedom: int) -> float:
     """Lower quartile of a variance estimate over the variance (Wilson and Hilferty's chi-square)."""
     spread = 2.0 / (9.0 * freedom)
@@ -155,8 +161,10 @@ class ImuGate:
         profile: NoiseProfile,
         steps: tuple[float, float] = (0.0, 0.0),
         own: OwnNoise | None = None,
+        *,
+        sways: bool = False,
     ) -> None:
-        self._name = name
+        self._name, self._sways = name, sways
         self._own = own or OwnNoise((profile.gyro.white, profile.accel.white))
         self._white = np.repeat([profile.gyro.white, profile.accel.white], 3)
         self._steps = Steps([steps[0]] * 3 + [steps[1]] * 3)
@@ -194,7 +202,7 @@ class ImuGate:
             return _fault(f"imu {name} sends {batch.n} Hz, needs {MIN_IMU_SAMPLES}")
         if batch.largest_gap_s > MAX_IMU_GAP_S:
             return _fault(f"imu {name} was silent for {batch.largest_gap_s:.1f} s > {MAX_IMU_GAP_S}")
-        if batch.clipped:
+        if batch.clipped and not (self._sways and _is_within(batch)):
             return _fault(f"imu {name} hits the end of its range")
         distinct = batch.distinct.tolist()
         if batch.n >= STUCK_SAMPLES and 1 in distinct:
