@@ -1,4 +1,4 @@
-"""`python -m sim`: devices, autopilot, all, demo, ardupilot, px4, residuals, turntable, flights, turning, ..."""
+"""`python -m sim`: devices, autopilot, all, demo, ardupilot, px4, residuals, turntable, flights, ..."""
 
 from __future__ import annotations
 
@@ -27,10 +27,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         from sim.accuracy.cli import main as accuracy
 
         return accuracy(arguments[1:])
-    if arguments[:1] == ["turning"]:
-        from sim.experiments.turning import main as turning
-
-        return turning(arguments[1:])
     if arguments[:1] == ["rest"]:
         from sim.experiments.rest import main as rest
 

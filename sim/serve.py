@@ -86,7 +86,6 @@ def parser() -> argparse.ArgumentParser:
     for name, text in FIRMWARE_COMMANDS.items():
         commands.add_parser(name, help=text)
     commands.add_parser("turntable", help="the paper's five poses, with tables beside its own")
-    commands.add_parser("turning", help="a ground that turns slowly: what is written all the same")
     commands.add_parser("drive", help="the paper's drive of 180 s, many times")
     commands.add_parser("flights", help="banked circles and shuttling, beside the filters of others")
     accuracy.add_options(commands.add_parser("accuracy", help=accuracy.HELP))

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from sim.accuracy import deck_tables, paper, warmup_table
+from sim.accuracy import deck_tables, paper, turning, warmup_table
 from sim.accuracy.experiments import (
     FIELD_HEADING_DEG,
     FIELD_TILT_DEG,
@@ -51,7 +51,7 @@ def report(
 
     Args:
         runs: stands with white noise; a fifth of it of every part, a hundredth of it in every case of a warm-up, a
-            twentieth for every step of noise under integers.
+            twentieth for every step of noise under integers, a sixteenth of every rate of a ground that turns.
         seed: of everything.
         only: of `cli.SECTIONS`.
         jobs: processes.
@@ -86,6 +86,10 @@ def report(
         voyages, stands = max(runs // 10, 4), max(runs // 40, 4)
         progress(f"deck: {voyages} voyages, {stands} stands")
         found["deck"] = deck_tables.deck(voyages, stands, seed, jobs)
+    if "turning" in only:
+        each = max(runs // 16, 2)
+        progress(f"turning: {each} stands of each of {len(turning.RATES_DEG_S)} rates")
+        found["turning"] = turning.section(each, seed, jobs)
     if "paper" in only:
         found["paper"] = _paper(errata(seed, 400))
     return found

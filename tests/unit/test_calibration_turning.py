@@ -18,7 +18,7 @@ from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.calibration.solution.solve import solve
 from companion.calibration.turning.watch import Turn
 from companion.physics.units import DEG, DEG_H
-from sim.experiments import turning
+from sim.accuracy import turning
 from tests.support.extent import extent
 from tests.support.still_aircraft import Feeder, imu, settings
 
