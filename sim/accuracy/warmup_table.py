@@ -11,6 +11,7 @@ from sim.accuracy.warmup import CURVE_K, CURVES_S, LATE_S, NEXT_MINUTE_S, RAMPS,
 from sim.imu_model import DEG_H
 
 _GYRO: Final = slice(0, 3)
+_ACCEL: Final = slice(3, 6)
 _LEAST: Final = 90.0
 _ON: Final = {0.0: "just on", 600.0: "10 min on", 3600.0: "1 h on"}
 
@@ -21,6 +22,7 @@ def section(runs: list[WarmRun], each: int) -> Section:
     by_case = {(part, case): [next(flat) for _ in range(each)] for part in WARMING for case in cases()}
     lines = [
         f"gyros against the bias of the next {NEXT_MINUTE_S:.0f} s; 2 sigma of sigma_use cover, %; rms sigma, deg/h",
+        "(accelerometers: below, what must hold)",
         "",
         f"{'':27}{'no thermometer':>38}{'thermometer':>35}",
         f"{'':27}" + f"{'10 s 30 s 60 s':>17}{'10 s 30 s 60 s':>18}" * 2,
@@ -28,7 +30,7 @@ def section(runs: list[WarmRun], each: int) -> Section:
     figures: dict[str, Any] = {}
     claims = []
     for part in WARMING:
-        lowest: dict[str, list[Figure]] = {"ramps": [], "curves": []}
+        lowest: dict[str, list[Figure]] = {f"{what}{of}": [] for of in ("", ", accel") for what in ("ramps", "curves")}
         for row, (words, wanted) in enumerate(_rows()):
             line = f"{part if not row else '':10}{words:17}"
             for thermometer in (False, True):
@@ -36,15 +38,20 @@ def section(runs: list[WarmRun], each: int) -> Section:
                 if not mine:
                     continue
                 error, sigma = np.array([run.error for run in mine]), np.array([run.sigma for run in mine])
-                shares = [covered(error[:, at, _GYRO], sigma[:, at, _GYRO], 2.0).times(100.0) for at in range(3)]
+                shares, accel = (
+                    [covered(error[:, at, part_of], sigma[:, at, part_of], 2.0).times(100.0) for at in range(3)]
+                    for part_of in (_GYRO, _ACCEL)
+                )
                 sizes = [rms(sigma[:, at, _GYRO]).times(1.0 / DEG_H) for at in range(3)]
                 line += "   " + "".join(f"{share.value:5.0f}" for share in shares)
                 line += "   " + "".join(f"{size.value:5.0f}" for size in sizes)
                 figures.setdefault(part, {}).setdefault(words, {})[
                     "thermometer" if thermometer else "no thermometer"
-                ] = {"covered": shares, "sigma_deg_h": sizes}
+                ] = {"covered": shares, "sigma_deg_h": sizes, "accel_covered": accel}
                 if not wanted[0].is_steady:
-                    lowest["curves" if wanted[0].curve_s else "ramps"] += shares
+                    what = "curves" if wanted[0].curve_s else "ramps"
+                    lowest[what] += shares
+                    lowest[f"{what}, accel"] += accel
             lines.append(line)
         claims += [
             Claim(f"{part}, {what}: least that 2 sigma cover, next minute", "%", min(found), 100.0, _LEAST)

@@ -8,15 +8,19 @@ import msgspec
 import numpy as np
 import pytest
 
+from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.warming import Warming, likely_k_s, temperature_rate
 from companion.calibration.noise.allan import WARM_UP, WARM_UP_K, AllanModel, NoiseProfile
 from companion.calibration.seconds.batch import Batch, BatchSource
+from companion.config.sections import Imu
+from companion.configured.models import imu_input
 from companion.physics.units import DEG_H, MG
+from companion.protocols.registry import PROTOCOLS
 from sim.accuracy import warmup_table
 from sim.accuracy.experiments import SPANS_S
 from sim.accuracy.figures import covered
 from sim.accuracy.warmup import Case, cases, warm
-from tests.support.still_aircraft import imu
+from tests.support.still_aircraft import imu, imu_sample, noise, settings
 from tests.unit.test_calibration_windows import batches_of, window_of
 
 
@@ -103,6 +107,46 @@ def test_a_stream_begins_anew_after_a_pause_and_after_its_clock_went_back() -> N
         source.add(float(t_s), (0.0,))
     assert source.begun is not None
     assert 50 <= source.begun < 60
+
+
+@pytest.mark.parametrize(
+    ("says", "clock_s", "age_s"),
+    [
+        (True, 5000.0, 5020.0),
+        (True, 2.0, 22.0),
+        (True, None, 20.0),
+        (False, 5000.0, 20.0),  # the time of week of a GPS, say
+        (True, 1.8e9, 20.0),  # UTC
+    ],
+)
+def test_how_long_a_part_has_been_on_says_its_device_else_its_stream(
+    says: bool,
+    clock_s: float | None,
+    age_s: float,
+) -> None:
+    collector = RollingCollector(settings(), [imu("fc", clock_from_start=says)], gradienter=False, compass=False)
+    rows = noise(np.random.default_rng(1), 1000)
+    for k, row in enumerate(rows):
+        sample = imu_sample(100.0 + k / 50.0, row)
+        device_s = None if clock_s is None else clock_s + k / 50.0
+        collector.add_imu("fc", msgspec.structs.replace(sample, t_device_s=device_s))
+    collector.tick(120.0)
+    window = collector.window(120.0)
+    assert window.powered_s["fc"] == pytest.approx(age_s, abs=1.5)
+    told = says and clock_s is not None and clock_s < 1e9
+    assert collector.up_s("fc") == (pytest.approx(age_s, abs=1.5) if told else None)
+    # Restarted without a pause in the stream: young again.
+    for k, row in enumerate(rows):
+        collector.add_imu("fc", msgspec.structs.replace(imu_sample(120.0 + k / 50.0, row), t_device_s=k / 50.0))
+    collector.tick(140.0)
+    assert not told or collector.window(140.0).powered_s["fc"] == pytest.approx(20.0, abs=1.5)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS["imu"])
+def test_only_clocks_that_count_from_the_start_by_their_documents_tell_an_age(protocol: str) -> None:
+    imu = Imu(name="own", source="serial", port="/dev/x", protocol=protocol)  # type: ignore[arg-type]
+    assert imu_input(imu, None).clock_from_start == (protocol in {"vectornav", "xsens"})
+    assert imu_input(Imu(name="fc", source="autopilot"), None).clock_from_start
 
 
 @pytest.mark.parametrize(
