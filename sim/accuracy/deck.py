@@ -6,6 +6,7 @@ windows into `solve`. The bound is that of least squares with the sea's true spe
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ from companion.calibration.seconds.batch import summary, unrolled
 from companion.calibration.solution.site import local_earth
 from companion.calibration.solution.solve import solve
 from companion.errors import CalibrationRefusedError
-from sim.accuracy.stand import ACCEL_BIAS_M_S2, GYRO_BIAS_RAD_S, NEXT_S
+from sim.accuracy.stand import ACCEL_BIAS_M_S2, GRAVITY_ANOMALY_M_S2, GYRO_BIAS_RAD_S, NEXT_S, AnomalousSite
 from sim.aircraft import Pose, VirtualAircraft
 from sim.devices import Gradienter
 from sim.earth import STANDARD_GRAVITY_M_S2, Array
@@ -80,9 +81,10 @@ class DeckRun:
 def sail(voyage: Voyage, spans_s: Sequence[int], seed: int) -> DeckRun:
     """One aircraft with one IMU, calibrated after so many seconds each (ascending)."""
     random = np.random.default_rng([seed, 51])
-    site = site_at(voyage.latitude_deg, 10.0, 100.0)
     pitch, roll = random.normal(size=2) * 2.0
     pose = Pose(float(pitch), float(roll), float(random.uniform(0.0, 360.0)))
+    anomaly = float(np.random.default_rng([seed, 52]).normal()) * GRAVITY_ANOMALY_M_S2
+    site = AnomalousSite(**dataclasses.asdict(site_at(voyage.latitude_deg, 10.0, 100.0)), anomaly_m_s2=anomaly)
     aircraft = VirtualAircraft(pose, site, motions=voyage.motions(seed))
     axes = random.normal(size=6) * voyage.gyro_axes_sigma
     imu = ImuModel(
@@ -179,7 +181,8 @@ def bound(voyage: Voyage, span_s: int) -> Array:
     """(6,) the least rms error against the next minutes: what the noise would allow somebody who knew its spectrum.
 
     Seconds of tilt with the sea's covariance, headings with the compass' noise, constant part and iron, the gyros'
-    white noise; and what no measurement here tells: V(T, H), scale and cross-axis errors, the gradienter's zero.
+    white noise; and what no measurement here tells: V(T, H), scale and cross-axis errors, the gradienter's zero,
+    the anomaly of gravity.
     """
     times = np.arange(span_s) + 0.5
     apart = times[:, None] - times
@@ -202,7 +205,9 @@ def bound(voyage: Voyage, span_s: int) -> Array:
     gyro = gyro + (voyage.gyro_axes_sigma * math.radians(voyage.turn_deg_s)) ** 2
     accel = floor_variance(spec.accel.flicker, spec.accel.walk, span_s, NEXT_S) + spec.accel.white**2 / span_s
     zero = (STANDARD_GRAVITY_M_S2 * math.radians(TILT_SIGMA_DEG)) ** 2
-    return np.sqrt([across + gyro, across + gyro, upright + gyro, zero + accel, zero + accel, accel])
+    return np.sqrt(
+        [across + gyro, across + gyro, upright + gyro, zero + accel, zero + accel, accel + GRAVITY_ANOMALY_M_S2**2]
+    )
 
 
 def _slope_variance(regressors: Array, covariance: Array) -> float:

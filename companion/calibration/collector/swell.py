@@ -13,9 +13,16 @@ from companion.physics.units import DEG
 WATCHED_S: Final = 40
 HINT: Final = '; on a boat? set vehicle.platform = "deck"'
 _LEAST_RAD_S: Final = 0.1 * DEG
-_PERIODS_S: Final = range(3, 21)
-_LIKENESS: Final = 0.4
-"""Correlation of the rates with themselves a period later; half a period later with the other sign, as much."""
+_SLOWEST_HZ: Final = 0.05
+_FASTEST_HZ: Final = 1.0 / 3.0
+_NARROW: Final = 0.25
+"""Half the width of a wave's band, over its frequency; never below `_RESOLVED_HZ`."""
+_RESOLVED_HZ: Final = 0.03
+_FINER: Final = 4
+"""Points of the spectrum to every one that is independent."""
+_REGULAR: Final = 0.75
+"""Share of the rates' power, of all axes, in one band. Waves of 3 to 14 s have it in nine of ten looks; hands have
+many frequencies, on each axis others (BROAD's slow rotation: at most 0.72)."""
 
 
 class Swell:
@@ -45,15 +52,12 @@ class Swell:
     def _is_regular(self) -> bool:
         rates = np.array([rate for _, rate in self._rates])
         rates = rates - rates.mean(axis=0)
-        # The axis that moves most.
-        rate = rates[:, int(np.square(rates).sum(axis=0).argmax())]
-        power = float(rate @ rate) / len(rate)
-        if power < _LEAST_RAD_S**2:
+        if float(np.square(rates).sum()) / len(rates) < _LEAST_RAD_S**2:
             return False
-        like = [float(rate[lag:] @ rate[:-lag]) / (len(rate) - lag) / power for lag in range(1, _PERIODS_S.stop)]
-        for period in _PERIODS_S:
-            # Sampled once a second, half of a short period lies between two lags.
-            half = min(like[(period // 2) - 1], like[(period + 1) // 2 - 1])
-            if like[period - 1] > _LIKENESS and half < -_LIKENESS:
-                return True
-        return False
+        tapered, size = rates * np.hanning(len(rates))[:, None], _FINER * len(rates)
+        power = np.square(np.abs(np.fft.rfft(tapered, size, axis=0))).sum(axis=1)
+        frequencies = np.fft.rfftfreq(size)
+        waves = np.where((frequencies >= _SLOWEST_HZ) & (frequencies <= _FASTEST_HZ), power, 0.0)
+        middle = frequencies[waves.argmax()]
+        band = np.abs(frequencies - middle) <= max(_NARROW * middle, _RESOLVED_HZ)
+        return bool(power[band].sum() > _REGULAR * power.sum())
