@@ -64,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
     residuals.add_argument(
         "--config", type=Path, action="append", default=[], metavar="FILE",
         help="further lines of the companion's configuration, such as [calibration], instead of a minute of standing"
-        " still; may be repeated",
+        " still, or a deck where it sways; may be repeated",
     )  # fmt: skip
     residuals.add_argument(
         "--listen", type=float, default=0.0, metavar="SECONDS",
@@ -146,9 +146,10 @@ def main(argv: Sequence[str]) -> int:
     try:
         vehicle = vehicle_of(arguments, scenario, folder / "firmware")
         if arguments.command == "residuals":
-            from sim.sitl.residuals import STILL, report
+            from sim.sitl.residuals import DECK, STILL, report
 
-            more = "".join(path.read_text(encoding="utf-8") for path in arguments.config) or STILL
+            more = "".join(path.read_text(encoding="utf-8") for path in arguments.config)
+            more = more or (DECK if arguments.motion in ("sea", "engine") else STILL)
             return asyncio.run(
                 report(
                     vehicle, folder, arguments.observe, more, listen_s=arguments.listen,

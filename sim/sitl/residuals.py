@@ -38,6 +38,15 @@ may be good by chance."""
 STILL = "[calibration]\nmin_still_s = 60\nmax_s = 60\n"
 """A whole minute, as the figures of autopilots 9.3. By itself the companion stops where the part's flicker, which its
 profile knows, makes more averaging worthless; a part of white noise only has none."""
+DECK = """
+[vehicle]
+platform = "deck"
+[calibration]
+at_arm = "off"
+target_gyro_sigma_deg_h = 500
+target_accel_sigma_mg = 5
+"""
+"""On a sea: when it is asked, not by itself, and as soon as it has heard a minute; for longer there is `--listen`."""
 SLOW = 0.95
 UNITS = np.array([DEG_H] * 3 + [MG] * 3)
 

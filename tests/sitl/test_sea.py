@@ -12,11 +12,9 @@ from sim.imu_model import DEG_H, MG
 from sim.sea import motions_of
 from sim.sitl.daemon import companion_daemon, instances_of
 from sim.sitl.observe import residual
-from sim.sitl.residuals import Row, ground_station
+from sim.sitl.residuals import DECK, Row, ground_station
 from tests.sitl.craft import BINARIES, binary_vehicle, missing
 
-DECK = '[vehicle]\nplatform = "deck"\n[calibration]\ntarget_gyro_sigma_deg_h = 500\ntarget_accel_sigma_mg = 5\n'
-"""As soon as there is anything: a minute of waves."""
 WAITS_S = 50.0
 """A wave is a wave after forty seconds."""
 CALIBRATED_WITHIN_S = 300.0
