@@ -210,22 +210,16 @@ class ImuLevel:
             level.temperature_degc += share * (second.temperature_degc - level.temperature_degc)
         return level
 
-    @property
-    def down(self) -> Array | None:
-        """The vertical by its accelerometers, (3,) vehicle FRD; good to some degrees, and enough here."""
-        if not self._seconds:
-            return None
-        force = sum((second.rows[3:] for second in self._seconds), np.zeros(3))
-        return np.asarray(-force / math.sqrt(force @ force))
-
     def look(self) -> Look | None:
         """Against its level, if there is one, and against gravity, over the seconds of this stretch."""
-        down = self.down
-        if down is None or len(self._seconds) < FEWEST:
+        if len(self._seconds) < FEWEST:
             return None
         kind = self._kind
         slots = np.array([second.slot for second in self._seconds], dtype=np.int64)
         rows = np.array([second.rows for second in self._seconds])
+        # The vertical by its accelerometers, (3,) vehicle FRD; good to some degrees, and enough here.
+        force = rows[:, 3:].mean(axis=0)
+        down = np.asarray(-force / math.sqrt(force @ force))
         steps = (kind.gyro_step_rad_s, kind.accel_step_m_s2)
         hidden = [hidden_by_steps(steps[k // 3], float(self._spread[k])) for k in range(6)]
         models = (kind.gyro, kind.accel)

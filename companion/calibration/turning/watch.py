@@ -51,6 +51,8 @@ CLEARED_S: Final = 10
 """So many seconds say whether the level is the one before."""
 HINT_SIGMAS: Final = 2.0
 """And one that may be chance that of its own window."""
+GROWN: Final = 60
+"""A stretch of more than two minutes is looked at again once it has grown by this part of it: a log may have an hour."""
 CHANGED_RAD_S: Final = 0.5 * DEG
 CHANGED_HELD_S: Final = 30
 """A gyro that is so far off its level by itself, by a shock, is believed after so long."""
@@ -169,6 +171,8 @@ class TurnWatch:
         """Seconds of the compass, and whether each was one of a still stretch."""
         self._start: int | None = None
         """First second of the stretch under way."""
+        self._looked = 0
+        """Last second in which it was looked at."""
         self._moved: int | None = None
         """Last second in which something else moved."""
         self._is_suspect = False
@@ -221,6 +225,10 @@ class TurnWatch:
                 if name in imus:
                     level.add(slot, imus[name])
                 level.keep(self._span, trusted=self._is_steady, turn_variance=self._unknown)
+        seconds = 0 if self._start is None else min(slot - self._start, self._span)
+        if 0 < slot - self._looked < seconds // GROWN:
+            return True
+        self._looked = slot
         return self._judge(slot)
 
     @property
