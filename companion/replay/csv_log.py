@@ -65,15 +65,17 @@ class _Lines:
         self._path = path
 
     def __iter__(self) -> Iterator[str]:
-        some = False
-        for line in iter(lambda: self._file.readline(_LONGEST), ""):
+        some, readline = False, self._file.readline
+        while line := readline(_LONGEST):
             self.number += 1
             if len(line) == _LONGEST:
                 raise StorageError(f"{self._path}, line {self.number}: found no line end within {_LONGEST} characters")
             if some and not line.endswith(("\n", "\r")):
                 return  # in the middle of a number, perhaps, which then still looks like one
             text = line.strip(" \r\n")
-            if text.strip() and not text.startswith(_REMARKS) and not text.lower().startswith("sep="):
+            if text[:1].isdigit() or (
+                text.strip() and not text.startswith(_REMARKS) and not text.lower().startswith("sep=")
+            ):
                 some = True
                 yield text
 

@@ -52,7 +52,7 @@ CLEARED_S: Final = 10
 HINT_SIGMAS: Final = 2.0
 """And one that may be chance that of its own window."""
 GROWN: Final = 60
-"""A stretch of more than two minutes is looked at again once it has grown by this part of it: a log may have an hour."""
+"""A stretch of two minutes and more is looked at again once it has grown by this part: a log may have an hour."""
 CHANGED_RAD_S: Final = 0.5 * DEG
 CHANGED_HELD_S: Final = 30
 """A gyro that is so far off its level by itself, by a shock, is believed after so long."""
