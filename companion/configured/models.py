@@ -11,7 +11,7 @@ from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.deck.deck import Deck
+from companion.calibration.deck.deck import KEPT_S, Deck
 from companion.calibration.deck.stream import Surroundings
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
@@ -215,6 +215,11 @@ def deck(config: Config) -> Deck | None:
             compass_lag_s=lag("compass", config.compass).lag_s,
         )
     )
+
+
+def longest_window_s(config: Config) -> float:
+    """The longest time that a calibration is made of."""
+    return config.calibration.max_s if config.vehicle.platform == "ground" else KEPT_S
 
 
 def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from companion.calibration.request import What
+from companion.calibration.solution.record import Record
 from companion.component.service import Refusal
 from companion.daemon.calibrating.align_steps import Plan
 from sim.imu_model import DEG_H, MG
@@ -15,6 +17,7 @@ from sim.motions import SlowTurn
 from sim.sea import DAY_S, Sea, Wave
 from tests.e2e.test_arm_gate import AUTHORISED_BY_US, texts, try_to_arm
 from tests.e2e.test_calibration import started
+from tests.e2e.test_record_replay import replayed, ring, same
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -113,6 +116,31 @@ def test_three_imus_on_a_boat_are_each_calibrated(tmp_path: Path) -> None:
                 assert np.abs(np.subtract(imu.accel_bias_m_s2, truth.accel_m_s2)).max() < 1.0 * MG
 
     run_virtual(main())
+
+
+def test_a_replay_on_a_deck_gives_the_same_records(tmp_path: Path) -> None:
+    """Also from a file of the ring that begins with what the deck has known for minutes."""
+
+    async def main() -> list[Record]:
+        async with boat(tmp_path, more=f"{DECK}[push]\nparameters = false\n", recordings_mb=64).running() as rig:
+            await rig.ready()
+            rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=20 * DEG_H, target_accel_sigma_m_s2=0.5 * MG)
+            for _ in range(2):
+                job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", 300.0))
+                result = await job.finished
+                assert result.outcome == "done", result
+                await asyncio.sleep(40.0)
+        return rig.service.calibrating.store.history()[::-1]
+
+    records = run_virtual(main())
+    assert len(records) == 2
+    spans_s = []
+    for path, record in zip(ring(tmp_path), records, strict=False):
+        result = replayed(path)
+        same(result, [record])
+        spans_s.append(result.calibrations[0].record.imus[0].samples / 50.0)
+    # More than the ground's longest stretch and what its gates learn from: 30 and 65 s.
+    assert spans_s[1] > 95.0
 
 
 def test_where_the_ground_is_meant_the_words_name_the_deck(tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ from companion.physics.units import DEG
 EVERY_S: Final = {180: 10, 600: 30, MAX_S: 60}
 """By how many seconds there are at most, how often a window ends: an estimate of more costs more, and tells less that
 is new."""
-_KEPT_S: Final = MAX_S + 2 * max(EVERY_S.values())
+KEPT_S: Final = MAX_S + 2 * max(EVERY_S.values())
+"""What a window that is the latest until the next one may begin with."""
 
 
 class Deck:
@@ -29,7 +30,7 @@ class Deck:
 
     def set_imu(self, imu: ImuInput) -> None:
         """Add an IMU, or begin anew with one whose stream is another now."""
-        self._streams[imu.name] = Stream(imu, self._around, _KEPT_S)
+        self._streams[imu.name] = Stream(imu, self._around, KEPT_S)
 
     def forget(self, imu: str | None) -> None:
         """Drop what was measured, of one IMU or of all."""
@@ -57,7 +58,7 @@ class Deck:
     def take_heading(self, batch: Batch, times: Floats, rows: Floats) -> None:
         """The headings (n, 1) of one second, degrees."""
         self._headings[batch.slot] = float(batch.mean[0]) * DEG
-        while len(self._headings) > _KEPT_S:
+        while len(self._headings) > KEPT_S:
             del self._headings[next(iter(self._headings))]
 
     def slots(self, since_s: float | None = None) -> range:
