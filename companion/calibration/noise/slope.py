@@ -25,8 +25,8 @@ from companion.physics.frames import Floats
 FEWEST: Final = 3
 """Seconds: two always lie on a line."""
 _SPANS: Final = 5
-_WALKS: Final = 1.5
-"""So many times the Allan variance that white noise has: then the readings walk, and do not only flicker."""
+_WALKS: Final = 2.5
+"""So many times the Allan variance that white noise has, which has that once in forty: the readings walk."""
 _LINE_TAKES: Final = 1.6
 """So many times the Allan variance at T/5 had a random walk before the line was taken off."""
 
