@@ -140,6 +140,8 @@ class ImuLevel:
         self._kind = kind
         self._memory = _REMEMBERED * span
         self._turned = np.asarray(kind.rotation, dtype=np.float64)
+        self._least = np.repeat([[m.white, m.flicker, m.walk] for m in (kind.gyro, kind.accel)], 3, axis=0).T
+        """N, B and K of its six channels."""
         self._white = 0.0
         self._spread = np.zeros(6)
         """Variance of one reading."""
@@ -222,14 +224,13 @@ class ImuLevel:
         down = np.asarray(-force / math.sqrt(force @ force))
         steps = (kind.gyro_step_rad_s, kind.accel_step_m_s2)
         hidden = [hidden_by_steps(steps[k // 3], float(self._spread[k])) for k in range(6)]
-        models = (kind.gyro, kind.accel)
         own = len(slots) >= TELLS_NOISE_S
         slope = fit_slope(
             slots,
             rows,
-            white=np.repeat([kind.gyro.white if own else max(self._white, kind.gyro.white), kind.accel.white], 3),
-            flicker=np.repeat([model.flicker for model in models], 3),
-            walk=np.repeat([model.walk for model in models], 3),
+            white=self._least[0] if own else np.maximum(self._least[0], [self._white] * 3 + [0.0] * 3),
+            flicker=self._least[1],
+            walk=self._least[2],
             hidden=np.array(hidden),
         )
         change = self._change(slots, rows[:, :3], slope, down)
@@ -246,7 +247,7 @@ class ImuLevel:
                 kind.gyro,
                 len(slots),
             )
-        return Look(change=change, tilting=_tilting(rows[:, 3:].mean(axis=0), slope), step=step, white=white)
+        return Look(change=change, tilting=_tilting(force, slope), step=step, white=white)
 
     def _change(self, slots: NDArray[np.int64], rates: Floats, slope: Slope, down: Array) -> Change | None:
         level, white = self._level, slope.white[:3]
