@@ -1,8 +1,8 @@
 """Does sigma keep its word on this sensor? Every window of a long still log is calibrated by itself, as after a start.
 
 What it finds is held against what the windows after it find: the biases' difference has to come out within 2 sigma in
-95 of 100 cases. How the sensor lay is the same in all of them, so that it cancels: the pose counts as known, and sigma
-is the sensor's alone.
+95 of 100 cases. How the sensor lay is the same in both, so that it cancels: the pose counts as known, and sigma is the
+sensor's alone. Where it was moved in between, windows are not compared.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ PAUSE_S: Final = 3.0
 HORIZON_S: Final = 180.0
 """What sigma_use speaks of."""
 _AXES: Final = ("gyro x", "gyro y", "gyro z", "accel x", "accel y", "accel z")
+_SAME_RAD: Final = 1.0 * DEG
+"""More than any bias drifts by: gravity from elsewhere is another pose."""
 _EXACT_DEG: Final = 1e-4
 _LATITUDE_DEG: Final = 45.0
 """Any: the Earth's rate cancels, too."""
@@ -82,7 +84,7 @@ class _Found(msgspec.Struct, frozen=True):
 
 def windows(log: StillLog, given: Given, length_s: float) -> Windows:
     """Calibrate in every window of so many seconds."""
-    posed = _posed(log, given)
+    posed, force = given, np.zeros(3)
     found: list[_Found | None] = []
     whys: list[str] = []
     begin_s = float(log.t_s[0])
@@ -100,6 +102,10 @@ def windows(log: StillLog, given: Given, length_s: float) -> Windows:
             log, t_s=log.t_s[start:end], readings=log.readings[start:end],
             temperature_degc=log.temperature_degc[start:end], poses=None,
         )  # fmt: skip
+        here = part.readings[:, 3:].mean(axis=0)
+        if not here @ force >= math.cos(_SAME_RAD) * np.linalg.norm(here) * np.linalg.norm(force) > 0.0:
+            posed, force = _posed(here, given), here
+            found.append(None)
         # What was switched on before the window says how far a warm-up may still go.
         at = int(np.searchsorted(starts_s, log.t_s[start], side="right")) - 1
         powered_s = float(log.t_s[start] - starts_s[at]) + (posed.powered_s if at == 0 else 0.0)
@@ -119,9 +125,9 @@ def windows(log: StillLog, given: Given, length_s: float) -> Windows:
     )
 
 
-def _posed(log: StillLog, given: Given) -> Given:
-    """With a pose and a place for whatever was not said, all of it without doubt."""
-    mean = rotation_matrix(given.mounting) @ log.readings[:, 3:].mean(axis=0)
+def _posed(force: Floats, given: Given) -> Given:
+    """With a pose by that specific force (3,), and a place, for whatever was not said, all of it without doubt."""
+    mean = rotation_matrix(given.mounting) @ force
     roll_rad, pitch_rad = roll_pitch_from_up(mean / np.linalg.norm(mean))
     return msgspec.structs.replace(
         given,

@@ -107,6 +107,19 @@ def test_how_it_lay_and_was_mounted_does_not_matter(
         assert other["sigma_use"] == pytest.approx(one["sigma_use"], rel=1e-3)
 
 
+def test_windows_in_another_pose_are_not_held_against_each_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], hour: tuple[Floats, Floats]
+) -> None:
+    """Turned over after seven minutes: calibrated in both poses, compared within each."""
+    t_s, readings = hour[0][:9000], hour[1][:9000]
+    turned = np.where(t_s[:, None] < 420.0, readings, readings * [1, -1, -1, 1, -1, -1])
+    _, answer = run(capsys, write_csv(tmp_path / "a.csv", t_s, turned), "--profile", "adis16405")
+    assert (answer["windows"]["count"], answer["windows"]["done"]) == (14, 14)
+    for each in by_axis(answer, 60.0).values():
+        assert each["pairs"] == 6 + 6
+        assert each["ratio"] < 1.5
+
+
 def test_what_was_switched_on_long_before_warms_up_no_more(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], hour: tuple[Floats, Floats]
 ) -> None:

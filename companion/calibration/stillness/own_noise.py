@@ -115,6 +115,7 @@ class OwnNoise:
             ],
             3,
         )
+        self._at_rest = at_rest
         self._too_much = [False, False]
         self._calm = 0
         """Seconds in a row that any common part's noise may look like."""
@@ -129,7 +130,7 @@ class OwnNoise:
 
     def hint(self, triad: int) -> str:
         """What to add to the words that gyro (0) or accelerometer (1) moves: when it may be noise; else nothing."""
-        if self.known[triad] is not None:
+        if self._at_rest or self.known[triad] is not None:
             return ""
         if self._too_much[triad]:
             return " (steady as noise: name its part, or companion profile)"
