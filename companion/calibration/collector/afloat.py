@@ -87,7 +87,7 @@ class Afloat:
         slots = self._slots(since_s)
         if slots is None:
             raise CalibrationRefusedError(
-                f"measured {self.seconds} s, needs {MIN_S if since_s is None else MIN_LOOK_S} s"
+                f"measured {self.seconds} s of at least {MIN_S if since_s is None else MIN_LOOK_S} s"
             )
         kept = self._kept.get(since_s)
         known = kept[1] if kept is not None and kept[0] == slots else None
@@ -108,7 +108,7 @@ class Afloat:
         found = None if kept is None else kept[1]
         if found is None:
             share = min(self.seconds / MIN_S, 1.0) / 4.0
-            return Progress(enough=False, share=share, words=f"measured {self.seconds} s, needs {MIN_S} s")
+            return Progress(enough=False, share=share, words=f"measured {self.seconds} s of at least {MIN_S} s")
         if isinstance(found, CalibrationRefusedError):
             return Progress(enough=False, share=0.0, words=str(found))
         farthest, words = 1.0, "sigma is good enough"
