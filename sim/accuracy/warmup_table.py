@@ -54,7 +54,13 @@ def section(runs: list[WarmRun], each: int) -> Section:
                     lowest[f"{what}, accel"] += accel
             lines.append(line)
         claims += [
-            Claim(f"{part}, {what}: least that 2 sigma cover, next minute", "%", min(found), 100.0, _LEAST)
+            Claim(
+                f"{part}, {what}: least that 2 sigma cover{'' if 'accel' in what else ', next minute'}",
+                "%",
+                min(found),
+                100.0,
+                _LEAST,
+            )
             for what, found in lowest.items()
         ]
     lines += [
