@@ -169,6 +169,7 @@ def _log(path: Path, imu: str, t_s: Floats, readings: Floats, degc: Floats, note
         temperature_degc=degc[ahead],
         notes=(note,),
         left_out={why: count for why, count in left_out.items() if count},
+        clock_from_start=True,
     )
 
 

@@ -256,9 +256,12 @@ class _Pass:
     def _aged(self, measurement: Measurement) -> Measurement:
         """With what is known of the time before the log, where nothing was silent since."""
         begun_s = measurement.begun_s.get(self._log.imu, math.inf)
-        if not self._given.powered_s or begun_s > math.ceil(_FIRST_S):
+        powered_s = self._given.powered_s
+        if self._log.clock_from_start:
+            powered_s = max(powered_s, float(self._log.t_s[0]))
+        if not powered_s or begun_s > math.ceil(_FIRST_S):
             return measurement
-        return msgspec.structs.replace(measurement, begun_s={self._log.imu: begun_s - self._given.powered_s})
+        return msgspec.structs.replace(measurement, begun_s={self._log.imu: begun_s - powered_s})
 
     def _solved(self, draft: Draft, window: Window, seconds: float) -> Record:
         given, streams = self._given, self._streams

@@ -58,6 +58,8 @@ class StillLog(msgspec.Struct, frozen=True, kw_only=True):
     left_out: dict[str, int] = {}
     """Lines that do not count, by reason."""
     poses: Poses | None = None
+    clock_from_start: bool = False
+    """Whether its times count from when the autopilot was switched on."""
 
     @property
     def began_at(self) -> str | None:

@@ -6,10 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from companion.cli import main as companion
+from companion.replay.estimate import Given, estimate
+from companion.replay.log import StillLog
 from tests.support.made_noise import DEG_H, MG, Floats, adis16405, write_csv
 
 SECONDS, RATE_HZ = 3600, 10
@@ -143,3 +146,24 @@ def test_a_log_that_is_too_short_says_so(
     code, answer = run(capsys, path)
     assert (code, answer["state"], answer["reason"]) == (1, "failed", "no two windows in a row that can be calibrated")
     assert answer["windows"]["axes"] == []
+
+
+def test_an_autopilots_log_says_how_long_its_imu_has_been_on() -> None:
+    t_s, readings = adis16405(30, RATE_HZ, seed=3)
+    young = StillLog(
+        imu="fc", files=("a.bin",), began_unix_s=None, t_s=t_s, readings=readings,
+        temperature_degc=np.full(len(t_s), np.nan), clock_from_start=True,
+    )  # fmt: skip
+
+    def warm_up(log: StillLog, powered_s: float = 0.0) -> float:
+        sigma = estimate(log, Given(heading_deg=0.0, powered_s=powered_s)).record.imus[0].gyro_sigma_warm_up_rad_s
+        assert sigma is not None
+        return max(sigma) / DEG_H
+
+    old = msgspec.structs.replace(young, t_s=t_s + 3600.0)
+    assert warm_up(young) > 50.0
+    assert warm_up(old) < 10.0
+    # The same told by hand, of a log whose clock says nothing.
+    plain = msgspec.structs.replace(old, clock_from_start=False)
+    assert warm_up(plain) == pytest.approx(warm_up(young), rel=0.05)
+    assert warm_up(plain, 3600.0) == pytest.approx(warm_up(old), rel=0.05)
