@@ -170,6 +170,35 @@ def test_a_quiet_sensor_gains_nothing_for_random_rocking() -> None:
         assert own.known[0] is None
 
 
+def gusts(t_s: Floats, seed: int, low_hz: float, high_hz: float, rms_deg_s: float, axes: int) -> Floats:
+    """Swaying in the wind at all frequencies between two: rates about so many axes, and gravity with them."""
+    rng = np.random.default_rng(seed)
+    many, step_s = 2 * len(t_s), 0.01
+    frequency = np.fft.rfftfreq(many, step_s)
+    with np.errstate(divide="ignore"):
+        gain = 1.0 / np.sqrt((1.0 + (low_hz / frequency) ** 4) * (1.0 + (frequency / high_hz) ** 4))
+    motion = np.zeros((len(t_s), 6))
+    for axis in range(axes):
+        rate = np.fft.irfft(np.fft.rfft(rng.normal(size=many)) * gain, many)[: len(t_s)]
+        motion[:, axis] = rms_deg_s * DEG * rate / rate.std()
+    angle = np.cumsum(motion[:, :2], axis=0) * step_s
+    motion[:, 3:5] = 9.8 * np.sin(angle - angle.mean(axis=0))[:, ::-1] * [1.0, -1.0]
+    return motion
+
+
+@pytest.mark.parametrize("rms_deg_s", [0.05, 0.1, 0.2])
+@pytest.mark.parametrize(("low_hz", "high_hz"), [(0.02, 0.5), (0.05, 1.0), (0.1, 2.0), (0.05, 3.0)])
+def test_gusts_about_one_axis_are_never_learned(low_hz: float, high_hz: float, rms_deg_s: float) -> None:
+    """As flat and as steady as noise; but noise has no favourite axis."""
+    t_s, readings = filtered(150, 100, ICM42688P, 1e6, 1, 22)
+    readings += gusts(t_s, 23, low_hz, high_hz, rms_deg_s, 1)
+    own = OwnNoise()
+    for batch in seconds_of(t_s, readings):
+        own.add(batch)
+        known = own.known[0]
+        assert known is None or known.rms < 0.1 * rms_deg_s * DEG
+
+
 def test_more_than_any_part_has_is_never_learned_but_by_whoever_says_that_it_is_at_rest() -> None:
     noisy = (1.6 * 0.07 * DEG, 1.6 * MG)
     t_s, readings = filtered(120, 100, noisy, 10.0, 1, 9)
