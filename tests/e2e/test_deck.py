@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from companion.calibration.deck.estimate import DeckWork
 from companion.calibration.request import What
 from companion.calibration.solution.record import Record
 from companion.component.service import Refusal
@@ -82,6 +83,27 @@ def test_px4_on_a_boat_is_calibrated_by_itself_and_then_arms(tmp_path: Path) -> 
             assert np.abs(left.accel_m_s2).max() < 1.0 * MG
             assert await try_to_arm(rig) == 0
             assert "Armed: calibrated" in texts(rig)
+
+    run_virtual(main())
+
+
+def test_the_gate_answers_while_a_small_board_works_for_seconds(tmp_path: Path) -> None:
+    async def slow(function: Any, *arguments: Any) -> Any:
+        if isinstance(getattr(function, "__self__", None), DeckWork):
+            await asyncio.sleep(4.0)
+        return function(*arguments)
+
+    async def main() -> None:
+        rig = boat(tmp_path, at_arm="gate")
+        rig.offload = slow
+        async with rig.running():
+            await rig.ready()
+            said = set()
+            for _ in range(450):
+                await asyncio.sleep(0.2)
+                said.add(rig.service.arming.readiness.answer().words)
+            assert not any("busy" in words for words in said), said
+            assert any(words.startswith("wait: sigma") for words in said), said
 
     run_virtual(main())
 

@@ -161,13 +161,23 @@ class Readiness:
                 self.update()
                 await asyncio.sleep(0)  # a question that has come meanwhile is answered in between
                 # What a write under way makes of the output says nothing about what will be in force after it.
-                if not self._writing and await self.in_force.measure(loop.time()):
+                if not self._writing and await self._measured(loop.time()):
                     self.update()
                 self.turns += 1
             except Exception:
                 # Without a renewed answer the gate closes by itself.
                 logger.exception("looking whether it may arm failed")
             await asyncio.sleep(POLL_S)
+
+    async def _measured(self, now_s: float) -> bool:
+        """As `InForce.measure`, with the answer kept fresh while it takes its time: a deck may take seconds."""
+        measuring = asyncio.ensure_future(self.in_force.measure(now_s))
+        try:
+            while not (await asyncio.wait((measuring,), timeout=POLL_S))[0]:
+                self.update()
+        finally:
+            measuring.cancel()
+        return measuring.result()
 
     def update(self) -> None:
         """Work out the answer anew."""
