@@ -51,7 +51,7 @@ def report(
 
     Args:
         runs: stands with white noise; a fifth of it of every part, a hundredth of it in every case of a warm-up, a
-            twentieth for every step of noise under integers, a sixteenth of every rate of a ground that turns.
+            twentieth for every step of noise under integers, a thirty-second of every rate of a ground that turns.
         seed: of everything.
         only: of `cli.SECTIONS`.
         jobs: processes.
@@ -87,7 +87,7 @@ def report(
         progress(f"deck: {voyages} voyages, {stands} stands")
         found["deck"] = deck_tables.deck(voyages, stands, seed, jobs)
     if "turning" in only:
-        each = max(runs // 16, 2)
+        each = max(runs // 32, 2)
         progress(f"turning: {each} stands of each of {len(turning.RATES_DEG_S)} rates")
         found["turning"] = turning.section(each, seed, jobs)
     if "paper" in only:
