@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,9 @@ def test_one_just_switched_on_says_why_its_sigma_is_wide_and_takes_no_longer(tmp
     assert "deg/h warming" in reason
     (words,) = [words for words in young.warnings if "warming" in words]
     assert words.startswith("gyro fc: on for ")
-    assert "; after 2 min about " in words
+    later = re.search(r"; after (\d+) min about (\d+) deg/h$", words)
+    assert later is not None
+    assert float(later[2]) * DEG_H < 0.7 * largest(young.gyro_sigma_use_rad_s)
     assert took_s < old_s + 3.0
     # Whole: the part, and the rest that is as ever.
     rest = young.settled_sigma("gyro")

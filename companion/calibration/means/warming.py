@@ -28,6 +28,8 @@ NEXT_S: Final = 60.0
 """So far ahead an unseen slope is believed to go on."""
 _LATER_S: Final = (120.0, 600.0, 3600.0)
 """Ages at which to say what sigma will be."""
+_WORTH_WAITING: Final = 2.0 / 3.0
+"""Of the present sigma: what is no better than that is no reason to wait."""
 _FEWEST: Final = 3
 _NOTHING: Final = 1.0
 """Variance of a slope of which the window tells nothing, (rad/s^2)^2 or (m/s^3)^2: beyond every warm-up."""
@@ -82,11 +84,17 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
         if self.k_s is not None and abs(self.k_s) > 2.0 * math.sqrt(self.k_s_variance):
             return f"gyro {name}: its temperature moves by {abs(self.k_s) * 60.0:.1f} K a minute, sigma allows for that"
         words = f"gyro {name}: on for {_age(powered_s)}, may still be warming, sigma allows for that"
-        later = next((at_s for at_s in _LATER_S if at_s >= 2.0 * powered_s), None)
-        if later is None:
-            return words
-        sigma = math.sqrt((self.unseen(later)[:3] + other_variance[:3]).max())
-        return f"{words}; after {later / 60.0:.0f} min about {sigma / DEG_H:.0f} deg/h"
+        at_s, sigma = self._better(powered_s, other_variance)
+        return words if at_s is None else f"{words}; after {at_s / 60.0:.0f} min about {sigma / DEG_H:.0f} deg/h"
+
+    def _better(self, powered_s: float, other_variance: Floats) -> tuple[float | None, float]:
+        """The age from which the gyros' sigma is better by a third, and what it is then; None: it never will be."""
+
+        def sigma(age_s: float) -> float:
+            return math.sqrt((self.unseen(age_s)[:3] + other_variance[:3]).max())
+
+        enough = _WORTH_WAITING * sigma(powered_s)
+        return next(((at_s, sigma(at_s)) for at_s in _LATER_S if sigma(at_s) <= enough), (None, 0.0))
 
     def _kelvin(self, powered_s: float) -> float:
         """Mean square of the rate, K/s, by age and thermometer."""
