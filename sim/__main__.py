@@ -1,4 +1,4 @@
-"""`python -m sim`: devices, autopilot, all, demo, ardupilot, px4, residuals, turntable, flights, accuracy, rest, ..."""
+"""`python -m sim`: devices, autopilot, all, demo, ardupilot, px4, residuals, turntable, flights, ..."""
 
 from __future__ import annotations
 

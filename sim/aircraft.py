@@ -250,4 +250,8 @@ class VirtualAircraft:
             acting = (t_s >= motion.start_s) & (t_s < motion.end_s)
             if acting.any():
                 force[acting] += motion.acceleration_m_s2(t_s[acting])
+                forward, right, down = motion.level_acceleration_m_s2(t_s[acting]).T
+                c, s = cy[acting], sy[acting]
+                ned = np.column_stack([c * forward - s * right, s * forward + c * right, down])
+                force[acting] += np.einsum("nij,nj->ni", to_body[acting], ned)
         return Truth(turning + to_body @ self._earth_rate_ned, force)

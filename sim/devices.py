@@ -130,6 +130,7 @@ class HMR3300(SerialDevice):
         seed: int = 0,
         heading_error_deg: float = 0.0,
         heading_noise_deg: float = 0.05,
+        lag_s: float = 0.0,
         field_noise_gauss: float = 0.0003,
         tilt_error_deg: tuple[float, float] = (0.0, 0.0),
         mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -142,7 +143,8 @@ class HMR3300(SerialDevice):
             heading_noise_deg,
             tilt_error_deg,
         )
-        self.field_noise_gauss = field_noise_gauss
+        self.field_noise_gauss, self.lag_s = field_noise_gauss, lag_s
+        self._followed: tuple[float, float, float] | None = None
         self.magnetometer_mode = False
         self._mounting = mounting_matrix(*mounting_deg)
         self._random = np.random.default_rng([seed, 5])
@@ -165,12 +167,26 @@ class HMR3300(SerialDevice):
         _, _, heading = self.aircraft.mounted_angles_rad(t_s, self._mounting)
         noise = self.heading_noise_deg * float(self._random.standard_normal())
         declination = self.aircraft.declination_rad(t_s)
-        magnetic = math.degrees(heading - declination) + self.heading_error_deg + noise
+        magnetic = self._follow(t_s, math.degrees(heading - declination)) + self.heading_error_deg + noise
         tenths = round(magnetic * 10.0) % 3600
         x, y, z = self._mounting.T @ self.aircraft.truth_at(t_s).force_m_s2
         pitch = math.degrees(math.atan2(x, math.hypot(y, z))) + self.tilt_error_deg[0]
         roll = math.degrees(math.atan2(-y, -z)) + self.tilt_error_deg[1]
         return f"{tenths / 10.0:.1f}, {_tidy(pitch, 1)}, {_tidy(roll, 1)}\r\n".encode()
+
+    def _follow(self, t_s: float, heading_deg: float) -> float:
+        """The heading with its first-order lag; exact for one that turns evenly between two readings."""
+        if self.lag_s <= 0.0:
+            return heading_deg
+        since_s, before, shown = self._followed or (t_s - 1.0, heading_deg, heading_deg)
+        span = max(t_s - since_s, 1e-6)
+        change = math.remainder(heading_deg - before, 360.0)
+        behind = change / span * self.lag_s
+        shown = before + change - behind + (shown - before + behind) * math.exp(-span / self.lag_s)
+        # Brought to the new reading's turn of the circle, so that the next difference is small.
+        shown += heading_deg - (before + change)
+        self._followed = (t_s, heading_deg, shown)
+        return shown
 
     def command(self, data: bytes, t_s: float) -> bytes:
         """Commands end with CR or LF; unknown ones are answered `#I`."""

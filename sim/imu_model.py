@@ -78,6 +78,7 @@ _G = STANDARD_GRAVITY_M_S2
 
 # Noise and floors: method section 2.2. Steps and ranges are the parts' usual digital formats; temperature figures of
 # the two Analog Devices parts, which are compensated inside, and the ADIS16405's accelerometer are assumptions.
+# VN-100: VectorNav's data sheet (0.0035 deg/s/rtHz, 5 to 7 deg/h, 0.14 mg/rtHz, 0.04 mg); its temperature is assumed.
 PARTS: dict[str, ImuSpec] = {
     "icm42688p": ImuSpec(
         name="icm42688p",
@@ -98,6 +99,11 @@ PARTS: dict[str, ImuSpec] = {
         name="adis16405",
         gyro=_triad(white=120 * DEG_H, floor=25 * DEG_H, per_kelvin=36 * DEG_H, step=0.05 * _DPS, limit=300 * _DPS),
         accel=_triad(white=350 * UG, floor=200 * UG, per_kelvin=0.3 * MG, step=3.33 * MG, limit=18 * _G),
+    ),
+    "vn100": ImuSpec(
+        name="vn100",
+        gyro=_triad(white=8.9 * DEG_H, floor=5 * DEG_H, per_kelvin=9 * DEG_H, step=0.0, limit=2000 * _DPS),
+        accel=_triad(white=99 * UG, floor=40 * UG, per_kelvin=0.05 * MG, step=0.0, limit=16 * _G),
     ),
     "white_only": ImuSpec(
         name="white_only", gyro=AxisNoise(white=7.1 * DEG_H), accel=AxisNoise(white=49.5 * UG)
@@ -209,6 +215,7 @@ class ImuModel:
         gyro_scale, accel_scale: relative scale errors of the three axes.
         gyro_misalignment_rad, accel_misalignment_rad: small rotation of the triad.
         mounting_deg: roll, pitch, yaw of the sensor's axes seen from the vehicle's (a MAVLink rotation's angles).
+        thermometer_off_k: what its own thermometer shows too much.
     """
 
     def __init__(
@@ -224,12 +231,14 @@ class ImuModel:
         gyro_misalignment_rad: Sequence[float] = (0.0, 0.0, 0.0),
         accel_misalignment_rad: Sequence[float] = (0.0, 0.0, 0.0),
         mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        thermometer_off_k: float = 0.0,
     ) -> None:
         self.aircraft = aircraft
         self.spec = PARTS[spec] if isinstance(spec, str) else spec
         self.mounting = mounting_matrix(*mounting_deg)
         """Sensor to vehicle FRD."""
         self._turn_on = np.concatenate([gyro_bias_rad_s, accel_bias_m_s2]).astype(np.float64)
+        self._thermometer_off_k = thermometer_off_k
         gyro, accel = self.spec.gyro, self.spec.accel
         self._per_kelvin = np.repeat([gyro.per_kelvin, accel.per_kelvin], 3)
         self._white = np.repeat([gyro.white, accel.white], 3)
@@ -258,7 +267,7 @@ class ImuModel:
 
     def temperature_degc(self, t_s: float) -> float:
         """What its own thermometer says."""
-        return self.aircraft.temperature_degc(t_s)
+        return self.aircraft.temperature_degc(t_s) + self._thermometer_off_k
 
     def true_bias(self, t_s: float) -> Bias:
         """The additive bias now: turn-on, flicker, walk and temperature."""

@@ -18,7 +18,7 @@ Euler = tuple[float, float, float]
 """Roll, pitch, heading."""
 
 
-def _smooth_step(u: Array) -> tuple[Array, Array]:
+def smooth_step(u: Array) -> tuple[Array, Array]:
     """A step from 0 to 1 over u in [0, 1] with continuous second derivative, and its derivative in u."""
     u = np.clip(u, 0.0, 1.0)
     return u**3 * (10.0 - 15.0 * u + 6.0 * u**2), 30.0 * u**2 * (1.0 - u) ** 2
@@ -44,6 +44,10 @@ class Motion(ABC):
         """Added acceleration (n, 3) of the IMU, in body axes."""
         return np.zeros((len(t_s), 3))
 
+    def level_acceleration_m_s2(self, t_s: Array) -> Array:
+        """The same (n, 3) along the heading, to the right of it, and down: of what goes up and down as a whole."""
+        return np.zeros((len(t_s), 3))
+
     def leaves_rad(self) -> Array:
         """What stays of the angles afterwards (3)."""
         result: Array = self.euler_rad(np.array([self.end_s]))[0][0]
@@ -60,7 +64,7 @@ class Turn(Motion):
 
     def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
         """Added angles and rates."""
-        step, slope = _smooth_step((t_s - self.start_s) / self.duration_s)
+        step, slope = smooth_step((t_s - self.start_s) / self.duration_s)
         change = np.radians([self.roll_deg, self.pitch_deg, self.heading_deg])
         return step[:, None] * change, slope[:, None] * change / self.duration_s
 

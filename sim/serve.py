@@ -22,6 +22,7 @@ from sim.hands import HELP, Hands, take_lines
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.pty_device import PtyDevice
 from sim.scenario import DEMO_DEVICES, DEMO_POSE, GRADIENTER_OFFSET_DEG, Scenario, demo
+from sim.sea import MOTIONS, TURN_DEG_S, motions_of
 from sim.udp import open_udp
 
 DEFAULT_UDP = "127.0.0.1:14550"
@@ -92,7 +93,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def add_world_options(command: argparse.ArgumentParser) -> None:
-    """--pose, --seed and --law."""
+    """--pose, --seed, --law, --motion and --turn."""
     command.add_argument(
         "--pose",
         type=float,
@@ -107,6 +108,17 @@ def add_world_options(command: argparse.ArgumentParser) -> None:
         choices=("axis", "slope", "euler"),
         default="axis",
         help="what the gradienter's two readings mean (default axis)",
+    )
+    command.add_argument(
+        "--motion", choices=MOTIONS, default="still",
+        help="what happens to it all the time: a slow turn; a sea with that turn; a running engine with both",
+    )  # fmt: skip
+    command.add_argument(
+        "--turn",
+        type=float,
+        metavar="DEG_S",
+        default=TURN_DEG_S,
+        help=f"how fast that turn is (default {TURN_DEG_S:g})",
     )
 
 
@@ -228,6 +240,7 @@ def main(argv: Sequence[str]) -> int:
         pose=Pose(pitch, roll, heading),
         seed=arguments.seed,
         unix_s=time.time(),
+        motions=motions_of(arguments.motion, seed=arguments.seed, turn_deg_s=arguments.turn),
         law=arguments.law,
         gradienter_offset_deg=(arguments.zero[0], arguments.zero[1]),
         gyr_cal_at_boot=autopilot and arguments.gyr_cal,

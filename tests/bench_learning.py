@@ -16,7 +16,7 @@ import numpy as np
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.profiling.coverage import Kept, coverage
 from companion.calibration.profiling.profile_fit import Rests, fit_profile, rests
-from companion.replay.csv_log import read_arrays
+from companion.replay.csv_log import read
 from tests.support.made_noise import DEG_H, adis16405, write_csv
 
 SECONDS: Final = 10080
@@ -43,7 +43,8 @@ def table() -> None:
         path = write_csv(Path(folder) / "night.csv", *adis16405(SECONDS, RATE_HZ, seed=1))
 
         def seconds() -> Rests:
-            return rests(*read_arrays(path), "adis", part)
+            log = read(path)
+            return rests(log.t_s, log.readings, log.temperature_degc, "adis", part)
 
         def all_of_it() -> list[Kept]:
             found = seconds()

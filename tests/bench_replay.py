@@ -22,8 +22,9 @@ import numpy as np
 from mcap.reader import make_reader
 
 from companion.recording.walk import Message, Recording
-from companion.replay.csv_log import PoseGiven, estimate, read
+from companion.replay.csv_log import read
 from companion.replay.engine import Replay
+from companion.replay.estimate import Given, estimate
 from tests.support.long_recordings import write_log, write_recording
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
@@ -61,7 +62,7 @@ def _replayed(path: Path) -> None:
 
 
 def _estimated(path: Path) -> None:
-    record = estimate(read(path), PoseGiven(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0, latitude_deg=40.0))
+    record = estimate(read(path), Given(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0, latitude_deg=40.0)).record
     assert record.state == "done", record.reason
 
 

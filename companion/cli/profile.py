@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
 
+from companion.cli.replay_log import add_table_options
 from companion.cli.terminal import (
     DONE,
     FAILED,
@@ -28,13 +29,15 @@ if TYPE_CHECKING:
     from companion.calibration.noise.allan import AllanModel, NoiseProfile
     from companion.calibration.profiling.coverage import Kept
     from companion.calibration.profiling.profile_fit import AxisFinding, Finding, Rests
-    from companion.replay.still_log import StillLog
+    from companion.replay.log import StillLog
 
 LEAST_SHARE: Final = 0.90
 """The least share of minutes within 2 sigma for a profile to be saved."""
 LEAST_MINUTES: Final = 20.0
 """The least number of windows side by side: fewer say nothing about a share of 90 %."""
 SHORT_S: Final = 1200
+MOST_STRETCHES: Final = 6
+"""Shown of each recording; --json has them all."""
 _UNITS: Final = {"gyro": (DEG_H, "deg/h", 1), "accel": (1e-3 * MG, "ug", 0)}
 _AXES: Final = "xyz"
 
@@ -65,9 +68,17 @@ def add_command(add: AddCommand) -> None:
     sub = add("profile", profile, "learn an IMU's noise from recordings of it at rest (docs/profiles.md)")
     sub.add_argument("files", nargs="+", type=Path, metavar="FILE", help="recordings (.mcap) or CSV logs")
     sub.add_argument("--imu", metavar="NAME", help="only this one; of CSV files: what theirs is called (default imu)")
-    sub.add_argument("--columns", metavar="NAMES", help="of CSV files without names, such as t_s,gx_deg_s,... ")
+    add_table_options(sub)
     sub.add_argument(
         "--profile", metavar="PART", help="to compare with, and for what the recordings do not tell (default: as used)"
+    )
+    sub.add_argument(
+        "--warm-up",
+        nargs="+",
+        type=Path,
+        default=(),
+        metavar="FILE",
+        help="recordings that begin when it was switched on, cold: by how much its biases move",
     )
     sub.add_argument("--skip", type=seconds, default=0.0, metavar="S", help="leave out so much at each beginning")
     sub.add_argument("--save", metavar="NAME", help='keep it: profile = "NAME" in [[imu]] then takes it')
@@ -76,8 +87,8 @@ def add_command(add: AddCommand) -> None:
 
 async def profile(options: argparse.Namespace) -> int:
     """`companion profile`."""
-    from companion.replay.csv_log import NAME
-    from companion.replay.still_log import read_logs
+    from companion.replay.log import NAME
+    from companion.replay.log_files import read_logs
     from companion.storage.profiles import ProfileStore, check_name
 
     store = None
@@ -85,11 +96,14 @@ async def profile(options: argparse.Namespace) -> int:
         check_name(options.save)
         store = ProfileStore(options.storage or load_config(options).storage.path)
     compared = _compared(options)
-    logs = read_logs(options.files, options.columns, options.imu or NAME)
+    logs, cold = (
+        read_logs(files, options.columns, options.rate, options.imu or NAME) if files else []
+        for files in (options.files, options.warm_up)
+    )
     results, refused = [], []
     for imu, own in _by_imu(logs, options.imu).items():
         try:
-            results.append(_learn(imu, own, compared, options.skip))
+            results.append(_learn(imu, own, compared, options.skip, [log for log in cold if log.imu == imu]))
         except CalibrationRefusedError as error:
             refused.append(f"imu {imu}: {error}")
     for words in refused:
@@ -138,7 +152,9 @@ def _by_imu(logs: Sequence[StillLog], wanted: str | None) -> dict[str, list[Stil
     return {wanted: found[wanted]}
 
 
-def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float) -> Result:
+def _learn(
+    imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s: float, cold: Sequence[StillLog] = ()
+) -> Result:
     """All of one IMU.
 
     Raises:
@@ -147,6 +163,7 @@ def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s
     from companion.calibration.noise.allan import noise_profile
     from companion.calibration.profiling.coverage import coverage
     from companion.calibration.profiling.profile_fit import fit_profile, joined, rests
+    from companion.calibration.profiling.warm_up import learn_warm_up
 
     whole = [log for log in logs if not log.truncated]
     if not whole:
@@ -165,8 +182,38 @@ def _learn(imu: str, logs: list[StillLog], compared: NoiseProfile | None, skip_s
         finding = fit_profile(imu, stretches, against)
     except CalibrationRefusedError as error:
         raise CalibrationRefusedError(f"{error}{f' (in the way: {obstacle})' if obstacle else ''}") from None
+    if cold:
+        seen = [rests(log.t_s, log.readings, log.temperature_degc, imu, against).stretches for log in cold]
+        finding = msgspec.structs.replace(
+            finding, profile=msgspec.structs.replace(finding.profile, warm_up=learn_warm_up(seen))
+        )
     kept = coverage([each.stretches for each in found], against)
-    return Result(imu, whole, found, finding, against, kept, _notes(finding, against, found, kept, obstacle))
+    notes = _notes(finding, against, found, kept, obstacle)
+    if cold:
+        gyro, accel = finding.profile.warm_up[0] / DEG_H, finding.profile.warm_up[1] / MG
+        notes.append(
+            f"warming up moves gyros by {gyro:.3g} deg/h, accelerometers by {accel:.3g} mg: sigma allows for it"
+        )
+    return Result(imu, whole, found, finding, against, kept, notes)
+
+
+def _used(result: Result) -> Iterator[tuple[StillLog, list[tuple[float, float]], float]]:
+    """Of each recording the stretches that were learned from, in seconds from its beginning on, and how long it is."""
+    for log, found in zip(result.logs, result.rests, strict=True):
+        begin_s = float(log.t_s[0])
+        spans = [(float(rest.slots[0]) - begin_s, float(rest.slots[-1]) + 1.0 - begin_s) for rest in found.stretches]
+        yield log, spans, float(log.t_s[-1]) - begin_s
+
+
+def _used_lines(result: Result) -> list[str]:
+    lines = []
+    for log, spans, seconds_s in _used(result):
+        shown = ", ".join(f"{from_s:.0f} to {to_s:.0f} s" for from_s, to_s in spans[:MOST_STRETCHES])
+        more = f" and {len(spans) - MOST_STRETCHES} more" if len(spans) > MOST_STRETCHES else ""
+        lines.append(f"used of {', '.join(log.files)}: {shown}{more}, of {seconds_s:.0f} s")
+        lines += [f"left out: {count} lines {why}" for why, count in log.left_out.items()]
+        lines += [f"note: {note}" for note in log.notes]
+    return lines
 
 
 def _notes(
@@ -236,8 +283,8 @@ def _lines(result: Result) -> list[str]:
             ]
             lines.append(f"{f'{triad}: {name}':24} {cells[0]:>16} {cells[1]:>16} {cells[2]:>16}")
     if result.kept:
-        heads = ("T, s", "sigma_use", "rms error", "2 sigma", "strictly", "naive")
-        widths = (5, 11, 11, 8, 9, 7)
+        heads = ("T, s", "sigma_use", "rms error", "over sigma", "2 sigma", "strictly", "naive")
+        widths = (5, 11, 11, 10, 8, 9, 7)
         lines.append(
             "the minute after windows of T s, learned from other recordings or the other half; within 2 sigma:"
         )
@@ -245,8 +292,10 @@ def _lines(result: Result) -> list[str]:
         for each in result.kept:
             unit, unit_name, digits = _UNITS[each.triad]
             sizes = [f"{value / unit:.{digits}f} {unit_name}" for value in (each.sigma_use, each.rms)]
-            shares = (each.share, each.share_strict, each.share_naive)
-            lines.append(_row(each.triad, (f"{each.mean_s}", *sizes, *(f"{share:.1%}" for share in shares)), widths))
+            shares = [f"{share:.1%}" for share in (each.share, each.share_strict, each.share_naive)]
+            over = f"{each.rms / each.sigma_use:.2f}"
+            lines.append(_row(each.triad, (f"{each.mean_s}", *sizes, over, *shares), widths))
+    lines += _used_lines(result)
     lines += [f"note: {note}" for note in result.notes]
     return lines + [f"DO NOT USE: {words}" for words in result.broken]
 
@@ -281,6 +330,7 @@ def _temperatures(logs: Sequence[StillLog]) -> tuple[float, float] | None:
 
 
 def _to_save(result: Result, name: str) -> Any:
+    from companion.calibration.noise.allan import WARM_UP
     from companion.storage.profiles import FORMAT_VERSION, SavedProfile, Source
 
     finding = result.finding
@@ -304,6 +354,7 @@ def _to_save(result: Result, name: str) -> Any:
             for log, rests in zip(result.logs, result.rests, strict=True)
         ),
         notes=tuple(result.notes),
+        warm_up=finding.profile.warm_up if finding.profile.warm_up != WARM_UP else None,
     )
 
 
@@ -314,6 +365,15 @@ def _object(result: Result) -> dict[str, Any]:
         "still_s": finding.still_s,
         "seconds": sum(each.seconds for each in result.rests),
         "recordings": [", ".join(log.files) for log in result.logs],
+        "used": [
+            {
+                "seconds": seconds_s,
+                "stretches": [{"from_s": from_s, "to_s": to_s} for from_s, to_s in spans],
+                "left_out": log.left_out,
+                "notes": log.notes,
+            }
+            for log, spans, seconds_s in _used(result)
+        ],
         "temperature_degc": _temperatures(result.logs),
         "profile": msgspec.to_builtins(finding.profile),
         "compared": msgspec.to_builtins(result.compared),

@@ -11,24 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from companion.cli import show
+from companion.cli import replay_log, show
 from companion.cli.client import finish
-from companion.cli.terminal import (
-    DONE,
-    FAILED,
-    AddCommand,
-    load_config,
-    print_json,
-    print_lines,
-    seconds,
-    storage_path,
-    within,
-)
+from companion.cli.terminal import DONE, FAILED, AddCommand, load_config, print_json, print_lines, seconds
 from companion.daemon.faces.control import ask
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
-    from companion.calibration.solution.record import Record
     from companion.replay.engine import Result
 
 Object = dict[str, Any]
@@ -42,26 +31,9 @@ def add_commands(add: AddCommand) -> None:
     recorder.add_argument("file", nargs="?", type=Path, metavar="FILE", help="default: one beside the daemon's own")
     recorder.add_argument("--seconds", type=seconds, metavar="S", help="end by itself (default: Ctrl-C or --stop)")
     recorder.add_argument("--stop", action="store_true", help="end a recording that runs")
-    player = add("replay", replay, "run a recording, or a CSV log of an IMU at rest, through the same estimator")
-    player.add_argument("file", type=Path, metavar="FILE", help="a recording (.mcap) or a CSV file")
-    csv = player.add_argument_group("for a CSV file (docs/recording.md)")
-    csv.add_argument("--columns", metavar="NAMES", help="such as t_s,gx_deg_s,gy_deg_s,gz_deg_s,ax_g,ay_g,az_g")
-    for name, least, most, words in (
-        ("--pitch-deg", -84.0, 84.0, "nose up"),
-        ("--roll-deg", -180.0, 180.0, "right side down"),
-        ("--heading-deg", -360.0, 360.0, "clockwise from true north"),
-        ("--latitude-deg", -90.0, 90.0, "north is positive"),
-        ("--height-m", -500.0, 9000.0, "above mean sea level"),
-    ):
-        csv.add_argument(name, type=within(least, most), metavar="M" if name.endswith("-m") else "DEG", help=words)
-    csv.add_argument(
-        "--sigma-deg", type=within(1e-4, 45.0), default=0.05, metavar="DEG", help="of pitch and roll (default 0.05)"
-    )
-    csv.add_argument("--heading-sigma-deg", type=within(1e-3, 180.0), default=3.0, metavar="DEG", help="default 3")
-    csv.add_argument("--mounting", default="ROTATION_NONE", metavar="ROTATION", help="sensor to vehicle")
-    csv.add_argument(
-        "--profile", metavar="PART", help="the sensor's model, such as icm42688p, or a saved profile's name or file"
-    )
+    player = add("replay", replay, "run a recording, or anybody's log of an IMU at rest, through the same estimator")
+    player.add_argument("file", type=Path, metavar="FILE", help="a recording (.mcap), or a log (CSV; .ulg, .bin)")
+    replay_log.add_options(player)
 
 
 async def record(options: argparse.Namespace) -> int:
@@ -100,13 +72,14 @@ async def _end(options: argparse.Namespace, reply: Object) -> int:
 async def replay(options: argparse.Namespace) -> int:
     """`companion replay`."""
     from companion.recording.walk import is_text
+    from companion.replay.autopilot_logs import reader_of
 
     try:
-        text = is_text(options.file)
+        is_log = reader_of(options.file) is not None or is_text(options.file)
     except OSError as error:
         raise ConfigError(f"companion replay: {options.file}: {error.strerror or error}") from None
-    if text:
-        return _replay_csv(options)
+    if is_log:
+        return replay_log.replay(options)
     return _replay_recording(options)
 
 
@@ -160,31 +133,3 @@ def _lines(result: Result) -> list[str]:
     else:
         lines.append(f"{recomputed} of {len(result.calibrations)} calibrations recomputed, the same to the last bit")
     return lines
-
-
-def _replay_csv(options: argparse.Namespace) -> int:
-    from companion.replay.csv_log import PoseGiven, estimate, read
-    from companion.rotations import ROTATIONS_DEG
-    from companion.storage.profiles import given_profile
-
-    if options.mounting not in ROTATIONS_DEG:
-        raise ConfigError(f"--mounting: found {options.mounting}; allowed: a MAVLink rotation such as ROTATION_YAW_90")
-    if (options.pitch_deg is None) != (options.roll_deg is None):
-        raise ConfigError("found only one of --pitch-deg and --roll-deg; allowed: both or neither")
-    pose = PoseGiven(
-        pitch_deg=options.pitch_deg,
-        roll_deg=options.roll_deg,
-        heading_deg=options.heading_deg,
-        sigma_deg=options.sigma_deg,
-        heading_sigma_deg=options.heading_sigma_deg,
-        latitude_deg=options.latitude_deg,
-        height_m=options.height_m,
-    )
-    wanted = options.profile
-    profile = None if wanted is None else given_profile(wanted, lambda: storage_path(options))
-    found: Record = estimate(read(options.file, options.columns), pose, mounting=options.mounting, profile=profile)
-    if getattr(options, "json", False):
-        print_json(msgspec.to_builtins(found))
-    else:
-        print_lines(*show.record_lines(msgspec.to_builtins(found)))
-    return DONE if found.state == "done" else FAILED

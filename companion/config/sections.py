@@ -61,6 +61,7 @@ GradienterProtocol = Literal[
 CompassProtocol = Literal["hmr3300", "nmea", "os5000", "pni", "rion"]
 Law = Literal["axis", "slope", "euler"]
 Parity = Literal["none", "even", "odd"]
+Platform = Literal["ground", "deck"]
 AtArm = Literal["gate", "warn", "off"]
 LogLevel = Literal["debug", "info", "warning", "error"]
 Signing = Literal["off", "sign", "require"]
@@ -90,12 +91,14 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class Vehicle(Section, frozen=True):
-    """Where the aircraft stands, if the autopilot is not to be asked, and its MAVLink system id."""
+    """Where and on what the aircraft stands, if the autopilot is not to be asked, and its MAVLink system id."""
 
     latitude_deg: Latitude | None = None
     longitude_deg: Longitude | None = None
     height_m: Height | None = None
     system_id: Annotated[int, Meta(ge=1, le=255)] | None = None
+    platform: Platform = "ground"
+    """Fixed to the Earth, or what may turn and sway under it: a boat, a vehicle with its engine running."""
 
 
 class Mavlink(Section, frozen=True):
@@ -130,6 +133,8 @@ class Noise(Section, frozen=True):
     accel: tuple[float, float, float]
     """Likewise in m/s^2."""
     origin: str = ""
+    warm_up: tuple[float, float] | None = None
+    """By how much a warm-up moves the biases, rad/s and m/s^2; None: nobody has watched one."""
 
 
 class Imu(Section, frozen=True):
@@ -202,6 +207,8 @@ class Calibration(Section, frozen=True):
     """How far the temperature may be from the one at which it was seen to be right (the same)."""
     prior: bool = True
     """Whether earlier calibrations guard new ones, and weigh in where that betters them (docs/calibration.md)."""
+    any_bias: bool = False
+    """Whether to take biases beyond what any part has, and readings along other axes than the tilt says."""
 
 
 class Push(Section, frozen=True):

@@ -11,6 +11,8 @@ from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.deck.deck import KEPT_S, Deck
+from companion.calibration.deck.stream import Surroundings
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
@@ -146,6 +148,7 @@ def imu_input(imu: Imu, kind: StreamKind | None, grid: tuple[float, float] = (0.
         truncates=integers,
         gyro_grid_rad_s=grid[0] if integers else 0.0,
         accel_grid_m_s2=grid[1] if integers else 0.0,
+        clock_from_start=imu.protocol is None or PROTOCOLS["imu"][imu.protocol].decoder.clock_from_start,
     )
 
 
@@ -198,6 +201,25 @@ def field_by(config: Config) -> tuple[CompassModel, GradienterModel | None] | No
     """How a heading comes of the compass' field vector, if there is a compass."""
     compass = compass_model(config.compass)
     return None if compass is None else (compass, gradienter_model(config.gradienter))
+
+
+def deck(config: Config) -> Deck | None:
+    """What collects where the platform moves; None on the ground."""
+    if config.vehicle.platform != "deck":
+        return None
+    return Deck(
+        Surroundings(
+            gradienter=gradienter_model(config.gradienter),
+            gradienter_lag_s=lag("gradienter", config.gradienter).lag_s,
+            compass=compass_model(config.compass),
+            compass_lag_s=lag("compass", config.compass).lag_s,
+        )
+    )
+
+
+def longest_window_s(config: Config) -> float:
+    """The longest time that a calibration is made of."""
+    return config.calibration.max_s if config.vehicle.platform == "ground" else KEPT_S
 
 
 def whereabouts(config: Config, vehicle: Vehicle) -> Whereabouts:

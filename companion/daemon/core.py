@@ -22,6 +22,8 @@ from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.listeners import Listeners
 from companion.recording.journal import RecordedCollector
 
+CATCH_UPS: Final = 3
+"""While an estimate is worked out the next one may become due; it must not be left to the event loop."""
 TICK_S: Final = 0.2
 """How often the seconds that are over end, also of sources that say nothing."""
 Handler = Callable[[Object, str], AsyncIterator[Object]]
@@ -112,8 +114,10 @@ class Core:
         The estimate costs milliseconds on a desktop and tens of them on a small board; an autopilot that asks whether
         it may arm waits with its commander stopped (autopilots 5.2).
         """
-        work = self.collector.pending(asyncio.get_running_loop().time(), since_s=since_s)
-        if work is not None:
+        for _ in range(CATCH_UPS):
+            work = self.collector.pending(asyncio.get_running_loop().time(), since_s=since_s)
+            if work is None:
+                return
             self.collector.accept(work, await self.offload(work.run))
 
     async def window(self, *, since_s: float | None = None) -> Window:

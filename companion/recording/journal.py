@@ -25,6 +25,7 @@ from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.solution.prior import Expectation
 from companion.calibration.solution.record import Record
 from companion.calibration.solution.site import Whereabouts
+from companion.calibration.turning.watch import Turn
 from companion.config.sections import Config
 from companion.configured import models
 from companion.links.system.listeners import Listeners
@@ -44,6 +45,10 @@ class Means(msgspec.Struct, frozen=True):
     number: int
     wander_deg: float | None
     """How far the heading has wandered since the aircraft last moved, which may be before the recording."""
+    begun_s: dict[str, float] = {}
+    """By IMU, since when it has been on, which may be likewise."""
+    turn: Turn | None = None
+    """What was known of the platform's own rate, likewise; None: of an older version."""
 
 
 class Solved(msgspec.Struct, frozen=True, kw_only=True):
@@ -270,6 +275,7 @@ class RecordedCollector(RollingCollector):
             gradienter_lag=models.lag("gradienter", config.gradienter),
             compass_lag=models.lag("compass", config.compass),
             field_by=models.field_by(config),
+            deck=models.deck(config),
         )
 
     def number_of(self, window: Window) -> int | None:
@@ -323,7 +329,7 @@ class RecordedCollector(RollingCollector):
             return super().window(now_s, since_s=since_s)
         self._windows_made += 1
         number = self._windows_made
-        self.journal.event(now_s, "window", Means(number, self.wander_deg))
+        self.journal.event(now_s, "window", Means(number, self.wander_deg, self.begun_s, self.turn))
         window = super().window(now_s)
         self.windows.append((number, window))
         return window

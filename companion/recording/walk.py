@@ -7,6 +7,7 @@ does; and it believes every length that a file says.
 
 from __future__ import annotations
 
+import codecs
 import io
 import mmap
 import struct
@@ -68,7 +69,8 @@ def is_text(path: Path) -> bool:
     """
     with path.open("rb") as file:
         head = file.read(len(MAGIC))
-    return bool(head) and not MAGIC.startswith(head) and b"\0" not in head
+    wide = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return bool(head) and not MAGIC.startswith(head) and (wide or b"\0" not in head)
 
 
 class Recording:
@@ -91,7 +93,7 @@ class Recording:
                 if not head:
                     raise StorageError(f"{path}: the file is empty")
                 if not MAGIC.startswith(head):
-                    raise StorageError(f"{path}: not a recording (MCAP)")
+                    raise StorageError(f"{path}: not a recording (MCAP), nor any log that is known")
                 self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         except (OSError, ValueError) as error:
             raise StorageError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None

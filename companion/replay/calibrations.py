@@ -188,7 +188,8 @@ class Calibrations:
         assert config is not None
         gradienter = aligned(models.gradienter_model(config.gradienter), self._alignment)
         compass = models.compass_model(config.compass)
-        return solve(window, local_earth(self.where), gradienter, compass, what)
+        local, platform, any_bias = local_earth(self.where), config.vehicle.platform, config.calibration.any_bias
+        return solve(window, local, gradienter, compass, what, platform, any_bias=any_bias)
 
     def _whole(self, found: ImuSolution) -> tuple[Array | None, Array | None]:
         calibration = self._solved_with.get(found.name)

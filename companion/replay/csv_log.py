@@ -1,272 +1,387 @@
-"""Somebody's own log of an IMU at rest, as comma separated values: its samples, and what the estimator makes of them.
+"""A table of text, as apps, loggers and other people's programs write them: its samples, and what was left out of it.
 
-A column's name says what it holds and its unit: t_s, gx_deg_s, ax_g and so on. Axes are the sensor's own; the mounting
-turns them into the vehicle's (x forward, y right, z down).
+`columns` says what its columns mean, `sizes` in which units, where nothing says it.
 """
 
 from __future__ import annotations
 
+import codecs
+import csv
 import datetime
+import itertools
 import math
 import re
 from array import array
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, TextIO
 
-import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-from companion.calibration.collector.measurement import Measurement
-from companion.calibration.collector.outlook import Settings
-from companion.calibration.collector.rolling import RollingCollector
-from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
-from companion.calibration.means.windows import ImuInput, Window
-from companion.calibration.noise.allan import noise_profile
-from companion.calibration.request import What
-from companion.calibration.solution.draft import Draft, in_words
-from companion.calibration.solution.record import Record
-from companion.calibration.solution.site import Remedies, Whereabouts, local_earth
-from companion.calibration.solution.solve import solve
-from companion.config.sections import Mounting, Noise
-from companion.errors import CalibrationRefusedError, StorageError
-from companion.physics.frames import Floats, rotation_matrix
-from companion.physics.units import DEG, DEG_H, MG
-from companion.samples import ImuSample
+from companion.calibration.noise.robust import median
+from companion.errors import StorageError
+from companion.physics.frames import Floats
+from companion.replay import sizes
+from companion.replay.columns import (
+    FIELD,
+    GAUSS,
+    IMU,
+    TILT,
+    TIMES,
+    UNITS,
+    Columns,
+    columns_of,
+    looks_like_units,
+    meaning,
+)  # fmt: skip
+from companion.replay.log import LAST_S, NAME, Poses, StillLog
 
-_TIMES: Final = {"t_s": 1.0, "t_ms": 1e-3, "t_us": 1e-6, "t_ns": 1e-9}
-_RATES: Final = {"rad_s": 1.0, "deg_s": DEG, "deg_h": DEG_H}
-_FORCES: Final = {"m_s2": 1.0, "g": 1e3 * MG, "mg": MG}
-_TEMPERATURE: Final = "temperature_degc"
-ALLOWED: Final = (
-    "t_s (or _ms, _us, _ns), gx gy gz each with _rad_s, _deg_s or _deg_h, ax ay az each with _m_s2, _g or _mg,"
-    " temperature_degc"
-)
 _LONGEST: Final = 1 << 14
 """The most characters of a line: a hundred columns have a tenth of that."""
-_AROUND: Final = ' "\t\r\n'
-"""What may stand around a number."""
+_REMARKS: Final = ("#", "//", "%")
+_NO_NUMBER: Final = frozenset(("", "nan", "na", "n/a", "null", "none", "-", "--", "nil", "#n/a"))
+"""What loggers write where they have no number."""
+_MOST_TEXTS: Final = 60
+"""Lines of text before the numbers: a logger's preamble, the names, the units."""
+_AT_ONCE: Final = 4096
+_NUMBERS: Final = 1e20
+"""What is larger is none, in any unit: nanoseconds since 1970 are 2e18."""
+_WRAPS: Final = 2.0**32
+"""A counter of 32 bits begins anew: an Arduino's micros() every 71.6 min."""
+_DECIMAL_COMMA: Final = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?")
 
 
-class _Columns:
-    """Which column holds what, and the factors to SI units."""
+class _Lines:
+    """The lines of a file, with the number of the one that was read last.
 
-    def __init__(self, names: Sequence[str], where: str) -> None:
-        self.names = [name.strip().strip('"').lower() for name in names]
-        self._wanted = [self._find("t", _TIMES, "", where)]
-        for kind, units in (("g", _RATES), ("a", _FORCES)):
-            self._wanted += [self._find(f"{kind}{axis}", units, "_", where) for axis in "xyz"]
-        self._temperature = self.names.index(_TEMPERATURE) if _TEMPERATURE in self.names else None
+    A last line that does not end is left out once there were others: the log may have been cut there.
+    """
 
-    def _find(self, what: str, units: dict[str, float], joint: str, where: str) -> tuple[int, float]:
-        names = {f"{what}{joint}{unit}" if joint else unit: factor for unit, factor in units.items()}
-        found = [(column, names[name]) for column, name in enumerate(self.names) if name in names]
-        if len(found) == 1:
-            return found[0]
-        wrong = f"two columns for {what}" if found else f"no column {' or '.join(names)}"
-        raise StorageError(f"{where}: {wrong} in {', '.join(self.names)}; allowed: {ALLOWED}; or name them: --columns")
+    def __init__(self, file: TextIO, path: Path) -> None:
+        self.number = 0
+        self._file = file
+        self._path = path
 
-    def sample(self, fields: Sequence[str], where: str) -> ImuSample:
-        """One line of the file; the time is its own.
-
-        Raises:
-            StorageError: it is none; says which field of which line.
-        """
-        if len(fields) != len(self.names):
-            raise StorageError(f"{where}: found {len(fields)} fields; allowed: {len(self.names)}, as many as columns")
-        wanted = self._wanted
-        if self._temperature is not None and fields[self._temperature].strip(_AROUND):
-            wanted = [*wanted, (self._temperature, 1.0)]
-        values = []
-        for column, factor in wanted:
-            try:
-                value = float(fields[column].strip(_AROUND)) * factor
-            except ValueError:
-                value = math.nan
-            if not math.isfinite(value):
-                raise StorageError(
-                    f"{where}: found {fields[column]!r} in column {self.names[column]}; allowed: a number"
-                )
-            values.append(value)
-        t_s, gx, gy, gz, ax, ay, az, *temperature = values
-        return ImuSample(t_s, (gx, gy, gz), (ax, ay, az), temperature[0] if temperature else None)
+    def __iter__(self) -> Iterator[str]:
+        some, readline = False, self._file.readline
+        while line := readline(_LONGEST):
+            self.number += 1
+            if len(line) == _LONGEST:
+                raise StorageError(f"{self._path}, line {self.number}: found no line end within {_LONGEST} characters")
+            if some and not line.endswith(("\n", "\r")):
+                return  # in the middle of a number, perhaps, which then still looks like one
+            text = line.strip(" \r\n")
+            if text[:1].isdigit() or (
+                text.strip() and not text.startswith(_REMARKS) and not text.lower().startswith("sep=")
+            ):
+                some = True
+                yield text
 
 
-def read(path: Path, columns: str | None = None) -> Iterator[ImuSample]:
-    """The samples of a CSV file; comma, semicolon or tab between fields, "#" begins a remark.
+def read(path: Path, columns: str | None = None, rate_hz: float | None = None, name: str = NAME) -> StillLog:
+    """All that is of use in a CSV file.
 
-    A last line that does not end is left out: the log may have been cut there.
+    Args:
+        path: fields separated by semicolons, tabs, commas or blanks; "#", "//" and "%" begin a remark.
+        columns: names of the columns in their order, in place of the file's own.
+        rate_hz: of a log without times, or whose times are of no use.
+        name: what the IMU is called.
 
     Raises:
         StorageError: one line with the number of the line, what was found and what is allowed.
     """
-    table = None if columns is None else _Columns(columns.split(","), "--columns")
-    separator, before_s = "", -math.inf
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            for number, line in enumerate(iter(lambda: file.readline(_LONGEST), ""), 1):
-                where, text = f"{path}, line {number}", line.strip()
-                if len(line) == _LONGEST:
-                    raise StorageError(f"{where}: found no line end within {_LONGEST} characters")
-                if separator and not line.endswith(("\n", "\r")):
-                    break  # in the middle of a number, perhaps, which then still looks like one
-                if not text or text.startswith("#"):
-                    continue
-                if not separator:
-                    separator = max(",;\t", key=text.count)
-                    if table is None:
-                        if not re.search("[A-Za-z]{2}", text):
-                            raise StorageError(f"{where}: no names of columns; name them: --columns t_s,gx_rad_s,...")
-                        table = _Columns(text.split(separator), where)
-                        continue
-                    if re.search("[A-DF-Za-df-z_]{2}", text):
-                        continue  # names of its own, which --columns replaces
-                assert table is not None
-                sample = table.sample(text.split(separator), where)
-                if sample.t_s <= before_s:
-                    raise StorageError(
-                        f"{where}: time {sample.t_s:.6f} s after {before_s:.6f} s; allowed: growing times"
-                    )
-                before_s = sample.t_s
-                yield sample
-    except (OSError, UnicodeDecodeError) as error:
-        raise StorageError(f"{path}: cannot be read as text: {getattr(error, 'strerror', None) or error}") from None
-    if not separator:
-        raise StorageError(f"{path}: the file is empty")
+        with path.open("rb") as file:
+            wide = file.read(2) in {codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE}
+        # Where it is Latin-1 instead, the degree sign still shows (`columns`).
+        encoding, errors = ("utf-16", "strict") if wide else ("utf-8-sig", "surrogateescape")
+        with path.open(encoding=encoding, errors=errors, newline="") as file:
+            return _Table(path, file, columns, rate_hz).log(name)
+    except UnicodeError as error:
+        raise StorageError(f"{path}: cannot be read as text: {error}") from None
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be read as text: {error.strerror or error}") from None
 
 
-def read_arrays(path: Path, columns: str | None = None) -> tuple[Floats, Floats, Floats]:
-    """All samples of a CSV file at once.
+class _Table:
+    """One file while it is read."""
 
-    Returns:
-        (n,) times in s; (n, 6) gyro in rad/s and accelerometer in m/s^2; (n,) degC, NaN where unknown.
+    def __init__(self, path: Path, file: TextIO, names: str | None, rate_hz: float | None) -> None:
+        self._path = path
+        self._rate_hz = rate_hz
+        self._left_out: Counter[str] = Counter()
+        self._notes: list[str] = []
+        self._lines = _Lines(file, path)
+        lines = iter(self._lines)
+        texts, first = self._beginning(lines)
+        self._separator = _separator(first, [text for _, text in texts])
+        self._comma = self._separator != "," and any(map(_DECIMAL_COMMA.fullmatch, self._split(first)))
+        self._columns, self._again = self._named(texts, names)
+        self._width = len(self._columns.names)
+        self._dates = False
+        self._rows = csv.reader(
+            itertools.chain((first,), lines), delimiter=self._separator, skipinitialspace=self._separator == " "
+        )
 
-    Raises:
-        StorageError: as `read`.
-    """
-    flat = array("d")
-    for sample in read(path, columns):
-        temperature_degc = math.nan if sample.temperature_degc is None else sample.temperature_degc
-        flat.extend((sample.t_s, *sample.gyro_rad_s, *sample.accel_m_s2, temperature_degc))
-    table = np.frombuffer(flat).reshape(-1, 8)
-    return table[:, 0].copy(), table[:, 1:7].copy(), table[:, 7].copy()
+    # --- the beginning
 
+    def _beginning(self, lines: Iterator[str]) -> tuple[list[tuple[int, str]], str]:
+        """The lines of text before the first one of numbers, with their numbers; and that one."""
+        texts: list[tuple[int, str]] = []
+        for line in lines:
+            if any(_is_data(_fields(line, separator)) for separator in _SEPARATORS):
+                return texts, line
+            texts.append((self._lines.number, line))
+            if len(texts) > _MOST_TEXTS:
+                raise StorageError(f"{self._path}: no line of numbers among the first {_MOST_TEXTS}")
+        if not texts:
+            raise StorageError(f"{self._path}: the file is empty")
+        return texts, ""
 
-MIN_STILL_S: Final = 5.0
-MAX_STILL_S: Final = 3600.0
-NAME: Final = "imu"
-# The collector drops the second in which a stream begins: here that is its first millisecond.
-_FIRST_S: Final = 999.999
-_REMEDIES: Final = Remedies("say --latitude-deg", "say --height-m", no_heading="no --heading-deg")
-_LONGER: Final = 1.1
-"""A window is worked out again when the stretch has grown by so much."""
+    def _split(self, text: str) -> list[str]:
+        return _fields(text, self._separator)
 
+    def _named(self, texts: Sequence[tuple[int, str]], names: str | None) -> tuple[Columns, list[str]]:
+        """The columns, and their names as they may come again further down."""
+        timed = self._rate_hz is None
+        if names is not None:
+            return columns_of(names.split(","), "--columns", timed=timed), []
+        if not texts:
+            raise StorageError(
+                f"{self._path}, line {self._lines.number}: no names of columns; name them: --columns t_s,gx_rad_s,..."
+            )
+        rows = [self._split(text) for _, text in texts]
+        known = [sum(meaning(name) is not None for name in row) for row in rows]
+        at = known.index(max(known)) if any(known) else len(rows) - 1
+        head = rows[at]
+        while len(head) > 1 and not head[-1].strip():
+            head = head[:-1]
+        units = next((row for row in rows[at + 1 :] if looks_like_units(row)), [])
+        return columns_of(head, f"{self._path}, line {texts[at][0]}", units, timed=timed), head
 
-class PoseGiven(msgspec.Struct, frozen=True, kw_only=True):
-    """How the IMU stood while it was logged, and where; None: not known, which widens the sigmas."""
+    # --- the numbers
 
-    pitch_deg: float | None = None
-    roll_deg: float | None = None
-    heading_deg: float | None = None
-    """True."""
-    sigma_deg: float = 0.05
-    heading_sigma_deg: float = 3.0
-    latitude_deg: float | None = None
-    height_m: float | None = None
+    def log(self, name: str) -> StillLog:
+        """Read it to its end."""
+        order = [what for what in UNITS if what in self._columns.used]
+        flat, numbers = array("d"), array("I")
+        for lines, block in self._blocks([self._columns.used[what].place for what in order]):
+            block[~(np.abs(block) < _NUMBERS)] = math.nan
+            flat.frombytes(np.ascontiguousarray(block).tobytes())
+            numbers.extend(lines)
+        if not flat:
+            raise StorageError(f"{self._path}: no line of numbers in it")
+        table = np.frombuffer(flat).reshape(-1, len(order))
+        values = {what: table[:, column] for column, what in enumerate(order)}
+        first = order.index("gx")
+        readings = table[:, first : first + 6]
+        t_s, kept = self._times(values.get("t"), readings, numbers)
+        if not len(kept):
+            raise StorageError(f"{self._path}: no line in it has a number for all of {', '.join(IMU)}")
+        if len(kept) < len(readings):
+            readings = readings[kept]
+            values = {what: column[kept] for what, column in values.items()}
+        units, notes = sizes.units_of(self._columns, t_s, readings, str(self._path))
+        self._notes += notes
+        # In place: of a night it is the largest thing there is.
+        readings *= sizes.factors(units)
+        return StillLog(
+            imu=name,
+            files=(self._path.name,),
+            began_unix_s=None,
+            t_s=t_s,
+            readings=readings,
+            temperature_degc=values.get("temperature", np.full(len(t_s), math.nan)),
+            poses=self._poses(values),
+            notes=tuple(self._notes),
+            left_out=dict(self._left_out),
+        )
 
-
-def estimate(
-    samples: Iterable[ImuSample],
-    pose: PoseGiven,
-    *,
-    mounting: Mounting = "ROTATION_NONE",
-    profile: str | Noise | None = None,
-) -> Record:
-    """The biases from the longest still stretch of a log.
-
-    Args:
-        samples: in order of time, by any clock in seconds.
-        pose: how it stood.
-        mounting: sensor to vehicle FRD.
-        profile: the sensor's model, or figures learned, for its Allan figures.
-
-    Raises:
-        StorageError: as `read`, where the samples are its.
-    """
-    settings = Settings(
-        min_still_s=MIN_STILL_S, max_s=MAX_STILL_S, target_gyro_sigma_rad_s=0.0, target_accel_sigma_m_s2=0.0
-    )
-    imu = ImuInput(name=NAME, rotation=rotation_matrix(mounting), profile=noise_profile(profile))
-    collector = RollingCollector(settings, [imu], gradienter=False, compass=False)
-    draft = Draft(datetime.datetime.now(tz=datetime.UTC))
-    found: list[Measurement] = []
-    still_s, obstacle = 0.0, "no samples"
-    offset_s: float | None = None
-    now_s = looked_s = _FIRST_S
-    for sample in samples:
-        if offset_s is None:
-            offset_s = _FIRST_S - sample.t_s
-        now_s = sample.t_s + offset_s
-        # Whoever looks has not seen the sample yet that tells him that it is time to.
-        if now_s - looked_s >= 1.0:
-            looked_s = math.floor(now_s)
-            collector.tick(now_s)
-            glance = collector.glance(now_s)
-            obstacle = obstacle if glance.obstacle is None else glance.obstacle.words
-            if glance.obstacle is None and glance.still_s >= max(MIN_STILL_S, _LONGER * still_s):
-                found.append(collector.measurement(now_s))
-                still_s = glance.still_s
-        collector.add_imu(NAME, ImuSample(now_s, sample.gyro_rad_s, sample.accel_m_s2, sample.temperature_degc))
-    collector.tick(now_s + 0.3)
-    glance = collector.glance(now_s + 0.3)
-    if glance.obstacle is None and glance.still_s > max(still_s, MIN_STILL_S - 1.0):
-        found.append(collector.measurement(now_s + 0.3))
-    best, refused = _latest(found)
-    seconds = now_s - _FIRST_S
-    if best is None:
-        return draft.record("failed", refused or f"no {MIN_STILL_S:.0f} s at rest in it: {obstacle}", seconds)
-    tilt_known = pose.pitch_deg is not None and pose.roll_deg is not None
-    if not tilt_known:
-        draft.warnings.append("no accelerometer biases without --pitch-deg and --roll-deg")
-    try:
-        window, where, gradienter, compass = _posed(best, pose)
-        what = What.BOTH if tilt_known else What.GYROS
-        draft.solution = solve(window, local_earth(where, _REMEDIES), gradienter, compass, what)
-    except CalibrationRefusedError as error:
-        return draft.record("failed", str(error), seconds)
-    return draft.record("done", in_words(draft.solution), seconds)
-
-
-def _latest(found: list[Measurement]) -> tuple[Window | None, str]:
-    """The window of the latest that gives one; where none does, why the very latest gives none."""
-    refused = ""
-    for each in reversed(found):
+    def _blocks(self, places: Sequence[int]) -> Iterator[tuple[list[int], Floats]]:
+        """Some thousand lines at a time: their numbers, and what stands in the columns."""
+        rows, numbers = [], []
         try:
-            return each.window(), ""
-        except CalibrationRefusedError as error:
-            refused = refused or str(error)
-    return None, refused
+            for row in self._rows:
+                rows.append(row)
+                numbers.append(self._lines.number)
+                if len(rows) == _AT_ONCE:
+                    yield self._block(rows, numbers, places)
+                    rows, numbers = [], []
+        except csv.Error as error:
+            raise StorageError(f"{self._path}, line {self._lines.number}: {error}") from None
+        if rows and rows != [[]]:
+            yield self._block(rows, numbers, places)
+
+    def _block(self, rows: list[list[str]], numbers: list[int], places: Sequence[int]) -> tuple[list[int], Floats]:
+        if not self._comma and all(len(row) == self._width for row in rows):
+            try:
+                return numbers, np.array([list(map(float, [row[place] for row in rows])) for place in places]).T
+            except ValueError:
+                pass  # not all of it is numbers: field by field
+        values, lines = [], []
+        for number, row in zip(numbers, rows, strict=True):
+            if row == self._again:
+                self._left_out["names again"] += 1
+                continue
+            self._check_width(number, row)
+            values.append([self._number(row[place], number, place) for place in places])
+            lines.append(number)
+        return lines, np.array(values).reshape(-1, len(places))
+
+    def _check_width(self, number: int, row: Sequence[str]) -> None:
+        if len(row) < self._width or any(field.strip() for field in row[self._width :]):
+            raise StorageError(
+                f"{self._path}, line {number}: found {len(row)} fields; allowed: {self._width}, as many as columns"
+            )
+
+    def _number(self, field: str, line: int, place: int) -> float:
+        text = field.strip(_AROUND)
+        if self._comma:
+            text = text.replace(",", ".")
+        try:
+            return float(text)
+        except ValueError:
+            if text.lower() in _NO_NUMBER:
+                return math.nan
+        if "t" in self._columns.used and place == self._columns.used["t"].place:
+            try:
+                found = datetime.datetime.fromisoformat(text)
+            except ValueError:
+                pass
+            else:
+                self._dates = True
+                return (found if found.tzinfo else found.replace(tzinfo=datetime.UTC)).timestamp()
+        raise StorageError(
+            f"{self._path}, line {line}: found {field!r} in column {self._columns.names[place]}; allowed: a number"
+        )
+
+    # --- times
+
+    def _times(self, stamps: Floats | None, readings: Floats, numbers: array[int]) -> tuple[Floats, NDArray[np.intp]]:
+        """Times of the lines that count, and which those are."""
+        whole = np.asarray(np.isfinite(readings).all(axis=1))
+        self._count("without a number in each of " + ", ".join(IMU), whole)
+        if stamps is None:
+            assert self._rate_hz is not None
+            kept = np.flatnonzero(whole)
+            return kept / self._rate_hz, kept
+        timed = np.isfinite(stamps)
+        self._count("without a time", timed)
+        kept = np.flatnonzero(whole & timed)
+        raw = _unwrapped(stamps[kept])
+        t_s = raw * TIMES[self._time_unit(raw)]
+        if len(t_s) and np.abs(t_s).max() > LAST_S:
+            line = numbers[int(kept[np.abs(t_s).argmax()])]
+            raise StorageError(
+                f"{self._path}, line {line}: time {np.abs(t_s).max():.3g} s; allowed: up to {LAST_S:g} s"
+            )
+        back = np.flatnonzero(np.diff(t_s) < 0.0)
+        if len(back):
+            line = numbers[int(kept[back[0] + 1])]
+            raise StorageError(
+                f"{self._path}, line {line}: time {t_s[back[0] + 1]:.6f} s after {t_s[back[0]]:.6f} s; allowed:"
+                " growing times, or --rate HZ in their place"
+            )
+        again = np.zeros(len(kept), dtype=bool)
+        equal = np.flatnonzero(np.diff(t_s) == 0.0) + 1
+        again[equal] = (readings[kept[equal]] == readings[kept[equal - 1]]).all(axis=1)
+        if again.any():
+            self._count("repeated: time and readings of the line before", ~again)
+            kept, t_s = kept[~again], t_s[~again]
+        return self._spread(t_s), kept
+
+    def _count(self, why: str, good: NDArray[np.bool_]) -> None:
+        if count := int((~good).sum()):
+            self._left_out[why] += count
+
+    def _time_unit(self, raw: Floats) -> str:
+        column = self._columns.used["t"]
+        if self._dates:
+            return "s"
+        if column.unit is not None:
+            return column.unit
+        unit = sizes.seconds_per(np.diff(raw))
+        if unit is None:
+            raise StorageError(
+                f"{self._path}: column {column.name} says no unit, and its steps do not tell; name them: --columns"
+                f" {self._columns.named({'t': 's'})}"
+            )
+        self._notes.append(f"{column.name}: taken for {unit}, by its steps")
+        return unit
+
+    def _spread(self, t_s: Floats) -> Floats:
+        """Lines of one stamp evenly over the time to the next one: a logger's clock has coarse steps."""
+        first = np.flatnonzero(np.diff(t_s, prepend=-math.inf) > 0.0)
+        runs = np.diff(np.append(first, len(t_s)))
+        if len(first) == len(t_s):
+            return t_s
+        self._notes.append(f"{len(t_s) - len(first)} lines with the time of the line before: spread evenly")
+        steps = np.diff(t_s[first])
+        usual = median(steps) if len(steps) else 0.0
+        steps = np.minimum(np.append(steps, usual), usual)
+        within = np.arange(len(t_s)) - np.repeat(first, runs)
+        return np.asarray(t_s + within * np.repeat(steps / runs, runs))
+
+    # --- what else there is
+
+    def _poses(self, values: dict[str, Floats]) -> Poses | None:
+        used = self._columns.used
+        factor = {what: UNITS[what][column.unit] for what, column in used.items() if column.unit is not None}
+        tilt = heading = field = None
+        if TILT[0] in values:
+            tilt = np.column_stack([values[what] * factor[what] for what in TILT])
+        if FIELD[0] in values:
+            field = np.column_stack([values[what] for what in FIELD])
+            unit = sizes.field_unit(self._columns, field, self._notes)
+            field = None if unit is None else field * GAUSS[unit]
+        for what in ("heading_magnetic", "heading"):
+            if what in values:
+                heading, magnetic = values[what] * factor[what], what == "heading_magnetic"
+        if tilt is None and heading is None and field is None:
+            return None
+        return Poses(tilt_deg=tilt, heading_deg=heading, magnetic=heading is not None and magnetic, field_gauss=field)
 
 
-def _posed(window: Window, pose: PoseGiven) -> tuple[Window, Whereabouts, GradienterModel | None, CompassModel | None]:
-    """The window with the pose in the place of gradienter and compass."""
-    level, north = np.eye(3), np.eye(3)
-    tilt = heading = None
-    gradienter = compass = None
-    if pose.pitch_deg is not None and pose.roll_deg is not None:
-        tilt = TiltWindow(
-            x_deg=pose.roll_deg,
-            y_deg=pose.pitch_deg,
-            x_sigma_deg=0.0,
-            y_sigma_deg=0.0,
-            temperature_degc=None,
-        )
-        gradienter = GradienterModel("euler", level, (0.0, 0.0), pose.sigma_deg)
-    if pose.heading_deg is not None:
-        heading = HeadingWindow(heading_deg=pose.heading_deg, sigma_deg=0.0)
-        compass = CompassModel(
-            magnetic=False, vehicle_from_sensor=north, offset_deg=0.0, sigma_deg=pose.heading_sigma_deg
-        )
-    source = None if pose.latitude_deg is None and pose.height_m is None else "command line"
-    where = Whereabouts(pose.latitude_deg, None, pose.height_m, source, None)
-    return msgspec.structs.replace(window, tilt=tilt, heading=heading), where, gradienter, compass
+_SEPARATORS: Final = (";", "\t", ",", " ")
+_AROUND: Final = ' "\t\r\n'
+"""What may stand around a number."""
+
+
+def _fields(text: str, separator: str) -> list[str]:
+    try:
+        return next(csv.reader((text,), delimiter=separator, skipinitialspace=separator == " "), [])
+    except csv.Error:
+        return [text]
+
+
+def _separator(first: str, texts: Sequence[str]) -> str:
+    """Of the first line of numbers; where that has but one field, of the texts before it."""
+    for separator in _SEPARATORS:
+        fields = _fields(first, separator)
+        if len(fields) > 1 and _is_data(fields):
+            return separator
+    return max(_SEPARATORS, key=lambda separator: max((text.count(separator) for text in texts), default=0))
+
+
+def _is_data(fields: Sequence[str]) -> bool:
+    """Whether there are more numbers than words in a line."""
+    texts = [text for field in fields if (text := field.strip(_AROUND)).lower() not in _NO_NUMBER]
+    numbers = sum(_is_number(text) for text in texts)
+    return numbers > len(texts) - numbers
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return _DECIMAL_COMMA.fullmatch(text) is not None
+
+
+def _unwrapped(stamps: Floats) -> Floats:
+    """The stamps of a counter of 32 bits, carried on over its end."""
+    falls = np.diff(stamps) < -_WRAPS / 2.0
+    if not falls.any() or not (np.abs(stamps) < _WRAPS).all():
+        return stamps
+    return stamps + _WRAPS * np.concatenate(([0], np.cumsum(falls)))

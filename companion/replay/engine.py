@@ -240,6 +240,7 @@ class Replay:
             gradienter_lag=models.lag("gradienter", config.gradienter),
             compass_lag=models.lag("compass", config.compass),
             field_by=models.field_by(config),
+            deck=models.deck(config),
         )
         self._decoders = {
             device.name: device.info.decoder(device.settings.seconds_per_byte) for device in self._devices
@@ -300,7 +301,9 @@ class Replay:
                 except CalibrationRefusedError as error:
                     self._calibrations.measured(detail.number, error)
                 else:
-                    self._calibrations.measured(detail.number, measurement.with_wander(detail.wander_deg))
+                    self._calibrations.measured(
+                        detail.number, measurement.watched_longer(detail.wander_deg, detail.begun_s, detail.turn)
+                    )
             case "reset":
                 collector.reset(*detail)
             case "imu":

@@ -13,7 +13,7 @@ from typing import Final
 import msgspec
 
 from companion import formats
-from companion.calibration.noise.allan import PROFILES, AllanModel, NoiseProfile
+from companion.calibration.noise.allan import PROFILES, AllanModel, NoiseProfile, noise_profile
 from companion.config import CATALOGUE
 from companion.config.sections import Noise
 from companion.errors import ConfigError, StorageError
@@ -54,6 +54,8 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
     """Figures that the recordings were too short to tell."""
     sources: tuple[Source, ...]
     notes: tuple[str, ...] = ()
+    warm_up: tuple[float, float] | None = None
+    """By how much a warm-up moves the biases, rad/s and m/s^2; null: not learned."""
 
     @property
     def origin(self) -> str:
@@ -65,12 +67,12 @@ class SavedProfile(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def noise(self) -> Noise:
         """As the configuration carries it."""
-        return _noise(self.name, self.gyro, self.accel, self.origin)
+        return msgspec.structs.replace(_noise(self.name, self.gyro, self.accel, self.origin), warm_up=self.warm_up)
 
     @property
     def profile(self) -> NoiseProfile:
         """As the estimator takes it."""
-        return NoiseProfile(self.name, self.gyro, self.accel)
+        return noise_profile(self.noise)
 
 
 def _noise(name: str, gyro: AllanModel, accel: AllanModel, origin: str) -> Noise:
@@ -214,4 +216,6 @@ def _from_json(data: bytes) -> SavedProfile:
         figures = msgspec.structs.astuple(model)
         if not all(map(math.isfinite, figures)) or min(figures) < 0.0 or model.white == 0.0:
             raise ValueError(f"found N, B, K of {figures}; allowed: N above 0, none negative")
+    if found.warm_up is not None and not all(0.0 < each < math.inf for each in found.warm_up):
+        raise ValueError(f"found warm_up of {found.warm_up}; allowed: above 0")
     return found

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Final
 from sim.accuracy.figures import Figure
 
 if TYPE_CHECKING:
-    from sim.accuracy.tables import Section
+    from sim.accuracy.figures import Section
 
-SECTIONS: Final = ("white", "floors", "methods", "tilt", "integers", "paper")
+SECTIONS: Final = ("white", "floors", "methods", "tilt", "warm-up", "integers", "deck", "turning", "paper")
 HELP: Final = "errors and sigmas of the estimator, beside the physical bound and what else is done"
 
 

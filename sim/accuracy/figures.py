@@ -1,9 +1,10 @@
-"""Figures with their own uncertainty, out of many stands."""
+"""Figures with their own uncertainty, out of many stands; claims on them, and the tables that they stand in."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -54,3 +55,37 @@ def beside(errors: Array, efficient: Array) -> Figure:
     added = rms(errors - efficient)
     value = math.sqrt(1.0 + added.value**2)
     return Figure(value, added.value * added.error / value)
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """What must hold, and whether it does: beyond what chance does with this number of stands (three sigmas)."""
+
+    words: str
+    unit: str
+    found: Figure
+    at_most: float
+    at_least: float = 0.0
+
+    @property
+    def holds(self) -> bool:
+        """Whether it does."""
+        slack = 3.0 * self.found.error
+        return self.at_least - slack <= self.found.value <= self.at_most + slack
+
+    def __str__(self) -> str:
+        allowed = f"<= {self.at_most:g}" if not self.at_least else f"{self.at_least:g} to {self.at_most:g}"
+        return (
+            f"{'yes' if self.holds else 'NO':4}{self.words:55}{self.found.value:9.3f} +- {self.found.error:.3f}"
+            f" {self.unit:6}{allowed:>11}"
+        )
+
+
+@dataclass(slots=True)
+class Section:
+    """One table."""
+
+    title: str
+    lines: list[str]
+    figures: dict[str, Any]
+    claims: list[Claim] = field(default_factory=list)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -41,6 +41,9 @@ GYRO_BIAS_RAD_S: Final = 100.0 * DEG_H
 ACCEL_BIAS_M_S2: Final = 2.0 * MG
 GRAVITY_ANOMALY_M_S2: Final = 3.0e-4
 """30 mGal, one sigma: what the formula of normal gravity leaves (method section 2.1)."""
+STEADY_DEGC: Final = 25.0
+THERMOMETER_K: Final = 0.02
+"""Noise of one reading of the IMU's own thermometer."""
 _CLOSE_S: Final = 0.3
 _TILT_HZ: Final = 10.0
 _TILT_NOISE_DEG: Final = 1e-4
@@ -134,6 +137,7 @@ def stand(
     anomaly_m_s2: float = 0.0,
     gyro_bias_rad_s: Array | None = None,
     accel_bias_m_s2: Array | None = None,
+    temperature_degc: float | Callable[[float], float] = STEADY_DEGC,
 ) -> Stand:
     """Put one up: its heading, its biases (unless given, in sensor axes) and its noise come from the seed."""
     random = np.random.default_rng([*seed, 21])
@@ -143,7 +147,7 @@ def stand(
     here = AnomalousSite(**dataclasses.asdict(site), anomaly_m_s2=float(random.normal() * anomaly_m_s2))
     gyro, accel = random.normal(size=3) * GYRO_BIAS_RAD_S, random.normal(size=3) * ACCEL_BIAS_M_S2
     imu = ImuModel(
-        VirtualAircraft(pose, here),
+        VirtualAircraft(pose, here, temperature_degc=temperature_degc),
         spec,
         seed=int(random.integers(2**62)),
         gyro_bias_rad_s=(gyro if gyro_bias_rad_s is None else gyro_bias_rad_s).tolist(),
@@ -160,7 +164,14 @@ def samples(standing: Stand, seconds: float, rate_hz: int = RATE_HZ) -> tuple[Ar
 
 
 def collected(
-    standing: Stand, taken: ImuInput, times: Array, rows: Array, spans_s: Sequence[int], *, horizon_s: float = NEXT_S
+    standing: Stand,
+    taken: ImuInput,
+    times: Array,
+    rows: Array,
+    spans_s: Sequence[int],
+    *,
+    horizon_s: float = NEXT_S,
+    thermometer: bool = True,
 ) -> list[Window]:
     """The windows after so many seconds each (ascending), fed sample by sample in the order of time.
 
@@ -180,15 +191,24 @@ def collected(
     tilts, headings = _tilts(standing, float(times[-1])), _headings(standing, float(times[-1]))
     found: list[Window] = []
     spans = list(spans_s)
-    for t_s, (p, q, r, x, y, z) in zip(times.tolist(), rows.tolist(), strict=True):
+    warm = _temperatures(standing, times) if thermometer else [None] * len(times)
+    for t_s, (p, q, r, x, y, z), degc in zip(times.tolist(), rows.tolist(), warm, strict=True):
         if spans and t_s >= 1.0 + spans[0]:
             found.append(_window(collector, 1.0 + spans.pop(0) + _CLOSE_S))
         while tilts and tilts[-1].t_s <= t_s:
             collector.add_tilt(tilts.pop())
         while headings and headings[-1].t_s <= t_s:
             collector.add_compass(headings.pop())
-        collector.add_imu(taken.name, ImuSample(t_s, (p, q, r), (x, y, z)))
+        collector.add_imu(taken.name, ImuSample(t_s, (p, q, r), (x, y, z), degc))
     return found + [_window(collector, 1.0 + span + _CLOSE_S) for span in spans]
+
+
+def _temperatures(standing: Stand, times: Array) -> list[float | None]:
+    """What its thermometer says at these times, each 0.1 s or so."""
+    noise = np.random.default_rng(round(1e6 * standing.heading_deg))
+    coarse = np.linspace(times[0], times[-1], max(2, round(float(times[-1] - times[0]) * 10.0)))
+    smooth = np.interp(times, coarse, [standing.imu.temperature_degc(float(t_s)) for t_s in coarse])
+    return list((smooth + noise.normal(size=len(times)) * THERMOMETER_K).tolist())
 
 
 def _window(collector: RollingCollector, now_s: float) -> Window:
@@ -273,4 +293,4 @@ def sigmas_stat(found: ImuSolution) -> Array:
 
 def sigmas_use(found: ImuSolution) -> Array:
     """(6,) sigma_use."""
-    return np.sqrt(np.diag(found.covariance))
+    return np.sqrt(np.diag(found.use_covariance))

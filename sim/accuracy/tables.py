@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 
-from sim.accuracy import paper
+from sim.accuracy import deck_tables, paper, turning, warmup_table
 from sim.accuracy.experiments import (
     FIELD_HEADING_DEG,
     FIELD_TILT_DEG,
@@ -28,8 +27,9 @@ from sim.accuracy.experiments import (
     predicted,
     white,
 )
-from sim.accuracy.figures import Figure, beside, covered, rms
+from sim.accuracy.figures import Claim, Figure, Section, beside, covered, rms
 from sim.accuracy.stand import NEXT_S, POSTURES
+from sim.accuracy.warmup import WARMING, cases, warm
 from sim.earth import STANDARD_GRAVITY_M_S2, Array
 from sim.imu_model import DEG_H, MG, PARTS, UG
 
@@ -44,47 +44,14 @@ _HALF_A_STEP: Final = 0.45
 """A sigma_stat of so many steps is no measurement."""
 
 
-@dataclass(frozen=True, slots=True)
-class Claim:
-    """What must hold, and whether it does: beyond what chance does with this number of stands (three sigmas)."""
-
-    words: str
-    unit: str
-    found: Figure
-    at_most: float
-    at_least: float = 0.0
-
-    @property
-    def holds(self) -> bool:
-        """Whether it does."""
-        slack = 3.0 * self.found.error
-        return self.at_least - slack <= self.found.value <= self.at_most + slack
-
-    def __str__(self) -> str:
-        allowed = f"<= {self.at_most:g}" if not self.at_least else f"{self.at_least:g} to {self.at_most:g}"
-        return (
-            f"{'yes' if self.holds else 'NO':4}{self.words:55}{self.found.value:9.3f} +- {self.found.error:.3f}"
-            f" {self.unit:6}{allowed:>11}"
-        )
-
-
-@dataclass(slots=True)
-class Section:
-    """One table."""
-
-    title: str
-    lines: list[str]
-    figures: dict[str, Any]
-    claims: list[Claim] = field(default_factory=list)
-
-
 def report(
     runs: int, seed: int, only: tuple[str, ...], jobs: int, progress: Callable[[str], None]
 ) -> dict[str, Section]:
     """All sections asked for, by name.
 
     Args:
-        runs: stands with white noise; a fifth of it of every part, a twentieth for every step of noise under integers.
+        runs: stands with white noise; a fifth of it of every part, a hundredth of it in every case of a warm-up, a
+            twentieth for every step of noise under integers, a thirty-second of every rate of a ground that turns.
         seed: of everything.
         only: of `cli.SECTIONS`.
         jobs: processes.
@@ -103,6 +70,11 @@ def report(
         for name, make in (("floors", _floors), ("methods", _methods), ("tilt", _tilt)):
             if name in only:
                 found[name] = make(parts)
+    if "warm-up" in only:
+        each = max(runs // 100, 1)
+        progress(f"warm-up: {each} stands of each of {len(WARMING)} parts in {len(cases())} cases")
+        heated = [(part, case, seed, number) for part in WARMING for case in cases() for number in range(each)]
+        found["warm-up"] = warmup_table.section(many(warm, heated, jobs), each)
     if "integers" in only:
         each = max(runs // 20, 4)
         progress(f"integers: {each} stands of each of {len(NOISE_LSB)} noises")
@@ -110,6 +82,14 @@ def report(
         found["integers"] = _integers(
             {noise: cut[each * index : each * (index + 1)] for index, noise in enumerate(NOISE_LSB)}
         )
+    if "deck" in only:
+        voyages, stands = max(runs // 10, 4), max(runs // 40, 4)
+        progress(f"deck: {voyages} voyages, {stands} stands")
+        found["deck"] = deck_tables.deck(voyages, stands, seed, jobs)
+    if "turning" in only:
+        each = max(runs // 32, 2)
+        progress(f"turning: {each} stands of each of {len(turning.RATES_DEG_S)} rates")
+        found["turning"] = turning.section(each, seed, jobs)
     if "paper" in only:
         found["paper"] = _paper(errata(seed, 400))
     return found

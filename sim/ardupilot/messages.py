@@ -39,7 +39,7 @@ def highres_imu(double: Board, loop_s: float) -> Message:
     t_s = double.aircraft.time_at(loop_s)
     gx, gy, gz, ax, ay, az = double.imu_output(0, loop_s).tolist()
     mx, my, mz = (magnetic_body(double, t_s) * 1000.0).tolist()
-    baro_degc = double.aircraft.temperature_degc(t_s) + 7.5
+    baro_degc = double.aircraft.temperature_degc(t_s) + 7.63
     return mavlink.MAVLink_highres_imu_message(
         double.boot_us(loop_s), ax, ay, az, gx, gy, gz, mx, my, mz,
         pressure_hpa(double), 0.0, double.aircraft.site.height_m, baro_degc, 8191, 0,

@@ -151,7 +151,7 @@ def _estimators(setup: Setup, still: Still) -> dict[str, AttitudeEstimator]:
                 latitude_deg=setup.site.latitude_deg,
                 gyro_noise=noise_profile(setup.part).gyro,
                 gyro_bias_rad_s=(float(gyro[0]), float(gyro[1]), float(gyro[2])),
-                gyro_covariance=found.covariance[:3, :3],
+                gyro_covariance=found.use_covariance[:3, :3],
                 accel_bias_m_s2=(float(accel[0]), float(accel[1]), float(accel[2])),
                 accel_sigma_m_s2=(float(np.max(found.accel_sigma_use_m_s2)),) * 3,
             )

@@ -55,7 +55,7 @@ def highres_imu(double: Board, loop_s: float) -> Message:
     mx, my, mz = (magnetic_body(double, t_s) * 0.001).tolist()
     return mavlink.MAVLink_highres_imu_message(
         double.boot_us(double.aircraft.loop_time_of(sample_s)), ax, ay, az, gx, gy, gz, mx, my, mz,
-        pressure_hpa(double), 0.0, double.aircraft.site.height_m, double.aircraft.temperature_degc(t_s) + 7.5, 4095, 0,
+        pressure_hpa(double), 0.0, double.aircraft.site.height_m, double.aircraft.temperature_degc(t_s) + 7.63, 4095, 0,
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from sim.scenario import Scenario
 from sim.sitl.json_backend import JsonBackend
 from sim.sitl.ports import LOOPBACK, free_tcp_window, free_udp_port
 from sim.sitl.process import FirmwareProcess, check_binary
+from sim.sitl.samples import SampleBlocks
 from sim.sitl.vehicle import SitlVehicle
 
 AXES = ("X", "Y", "Z")
@@ -122,6 +123,11 @@ class ArduPilotSitl(SitlVehicle):
     def stored(self) -> tuple[str, ...]:
         """The image of its EEPROM."""
         return ("eeprom.bin",)
+
+    @property
+    def samples(self) -> SampleBlocks:
+        """The back end's."""
+        return self.backend.blocks
 
     @property
     def imus(self) -> tuple[ImuModel, ...]:

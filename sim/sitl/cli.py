@@ -16,6 +16,7 @@ from pathlib import Path
 from sim.aircraft import Pose
 from sim.imu_model import PARTS
 from sim.scenario import FIRST_ACCEL_MG, FIRST_GYRO_DEG_H, GRADIENTER_OFFSET_DEG, Scenario, demo
+from sim.sea import motions_of
 from sim.serve import FIRMWARE_COMMANDS, add_world_options, address, configuration, describe, run_until_stopped, serve
 from sim.sitl.ardupilot import ArduPilotSitl
 from sim.sitl.process import BinaryError
@@ -63,11 +64,15 @@ def parser() -> argparse.ArgumentParser:
     residuals.add_argument(
         "--config", type=Path, action="append", default=[], metavar="FILE",
         help="further lines of the companion's configuration, such as [calibration], instead of a minute of standing"
-        " still; may be repeated",
+        " still, or a deck where it sways; may be repeated",
     )  # fmt: skip
     residuals.add_argument(
-        "--companion-only", action="store_true", help="leave the firmware's own calibrations out: three minutes less"
-    )
+        "--listen", type=float, default=0.0, metavar="SECONDS",
+        help="how long the companion hears the sensors before it is asked (default 0)",
+    )  # fmt: skip
+    only = residuals.add_mutually_exclusive_group()
+    only.add_argument("--companion-only", action="store_true", help="leave the firmware's own calibrations out")
+    only.add_argument("--own-only", action="store_true", help="leave the companion out")
     return top
 
 
@@ -100,6 +105,7 @@ def scenario_of(arguments: argparse.Namespace) -> Scenario:
         pose=Pose(pitch, roll, heading),
         seed=arguments.seed,
         unix_s=time.time(),
+        motions=motions_of(arguments.motion, seed=arguments.seed, turn_deg_s=arguments.turn),
         law=arguments.law,
         part=arguments.part,
         gyro_deg_h=arguments.gyro_bias,
@@ -140,11 +146,16 @@ def main(argv: Sequence[str]) -> int:
     try:
         vehicle = vehicle_of(arguments, scenario, folder / "firmware")
         if arguments.command == "residuals":
-            from sim.sitl.residuals import STILL, report
+            from sim.sitl.residuals import DECK, STILL, report
 
-            more = "".join(path.read_text(encoding="utf-8") for path in arguments.config) or STILL
-            own = not arguments.companion_only
-            return asyncio.run(report(vehicle, folder, arguments.observe, more, own=own))
+            more = "".join(path.read_text(encoding="utf-8") for path in arguments.config)
+            more = more or (DECK if arguments.motion in ("sea", "engine") else STILL)
+            return asyncio.run(
+                report(
+                    vehicle, folder, arguments.observe, more, listen_s=arguments.listen,
+                    own=not arguments.companion_only, companion=not arguments.own_only,
+                )
+            )  # fmt: skip
         return asyncio.run(
             run_until_stopped(
                 lambda started: _serve(vehicle, scenario, folder, started), lambda: _words(vehicle, scenario, folder)

@@ -54,7 +54,7 @@ class HilBackend:
         if not 1 <= len(imus) <= 2:
             raise ValueError(f"imus: found {len(imus)}; allowed: 1 or 2")
         self._aircraft = aircraft
-        self._blocks = SampleBlocks(aircraft, imus)
+        self.blocks = SampleBlocks(aircraft, imus)
         self._wanted_port = port
         declination = math.radians(aircraft.site.declination_deg)
         north, down = field_gauss
@@ -116,7 +116,7 @@ class HilBackend:
             self._driving.cancel()
         cast("socket.socket", writer.get_extra_info("socket")).setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         codec = Codec()
-        self._blocks.restart()
+        self.blocks.restart()
         self._answered.clear()
         self._locked = self.armed = False
         self.boots += 1
@@ -143,7 +143,7 @@ class HilBackend:
             while True:
                 self._answered.clear()
                 self.frames += 1
-                writer.write(self._frame(codec, self._blocks.next(1.0 / FRAME_HZ, self._now_s(loop))))
+                writer.write(self._frame(codec, self.blocks.next(1.0 / FRAME_HZ, self._now_s(loop))))
                 await writer.drain()
                 if self._locked and not self._answered.is_set():
                     await self._wait_answer()

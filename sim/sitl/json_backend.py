@@ -32,7 +32,7 @@ class JsonBackend:
 
     def __init__(self, aircraft: VirtualAircraft, imu: ImuModel, *, port: int = 0) -> None:
         self._aircraft = aircraft
-        self._blocks = SampleBlocks(aircraft, [imu])
+        self.blocks = SampleBlocks(aircraft, [imu])
         self._wanted_port = port
         self._socket: socket.socket | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -63,7 +63,7 @@ class JsonBackend:
     @property
     def jumps(self) -> int:
         """How often the machine was too slow to keep up."""
-        return self._blocks.jumps
+        return self.blocks.jumps
 
     async def __aenter__(self) -> Self:
         """Bind the port.
@@ -121,7 +121,7 @@ class JsonBackend:
     def _begin(self, peer: tuple[str, int]) -> None:
         """A firmware has started: its time starts from zero, and so must ours, or it would leap."""
         self._peer, self._count, self._physics_s = peer, -1, 0.0
-        self._blocks.restart()
+        self.blocks.restart()
         self.boots += 1
         self.frames = 0
 
@@ -143,6 +143,6 @@ class JsonBackend:
         self._physics_s += interval_s
         self._last_s = self._loop.time()
         now_s = self._aircraft.time_at(self._last_s)
-        self._last = encode_frame(self._physics_s, self._blocks.next(interval_s, now_s))
+        self._last = encode_frame(self._physics_s, self.blocks.next(interval_s, now_s))
         self.frames += 1
         return self._last

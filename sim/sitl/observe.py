@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim.aircraft import VirtualAircraft
 from sim.earth import STANDARD_GRAVITY_M_S2, Array
-from sim.sitl.ground import GroundStation
+from sim.sitl.ground import GroundStation, imu_row
 from sim.sitl.hil_frames import FIFO_STEPS
 from sim.sitl.vehicle import SitlVehicle
 
@@ -19,6 +21,9 @@ SCALED = (
 )
 STEP = np.array([1e-3] * 3 + [1e-3 * STANDARD_GRAVITY_M_S2] * 3)
 """Of the SCALED_IMU messages: mrad/s and mG."""
+SWAYS_STEPS = 10.0
+"""An aircraft that moves by more has all digits in its integers."""
+_NEAR_S = 0.005
 _STEADY_SIGMA = 1.0 / math.sqrt(2.0)
 """PX4 integrates by the trapezoid rule: an output is the mean of two samples (the figure of autopilots 9.3.2)."""
 PX4_RATE_HZ = 250.0
@@ -59,14 +64,61 @@ async def mean_reading(vehicle: SitlVehicle, ground: GroundStation, instance: in
 
 
 async def residual(vehicle: SitlVehicle, ground: GroundStation, instance: int, seconds: float) -> Array:
-    """`mean_reading` less the truth of the aircraft at the end of the look; the same six numbers.
+    """What an IMU reads more than the truth of the aircraft, after its offsets; the same six numbers.
 
     Raises:
         RuntimeError: the messages do not come.
     """
+    aircraft, begun_s = vehicle.aircraft, vehicle.now_s
+    ahead = np.concatenate(aircraft.truth(begun_s + np.linspace(0.0, min(seconds, 30.0), 301)), axis=1)
+    if (np.ptp(ahead, axis=0) > SWAYS_STEPS * STEP).any():
+        return await _residual_on_the_move(vehicle, ground, instance, seconds)
     mean = await mean_reading(vehicle, ground, instance, seconds)
-    truth = vehicle.aircraft.truth_at(vehicle.now_s)
-    return np.asarray(mean - np.concatenate([truth.rate_rad_s, truth.force_m_s2]), dtype=np.float64)
+    truth = np.concatenate(aircraft.truth(np.linspace(begun_s, vehicle.now_s, 301)), axis=1).mean(axis=0)
+    return np.asarray(mean - truth, dtype=np.float64)
+
+
+async def _residual_on_the_move(vehicle: SitlVehicle, ground: GroundStation, instance: int, seconds: float) -> Array:
+    floats = vehicle.firmware == "ardupilot" and instance == 1
+    kind = mavlink.MAVLink_highres_imu_message if floats else SCALED[instance - 1]
+    since_s = asyncio.get_running_loop().time()
+    await ground.imu(kind, seconds, rate_hz=100.0 if vehicle.firmware == "ardupilot" else PX4_RATE_HZ)
+    heard = ground.timed(kind, since_s=since_s)
+    rows = np.array([imu_row(message) for _, message in heard])
+    if not floats:  # they move by many digits, so that half a digit towards zero is what was cut off
+        rows += np.sign(rows) * STEP / 2.0
+    times = vehicle.samples.aircraft_times(np.array([_own_s(message) for _, message in heard]))
+    arrived_s = np.array([vehicle.aircraft.time_at(t_s) for t_s, _ in heard])
+    # The firmware's clock may have begun some time before our physics.
+    return excess(vehicle.aircraft, rows, times + float(np.median(arrived_s - times)))
+
+
+def excess(aircraft: VirtualAircraft, rows: Array, times: Array) -> Array:
+    """What readings of a swaying aircraft are too large by (6); how late they are is found beside it.
+
+    Args:
+        aircraft: the truth.
+        rows: readings (n, 6): rad/s, m/s^2.
+        times: when they were made, aircraft time, and the same for all too late (n).
+    """
+    found = []
+    for sensor in range(2):
+        shown, late_s, more = rows[:, 3 * sensor : 3 * sensor + 3], 0.0, np.zeros(3)
+        for _ in range(4):
+            before, at, after = (aircraft.truth(times - late_s + d)[sensor] for d in (-_NEAR_S, 0.0, _NEAR_S))
+            slope, left = (after - before) / (2.0 * _NEAR_S), shown - at
+            middle = slope - slope.mean(axis=0)
+            later_s = -float((middle * left).sum() / (middle**2).sum())
+            more = left.mean(axis=0) + later_s * slope.mean(axis=0)
+            late_s += later_s
+        found.append(more)
+    return np.concatenate(found)
+
+
+def _own_s(message: mavlink.MAVLink_message) -> float:
+    """The firmware's clock."""
+    fields = message.to_dict()
+    return float(fields["time_usec"]) * 1e-6 if "time_usec" in fields else float(fields["time_boot_ms"]) * 1e-3
 
 
 async def _corrections(ground: GroundStation) -> tuple[list[float], list[float]]:

@@ -12,6 +12,7 @@ from sim.scenario import Scenario
 from sim.sitl.hil_backend import HilBackend
 from sim.sitl.ports import LOOPBACK, ports_free, unlocked
 from sim.sitl.process import BinaryError, FirmwareProcess, check_binary
+from sim.sitl.samples import SampleBlocks
 from sim.sitl.vehicle import SitlVehicle
 
 MODEL = "none_iris"
@@ -118,6 +119,11 @@ class Px4Sitl(SitlVehicle):
     def stored(self) -> tuple[str, ...]:
         """Parameters and their backup."""
         return "parameters.bson", "parameters_backup.bson"
+
+    @property
+    def samples(self) -> SampleBlocks:
+        """The back end's."""
+        return self.backend.blocks
 
     @property
     def imus(self) -> tuple[ImuModel, ...]:

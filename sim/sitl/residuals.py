@@ -22,8 +22,14 @@ from sim.udp import open_udp
 
 SETTLE_S = 40.0
 """After a start: the estimator has its position and the first transients are over."""
-OWN_CALIBRATION_S = 35.0
+OWN_CALIBRATION_S = 60.0
 """ArduPilot's gyro calibration gives up after about 30 s; it must not be asked twice (autopilots 9.3.1)."""
+QUIET_S = 3.0
+GYROS, QUICK, LEVEL = (1.0,), (0.0, 0.0, 0.0, 0.0, 4.0), (0.0, 0.0, 0.0, 0.0, 2.0)
+"""Parameters of MAV_CMD_PREFLIGHT_CALIBRATION: gyros; accelerometers by one pose; what is level."""
+_QUICK_NAME = {"ardupilot": "simple, param5 = 4", "px4": "quick, param5 = 4"}
+_LEVEL = {"ardupilot": ("AHRS_TRIM_X", "AHRS_TRIM_Y"), "px4": ("SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF")}
+"""What a level calibration sets: rad, degrees."""
 CALIBRATE_WITHIN_S = 420.0
 """Two IMUs whose offsets are dithered one after the other, on a busy machine."""
 OWN_TRIES = 3
@@ -32,6 +38,15 @@ may be good by chance."""
 STILL = "[calibration]\nmin_still_s = 60\nmax_s = 60\n"
 """A whole minute, as the figures of autopilots 9.3. By itself the companion stops where the part's flicker, which its
 profile knows, makes more averaging worthless; a part of white noise only has none."""
+DECK = """
+[vehicle]
+platform = "deck"
+[calibration]
+at_arm = "off"
+target_gyro_sigma_deg_h = 500
+target_accel_sigma_mg = 5
+"""
+"""On a sea: when it is asked, not by itself, and as soon as it has heard a minute; for longer there is `--listen`."""
 SLOW = 0.95
 UNITS = np.array([DEG_H] * 3 + [MG] * 3)
 
@@ -77,36 +92,33 @@ async def ground_station(vehicle: SitlVehicle) -> AsyncIterator[GroundStation]:
         end.close()
 
 
-async def own_gyro_calibration(vehicle: SitlVehicle, ground: GroundStation) -> int:
-    """MAV_CMD_PREFLIGHT_CALIBRATION param1 = 1, until it is over; returns the result of the command.
+async def own_calibration(vehicle: SitlVehicle, ground: GroundStation, *params: float) -> str:
+    """MAV_CMD_PREFLIGHT_CALIBRATION until it is over; how it answered, and what it said."""
+    loop = asyncio.get_running_loop()
+    since_s = loop.time()
+    result = await ground.command(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, *params, wait_s=OWN_CALIBRATION_S)
+    texts: list[str] = []
 
-    Raises:
-        TimeoutError: PX4 does not say that it is done.
-    """
-    since_s = asyncio.get_running_loop().time()
-    result = await ground.command(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 1.0, wait_s=OWN_CALIBRATION_S)
-    if vehicle.firmware == "px4":
-        await ground.wait_for(
-            lambda: any(
-                "calibration done" in message.text or "calibration failed" in message.text
-                for message in ground.all(mavlink.MAVLink_statustext_message, since_s=since_s)
-            ),
-            OWN_CALIBRATION_S,
-            "[cal] calibration done",
-        )
-    return result
+    def over() -> bool:
+        said = ground.all(mavlink.MAVLink_statustext_message, since_s=since_s)
+        texts[:] = dict.fromkeys(message.text.strip() for message in said)
+        return any("calibration done" in text or "calibration failed" in text for text in texts)
 
-
-async def own_accel_calibration(vehicle: SitlVehicle, ground: GroundStation) -> int:
-    """MAV_CMD_PREFLIGHT_CALIBRATION param5 = 4, simple (ArduPilot) or quick (PX4); returns the result."""
-    result = await ground.command(
-        mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 0.0, 0.0, 0.0, 0.0, 4.0, wait_s=OWN_CALIBRATION_S
-    )
-    await asyncio.sleep(3.0)  # PX4 answers before it has begun
-    return result
+    if vehicle.firmware == "px4":  # it answers before it has begun, and says no word of a quick one
+        with contextlib.suppress(TimeoutError):
+            await ground.wait_for(over, QUIET_S if params == QUICK else OWN_CALIBRATION_S * 3.0, "its end")
+    else:
+        await asyncio.sleep(QUIET_S)
+    over()
+    named = mavlink.enums["MAV_RESULT"].get(result)
+    name = "no answer" if named is None else named.name.removeprefix("MAV_RESULT_").lower()
+    return f"{name} after {loop.time() - since_s:.0f} s: {'; '.join(texts) or 'no word'}"
 
 
-async def report(vehicle: SitlVehicle, folder: Path, observe_s: float, more: str = STILL, *, own: bool = True) -> int:
+async def report(
+    vehicle: SitlVehicle, folder: Path, observe_s: float, more: str = STILL, *, listen_s: float = 0.0, own: bool = True,
+    companion: bool = True,
+) -> int:  # fmt: skip
     """Start the firmware, calibrate it in every way, print the table; the exit code (1: the companion failed).
 
     Args:
@@ -114,7 +126,9 @@ async def report(vehicle: SitlVehicle, folder: Path, observe_s: float, more: str
         folder: for the companion's files; exists.
         observe_s: length of each look.
         more: further lines of the companion's configuration.
+        listen_s: how long the companion hears the sensors before it is asked.
         own: whether the firmware's own calibrations are wanted in the table.
+        companion: whether ours is.
     """
     async with vehicle, ground_station(vehicle) as ground:
         p = vehicle.aircraft.pose
@@ -127,38 +141,47 @@ async def report(vehicle: SitlVehicle, folder: Path, observe_s: float, more: str
         if own:
             await _look(vehicle, ground, "as it came", observe_s)
             await _own_calibrations(vehicle, ground, observe_s)
+        if own and companion:
             await vehicle.factory_reset()
             await asyncio.sleep(SETTLE_S)
-        try:
-            async with companion_daemon(vehicle, folder, more=more) as daemon:
-                record = await daemon.calibrate(CALIBRATE_WITHIN_S)
-        except (RuntimeError, TimeoutError) as error:
-            print(f"companion: {error}", file=sys.stderr)
-            return 1
-        outcome = f"{record['state']} in {record['duration_s']:.0f} s"
-        for imu in record["imus"]:
-            print(f"imu {imu['name']}: {imu['samples']} samples; {'; '.join(imu['warnings'])}", file=sys.stderr)
-        print("; ".join([record["reason"], *record["warnings"]]), file=sys.stderr)
-        await _look(vehicle, ground, f"companion ({outcome})", observe_s)
-        if record["state"] != "done":
-            print(f"companion: {record['state']}: {record['reason']}", file=sys.stderr)
-            return 1
-        await vehicle.power_cycle()
-        await asyncio.sleep(SETTLE_S)
-        await _look(vehicle, ground, "companion, after a power cycle", observe_s)
-        return 0
+        return await _companion(vehicle, ground, folder, observe_s, more, listen_s) if companion else 0
+
+
+async def _companion(
+    vehicle: SitlVehicle, ground: GroundStation, folder: Path, observe_s: float, more: str, listen_s: float
+) -> int:
+    try:
+        async with companion_daemon(vehicle, folder, more=more) as daemon:
+            await vehicle.sleep(listen_s)
+            record = await daemon.calibrate(CALIBRATE_WITHIN_S)
+    except (RuntimeError, TimeoutError) as error:
+        print(f"companion: {error}", file=sys.stderr)
+        return 1
+    outcome = f"{record['state']} in {record['duration_s']:.0f} s"
+    for imu in record["imus"]:
+        print(f"imu {imu['name']}: {imu['samples']} samples; {'; '.join(imu['warnings'])}", file=sys.stderr)
+    print("; ".join([record["reason"], *record["warnings"]]), file=sys.stderr)
+    await _look(vehicle, ground, f"companion ({outcome})", observe_s)
+    if record["state"] != "done":
+        print(f"companion: {record['state']}: {record['reason']}", file=sys.stderr)
+        return 1
+    await vehicle.power_cycle()
+    await asyncio.sleep(SETTLE_S)
+    await _look(vehicle, ground, "companion, after a power cycle", observe_s)
+    return 0
 
 
 async def _own_calibrations(vehicle: SitlVehicle, ground: GroundStation, observe_s: float) -> None:
     for number in range(1, OWN_TRIES + 1):
-        await own_gyro_calibration(vehicle, ground)
+        print(f"  {await own_calibration(vehicle, ground, *GYROS)}")
         await _look(vehicle, ground, f"own gyro calibration (param1 = 1), no. {number}", observe_s / OWN_TRIES)
-    await own_accel_calibration(vehicle, ground)
-    await _look(vehicle, ground, f"own accelerometer calibration ({_accel_name(vehicle)})", observe_s)
-
-
-def _accel_name(vehicle: SitlVehicle) -> str:
-    return "simple, param5 = 4" if vehicle.firmware == "ardupilot" else "quick, param5 = 4"
+    print(f"  {await own_calibration(vehicle, ground, *QUICK)}")
+    await _look(vehicle, ground, f"own accelerometer calibration ({_QUICK_NAME[vehicle.firmware]})", observe_s)
+    names = _LEVEL[vehicle.firmware]
+    before = [await ground.get(name) for name in names]
+    print(f"  {await own_calibration(vehicle, ground, *LEVEL)}")
+    for name, was in zip(names, before, strict=True):
+        print(f"  own level calibration (param5 = 2): {name} {was:.4f}, now {await ground.get(name):.4f}", flush=True)
 
 
 async def _look(vehicle: SitlVehicle, ground: GroundStation, what: str, seconds: float) -> None:

@@ -6,6 +6,7 @@ Drawing noise sample by sample would cost more than everything else at 1000 fram
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ BLOCK_S = 0.02
 JUMP_S = 0.25
 """Further behind the wall clock than this, and the aircraft's time is set anew instead of hurried."""
 _SLOWEST, _FASTEST = 0.8, 1.25
+_BLOCKS_KEPT = 30_000
 
 
 class Sample(NamedTuple):
@@ -48,6 +50,8 @@ class SampleBlocks:
         self._at = 0
         self.jumps = 0
         """How often the machine was too slow to keep up."""
+        self._track: deque[tuple[float, float]] = deque(maxlen=_BLOCKS_KEPT)
+        self._own_s = 0.0
 
     def next(self, interval_s: float, now_s: float) -> Sample:
         """The next sample, `interval_s` of the firmware's time after the last; `now_s` is aircraft time by the wall."""
@@ -60,6 +64,14 @@ class SampleBlocks:
     def restart(self) -> None:
         """Forget what was made ahead: the firmware has started anew."""
         self._next_s, self._samples, self._at = None, [], 0
+        self._track.clear()
+        self._own_s = 0.0
+
+    def aircraft_times(self, own_s: Array) -> Array:
+        """Aircraft times of instants of the firmware's clock since its start, of the last ten minutes."""
+        own, aircraft = np.array([*self._track, (self._own_s, self._next_s)]).T
+        times: Array = np.interp(own_s, own, aircraft)
+        return times
 
     def _fill(self, interval_s: float, now_s: float) -> None:
         start_s = now_s if self._next_s is None else self._next_s
@@ -69,6 +81,8 @@ class SampleBlocks:
             start_s, late_s = now_s, 0.0
         step_s = interval_s * min(max(1.0 + late_s, _SLOWEST), _FASTEST)
         count = max(1, round(BLOCK_S / interval_s))
+        self._track.append((self._own_s, start_s))
+        self._own_s += count * interval_s
         times: Array = start_s + step_s * np.arange(1, count + 1, dtype=np.float64)
         self._next_s = float(times[-1])
         # The noise of a reading belongs to the firmware's interval: that is what its filters average over.

@@ -15,6 +15,7 @@ from sim.motions import Motion
 from sim.scenario import Scenario
 from sim.sitl.ground import Firmware
 from sim.sitl.process import FirmwareProcess
+from sim.sitl.samples import SampleBlocks
 
 BOOT_S = 60.0
 """A binary that does not ask for physics by then never will."""
@@ -55,6 +56,11 @@ class SitlVehicle(ABC):
     @abstractmethod
     def physics_s(self) -> float:
         """The firmware's simulated time since its boot."""
+
+    @property
+    @abstractmethod
+    def samples(self) -> SampleBlocks:
+        """What the back end sends."""
 
     @property
     @abstractmethod

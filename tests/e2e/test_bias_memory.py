@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 from companion.calibration.solution.history import PowerUp
-from companion.calibration.solution.record import Record
+from companion.calibration.solution.record import Record, Standing
 from companion.daemon.job import Job
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
 from companion.storage.learned import KEEP_POINTS, BiasStore
 from sim.devices import Gradienter
 from sim.imu_model import DEG_H, MG
+from sim.motions import SlowTurn
 from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
@@ -239,3 +240,48 @@ def test_a_damaged_file_costs_one_line_and_what_is_undone_is_forgotten(
     (line,) = [each.message for each in caplog.records if "biases.json" in each.message]
     assert line.startswith(f"{tmp_path}/biases.json: cannot be used: ")
     assert line.endswith("; set aside as biases.json.unusable")
+
+
+def blind(rate_deg_s: float) -> Callable[[Rig], None]:
+    """No compass, on a platform that turns so fast from before the beginning."""
+
+    def before(rig: Rig) -> None:
+        rig.config = msgspec.structs.replace(rig.config, compass=None)
+        del rig.devices["compass"]
+        if rate_deg_s:
+            rig.aircraft.add(SlowTurn(start_s=-10.0, duration_s=1000.0, rate_deg_s=rate_deg_s))
+
+    return before
+
+
+def test_who_has_no_compass_and_no_history_is_told_what_was_assumed(tmp_path: Path) -> None:
+    records, _, rig = power_up(tmp_path, 0, before=blind(0.15), times=2)
+    for record in records:
+        # The second has the first before it, which may have turned as well.
+        assert sum("assumed Earth-fixed" in words for words in record.warnings) == 1
+        assert record.standing == Standing(platform="ground", turn_deg_s=None, turn_sigma_deg_s=None, told_by=None)
+    assert "assumed Earth-fixed" in "".join(rig.ground.texts())
+
+
+@pytest.mark.parametrize("rate_deg_s", [-0.15, 0.0, 0.15, 1.0])
+def test_a_turn_that_no_compass_shows_is_bounded_by_earlier_power_ups(
+    known: Path, tmp_path: Path, rate_deg_s: float
+) -> None:
+    records, truths, _ = power_up(copied(known, tmp_path), 5, before=blind(rate_deg_s), times=2)
+    for record in records:
+        for imu in record.imus:
+            assert imu.gyro_bias_rad_s is not None
+            assert imu.gyro_sigma_use_rad_s is not None
+            sigma = np.array(imu.gyro_sigma_use_rad_s)
+            assert (np.abs(np.subtract(imu.gyro_bias_rad_s, truths[imu.name][0])) < 3.0 * sigma).all()
+            assert (sigma.max() > abs(rate_deg_s) / 3.0 * 3600.0 * DEG_H) if rate_deg_s else (sigma < 60 * DEG_H).all()
+        standing = record.standing
+        assert standing is not None
+        assert standing.told_by == "earlier calibrations"
+        assert standing.turn_deg_s is not None
+        assert standing.turn_sigma_deg_s is not None
+        assert abs(standing.turn_deg_s - rate_deg_s) < 3.0 * standing.turn_sigma_deg_s < 3.0 * 0.05
+        assert not any("assumed" in words for words in record.warnings)
+        side = "right" if rate_deg_s > 0.0 else "left"
+        said = any(words.endswith("sigma widened") and side in words for words in record.warnings)
+        assert said == bool(rate_deg_s), record.warnings

@@ -56,7 +56,10 @@ def second_imu_only(
         gyro_bias_rad_s=[value * DEG_H for value in gyro],
         accel_bias_m_s2=[value * MG for value in accel],
     )
-    rig.autopilot = ArduPilotDouble(rig.aircraft, [rig.model, model], parameters={"INS_GYR_CAL": 0.0}, seed=seed)
+    # On for an hour: the figures asked of it are without what a warm-up might do.
+    rig.autopilot = ArduPilotDouble(
+        rig.aircraft, [rig.model, model], parameters={"INS_GYR_CAL": 0.0}, seed=seed, up_s=3600.0
+    )
     rig.wire, rig.radio = Wire(rig.link, rig.double, seed=seed), Wire(rig.ground, rig.double.ground, seed=seed + 1)
     return rig
 

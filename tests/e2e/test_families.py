@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from companion.calibration.noise.allan import PROFILES
 from companion.calibration.request import What
 from companion.calibration.solution.record import ImuRecord, Record
 from companion.config import parse
@@ -25,6 +26,7 @@ from companion.configured import models
 from companion.daemon.job import Job
 from companion.daemon.process.service import Service
 from companion.protocols.registry import PROTOCOLS
+from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source
 from sim.aircraft import Pose, VirtualAircraft
 from sim.ardupilot.double import ArduPilotDouble
 from sim.devices import SerialDevice
@@ -47,8 +49,8 @@ latitude_deg = 40.0
 longitude_deg = 116.0
 height_m = 50.0
 [calibration]
-min_still_s = 3
-max_s = 5
+min_still_s = 8
+max_s = 10
 at_arm = "off"
 [push]
 parameters = false
@@ -123,6 +125,23 @@ def section(role: str, device: SerialDevice, path: Path, *more: str) -> str:
     return "\n".join([*(more[:1] if role == "imu" else [f"[{role}]"]), *lines, *(more[1:] if role == "imu" else more)])
 
 
+def calm() -> SavedProfile:
+    """Learned of the IMUs that are simulated here: a BMI088's noise, and they do not warm up."""
+    part = PROFILES["bmi088"]
+    return SavedProfile(
+        format_version=FORMAT_VERSION,
+        name="calm",
+        saved_at="2026-11-21T10:00:00+00:00",
+        imu="imu",
+        gyro=part.gyro,
+        accel=part.accel,
+        kept_from=part.name,
+        kept=(),
+        sources=(Source(file="a.csv", began_at=None, still_s=5400.0, temperature_degc=None),),
+        warm_up=(10.0 * DEG_H, 0.1 * MG),
+    )
+
+
 async def carry_out(run: Run, folder: Path, number: int) -> Outcome:
     """One daemon from its start to a record."""
     aircraft = VirtualAircraft(POSE, site_at(40.0, 116.0, 50.0))
@@ -146,9 +165,7 @@ async def carry_out(run: Run, folder: Path, number: int) -> Outcome:
         gradienter = devices["gradienter"] = GRADIENTERS[run.gradienter](aircraft, number)
     path_of = {id(device): folder / name for name, device in devices.items()}
     parts = [
-        section(
-            "imu", devices[name], folder / name, f'[[imu]]\nname = "{name}"\nsource = "serial"', 'profile = "bmi088"'
-        )
+        section("imu", devices[name], folder / name, f'[[imu]]\nname = "{name}"\nsource = "serial"', 'profile = "calm"')
         for name in imus
     ]
     parts.append(section("gradienter", gradienter, path_of[id(gradienter)], f'law = "{law_of(gradienter)}"'))
@@ -160,7 +177,10 @@ async def carry_out(run: Run, folder: Path, number: int) -> Outcome:
         link = await open_udp(autopilot, listen=("127.0.0.1", 0))
         stack.callback(link.close)
         host, port = link.local
-        config = parse(CONFIG.format(host=host, port=port, folder=folder) + "\n".join(parts), "families.toml")
+        ProfileStore(folder / "state").write(calm())
+        config = parse(
+            CONFIG.format(host=host, port=port, folder=folder) + "\n".join(parts), "families.toml", ProfileStore
+        )
         service = Service(config)
         tasks = [asyncio.create_task(autopilot.run()), asyncio.create_task(service.run())]
         try:

@@ -172,7 +172,7 @@ def test_one_calibration_is_the_same_story_from_five_sides(tmp_path: Path) -> No
             assert started < ended
             figures = re.findall(r"[\d.]+ (?:deg/h|mg)", reason)
             assert figures
-            assert all(figure in texts[ended] for figure in figures)
+            assert all(figure in texts[ended] for figure in figures), (reason, texts[ended])
 
     asyncio.run(main())
 

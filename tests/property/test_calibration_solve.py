@@ -246,6 +246,31 @@ def test_without_a_gradienter_gyros_only() -> None:
         solve(blind, local, None, _compass(), What.ACCELEROMETERS)
 
 
+def test_on_a_deck_no_gyro_is_calibrated_without_a_heading() -> None:
+    local = _local(50.0)
+    window = ideal_window(
+        ned_body=ned_from_body(1.0, 2.0, 30.0),
+        body_gradienter=np.eye(3),
+        law="slope",
+        latitude_deg=50.0,
+        gravity_m_s2=local.gravity_m_s2,
+        heading_deg=30.0,
+        gyro_bias=np.full(3, 0.001),
+        accel_bias=np.zeros(3),
+    )
+    blind = msgspec.structs.replace(window, heading=None)
+    level = _gradienter("slope")
+    with pytest.raises(CalibrationRefusedError, match="on a deck gyros need a compass"):
+        solve(blind, local, level, None, What.GYROS, "deck")
+    both = solve(blind, local, level, None, What.BOTH, "deck")
+    assert _only(both).gyro_rad_s is None
+    assert _only(both).accel_m_s2 is not None
+    assert both.unknown == (("fc", "gyro"),)
+    assert any("deck" in words for words in both.warnings)
+    seeing = solve(window, local, level, _compass(), What.BOTH, "deck")
+    np.testing.assert_allclose(_vectors(_only(seeing))[0], np.full(3, 0.001), rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize(("what", "gyros", "accels"), [(What.GYROS, True, False), (What.ACCELEROMETERS, False, True)])
 def test_only_what_was_asked_for(what: What, gyros: bool, accels: bool) -> None:
     window, local = _window()

@@ -9,7 +9,7 @@ import os
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -45,9 +45,12 @@ KINDS = ("ardupilot-double", "px4-double", "ardupilot-sitl", "px4-sitl")
 BINARIES = {"ardupilot-sitl": "ARDUPILOT_SITL", "px4-sitl": "PX4_SITL"}
 
 
-def world() -> Scenario:
+def world(motions: Sequence[Motion] = ()) -> Scenario:
     """The aircraft at 5/-3/40 deg with case A and white noise only."""
-    return demo(pose=DEMO_POSE, part="white_only", gyro_deg_h=GYRO_DEG_H, accel_mg=ACCEL_MG, seed=1, unix_s=time.time())
+    return demo(
+        pose=DEMO_POSE, part="white_only", gyro_deg_h=GYRO_DEG_H, accel_mg=ACCEL_MG, seed=1, unix_s=time.time(),
+        motions=motions,
+    )  # fmt: skip
 
 
 class Craft(ABC):
@@ -310,7 +313,7 @@ class SitlAutopilot(Autopilot):
         self._loop.close()
 
 
-def binary_vehicle(kind: str, folder: Path, **options: Any) -> SitlVehicle:
+def binary_vehicle(kind: str, folder: Path, motions: Sequence[Motion] = (), **options: Any) -> SitlVehicle:
     """The binary that the environment names, on the world of these tests, not started.
 
     Raises:
@@ -319,8 +322,8 @@ def binary_vehicle(kind: str, folder: Path, **options: Any) -> SitlVehicle:
     binary = Path(os.environ[BINARIES[kind]])
     if kind.startswith("px4"):
         etc = os.environ.get("PX4_SITL_ETC")
-        return Px4Sitl(binary, world(), folder, etc=Path(etc) if etc else None, **options)
-    return ArduPilotSitl(binary, world(), folder, **options)
+        return Px4Sitl(binary, world(motions), folder, etc=Path(etc) if etc else None, **options)
+    return ArduPilotSitl(binary, world(motions), folder, **options)
 
 
 def missing(kind: str) -> str | None:

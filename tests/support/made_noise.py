@@ -59,3 +59,26 @@ def write_csv(path: Path, t_s: Floats, readings: Floats) -> Path:
     rows = np.column_stack([t_s, readings])
     np.savetxt(path, rows, fmt=["%.6f", *["%.9g"] * 6], delimiter=",", header=head, comments="")
     return path
+
+
+def filtered(
+    seconds: int, rate_hz: int, white: tuple[float, float], corner_hz: float, poles: int, seed: int, every: int = 1
+) -> tuple[Floats, Floats]:
+    """Times and readings (n, 6) of a still IMU behind a low-pass filter, made in the frequency domain.
+
+    Args:
+        white: N of gyros and accelerometers, rad/s and m/s^2 times sqrt(s).
+        corner_hz: of a Butterworth filter.
+        every: the filter's own rate over that of the stream, which takes every such sample.
+    """
+    rng = np.random.default_rng(seed)
+    inner_hz = rate_hz * every
+    many = seconds * inner_hz
+    size = 1 << math.ceil(math.log2(many + inner_hz))
+    gain = 1.0 / np.sqrt(1.0 + (np.fft.rfftfreq(size, 1.0 / inner_hz) / corner_hz) ** (2 * poles))
+    readings = np.empty((seconds * rate_hz, 6))
+    for column in range(6):
+        noise = rng.normal(0.0, white[column // 3] * math.sqrt(inner_hz), size)
+        readings[:, column] = np.fft.irfft(np.fft.rfft(noise) * gain, size)[:many:every]
+    readings += [0.3 * DEG, -0.2 * DEG, 0.1 * DEG, 0.2, -0.1, -9.8]
+    return np.arange(len(readings)) / rate_hz + 0.0003, readings

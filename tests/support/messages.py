@@ -50,7 +50,7 @@ ELSEWHERE = {
 }
 """Rooms whose words need no row of their own, and why."""
 
-HELP = {"_parser", "add_command", "add_commands", "error"}
+HELP = {"_parser", "add_command", "add_commands", "add_options", "add_table_options", "error"}
 """Functions that build the command line: their words are its help."""
 
 _WORD = re.compile(r"[A-Za-z]{2,}")

@@ -28,6 +28,8 @@ from tests.support.wire import Wire
 
 POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
 GYRO_BIAS_DEG_H = (162.234, 169.563, -98.289)
+THERMOMETER_OFF_K = 0.13
+"""So that its last digits show: one that gives whole kelvins tells little of how steady they are."""
 ACCEL_BIAS_MG = (2.4125, -2.1596, 0.89809)
 
 CONFIG = """
@@ -125,11 +127,21 @@ class Rig:
             gyro_bias_rad_s=[value * DEG_H for value in GYRO_BIAS_DEG_H],
             accel_bias_m_s2=[value * MG for value in ACCEL_BIAS_MG],
             mounting_deg=mounting_deg,
+            thermometer_off_k=THERMOMETER_OFF_K,
         )
         if firmware == "px4":
             # Nobody looks at them, and half of the time goes there; but they are what a serial line has to carry.
             autopilot.setdefault("default_streams", baud is not None)
-        others = [ImuModel(self.aircraft, part, seed=seed + 10 + k, mounting_deg=mounting_deg) for k in range(imus - 1)]
+        others = [
+            ImuModel(
+                self.aircraft,
+                part,
+                seed=seed + 10 + k,
+                mounting_deg=mounting_deg,
+                thermometer_off_k=THERMOMETER_OFF_K,
+            )
+            for k in range(imus - 1)
+        ]
         self.models = models = [self.model, *others]
         """The autopilot's IMUs."""
         kind, usual = _FIRMWARES[firmware]
@@ -165,6 +177,7 @@ class Rig:
                 seed=seed + 5,
                 gyro_bias_rad_s=[60.294 * DEG_H, -124.657 * DEG_H, 108.289 * DEG_H],
                 accel_bias_m_s2=[0.21593 * MG, -2.2118 * MG, 1.2953 * MG],
+                thermometer_off_k=THERMOMETER_OFF_K,
             )
             self.devices["own"] = VectorNavBinary(self.own_model)
         self.ground = Ground()

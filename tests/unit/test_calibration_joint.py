@@ -22,6 +22,7 @@ from companion.calibration.solution.joint import Weighed, Whole, points, weigh
 from companion.calibration.solution.prior import Expectation, Expected, ExpectedImu
 from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution, solve
+from companion.calibration.turning.watch import Turn
 from tests.prior_study import BY_READING, DEG, DEG_H, LEVEL, MG, G, imu_solution, shared_errors, solution
 from tests.support.windows import about, ideal_window, ned_from_body
 
@@ -185,6 +186,28 @@ def test_a_cautious_sigma_of_the_zero_is_no_reason_to_believe_the_past() -> None
     vouched = weigh(of, whole_of(of), Expectation(imus=known, zero_is_known=True)).solution
     assert accel_of(guessed.imus[0])[0] > 1.49 * MG
     assert accel_of(vouched.imus[0])[0] < 0.2 * MG
+
+
+def test_what_a_compass_does_not_know_of_a_turn_earlier_power_ups_know_better() -> None:
+    random, scatter, turns = np.random.default_rng(8), 70.0 * DEG_H, 70.0 * DEG_H
+    shared = shared_errors(ZERO_RAD)
+    shared.covariance[2, 2] += turns**2
+    errors, sigmas = [], []
+    for _ in range(300):
+        # Both gyros of an aircraft that turns, or not, by as much as its compass cannot exclude.
+        biases, turn = random.normal(0.0, scatter, (2, 3)), np.array([0.0, 0.0, random.normal(0.0, turns)])
+        read = [bias + turn + random.normal(0.0, 20.0 * DEG_H, 3) for bias in biases]
+        of = solution(imus([np.zeros(3)] * 2, shared, gyros=read), shared)
+        of = dataclasses.replace(of, turn=Turn(sigma_rad_s=turns, by="compass"))
+        known = [ExpectedImu(name=f"imu{k}", gyro=expected(np.zeros(3), scatter)) for k in range(2)]
+        for imu, bias in zip(weighed(of, known).solution.imus, biases, strict=True):
+            errors.append((gyro_of(imu) - bias)[2])
+            sigmas.append(imu.gyro_sigma_use_rad_s[2])
+    rms = float(np.sqrt(np.mean(np.square(errors))))
+    assert rms == pytest.approx(float(np.mean(sigmas)), rel=0.1)
+    # Of two gyros' sums and differences: 1 / (1/70^2 + 1/(2 70^2 + 20^2)), and 1 / (1/70^2 + 1/20^2).
+    together, apart = 1 / (1 / 70**2 + 1 / (2 * 70**2 + 20**2)), 1 / (1 / 70**2 + 1 / 20**2)
+    assert float(np.mean(sigmas)) / DEG_H == pytest.approx(np.sqrt((together + apart) / 2.0), rel=0.01)
 
 
 # --- symmetries

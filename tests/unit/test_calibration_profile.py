@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from companion.calibration.noise.allan import AllanModel, NoiseProfile, allan_model, noise_profile
 from companion.calibration.profiling.coverage import Kept, coverage, keeps
 from companion.calibration.profiling.profile_fit import Finding, Rest, Rests, fit_profile, rests, seconds_of
-from companion.calibration.seconds.batch import BatchSource
+from companion.calibration.seconds.batch import Batch, BatchSource
 from companion.errors import CalibrationRefusedError
 from tests.support.made_noise import DEG, DEG_H, FLICKER_OF_FLOOR, MG, adis16405, slow
 from tests.support.recordings import Recording, px4, shared, xio, xsens_counts
@@ -185,6 +185,62 @@ def test_the_night_tells_the_part_s_figures(night: Rests) -> None:
     assert profile.gyro.white / DEG_H == pytest.approx(152.0, rel=0.04)
     assert 23.0 < profile.gyro.floor / DEG_H < 34.0
     assert 0.17 < profile.accel.floor / MG < 0.23
+
+
+def made_session(figures: tuple[float, float, float], bounded: tuple[float, float], seconds: int, seed: int) -> Rest:
+    """Six channels of white noise, flicker floor and walk, and of a wander (rms, time constant) that is bounded; mg."""
+    rng = np.random.default_rng(seed)
+    white, floor, walk = (figure * MG for figure in figures)
+    rms, constant_s = bounded
+    means = np.empty((seconds, 6))
+    for column in range(6):
+        wander = np.empty(seconds)
+        state, keep = rng.normal() * rms * MG, np.exp(-1.0 / constant_s)
+        kicks = rng.normal(0.0, rms * MG * np.sqrt(1.0 - keep**2), seconds)
+        for second in range(seconds):
+            wander[second] = state = keep * state + kicks[second]
+        means[:, column] = slow(rng, seconds, floor * FLICKER_OF_FLOOR, walk, white) + wander
+    spread, many = np.full(6, (white * 10.0) ** 2), np.full(6, 100)
+    batches = [
+        Batch(
+            slot=slot, n=100, mean=mean, variance=spread, white=spread, low=mean - 30.0 * white,
+            high=mean + 30.0 * white, distinct=many, clipped=False, largest_gap_s=0.01,
+            missing=None, temperature_degc=None,
+        )
+        for slot, mean in enumerate(means)
+    ]  # fmt: skip
+    return Rest(np.arange(seconds), means, np.full(seconds, np.nan), tuple(batches))
+
+
+@pytest.mark.parametrize(
+    ("figures", "bounded"),
+    [
+        ((0.34, 0.03, 0.0), (0.3, 30.0)),
+        ((0.34, 0.03, 0.0), (0.5, 100.0)),
+        ((0.05, 0.01, 0.0), (0.5, 100.0)),
+        ((0.34, 0.1, 0.0), (0.5, 300.0)),
+        ((0.34, 0.1, 0.02), (0.0, 1.0)),
+        ((0.34, 0.2, 0.0), (0.0, 1.0)),
+    ],
+    ids=["bounded in 30 s", "bounded in 100 s", "little white noise", "flicker and 300 s", "a walk", "flicker"],
+)
+def test_a_wander_costs_what_it_does_in_the_next_minutes(
+    figures: tuple[float, float, float], bounded: tuple[float, float]
+) -> None:
+    """Learned from three nights, tested on the fourth: neither too little nor, as of a walk, too much."""
+    nights = [made_session(figures, bounded, 7200, seed) for seed in range(40, 44)]
+    tests = [
+        ([night], fit_profile("made", [other for other in nights if other is not night], UNKNOWN).profile)
+        for night in nights
+    ]
+    for next_s in (60, 180):
+        found = by(keeps(tests, next_s=next_s))
+        for mean_s in (10, 30, 60):
+            both = [found[triad, mean_s] for triad in ("gyro", "accel")]  # six axes of the same noise
+            # 120 windows of 60 and 180 s side by side in six axes: the share is good to a percent.
+            assert 0.93 <= np.mean([each.share for each in both]) <= 0.985
+            ratio = np.sqrt(np.mean([(each.rms / each.sigma_use) ** 2 for each in both]))
+            assert 0.82 <= ratio <= 1.08
 
 
 def test_a_profile_that_promises_too_much_is_found_out(night: Rests) -> None:

@@ -31,6 +31,7 @@ HELD = Held(
     confirmed_s=0.0,
     temperature_degc=25.0,
     sigma_use=SIGMA,
+    sigma=SIGMA,
     expected=(0.0, 0.0, 0.0),
     seen=True,
     averaged_s=30.0,
@@ -45,7 +46,7 @@ def whys(
 
 
 def output(x_deg_h: float) -> Present:
-    return Present(residual=(x_deg_h * DEG_H, 0.0, 0.0), sigma_use=SIGMA)
+    return Present(residual=(x_deg_h * DEG_H, 0.0, 0.0), sigma_use=SIGMA, sigma=SIGMA)
 
 
 def test_a_fresh_verified_calibration_has_nothing_against_it() -> None:
@@ -120,3 +121,14 @@ def test_a_write_is_worth_it_beyond_two_sigma_and_beyond_the_floor() -> None:
     assert worth_writing(output(-14.3), HELD, 0.0)
     own = msgspec.structs.replace(HELD, expected=(100.0 * DEG_H, 0.0, 0.0))
     assert not worth_writing(output(100.0), own, 0.0)
+
+
+def test_a_warm_up_to_come_is_in_the_promise_and_in_no_comparison() -> None:
+    wide = (200.0 * DEG_H,) * 3
+    young = msgspec.structs.replace(HELD, sigma_use=wide)
+    assert whys(young) == whys(HELD)
+    off = msgspec.structs.replace(output(60.0), sigma_use=wide)
+    assert whys(young, present=off) == {Why.RESIDUAL}
+    assert worth_writing(off, young, 0.0)
+    assert worth_writing(off, None, 0.0)
+    assert age_limit_s(GYRO, young.sigma, 30.0) == age_limit_s(GYRO, HELD.sigma, 30.0)

@@ -16,7 +16,7 @@ ALSO = ROOT / "docs/service.md"
 NOT_MESSAGES = {
     # Places where a position or a pose comes from, in records and over MQTT.
     "autopilot GLOBAL_POSITION_INT", "autopilot GPS_RAW_INT", "configuration; height: …", "…; height: configuration",
-    "gradienter and compass", "gyros and accelerometers",
+    "gradienter and compass", "gyros and accelerometers", "compass and gyros", "earlier calibrations",
     # Kinds of port in `companion ports`.
     "USB device", "on-board port", "on-board port (…)",
     # Headings and labels of `status`, `history`, `calibrate` and `check`.

@@ -21,7 +21,7 @@ from companion.recording import journal, topics
 from companion.recording.files import Beginning, RecordingFile, versions
 from companion.recording.journal import Entry
 from companion.recording.past import Past
-from companion.replay.still_log import read_logs
+from companion.replay.log_files import read_logs
 from companion.samples import ImuSample
 from companion.storage.profiles import FORMAT_VERSION, ProfileStore, SavedProfile, Source, check_name
 from companion.storage.state import sealed, unsealed
@@ -185,6 +185,9 @@ def test_learned_saved_and_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[
     (imu,) = answer["imus"]
     assert imu["still_s"] == pytest.approx(1798, abs=8)
     assert {each["mean_s"] for each in imu["coverage"]} == {10, 30, 60}
+    (used,) = imu["used"]
+    assert used["seconds"] == pytest.approx(1800, abs=1)
+    assert sum(each["to_s"] - each["from_s"] for each in used["stretches"]) == pytest.approx(1798, abs=8)
     profile = ProfileStore(tmp_path).read("mine")
     assert profile.gyro.white / DEG_H == pytest.approx(150.0, rel=0.08)
     assert (profile.sources[0].file, profile.imu) == ("half_hour.csv", "imu")
@@ -254,6 +257,7 @@ def test_the_table_says_what_it_found(capsys: pytest.CaptureFixture[str], half_h
         "imu imu: 0.48 h at rest in 1 recording",
         "gyro x, deg/h",
         "gyro: adis16405                     152.0             29.0",
+        "used of half_hour.csv: ",
         "note: too short to tell gyro K",
     ):
         assert words in said
@@ -267,6 +271,28 @@ def test_a_log_of_the_simulator_can_be_learned_from(tmp_path: Path, capsys: pyte
     assert code == 0
     # 20 Hz and steps of 1/16.4 deg/s: they add to N.
     assert answer["imus"][0]["profile"]["gyro"]["white"] / DEG_H == pytest.approx(37.0, rel=0.15)
+
+
+def test_the_part_at_rest_is_named_and_lines_left_out_are_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two minutes at rest, half a minute in the hand, a line without a number; the clock began at 500 s."""
+    t_s, readings = adis16405(150, 20, seed=2)
+    readings[2400:, :3] += np.random.default_rng(1).normal(0.0, 0.5, (600, 3))
+    readings[7, 3] = np.nan
+    path = write_csv(tmp_path / "a.csv", t_s + 500.0, readings)
+    code, answer, _ = run(capsys, path)
+    assert code == 0
+    (used,) = answer["imus"][0]["used"]
+    (stretch,) = used["stretches"]
+    assert 0.0 <= stretch["from_s"] <= 2.0
+    assert 118.0 <= stretch["to_s"] <= 121.0
+    assert used["left_out"] == {"without a number in each of gx, gy, gz, ax, ay, az": 1}
+    assert any("were not at rest and are left out (gyro" in note for note in answer["imus"][0]["notes"])
+    assert companion(["profile", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert f"used of a.csv: {stretch['from_s']:.0f} to {stretch['to_s']:.0f} s, of 150 s" in said
+    assert "left out: 1 lines without a number in each of" in said
 
 
 def test_sessions_are_tested_on_one_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -298,7 +324,7 @@ def test_a_profile_that_does_not_keep_its_word_is_not_saved(tmp_path: Path, caps
 @pytest.mark.parametrize(
     ("text", "more", "code", "words"),
     [
-        ("t_s,gx\n1,2\n", [], 1, "line 1: no column gx_rad_s"),
+        ("t_s,gx\n1,2\n", [], 1, "line 1: no column for gy, gz, ax, ay, az in t_s, gx"),
         ("", [], 1, "the file is empty"),
         (None, [], 1, "No such file"),
         (None, ["--save", "bmi088"], 1, "that name is the catalogue's"),

@@ -61,7 +61,13 @@ def test_the_biases_are_those_of_the_imu(
 ) -> None:
     data, model = rows()
     code, record = replay(
-        capsys, written(tmp_path / "imu.csv", data, units, separator), *WHERE, "--profile", "adis16470"
+        capsys,
+        written(tmp_path / "imu.csv", data, units, separator),
+        *WHERE,
+        "--profile",
+        "adis16470",
+        "--powered",
+        "3600",
     )
     assert (code, record["state"]) == (0, "done")
     (imu,) = record["imus"]
@@ -139,11 +145,10 @@ def test_the_still_part_of_a_log_is_what_counts(tmp_path: Path, capsys: pytest.C
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda data: data * [1, 1, 1, 1, 1 / G, 1 / G, 1 / G], "not gravity"),
         (lambda data: data + np.random.default_rng(1).normal(0.0, 1.0, data.shape) * SHAKEN, "no 5 s at rest"),
         (lambda data: data[:300], "no 5 s at rest"),
     ],
-    ids=["g taken for m/s^2", "shaken", "short"],
+    ids=["shaken", "short"],
 )  # fmt: skip
 def test_a_log_that_tells_nothing_fails_and_says_why(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], change: object, words: str
@@ -161,16 +166,12 @@ GOOD = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n"
     ("text", "words"),
     [
         (GOOD + "0,0,0,0,0,0,-9.8\n0.01,0,0,x,0,0,-9.8\n", "line 3: found 'x' in column gz_rad_s; allowed: a number"),
-        (GOOD + "0,0,0,0,0,0,nan\n", "line 2: found 'nan' in column az_m_s2; allowed: a number"),
-        (
-            GOOD.replace("ax_m_s2", "ax_g") + "0,0,0,0,1e308,0,0\n",
-            "line 2: found '1e308' in column ax_g; allowed: a number",
-        ),
+        (GOOD + "0,0,0,0,0,0,nan\n", "no line in it has a number for all of gx, gy, gz, ax, ay, az"),
         (GOOD + "\n# remark\n0,0,0\n", "line 4: found 3 fields; allowed: 7, as many as columns"),
         (GOOD + "1,0,0,0,0,0,-9.8\n0.5,0,0,0,0,0,-9.8\n", "line 3: time 0.500000 s after 1.000000 s"),
-        ("t_s,gx_rad_s\n0,1\n", "line 1: no column gy_rad_s or gy_deg_s or gy_deg_h in t_s, gx_rad_s"),
-        ("time,x\n0,1\n", "line 1: no column t_s or t_ms or t_us or t_ns"),
-        (GOOD.replace("gy_rad_s", "gx_deg_s") + "0\n", "line 1: two columns for gx"),
+        ("t_s,gx_rad_s\n0,1\n", "line 1: no column for gy, gz, ax, ay, az in t_s, gx_rad_s; allowed: t_s"),
+        ("time,x\n0,1\n", "line 1: no column for gx, gy, gz, ax, ay, az in time, x"),
+        (GOOD.replace("gy_rad_s", "gx_deg_s") + "0\n", "line 1: two columns for gx: gx_rad_s and gx_deg_s"),
         ("0,0,0,0,0,0,-9.8\n", "line 1: no names of columns; name them: --columns"),
         ("# only a remark\n", "the file is empty"),
     ],
@@ -232,7 +233,7 @@ def test_every_line_is_read_however_it_is_written(tmp_path: Path, separator: str
     rng = np.random.default_rng(3)
     lines = [GOOD.strip().replace(",", separator) + separator + "temperature_degc"]
     for number in range(3000):
-        values = [number * 0.01, *rng.normal(size=6).tolist(), 25.0]
+        values = [number * 0.01, *np.add(rng.normal(size=6), [0, 0, 0, 0, 0, -9.8]).tolist(), 25.0]
         fields = [repr(value) for value in values]
         # Long stretches of plain lines, too.
         match -1 if 1000 < number < 2000 else rng.integers(0, 100):
@@ -254,8 +255,9 @@ def test_every_line_is_read_however_it_is_written(tmp_path: Path, separator: str
     for end in ("\n", "\r\n"):
         path, text = tmp_path / "imu.csv", end.join(lines) + end
         path.write_bytes(text.encode())
-        found = [[sample.t_s, *sample.gyro_rad_s, *sample.accel_m_s2, sample.temperature_degc] for sample in read(path)]
-        assert found == by_hand(text, 8)
+        log = read(path)
+        found = np.column_stack([log.t_s, log.readings, log.temperature_degc])
+        np.testing.assert_array_equal(found, np.array(by_hand(text, 8), dtype=np.float64))
 
 
 @pytest.mark.parametrize("line", ["30.5,0,0,0,0,0", "30.5,0,0,0,0,0,-9.8,1", "30.5,0,0,x,0,0,-9.8", "1,0,0,0,0,0,-9.8"])

@@ -14,11 +14,11 @@ import pytest
 
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
-from sim.accuracy import cli, experiments, paper, peers, tables
+from sim.accuracy import cli, deck_tables, experiments, paper, peers, tables
 from sim.accuracy.experiments import FloorRun, IntegerRun, WhiteRun, floors, integers, predicted, white
-from sim.accuracy.figures import Figure, beside, covered, rms
+from sim.accuracy.figures import Claim, Figure, beside, covered, rms
 from sim.accuracy.stand import EXACT, POSTURES, Stand, biases, collected, samples, sites, solved, stand
-from sim.accuracy.tables import Claim, report
+from sim.accuracy.tables import report
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.earth import Array
 from sim.imu_model import DEG_H, MG, PARTS, ImuModel
@@ -283,10 +283,12 @@ def test_the_command_prints_tables_claims_and_one_json_object(
 def test_all_sections_are_made_of_the_same_stands(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tables, "FLOORED", ("icm42688p",))
     monkeypatch.setattr(tables, "NOISE_LSB", (0.5,))
+    monkeypatch.setattr(deck_tables, "SPANS_S", (120,))
+    monkeypatch.setattr(deck_tables, "STILL_S", (60,))
     said: list[str] = []
     found = report(4, 7, cli.SECTIONS, 1, said.append)
     assert tuple(found) == cli.SECTIONS
-    assert len(said) == 3
+    assert len(said) == 6
     assert all(len(line) <= 100 for section in found.values() for line in section.lines)
 
 

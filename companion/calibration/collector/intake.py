@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
@@ -9,16 +11,21 @@ from typing import Final, Literal
 
 import msgspec
 
+from companion.calibration.deck.deck import Deck
 from companion.calibration.means.pose import CompassModel, FieldHeading, GradienterModel
 from companion.calibration.means.windows import ImuInput, integer_steps
 from companion.calibration.seconds.batch import Batch, BatchSource
-from companion.calibration.stillness.gates import ImuGate, PoseGate, Verdict
+from companion.calibration.stillness.gates import STILL, ImuGate, PoseGate, Verdict
 from companion.calibration.stillness.stretch import Lag, Settling
+from companion.calibration.turning.level import ImuKind
+from companion.calibration.turning.watch import Turn, TurnWatch
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 
 Kind = Literal["imu", "gradienter", "compass"]
 
 _SILENT_S: Final = 2.5
+_LONGEST_UP_S: Final = 3e8
+"""A clock that says more counts from somewhere else: UTC, say."""
 _CARRY: Final = 2
 """Seconds for which a slow gradienter's or compass' last reading stands."""
 LIMITS_IMU: Final = (1e3,) * 3 + (1e4,) * 3
@@ -61,6 +68,8 @@ class Source:
         self.batches = batches
         self.gate = gate
         self.settling = settling
+        self.may_move = False
+        """Whether only faults count: on a deck."""
         self.verdict = Verdict(still=False)
         self.unsettled: deque[int] = deque(maxlen=keep)
         """Seconds in which its readings still followed a movement; good for the others, not for a mean of its own."""
@@ -92,7 +101,8 @@ class Source:
             words = f"{self.label} was silent for a second" if self.batches.batches else ""
             self.verdict = Verdict(still=False, words=words, fault=True)
         elif batch.slot == slot:
-            self.verdict = self.gate.judge(batch)
+            verdict = self.gate.judge(batch)
+            self.verdict = STILL if self.may_move and not verdict.fault else verdict
         return self.verdict.still
 
     def settled(self, slots: Sequence[int]) -> list[Batch]:
@@ -132,13 +142,6 @@ class Source:
         )
 
 
-def _pose_source(name: Literal["gradienter", "compass"], keep: int, lag: Lag) -> Source:
-    """A gradienter's two channels, or a compass' heading, in degrees."""
-    circle = name == "compass"
-    batches = BatchSource(_LIMITS_HEADING if circle else _LIMITS_TILT, keep, circle=circle)
-    return Source(name, name, batches, PoseGate(name), Settling(lag, circle=circle), keep)
-
-
 class Intake(ABC):
     """The streams, and what is known of each. Nothing that a sample holds makes it raise."""
 
@@ -150,15 +153,21 @@ class Intake(ABC):
         compass: bool,
         lags: tuple[Lag, Lag],
         field_by: tuple[CompassModel, GradienterModel | None] | None,
+        deck: Deck | None,
+        span: int,
     ) -> None:
-        self._keep = keep
+        self._keep, self._deck = keep, deck
         self._inputs: dict[str, ImuInput] = {}
         self._imus: dict[str, Source] = {}
         self._lags = lags
-        self._tilt = _pose_source("gradienter", keep, lags[0]) if gradienter else None
-        self._heading = _pose_source("compass", keep, lags[1]) if compass else None
+        self._tilt = self._pose_source("gradienter") if gradienter else None
+        self._heading = self._pose_source("compass") if compass else None
         self._breaks: dict[str, int] = {}
+        self._restarted_s: dict[str, float] = {}
+        self._up: dict[str, tuple[float, float]] = {}
+        """By IMU whose device tells: a time, and for how long it had been on by then."""
         self._field = None if field_by is None else FieldHeading(*field_by, keep)
+        self._turns = TurnWatch(span)
 
     @abstractmethod
     def _evaluate(self) -> None:
@@ -181,11 +190,18 @@ class Intake(ABC):
             return
         if sample.breaks != self._breaks.get(name, 0):
             self._breaks[name] = sample.breaks
+            self._restarted_s[name] = sample.t_s
             self._forget(name)
         stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
         row = sample.gyro_rad_s + sample.accel_m_s2
         if source.batches.add(sample.t_s, row, sample.temperature_degc, stamp):
+            self._note_up(name, sample)
             self._evaluate()
+
+    def _note_up(self, name: str, sample: ImuSample) -> None:
+        up_s = sample.t_device_s
+        if self._inputs[name].clock_from_start and up_s is not None and 0.0 <= up_s < _LONGEST_UP_S:
+            self._up[name] = (sample.t_s, up_s)
 
     def add_tilt(self, sample: TiltSample) -> None:
         """Take one reading of the gradienter; dropped when none is expected."""
@@ -220,11 +236,26 @@ class Intake(ABC):
     def set_imu(self, imu: ImuInput) -> None:
         """Add an IMU, or say that its stream is another kind now: all that was learned of it is forgotten."""
         self._inputs[imu.name] = imu
-        gate = ImuGate(imu.name, imu.profile, (imu.gyro_step_rad_s, imu.accel_step_m_s2))
+        steps = (imu.gyro_step_rad_s, imu.accel_step_m_s2)
+        gate = ImuGate(imu.name, imu.profile, steps, sways=self._deck is not None)
+        self._turns.set_imu(
+            ImuKind(
+                name=imu.name,
+                rotation=imu.rotation,
+                gyro=imu.profile.gyro,
+                accel=imu.profile.accel,
+                gyro_step_rad_s=imu.gyro_step_rad_s,
+                accel_step_m_s2=imu.accel_step_m_s2,
+            )
+        )
         known = self._imus.get(imu.name)
+        if self._deck is not None:
+            self._deck.set_imu(imu)
         if known is None:
             batches = BatchSource(LIMITS_IMU, self._keep, steps=integer_steps(imu))
-            self._imus[imu.name] = Source("imu", imu.name, batches, gate)
+            self._imus[imu.name] = source = Source("imu", imu.name, batches, gate)
+            if self._deck is not None:
+                source.may_move, batches.on_second = True, functools.partial(self._deck.take_imu, imu.name)
             # It has no share in the seconds so far.
             self._break()
         else:
@@ -236,19 +267,72 @@ class Intake(ABC):
         """Change which pose sensors are waited for, for example when one is found dead; the IMUs' history stays."""
         added = (gradienter and self._tilt is None) or (compass and self._heading is None)
         if gradienter != (self._tilt is not None):
-            self._tilt = _pose_source("gradienter", self._keep, self._lags[0]) if gradienter else None
+            self._tilt = self._pose_source("gradienter") if gradienter else None
         if compass != (self._heading is not None):
-            self._heading = _pose_source("compass", self._keep, self._lags[1]) if compass else None
+            self._heading = self._pose_source("compass") if compass else None
         if added:
             self._break()
 
+    def _pose_source(self, name: Literal["gradienter", "compass"]) -> Source:
+        """A gradienter's two channels, or a compass' heading, in degrees."""
+        circle, lag = name == "compass", self._lags[name == "compass"]
+        batches = BatchSource(_LIMITS_HEADING if circle else _LIMITS_TILT, self._keep, circle=circle)
+        source = Source(name, name, batches, PoseGate(name), Settling(lag, circle=circle), self._keep)
+        if self._deck is not None:
+            source.may_move = True
+            batches.on_second = self._deck.take_heading if circle else self._deck.take_tilt
+        return source
+
+    @property
+    def begun_s(self) -> dict[str, float]:
+        """By IMU, since when it has been switched on: by its device's clock, else as long as its stream has come."""
+        heard = {
+            name: max(float(source.batches.begun), self._restarted_s.get(name, -math.inf))
+            for name, source in self._imus.items()
+            if source.batches.begun is not None
+        }
+        return heard | {name: t_s - up_s for name, (t_s, up_s) in self._up.items() if name in heard}
+
+    def up_s(self, name: str) -> float | None:
+        """For how long the device of an IMU had been on when that was heard last; None where it does not tell."""
+        return self._up[name][1] if name in self._up else None
+
+    @property
+    def turn(self) -> Turn:
+        """What is known of the platform's own rate."""
+        return self._turns.turn
+
+    def _watch_turn(self, slot: int, *, good: bool) -> bool:
+        """Look for a turn in a second that has been judged; False where the still stretch ends with it."""
+        others = [source.verdict for source in self._sources() if source is not self._heading]
+        if self._deck is not None or any(verdict.fault for verdict in others):
+            return True
+        if not all(verdict.still for verdict in others):
+            self._turns.moved(slot)
+            return True
+        heading = None if self._heading is None else next(iter(self._heading.settled([slot])), None)
+        imus = {name: source.batches.batches[slot] for name, source in self._imus.items()}
+        return self._turns.add_second(slot, imus, heading, good=good)
+
+    def imu_seconds(self) -> dict[str, Batch]:
+        """The last whole second of each IMU that has one, still or not."""
+        newest = {name: next(reversed(source.batches.batches.values()), None) for name, source in self._imus.items()}
+        return {name: batch for name, batch in newest.items() if batch is not None}
+
+    def tilt_second(self) -> Batch | None:
+        """The same of the gradienter."""
+        return None if self._tilt is None else next(reversed(self._tilt.batches.batches.values()), None)
+
     def _forget(self, imu: str | None) -> None:
+        if self._deck is not None:
+            self._deck.forget(imu)
         for source in self._sources():
             if imu is None or (source.kind == "imu" and source.name == imu):
                 source.batches.forget()
                 source.verdict = Verdict(still=False)
                 if isinstance(source.gate, ImuGate):
                     source.gate.forget_level()
+        self._turns.forget(imu)
         self._break()
 
     def _sources(self) -> list[Source]:

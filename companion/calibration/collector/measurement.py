@@ -12,6 +12,7 @@ import msgspec
 from companion.calibration.means.pose import FieldWindow, heading_window, tilt_window
 from companion.calibration.means.windows import ImuEstimate, ImuInput, Window, imu_estimates
 from companion.calibration.seconds.batch import Batch
+from companion.calibration.turning.watch import Turn
 from companion.errors import CalibrationRefusedError
 
 Found = list[ImuEstimate] | CalibrationRefusedError
@@ -97,6 +98,9 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
     tilt: PoseSeconds | None
     heading: PoseSeconds | None
     field: FieldWindow | None
+    begun_s: dict[str, float] = {}
+    """By IMU, since when it has been switched on, as far as that is known."""
+    turn: Turn = Turn()
 
     def window(self) -> Window:
         """Work it out; takes milliseconds.
@@ -119,10 +123,11 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
             if heading is None
             else heading_window(heading.some(), from_field=heading.from_field, wander_deg=heading.wander_deg),
             field=self.field,
+            powered_s={name: self.slots[-1] + 1.0 - since_s for name, since_s in self.begun_s.items()},
+            turn=self.turn,
         )
 
-    def with_wander(self, wander_deg: float | None) -> Measurement:
-        """The same where the heading was watched for longer than its readings are known."""
-        if self.heading is None:
-            return self
-        return msgspec.structs.replace(self, heading=msgspec.structs.replace(self.heading, wander_deg=wander_deg))
+    def watched_longer(self, wander_deg: float | None, begun_s: dict[str, float], turn: Turn | None) -> Measurement:
+        """The same where heading and IMUs were watched for longer than their readings are known."""
+        heading = None if self.heading is None else msgspec.structs.replace(self.heading, wander_deg=wander_deg)
+        return msgspec.structs.replace(self, heading=heading, begun_s=begun_s, turn=turn or self.turn)

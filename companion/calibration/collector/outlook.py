@@ -37,6 +37,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     progress: float
     """0..1 towards `enough`; falls to 0 when the stretch breaks."""
     sources: tuple[SourceStatus, ...]
+    measuring: str
+    """What is under way where nothing is waited for, in words."""
 
     @property
     def waiting_for(self) -> str | None:

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
+from companion.calibration.collector.afloat import Afloat
 from companion.calibration.collector.intake import Intake, Source
 from companion.calibration.collector.measurement import Estimates, Found, Measurement, PoseSeconds, Work
 from companion.calibration.collector.outlook import (
@@ -22,11 +23,12 @@ from companion.calibration.collector.outlook import (
     expected_s,
     is_enough,
 )
+from companion.calibration.collector.swell import Swell
 from companion.calibration.collector.trace import Snapshot, TraceLog
+from companion.calibration.deck.deck import Deck
+from companion.calibration.deck.estimate import DeckWork
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput, Window
-from companion.calibration.seconds.batch import Batch
-from companion.calibration.stillness.gates import ImuGate
 from companion.calibration.stillness.stretch import AT_ONCE, HeadingWatch, Lag, Stretch
 from companion.errors import CalibrationRefusedError
 
@@ -59,6 +61,7 @@ class RollingCollector(Intake):
         gradienter_lag: Lag = AT_ONCE,
         compass_lag: Lag = AT_ONCE,
         field_by: tuple[CompassModel, GradienterModel | None] | None = None,
+        deck: Deck | None = None,
     ) -> None:
         if len({imu.name for imu in imus}) != len(imus):
             raise ValueError("two IMUs have one name")
@@ -71,7 +74,10 @@ class RollingCollector(Intake):
             compass=compass,
             lags=(gradienter_lag, compass_lag),
             field_by=field_by,
+            deck=deck,
+            span=self._max_slots,
         )
+        self._afloat = None if deck is None else Afloat(deck, settings.horizon_s)
         self._watch = HeadingWatch()
         self._stretch = Stretch(self._min_good, self._max_slots)
         self._next: int | None = None
@@ -80,6 +86,7 @@ class RollingCollector(Intake):
         self._estimates = Estimates()
         self._trace = TraceLog()
         self._restarts = 0
+        self._swell = Swell()
         for imu in imus:
             self.set_imu(imu)
 
@@ -99,6 +106,8 @@ class RollingCollector(Intake):
         The second under way is forgotten too. The stretch begins again; learned noise stays.
         """
         self._forget(imu)
+        if self._afloat is not None:
+            self._afloat.clear()
 
     def tick(self, now_s: float) -> None:
         """Let the seconds end that are over at `now_s` (the samples' clock), also of sources that say nothing.
@@ -117,31 +126,41 @@ class RollingCollector(Intake):
 
     def glance(self, now_s: float) -> Glance:
         """How still it is at `now_s`; costs a small part of what `status` does."""
+        if self._afloat is not None:
+            seconds = float(self._afloat.seconds)
+            return Glance(obstacle=self._obstacle(now_s), still_s=seconds, steady_s=seconds)
         return Glance(
             obstacle=self._obstacle(now_s),
             still_s=float(self._stretch.good),
             steady_s=float(self._stretch.steady),
         )
 
-    def pending(self, now_s: float, *, since_s: float | None = None) -> Work | None:
+    def pending(self, now_s: float, *, since_s: float | None = None) -> Work | DeckWork | None:
         """What `window` would have to work out now, for somebody who does it elsewhere; None when there is nothing.
 
         It takes milliseconds, more on small boards, and what must be answered at once shall not wait for it.
         """
         if self._obstacle(now_s) is not None:
             return None
+        if self._afloat is not None:
+            return self._afloat.pending(since_s)
         slots = self._slots(since_s)
         if not self._are_enough(slots, since_s) or self._estimates.known(slots[-1], since_s) is not None:
             return None
         return self._work(slots, since_s)
 
-    def accept(self, work: Work, found: Found) -> None:
-        """Take what a `Work` has found; too late, it is left."""
-        self._estimates.keep(work, found)
+    def accept(self, work: Work | DeckWork, found: Any) -> None:
+        """Take what such work has found; too late, it is left."""
+        if isinstance(work, Work):
+            self._estimates.keep(work, found)
+        elif self._afloat is not None:
+            self._afloat.accept(work, found)
 
     def status(self, now_s: float) -> Status:
         """Where it stands at `now_s` (the samples' clock). Its figures may be those of the second before."""
         sources = self._sources()
+        if self._afloat is not None:
+            return self._afloat_status(self._afloat, now_s, sources)
         waiting = self._waiting_for(now_s)
         enough = False
         progress = 0.0
@@ -161,6 +180,18 @@ class RollingCollector(Intake):
             enough=enough,
             progress=min(progress, 1.0 if enough else 0.99),
             sources=tuple(source.status(now_s) for source in sources),
+            measuring=f"still for {self._stretch.good} s, measuring",
+        )
+
+    def _afloat_status(self, afloat: Afloat, now_s: float, sources: list[Source]) -> Status:
+        obstacle, progress = self._obstacle(now_s), afloat.progress(self._settings)
+        return Status(
+            still_s=float(afloat.seconds),
+            obstacle=obstacle,
+            enough=progress.enough and obstacle is None,
+            progress=min(progress.share, 1.0 if progress.enough else 0.99),
+            sources=tuple(source.status(now_s) for source in sources),
+            measuring=progress.words,
         )
 
     def window(self, now_s: float, *, since_s: float | None = None) -> Window:
@@ -184,6 +215,8 @@ class RollingCollector(Intake):
         """
         if (reason := self._obstacle(now_s)) is not None:
             raise CalibrationRefusedError(reason.words)
+        if self._afloat is not None:
+            return self._afloat.measurement(since_s)
         slots = self._slots(since_s)
         if not self._are_enough(slots, since_s):
             needed = self._min_good if since_s is None else min(MIN_BATCHES, self._min_good)
@@ -200,17 +233,14 @@ class RollingCollector(Intake):
                 wander_deg=self.wander_deg,
             ),
             field=self._field.window(slots) if self._field and self._heading else None,
+            begun_s=self.begun_s,
+            turn=self.turn,
         )
 
     @property
     def wander_deg(self) -> float | None:
         """How far the heading has wandered since the aircraft last moved; None until that is known."""
         return self._watch.wander_deg
-
-    def imu_seconds(self) -> dict[str, Batch]:
-        """The last whole second of each IMU that has one, still or not."""
-        newest = {name: next(reversed(source.batches.batches.values()), None) for name, source in self._imus.items()}
-        return {name: batch for name, batch in newest.items() if batch is not None}
 
     def snapshot(self, started_s: float, measured_s: tuple[float, float] | None) -> Snapshot:
         """What was seen since `started_s`, or since the window `measured_s` (start, end) began; cheap."""
@@ -222,6 +252,7 @@ class RollingCollector(Intake):
         self._stretch.clear()
         self._good.clear()
         self._estimates.clear()
+        self._turns.new_stretch()
         for source in self._sources():
             source.gate.new_stretch()
 
@@ -265,7 +296,10 @@ class RollingCollector(Intake):
             others = [source.verdict for source in sources if source is not self._heading]
             self._watch.add_second(self._heading.batches.batches.get(slot), others)
         self._trace.add(slot, sources, good=good)
+        self._swell.add(next((each.batches.batches.get(slot) for each in self._imus.values()), None))
         if not self._stretch.add(slot, good=good):
+            self._break()
+        if not self._watch_turn(slot, good=good):
             self._break()
         if not good and self._stretch.start is None:
             return
@@ -278,9 +312,7 @@ class RollingCollector(Intake):
             batch = source.batches.batches.get(slot)
             if batch is None:
                 continue
-            if isinstance(source.gate, ImuGate):
-                source.gate.accept(batch, settled=self._stretch.begun)
-            elif slot not in source.unsettled:
+            if source.kind == "imu" or slot not in source.unsettled:
                 source.gate.accept(batch)
 
     def _obstacle(self, now_s: float) -> Obstacle | None:
@@ -288,14 +320,19 @@ class RollingCollector(Intake):
         sources = self._sources()
         if (silence := next(filter(None, (source.silence(now_s) for source in sources)), None)) is not None:
             return Obstacle(silence)
+        others = any(source.verdict.words for source in sources if source is not self._heading)
+        if self._turns.words and not others:
+            return Obstacle(self._turns.words, moving=True)
         if self._stretch.good_now:
             return None
         said = [source.verdict for source in sources if source.verdict.words]
         moving = not any(verdict.fault for verdict in said)
+        if self._afloat is not None and moving:
+            return None
         if not said:
             return Obstacle(f"hold still {self._min_good} s", moving, self._min_good)
         words = said[0].words
-        return Obstacle(words if said[0].fault else f"waiting for still: {words}", moving)
+        return Obstacle(words if said[0].fault else f"waiting for still: {words}{self._swell.hint}", moving)
 
     def _waiting_for(self, now_s: float) -> Obstacle | None:
         if (moves := self._obstacle(now_s)) is not None:

@@ -18,6 +18,7 @@ import numpy as np
 from companion.calibration.noise.allan import white_noise
 from companion.calibration.noise.robust import huber_mean
 from companion.calibration.seconds.batch import Batch, BatchSource
+from companion.calibration.seconds.resolution import decimal, few_distinct
 from companion.physics.frames import Array, Floats, Matrix, body_from_ned, roll_pitch_from_up
 from companion.physics.gradienter import Law, up_in_sensor
 from companion.physics.magnetic import heading_rad
@@ -81,9 +82,6 @@ def vehicle_heading_rad(compass: CompassModel, heading_deg: float, up: Array) ->
     forward_ned = body_from_ned(gamma, theta, 0.0).T @ compass.vehicle_from_sensor[:, 0]
     mounted_rad = math.atan2(forward_ned[1], forward_ned[0])
     return (heading_deg + compass.offset_deg) * DEG - mounted_rad
-
-
-_MAX_DECIMALS: Final = 4
 
 
 class TiltWindow(msgspec.Struct, frozen=True, kw_only=True):
@@ -163,12 +161,7 @@ def _resolution(batches: Sequence[Batch]) -> Floats:
     """Step of a reading that shows fewer than 3 values: their distance, or that of the last decimal it prints."""
     low = np.min([batch.low for batch in batches], axis=0)
     high = np.max([batch.high for batch in batches], axis=0)
-    few = np.max([batch.distinct for batch in batches], axis=0) < 3
-    decimal = np.full(len(low), 10.0**-_MAX_DECIMALS)
-    for digits in range(_MAX_DECIMALS - 1, -1, -1):
-        prints = (np.abs(low - np.round(low, digits)) < 1e-9) & (np.abs(high - np.round(high, digits)) < 1e-9)
-        decimal = np.where(prints, 10.0**-digits, decimal)
-    return np.where(few, np.where(high > low, high - low, decimal), 0.0)
+    return np.where(few_distinct(batches), np.where(high > low, high - low, decimal(low, high)), 0.0)
 
 
 OLDEST_TILT_S: Final = 1.0

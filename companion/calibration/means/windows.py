@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.calibration.means.integers import IntegerColumns, integer_columns
+from companion.calibration.means.losses import lost, refuse_broken
 from companion.calibration.means.pose import FieldWindow, HeadingWindow, TiltWindow
 from companion.calibration.means.quantised import EDGE_RMS
+from companion.calibration.means.warming import Warming, warming
 from companion.calibration.noise.allan import (
     FLOOR_OF_FLICKER,
     PROFILES,
@@ -26,9 +28,9 @@ from companion.calibration.noise.allan import (
     slope_variance,
     white_noise,
 )
-from companion.calibration.noise.robust import RAMP_BATCHES, huber_line, is_ramp, median, robust_mean
+from companion.calibration.noise.robust import RAMP_BATCHES, huber_line, is_ramp, robust_mean
 from companion.calibration.seconds.batch import Batch
-from companion.errors import CalibrationRefusedError
+from companion.calibration.turning.watch import Turn
 from companion.physics.frames import Floats, vector
 from companion.physics.units import DEG_H, MG
 from companion.samples import Triad, Vector
@@ -36,14 +38,11 @@ from companion.samples import Triad, Vector
 WHITE_SHARE: Final = 0.09
 """White variance over floor variance below which more averaging buys nothing: white part 30 % of the floor."""
 _ALLAN_SPANS: Final = 5
-_ALLAN_SIGNIFICANT: Final = 3.0
-"""ADEV^2 at T/5 over what white noise explains: the upper 5 % point with its about four degrees of freedom."""
 _LOST_WARNING: Final = 0.01
-_LOST_REFUSAL: Final = 0.5
-_USUAL_SHARE: Final = 0.95
-"""A second that holds fewer samples than this share of the usual lost some; what is above is the grid's phase."""
 _TEMPERATURE_WARNING_K: Final = 3.0
 _AXIS: Final = "xyz"
+_ALLAN_SIGNIFICANT: Final = 3.0
+"""ADEV^2 at T/5 over what white noise explains: the upper 5 % point with its about four degrees of freedom."""
 
 
 class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
@@ -61,6 +60,8 @@ class ImuInput(msgspec.Struct, frozen=True, kw_only=True):
     gyro_grid_rad_s: float = 0.0
     """Steps of its own that the sensor's readings had before they became integers of the stream; 0: much finer."""
     accel_grid_m_s2: float = 0.0
+    clock_from_start: bool = False
+    """Whether the time in its samples (`t_device_s`) counts from when its device was switched on."""
 
 
 def integer_steps(imu: ImuInput) -> Floats | None:
@@ -92,7 +93,6 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     samples: int
     duration_s: float
-    """Good seconds that went into the means."""
     gyro_rad_s: Vector
     accel_m_s2: Vector
     gyro_sigma_stat_rad_s: Vector
@@ -104,9 +104,15 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     warnings: tuple[str, ...]
     hidden: dict[Triad, Hidden] = {}
     """By triad, where the noise spreads the integers too little for a mean."""
-
     dithered: bool = False
     """Its means come from a dither, in which the telemetry followed every step of the offsets."""
+    covariance: NDArray[np.float64] | None = None
+    by_earth: NDArray[np.float64] | None = None
+    """Of a deck: 6x6 of all axes; and 3x3, what the gyro means hold of the Earth's rate (ahead, right, down)."""
+    mounting: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    """Rows of the rotation from the sensor's axes."""
+    warming: Warming | None = None
+    """What may be hidden of a warm-up; None: nothing."""
 
     def refused(self, part: Triad) -> str | None:
         """Why a triad's means are no measurement although they have a figure; None when they are one."""
@@ -124,6 +130,12 @@ class Window(msgspec.Struct, frozen=True, kw_only=True):
     heading: HeadingWindow | None
     field: FieldWindow | None = None
     """Of a compass that gives the field too; its seconds are those of the others, as far as it sent in them."""
+    turn_rad_s: Vector | None = None
+    """Of a deck's mean turn, its axis levelled by the gradienter's readings without an offset."""
+    powered_s: dict[str, float] = {}
+    """By IMU, for how long it has been switched on at least, at the end."""
+    turn: Turn = Turn()
+    """What else was known of the platform's own rate, where it stands still."""
 
 
 class Estimate(msgspec.Struct, frozen=True, kw_only=True):
@@ -140,6 +152,10 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     walk: Floats
     ramp_per_s: Floats
     """Zero where no ramp is significant."""
+    slope_per_s: Floats
+    """Of those that are not significant; zero of the others."""
+    slope_variance: Floats
+    """Of `slope_per_s`; infinite where the window is too short for a line."""
     half_step: NDArray[np.bool_]
     """Fewer than 3 distinct readings; of a stream of integers, too few outside the two commonest."""
     undecided: NDArray[np.bool_]
@@ -184,7 +200,7 @@ def estimates(
     # The profile of an unknown part has the floor of the worst, behind which every warm-up would hide.
     named = np.repeat([imu.profile != PROFILES["unknown"] for imu in imus], 6)
     wander = np.where(named, slope_variance(flicker, walk, end_s - slots[0]), 0.0)
-    mean, leverage, slope, level = _levelled(slots, values, end_s, whole, wander)
+    mean, leverage, slope, level, hidden = _levelled(slots, values, end_s, whole, wander)
     measured = np.maximum(white_noise(slots, level), whole.least)
     white = np.maximum(measured, np.repeat([model.white for model in models], 3))
     flicker = _flicker(slots, level, measured, flicker)
@@ -196,6 +212,8 @@ def estimates(
     stat = np.square(measured) * leverage + np.square(quantum)
     white_part = np.square(white) * leverage
     use = white_part + floor_variance(flicker, walk, seconds, horizon_s) + np.square(quantum) + going_on
+    of_line = np.square(white) / max(float(np.square(slots - slots.mean()).sum()), 1.0) + wander
+    of_line = of_line + 3.0 * np.square(quantum / (end_s - slots[0]))
 
     columns: dict[str, Any] = {
         "mean": mean,
@@ -206,6 +224,8 @@ def estimates(
         "flicker": flicker,
         "walk": walk,
         "ramp_per_s": slope,
+        "slope_per_s": np.nan_to_num(hidden),
+        "slope_variance": np.where(np.isnan(hidden), np.inf, np.where(slope != 0.0, 0.0, of_line)),
         "half_step": half_step,
         "undecided": whole.unknown,
         "useless": whole.useless,
@@ -220,18 +240,22 @@ def estimates(
 
 def _levelled(
     slots: NDArray[np.int64], values: Floats, end_s: float, whole: IntegerColumns, wander: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Means, or the ends of ramps; their leverages; slopes, zero but of ramps; and the values without those."""
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Means, or the ends of ramps; their leverages; slopes, zero but of ramps; the values without those; other slopes.
+
+    The others are zero of ramps, and NaN where the window is too short for a line.
+    """
     mean = robust_mean(values, whole.huber_c, whole.least)
     leverage = np.full(values.shape[1], 1.0 / len(values))
     if len(values) < RAMP_BATCHES:
-        return mean, leverage, np.zeros(values.shape[1]), values
+        return mean, leverage, np.zeros(values.shape[1]), values, np.full(values.shape[1], np.nan)
     times = slots.astype(np.float64) + 0.5
     line = huber_line(times, values, end_s, whole.huber_c, whole.least)
     ramps = is_ramp(line, len(values), wander)
     slope = np.where(ramps, line.slope, 0.0)
     level = values - slope * (times - times.mean())[:, None]
-    return np.where(ramps, line.end, mean), np.where(ramps, line.end_leverage, leverage), slope, level
+    leverage = np.where(ramps, line.end_leverage, leverage)
+    return np.where(ramps, line.end, mean), leverage, slope, level, np.asarray(line.slope - slope)
 
 
 def _columns(values: list[list[Floats]]) -> Floats:
@@ -281,7 +305,7 @@ def imu_estimates(
     if not imus:
         return []
     for imu, own in zip(imus, batches, strict=True):
-        _refuse_broken(imu, own)
+        refuse_broken(imu.name, (imu.gyro_step_rad_s, imu.accel_step_m_s2), own)
     triads = estimates(imus, batches, end_s=end_s, horizon_s=horizon_s)
     return [
         _imu_estimate(imu, own, gyro, accel, rejected)
@@ -307,6 +331,14 @@ def _imu_estimate(
         temperature_degc=float(np.mean(temperatures)) if temperatures else None,
         warnings=tuple(_warnings(imu, batches, gyro, accel, temperatures, rejected)),
         hidden=_hidden(imu, gyro, accel),
+        mounting=(vector(rotation[0]), vector(rotation[1]), vector(rotation[2])),
+        warming=warming(
+            rotation,
+            (gyro.slope_per_s, accel.slope_per_s),
+            (gyro.slope_variance, accel.slope_variance),
+            imu.profile.warm_up,
+            batches,
+        ),
     )
     return ImuEstimate(gyro=gyro, accel=accel, window=window)
 
@@ -314,33 +346,6 @@ def _imu_estimate(
 def _turned(rotation: Floats, variance: Floats) -> Vector:
     """Sigmas of independent axes after a rotation."""
     return vector(np.sqrt(np.square(rotation) @ variance))
-
-
-def _refuse_broken(imu: ImuInput, batches: Sequence[Batch]) -> None:
-    low = np.min([batch.low for batch in batches], axis=0)
-    high = np.max([batch.high for batch in batches], axis=0)
-    for triad, part, step in ((0, "gyro", imu.gyro_step_rad_s), (3, "accel", imu.accel_step_m_s2)):
-        for axis in range(3):
-            if step == 0.0 and low[triad + axis] == high[triad + axis]:
-                raise CalibrationRefusedError(
-                    f"{part} {imu.name} is stuck: axis {_AXIS[axis]} did not change in {len(batches)} s"
-                )
-    lost = _lost(batches)
-    if lost > _LOST_REFUSAL:
-        raise CalibrationRefusedError(f"imu {imu.name} lost {lost:.0%} of its samples, more than {_LOST_REFUSAL:.0%}")
-
-
-def _lost(batches: Sequence[Batch]) -> float:
-    """Share of the samples that never came: by the device's counter, else against the usual number in a second."""
-    usual = float(median([batch.n for batch in batches]))
-    missing = came = 0.0
-    for batch in batches:
-        came += batch.n
-        if batch.missing is not None:
-            missing += batch.missing
-        elif batch.n < _USUAL_SHARE * usual:
-            missing += usual - batch.n
-    return missing / (missing + came)
 
 
 def _hidden(imu: ImuInput, gyro: Estimate, accel: Estimate) -> dict[Triad, Hidden]:
@@ -388,8 +393,8 @@ def _warnings(
         if not grid and (axes := _axes(triad.edge_rms > EDGE_RMS)):
             why = "a coarser step inside the sensor?"
             found.append(f"{part} {imu.name} {axes}: integers not spread like noise ({why}), sigma widened")
-    if (lost := _lost(batches)) > _LOST_WARNING:
-        found.append(f"imu {imu.name} lost {lost:.0%} of its samples")
+    if (share := lost(batches)) > _LOST_WARNING:
+        found.append(f"imu {imu.name} lost {share:.0%} of its samples")
     if rejected:
         found.append(f"{rejected} of {rejected + len(batches)} s were not still and are left out")
     if temperatures and (span := max(temperatures) - min(temperatures)) > _TEMPERATURE_WARNING_K:

@@ -25,6 +25,13 @@ _FLOOR_REACHED_S: Final = 1000.0
 """Catalogues give no random walk; K is taken such that it reaches the flicker floor here (method section 2.2)."""
 
 
+WARM_UP_K: Final = 20.0
+"""A board with its processor and radio, from cold to warm; two sigma."""
+WARM_UP: Final = (WARM_UP_K * 54.0 * DEG_H, WARM_UP_K * 0.4 * MG)
+"""Of a part that nobody has watched warming up and no data sheet is known of: a BMI088's gyro (method section 2.1), a
+BMI160's accelerometer (the table named there)."""
+
+
 class AllanModel(msgspec.Struct, frozen=True):
     """White noise, flicker and random walk of one axis; rad/s or m/s^2 (times sqrt(s), 1, over sqrt(s))."""
 
@@ -44,6 +51,8 @@ class NoiseProfile(msgspec.Struct, frozen=True):
     name: str
     gyro: AllanModel
     accel: AllanModel
+    warm_up: tuple[float, float] = WARM_UP
+    """By how much the biases of gyro and accelerometer may move from cold to warm, two sigma."""
 
 
 def allan_model(white: float, floor: float) -> AllanModel:
@@ -51,11 +60,18 @@ def allan_model(white: float, floor: float) -> AllanModel:
     return AllanModel(white, floor / FLOOR_OF_FLICKER, floor * math.sqrt(3.0 / _FLOOR_REACHED_S))
 
 
-def _profile(name: str, gyro_deg_h: tuple[float, float], accel_ug: tuple[float, float]) -> NoiseProfile:
+def _profile(
+    name: str,
+    gyro_deg_h: tuple[float, float],
+    accel_ug: tuple[float, float],
+    per_kelvin: tuple[float, float] | None = None,
+) -> NoiseProfile:
+    """Figures of a data sheet; `per_kelvin` in deg/h and mg, None where it has none."""
     return NoiseProfile(
         name,
         allan_model(gyro_deg_h[0] * DEG_H, gyro_deg_h[1] * DEG_H),
         allan_model(accel_ug[0] * 1e-3 * MG, accel_ug[1] * 1e-3 * MG),
+        WARM_UP if per_kelvin is None else (WARM_UP_K * per_kelvin[0] * DEG_H, WARM_UP_K * per_kelvin[1] * MG),
     )
 
 
@@ -64,12 +80,13 @@ def _profile(name: str, gyro_deg_h: tuple[float, float], accel_ug: tuple[float, 
 # velocity random walk of 0.2 m/s/sqrt(h) and in-run stability of 0.2 mg.
 # "unknown" is for a part that nobody named. Its floors are those of the worst common parts, so that sigma_use never
 # promises what an unknown MEMS cannot hold; its white noise is that of the best, because white noise is measured in
-# every window and the larger figure counts.
+# every window and the larger figure counts. Temperature coefficients: method section 2.1, which has none of
+# the two ADIS.
 PROFILES: Final[dict[str, NoiseProfile]] = {
     profile.name: profile
     for profile in (
-        _profile("icm42688p", (7.1, 3.0), (49.5, 10.0)),
-        _profile("bmi088", (35.6, 2.0), (124.0, 20.0)),
+        _profile("icm42688p", (7.1, 3.0), (49.5, 10.0), (18.0, 0.15)),
+        _profile("bmi088", (35.6, 2.0), (124.0, 20.0), (54.0, 0.2)),
         _profile("adis16470", (20.4, 8.0), (63.0, 13.0)),
         _profile("adis16405", (152.0, 29.0), (340.0, 200.0)),
         _profile("unknown", (7.1, 30.0), (49.5, 200.0)),
@@ -84,7 +101,8 @@ def noise_profile(profile: str | Noise | None) -> NoiseProfile:
         ConfigError: no such profile.
     """
     if isinstance(profile, Noise):
-        return NoiseProfile(profile.name, AllanModel(*profile.gyro), AllanModel(*profile.accel))
+        models = AllanModel(*profile.gyro), AllanModel(*profile.accel)
+        return NoiseProfile(profile.name, *models, warm_up=profile.warm_up or WARM_UP)
     if profile is not None and profile not in PROFILES:
         raise ConfigError(f"no noise profile {profile!r} (known: {', '.join(PROFILES)})")
     return PROFILES[profile or "unknown"]

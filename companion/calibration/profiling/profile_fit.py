@@ -23,8 +23,10 @@ from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import FLOOR_OF_FLICKER, AllanModel, NoiseProfile
 from companion.calibration.noise.allan_fit import AxisFit, Curve, curve, fit_axis
+from companion.calibration.noise.horizon_fit import within_horizon
 from companion.calibration.seconds.batch import Batch, summary
 from companion.calibration.stillness.gates import ImuGate
+from companion.calibration.stillness.own_noise import learned_of
 from companion.calibration.stillness.stretch import Stretch
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Floats
@@ -56,7 +58,7 @@ class Rests(msgspec.Struct, frozen=True):
     seconds: int
     """Whole seconds in the recording."""
     obstacle: str
-    """What kept most of the others from counting; empty where all counted."""
+    """What kept most of the others from counting, in the words of the first; empty where all counted."""
 
     @property
     def still_s(self) -> int:
@@ -82,10 +84,12 @@ def rests(t_s: Floats, readings: Floats, temperature_degc: Floats | None, name: 
         profile: noise that the gate allows for before it has learned.
     """
     batches = seconds_of(t_s, readings, temperature_degc)
-    gate, stretch = ImuGate(name, profile), Stretch(_MIN_GOOD, max(len(batches), 1))
+    own = learned_of(batches, at_rest=True)
+    gate, stretch = ImuGate(name, profile, own=own), Stretch(_MIN_GOOD, max(len(batches), 1))
     stretches: list[Rest] = []
     kept: list[Batch] = []
     obstacles: Counter[str] = Counter()
+    words: dict[str, str] = {}
     before: int | None = None
 
     def end() -> None:
@@ -103,14 +107,15 @@ def rests(t_s: Floats, readings: Floats, temperature_degc: Floats | None, name: 
         if not stretch.add(batch.slot, good=verdict.still):
             end()
         if verdict.still:
-            gate.accept(batch, settled=stretch.begun)
+            gate.accept(batch)
             kept.append(batch)
         else:
             obstacles[verdict.what] += 1
+            words.setdefault(verdict.what, verdict.words)
             if stretch.start is None:
                 end()
     end()
-    obstacle = obstacles.most_common(1)[0][0] if obstacles else ""
+    obstacle = words[obstacles.most_common(1)[0][0]] if obstacles else ""
     return Rests(tuple(stretches), len(batches), obstacle)
 
 
@@ -211,10 +216,13 @@ def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Fin
     models, kept = [], []
     for triad, part in TRIADS:
         model, unknown = _triad(axes[part], fallback.gyro if triad == "gyro" else fallback.accel)
-        models.append(model)
+        models.append(within_horizon(model, [(rest.slots, rest.means[:, part]) for rest in rests]))
         kept += [f"{triad} {_NAMES[which]}" for which in unknown]
     return Finding(
-        profile=NoiseProfile(name, models[0], models[1]), axes=tuple(axes), kept=tuple(kept), still_s=still_s
+        profile=NoiseProfile(name, models[0], models[1], fallback.warm_up),
+        axes=tuple(axes),
+        kept=tuple(kept),
+        still_s=still_s,
     )
 
 

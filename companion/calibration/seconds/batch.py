@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from typing import Final
 
 import msgspec
@@ -23,6 +24,9 @@ MAX_LEVELS: Final = 1024
 
 _EVEN: Final = 1.4999
 """Steps of a counter that are all within so much of each other are one step each, whatever the usual one is."""
+_LEAST_OF_A_PART: Final = 4
+_FINEST: Final = 5
+"""Halvings of a second: 1/32 s; what is faster is vibration."""
 _PINNED_SIGMAS: Final = 4.0
 _PINNED_SAMPLES: Final = 5
 _PINNED_DISTINCT: Final = 8
@@ -59,6 +63,8 @@ class Batch(msgspec.Struct, frozen=True):
     temperature_degc: float | None
     counts: Counts | None = None
     """Of a stream of integers; None for floats, and for a second that spans more than `MAX_LEVELS`."""
+    allan: Floats | None = None
+    """(k, c) Allan variances at averaging times of 1/2, 1/4 ... 1/32 of the second, each of four samples or more."""
 
 
 def summary(
@@ -94,7 +100,24 @@ def summary(
         missing=None if stamps is None else missing_of(stamps),
         temperature_degc=temperature_degc,
         counts=None if steps is None else counts_of(rows, steps),
+        allan=_allan_within(off),
     )
+
+
+def _allan_within(off: Floats) -> Floats:
+    """Allan variances of (n, c) rows of one second, in halves, quarters and so on, of which each holds four or more."""
+    n = len(off)
+    depth = min(max(int(math.log2(n / _LEAST_OF_A_PART)), 0), _FINEST)
+    found = np.empty((depth, off.shape[1]))
+    if depth == 0:
+        return found
+    edges = np.arange((1 << depth) + 1) * n >> depth
+    means = np.add.reduceat(off, edges[:-1], axis=0) / (edges[1:] - edges[:-1])[:, None]
+    for rung in range(depth - 1, -1, -1):
+        step = means[1:] - means[:-1]
+        found[rung] = np.add.reduce(step * step, axis=0) / (2 * len(step))
+        means = (means[::2] + means[1::2]) / 2.0
+    return found
 
 
 def counts_of(rows: Floats, steps: Floats) -> Counts | None:
@@ -176,6 +199,8 @@ _MAX_TIME_S: Final = 1e12
 _BACKWARD_SAMPLES: Final = 20
 """Samples in a row from the past that mean that the clock went back, not that some were late."""
 _BACKWARD_S: Final = 2.0
+_PAUSE_S: Final = 3.0
+"""A sensor that was silent for longer may have been switched off."""
 
 
 class BatchSource:
@@ -196,6 +221,8 @@ class BatchSource:
         self.closed_through: int | None = None
         """No batch of this slot or an earlier one will come any more."""
         self.last_s: float | None = None
+        self.begun: int | None = None
+        """The second since which it has come without a longer pause."""
         self.lost = 0
         """Samples that never came, by the device's counter or clock, since the beginning."""
         self.restarts = 0
@@ -204,6 +231,8 @@ class BatchSource:
         self._keep = keep
         self._circle = circle
         self.steps = steps
+        self.on_second: Callable[[Batch, Floats, Floats], None] | None = None
+        """Told of every second, its times (n,) and its rows (n, c), before those are dropped."""
         self._restart()
 
     def _restart(self) -> None:
@@ -213,6 +242,7 @@ class BatchSource:
         self._partial = True
         self._backward = 0
         self._last_stamp = math.nan
+        self._heard_s = -math.inf
         self._clear()
 
     def _clear(self) -> None:
@@ -293,6 +323,10 @@ class BatchSource:
         return True
 
     def _close(self) -> None:
+        if self._rows:
+            if self._times[0] - self._heard_s > _PAUSE_S:
+                self.begun = math.floor(self._times[0])
+            self._heard_s = self._times[-1]
         if self._slot is not None and self._rows and not self._partial:
             batch = self._summarise(self._slot)
             if batch is not None:
@@ -323,7 +357,7 @@ class BatchSource:
         if stamps is not None:
             self.lost += missing_of(np.concatenate(((self._last_stamp,), stamps)))
             self._last_stamp = stamps[-1]
-        return summary(
+        batch = summary(
             slot,
             times,
             rows,
@@ -332,3 +366,6 @@ class BatchSource:
             circle=self._circle,
             steps=self.steps,
         )
+        if self.on_second is not None:
+            self.on_second(batch, times, rows)
+        return batch

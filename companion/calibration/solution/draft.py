@@ -15,11 +15,12 @@ from companion.calibration.solution.record import (
     CrossCovariance,
     ImuRecord,
     Record,
+    Standing,
     WrittenParameter,
 )
 from companion.calibration.solution.solve import ImuSolution, Solution
 from companion.physics.frames import Array, Matrix, vector
-from companion.physics.units import DEG_H, MG
+from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import Triad, Vector
 
 
@@ -70,7 +71,7 @@ class Draft:
         return Record(
             state=state,
             reason=reason,
-            warnings=(*(solution.warnings if solution else ()), *self.warnings),
+            warnings=(*(solution.warnings if solution else ()), *unseen_turn(solution), *self.warnings),
             started_at=self.started_at.isoformat(timespec="milliseconds"),
             duration_s=round(duration_s, 3),
             pose=solution.pose if solution else None,
@@ -78,6 +79,7 @@ class Draft:
             system_id=self.system_id,
             magnetic=solution.magnetic if solution else None,
             alignment=self.alignment,
+            standing=_standing(solution) if solution else None,
             imus=tuple(self._imu(estimate) for estimate in solution.imus) if solution else (),
             cross_covariance=_cross(solution) if solution else (),
         )
@@ -96,7 +98,9 @@ class Draft:
             accel_bias_m_s2=_axes(accel),
             accel_sigma_stat_m_s2=_axes(estimate.accel_sigma_stat_m_s2 if has_accel else None),
             accel_sigma_use_m_s2=_axes(estimate.accel_sigma_use_m_s2 if has_accel else None),
-            covariance=_where_known(estimate.covariance, _known(estimate), _known(estimate)),
+            covariance=_where_known(estimate.use_covariance, _known(estimate), _known(estimate)),
+            gyro_sigma_warm_up_rad_s=_axes(np.sqrt(estimate.warm_up_variance[:3]) if has_gyro else None),
+            accel_sigma_warm_up_m_s2=_axes(np.sqrt(estimate.warm_up_variance[3:]) if has_accel else None),
             residual_gyro_rad_s=_axes(estimate.gyro_rad_s if owner_corrects else None),
             residual_accel_m_s2=_axes(estimate.accel_m_s2 if owner_corrects else None),
             warnings=(*estimate.warnings, *self.imu_warnings.get(estimate.name, ())),
@@ -109,6 +113,28 @@ class Draft:
 
 def _axes(values: Array | None) -> Vector | None:
     return None if values is None else vector(values)
+
+
+def _standing(solution: Solution) -> Standing:
+    turn, told = solution.turn, solution.turn.is_told
+    return Standing(
+        platform=solution.platform,
+        turn_deg_s=round(turn.rate_rad_s / DEG, 6) if told else None,
+        turn_sigma_deg_s=round(turn.sigma_rad_s / DEG, 6) if told else None,
+        told_by=turn.by if told else None,
+    )
+
+
+def unseen_turn(solution: Solution | None) -> tuple[str, ...]:
+    """What a pilot without a compass should know: a platform that has turned from the start looks still."""
+    if solution is None or solution.platform == "deck" or all(imu.gyro_rad_s is None for imu in solution.imus):
+        return ()
+    turn = solution.turn
+    if not turn.is_told:
+        return ("assumed Earth-fixed: nothing saw whether the ground turns",)
+    if turn.by == "earlier calibrations" and not turn.is_chance:
+        return (f"the aircraft {turn.in_words}, or its gyros are unlike in earlier power-ups: sigma widened",)
+    return ()
 
 
 def _known(imu: ImuSolution) -> list[bool]:
@@ -135,8 +161,17 @@ def in_words(solution: Solution | None) -> str:
     gyros = [imu.gyro_sigma_use_rad_s for imu in solution.imus if imu.gyro_rad_s is not None]
     accels = [imu.accel_sigma_use_m_s2 for imu in solution.imus if imu.accel_m_s2 is not None]
     if gyros:
-        parts.append(f"{np.max(gyros) / DEG_H:.1f} deg/h")
+        # Warming is told by the hundred; its decimals would push the milli-g off a STATUSTEXT.
+        sigma_deg_h = np.max(gyros) / DEG_H
+        parts.append(f"{sigma_deg_h:.0f} deg/h warming" if _warms(solution) else f"{sigma_deg_h:.1f} deg/h")
     if accels:
         parts.append(f"{np.max(accels) / MG:.2f} mg")
     unknown = ", ".join(f"{triad} {name}" for name, triad in solution.unknown)
     return f"sigma {', '.join(parts)}{f'; not known: {unknown}' if unknown else ''}"
+
+
+def _warms(solution: Solution) -> bool:
+    """Whether the gyros' sigma is that of a warm-up above all."""
+    gyros = [imu for imu in solution.imus if imu.gyro_rad_s is not None]
+    worst = max(gyros, key=lambda imu: float(imu.gyro_sigma_use_rad_s.max()))
+    return bool(worst.warm_up_variance[:3].max() > np.diag(worst.covariance)[:3].max())

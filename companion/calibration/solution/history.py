@@ -83,9 +83,10 @@ class Point(msgspec.Struct, frozen=True, kw_only=True):
         """One half of it."""
         return self.gyro if triad == "gyro" else self.accel
 
-    def as_chosen(self) -> Point:
-        """The same, of a calibration that somebody has asked for and that is in force now."""
-        return msgspec.structs.replace(self, gyro=_as_chosen(self.gyro), accel=_as_chosen(self.accel))
+    def as_chosen(self, *, gyro: bool = True) -> Point:
+        """The same, of a calibration that somebody has asked for and that is in force now; perhaps not of its gyros."""
+        rates = _as_chosen(self.gyro) if gyro else self.gyro
+        return msgspec.structs.replace(self, gyro=rates, accel=_as_chosen(self.accel))
 
 
 def check(point: Point) -> None:

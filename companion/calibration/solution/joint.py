@@ -9,15 +9,16 @@ gradienter's zero is the same in all IMUs, and where the earlier calibrations we
 well, so that nothing averages it away. Where they were made with other zeros, several IMUs together tell today's tilt.
 
 A sigma_use that is too cautious would hand the estimate to the prior. So K counts as e_d only what is *known* to be
-noise: what averaging has left (sigma_stat), the gradienter's scatter, and the sigma of its zero if somebody vouches
-for it. K is then smaller than the best one, and with any K between zero and twice that the estimate is no worse than
-without a prior. The covariance is that of the K used, with the whole S_d.
+noise: what averaging has left (sigma_stat), the gradienter's scatter, what is not known of the platform's turn, and
+the sigma of the zero if somebody vouches for it. K is then smaller than the best one, and with any K between zero and
+twice that the estimate is no worse than without a prior. The covariance is that of the K used, with the whole S_d.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
@@ -28,7 +29,9 @@ from companion.calibration.solution.history import Measured, Point, PowerUp
 from companion.calibration.solution.prior import Expectation, Expected, ExpectedImu
 from companion.calibration.solution.record import AccelPrior, GyroPrior, Prior
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
+from companion.calibration.turning.watch import CHANCE_SIGMAS, Turn
 from companion.physics.frames import Array, Matrix, vector
+from companion.physics.units import DEG
 from companion.samples import Triad
 
 Whole = Mapping[str, tuple[Array | None, Array | None]]
@@ -38,6 +41,8 @@ _TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 AGREES: Final = 11.34
 """Chi square of three axes that is passed by chance once in a hundred: beyond it nobody is warned yet, but what may
 well be of another sensor takes no part."""
+BOUNDS_RAD_S: Final = 0.1 * DEG
+"""One sigma; what is known worse than that (no thermometer, say) says nothing of a turn."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -87,6 +92,7 @@ def weigh(solution: Solution, whole: Whole, expectation: Expectation) -> Weighed
         if one.expected.weighs and (one.witness.name, one.triad) not in found.doubted and _agrees(one.witness)
     ]
     weighed = _estimate(solution, used, zero_is_known=expectation.zero_is_known) if used else solution
+    weighed = _grounded(weighed, known, _known(solution, whole, expected, "gyro", today=True))
     imus = []
     for k, imu in enumerate(weighed.imus):
         own = [doubt.words for doubt in found.doubts if not doubt.of_all and imu.name in doubt.names]
@@ -109,6 +115,39 @@ def _doubts(solution: Solution, whole: Whole, expected: Mapping[str, ExpectedImu
                 found += said
                 break
     return found
+
+
+def _grounded(solution: Solution, earlier: Sequence[_Known], today: Sequence[_Known]) -> Solution:
+    """Where neither a compass nor a rest has told how fast the platform turns, what is known of the gyros bounds it.
+
+    What they read more about the vertical is taken for chance up to `CHANCE_SIGMAS`, and else belongs to sigma. Only
+    earlier power-ups tell that nothing turns: what was measured today may have turned already.
+    """
+    if solution.turn.is_told or solution.platform == "deck":
+        return solution
+    up, more_rad_s = solution.shared.up, 0.0
+    for known in (earlier, today):
+        found = [_about(up, one.witness) for one in known if one.triad == "gyro"]
+        rate, sigma = min(found, key=lambda each: each[1], default=(0.0, math.inf))
+        if abs(rate) > CHANCE_SIGMAS * sigma:
+            more_rad_s = max(more_rad_s, abs(rate))
+        if known is earlier and sigma < BOUNDS_RAD_S:
+            turn = Turn(rate_rad_s=-rate, sigma_rad_s=sigma, by="earlier calibrations")
+            solution = dataclasses.replace(solution, turn=turn)
+    by_turn = np.zeros((6, 6))
+    by_turn[:3, :3] = np.outer(up, up) * more_rad_s**2
+    return dataclasses.replace(
+        solution,
+        shared=dataclasses.replace(solution.shared, covariance=solution.shared.covariance + by_turn),
+        imus=tuple(dataclasses.replace(imu, covariance=imu.covariance + by_turn) for imu in solution.imus),
+        cross={pair: matrix + by_turn for pair, matrix in solution.cross.items()},
+    )
+
+
+def _about(up: Array, witness: Witness) -> tuple[float, float]:
+    """By how much it reads more about the vertical than expected, and one sigma of that."""
+    variance = np.square(up) @ witness.own_variance + up @ witness.common @ up
+    return float(up @ witness.difference), math.sqrt(variance)
 
 
 def points(
@@ -249,7 +288,9 @@ def _estimate(solution: Solution, used: Sequence[_Known], *, zero_is_known: bool
         [np.concatenate([imu.gyro_sigma_stat_rad_s, imu.accel_sigma_stat_m_s2]) for imu in solution.imus]
     )
     known = np.diag(np.minimum(np.square(stat), np.diag(s_d))) + noise_in_d @ noise_in_d.T
-    sure = known[:, index]
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = solution.turn.covariance(shared.up)
+    sure = (known + np.kron(np.ones((count, count)), turn))[:, index]
     if zero_is_known:
         sure = sure + zero_in_d @ zero_in_d[index].T - both
     gain = np.linalg.solve(of_difference, sure.T).T

@@ -77,10 +77,12 @@ def assess(
     local: LocalEarth,
     up: Array,
     up_covariance: Matrix | None,
+    may_turn_deg: float = 0.0,
 ) -> Heading:
     """The heading of the vehicle from the compass' window, and everything that bounds its error.
 
-    `up_covariance` None: up is not from a gradienter, and no inclination can be told.
+    `up_covariance` None: up is not from a gradienter, and no inclination can be told. `may_turn_deg` is how far the
+    aircraft itself may have turned, unseen, within the window.
     """
     heading = vehicle_heading_rad(compass, window.heading_deg, up)
     found = _Field(None, None, None) if field is None else _look(field, compass, local, up, up_covariance)
@@ -126,7 +128,7 @@ def assess(
             *(["compass field is vertical: no heading"] if vertical else []),
             *_near_pole(use),
             *_disturbed(found, local.field, bound_deg, useless=useless, use=use),
-            *_unsteady(window, difference),
+            *_unsteady(window, difference, may_turn_deg),
             *_unchecked(field, up_covariance),
         ),
     )
@@ -220,12 +222,14 @@ def _unchecked(field: FieldWindow | None, up_covariance: Matrix | None) -> list[
     return warnings
 
 
-def _unsteady(window: HeadingWindow, difference: float | None) -> list[str]:
+def _unsteady(window: HeadingWindow, difference: float | None, may_turn_deg: float) -> list[str]:
     warnings = []
     if window.wander_deg is not None and window.wander_deg > WANDER_WARNING_DEG:
-        warnings.append(
-            f"compass turned by {window.wander_deg:.1f} deg while nothing else moved: iron or current near it?"
-        )
+        moves = f"compass moves by {window.wander_deg:.1f} deg"
+        if window.wander_deg > may_turn_deg:
+            warnings.append(f"{moves}, gyros do not: iron or current near it?")
+        else:
+            warnings.append(f"{moves}: iron or current near it, or the aircraft turns slowly")
     if difference is not None and abs(difference) > DEVICE_WARNING_DEG:
         warnings.append(
             f"compass' own heading is {abs(difference):.0f} deg off the one from its field and the gradienter:"

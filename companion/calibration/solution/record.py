@@ -6,12 +6,13 @@ and never zero. All axes are the vehicle's FRD.
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import msgspec
 
 from companion import formats
-from companion.samples import Vector
+from companion.samples import Triad, Vector
 
 FORMAT_VERSION = 1
 
@@ -88,6 +89,19 @@ class Magnetic(msgspec.Struct, frozen=True, kw_only=True):
 
 def _earths(expected: float | None, form: str) -> str:
     return "" if expected is None else f" (the Earth's {expected:{form}})"
+
+
+class Standing(msgspec.Struct, frozen=True, kw_only=True):
+    """What it stood on, and what was known of that one's own turn; the gyros' sigma allows for it."""
+
+    platform: Literal["ground", "deck"]
+    """As configured."""
+    turn_deg_s: float | None
+    """About the vertical, clockwise seen from above; not taken off. None: nothing told, and the ground was taken for
+    fixed to the Earth."""
+    turn_sigma_deg_s: float | None
+    told_by: Literal["compass", "gyros", "compass and gyros", "earlier calibrations"] | None
+    """Gyros: by their level at an earlier rest; earlier calibrations: by the biases that they have led to expect."""
 
 
 class WrittenParameter(msgspec.Struct, frozen=True, kw_only=True):
@@ -187,6 +201,21 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     """None where the accelerometers were not determined."""
     held_back: tuple[Literal["gyro", "accel"], ...] = ()
     """Measured and not written, since it contradicts earlier ones and nobody had asked: the offsets are as before."""
+    gyro_sigma_warm_up_rad_s: Vector | None = None
+    """The part of sigma_use for a warm-up too small to see, which only time takes away."""
+    accel_sigma_warm_up_m_s2: Vector | None = None
+
+    def settled_sigma(self, triad: Triad) -> Vector | None:
+        """sigma_use without that part, which moves old and new offsets alike."""
+        whole, part = (
+            (self.gyro_sigma_use_rad_s, self.gyro_sigma_warm_up_rad_s)
+            if triad == "gyro"
+            else (self.accel_sigma_use_m_s2, self.accel_sigma_warm_up_m_s2)
+        )
+        if whole is None or part is None:
+            return whole
+        x, y, z = (math.sqrt(max(use**2 - of**2, 0.0)) for use, of in zip(whole, part, strict=True))
+        return x, y, z
 
 
 class Arming(msgspec.Struct, frozen=True, kw_only=True):
@@ -242,6 +271,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     """UTC, ISO 8601: when what this calibration has written was put back on request."""
     magnetic: Magnetic | None = None
     """How good the heading can be; None without a compass."""
+    standing: Standing | None = None
+    """None: nothing was measured, or by an older version."""
     cross_covariance: tuple[CrossCovariance, ...] = ()
     """Of every two IMUs."""
     armings: tuple[Arming, ...] = ()

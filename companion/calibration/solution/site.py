@@ -46,6 +46,8 @@ class Remedies:
     latitude: str = "set vehicle.latitude_deg or wait for GPS"
     height: str = "set vehicle.height_m or wait for GPS"
     no_heading: str = "no compass"
+    mounting: str = "mounting = \"{}\" (an autopilot's own IMU: its board orientation), or the gradienter's is wrong"
+    any_bias: str = "calibration.any_bias = true takes it all the same"
 
 
 IN_CONFIGURATION: Final = Remedies()

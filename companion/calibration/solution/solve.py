@@ -38,24 +38,29 @@ from companion.calibration.means.pose import (
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.request import What
 from companion.calibration.solution import magnetic
+from companion.calibration.solution.believable import believable, untold, widened
 from companion.calibration.solution.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site
 from companion.calibration.solution.site import LocalEarth, Uncertain
+from companion.calibration.turning.watch import Turn
+from companion.config.sections import Platform
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, skew
-from companion.physics.gradienter import up_jacobian
+from companion.physics.gradienter import up_in_sensor, up_jacobian
 from companion.physics.units import DEG
 from companion.samples import Triad
 
 # Without a gradienter the accelerometers level the Earth's rate; a 50 mg bias tilts it by 3 degrees (0.8 deg/h).
 LEVEL_BY_ACCELEROMETER_SIGMA_DEG: Final = 3.0
 
+_ON_DECK: Final = "on a deck gyros need a compass: without one a slow turn looks like a bias"
+
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class ImuSolution:
     """What is left in one IMU's output: mean minus truth, in vehicle FRD, shape (3,); None: not asked for or unknown.
 
-    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of the estimate as a prediction of the next
-    minutes: sigma_use is the root of its diagonal.
+    `covariance` (6x6: gyro rad/s, accelerometer m/s^2) is that of a prediction of the next minutes, without what a
+    warm-up may do in them: that moves the bias under old and new offsets alike, and no comparison must count it.
     """
 
     name: str
@@ -67,6 +72,7 @@ class ImuSolution:
     accel_sigma_stat_m_s2: Array
     covariance: Matrix
     warnings: tuple[str, ...]
+    warm_up_variance: Array = dataclasses.field(default_factory=lambda: np.zeros(6))
     dithered: bool = False
     """The telemetry was seen to follow this IMU's offsets step by step."""
     prior: Prior | None = None
@@ -77,12 +83,17 @@ class ImuSolution:
     @property
     def gyro_sigma_use_rad_s(self) -> Array:
         """One sigma per axis, shape (3,)."""
-        return np.sqrt(np.diag(self.covariance)[:3])
+        return np.sqrt(np.diag(self.use_covariance)[:3])
 
     @property
     def accel_sigma_use_m_s2(self) -> Array:
         """One sigma per axis, shape (3,)."""
-        return np.sqrt(np.diag(self.covariance)[3:])
+        return np.sqrt(np.diag(self.use_covariance)[3:])
+
+    @property
+    def use_covariance(self) -> Matrix:
+        """The warm-up in it: sigma_use is the root of its diagonal."""
+        return self.covariance + np.diag(self.warm_up_variance)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -141,6 +152,9 @@ class Solution:
     """IMUs and triads that were asked for and whose readings do not tell; the IMU's warnings say why."""
     magnetic: Magnetic | None = None
     """How good the heading can be; None without a compass."""
+    turn: Turn = dataclasses.field(default_factory=Turn)
+    """What was known of the platform's own rate."""
+    platform: Platform = "ground"
     cross: Mapping[tuple[str, str], Matrix] = dataclasses.field(default_factory=dict)
     """Cross-covariance (6x6) of every two IMUs, in their order."""
 
@@ -174,12 +188,15 @@ def solve(
     gradienter: GradienterModel | None,
     compass: CompassModel | None,
     what: What,
+    platform: Platform = "ground",
+    *,
+    any_bias: bool = False,
 ) -> Solution:
-    """Work out the biases of every IMU of the window.
+    """Work out the biases of every IMU of the window; with `any_bias` also such as no part has.
 
     Raises:
-        CalibrationRefusedError: the readings cannot be right together, or accelerometers were asked for without
-            a gradienter.
+        CalibrationRefusedError: the readings cannot be right together, accelerometers were asked for without
+            a gradienter, or gyros on a deck without a heading.
     """
     warnings = list(local.warnings)
     gradienter = gradienter if window.tilt is not None else None
@@ -196,22 +213,41 @@ def solve(
             f"{local.remedies.no_heading}: the horizontal part of the Earth's rate is unknown, gyro sigma widened"
         )
     truth = truth_of(window, gradienter, compass, local, warnings)
-    shared = _shared(truth, local, 0.0 if gradienter is None else gradienter.sigma_deg * DEG)
-    wanted: dict[Triad, bool] = {"gyro": what.gyros, "accel": what.accelerometers and gradienter is not None}
+    believed = window.imus if any_bias else believable(window.imus, truth.up, local)
+    sailing = np.zeros(3) if window.turn_rad_s is None else np.array(window.turn_rad_s)
+    shared = _shared(truth, local, window.turn, 0.0 if gradienter is None else gradienter.sigma_deg * DEG, sailing)
+    # A deck may turn, and a steady turn shows in nothing but the heading.
+    turn_unseen = platform == "deck" and what.gyros and truth.heading_rad is None
+    if turn_unseen:
+        if what is What.GYROS or gradienter is None:
+            raise CalibrationRefusedError(_ON_DECK)
+        warnings.append(f"{_ON_DECK}; not calibrated")
+    wanted: dict[Triad, bool] = {
+        "gyro": what.gyros and not turn_unseen,
+        "accel": what.accelerometers and gradienter is not None,
+    }
     asked = [triad for triad, is_wanted in wanted.items() if is_wanted]
-    imus = tuple(_estimate(imu, truth, local, shared, asked) for imu in window.imus)
+    tipped = _tipped(window, gradienter, truth, sailing)
+    imus = tuple(
+        _estimate(imu, truth, local, shared, asked, tipped, window.powered_s.get(imu.name, 0.0)) for imu in believed
+    )
     if all(imu.gyro_rad_s is None and imu.accel_m_s2 is None for imu in imus):
-        refusals = [words for imu in window.imus for words in _hidden(imu, asked)]
+        refusals = dict.fromkeys(words for imu in believed for words in untold(imu, asked))
         if refusals:
             raise CalibrationRefusedError("; ".join(refusals))
+    unknown = [(imu.name, triad) for triad in asked for imu in believed if imu.refused(triad)]
+    if turn_unseen:
+        unknown += [(imu.name, "gyro") for imu in window.imus]
     return Solution(
         pose=_pose(truth),
         site=local.site,
         imus=imus,
         warnings=tuple(warnings),
-        unknown=tuple((imu.name, triad) for triad in asked for imu in window.imus if imu.refused(triad)),
+        unknown=tuple(unknown),
         magnetic=truth.magnetic,
         shared=shared,
+        turn=window.turn,
+        platform=platform,
         cross=dict.fromkeys(itertools.combinations((imu.name for imu in imus), 2), shared.covariance),
     )
 
@@ -244,7 +280,8 @@ def truth_of(
     if compass is None or window.heading is None:
         return without
     tilt_covariance = None if by_reading is None else up_covariance
-    found = magnetic.assess(window.heading, window.field, compass, local, up, tilt_covariance)
+    may_turn_deg = window.turn.at_most_rad_s / DEG * (window.end_s - window.start_s)
+    found = magnetic.assess(window.heading, window.field, compass, local, up, tilt_covariance, may_turn_deg)
     warnings += found.warnings
     if not found.is_usable:
         return dataclasses.replace(without, magnetic=found.magnetic)
@@ -290,17 +327,17 @@ def _pose(truth: Truth) -> Pose:
     )
 
 
-def _shared(truth: Truth, local: LocalEarth, zero_sigma_rad: float) -> Shared:
-    """What one attitude, gravity and Earth's rate add to the errors of all; method section 2.1.
+def _shared(truth: Truth, local: LocalEarth, turn: Turn, zero_sigma_rad: float, turn_rad_s: Array) -> Shared:
+    """What one attitude, gravity, Earth's rate and turn of the platform add to the errors of all; method section 2.1.
 
     An attitude error eps makes db_a = eps x f and db_g = eps x w = -[w x] eps; the cross term is kept, since one tilt
     error makes both. What remains unknown of the Earth's rate (latitude, or a heading never measured) comes in with
-    its own covariance.
+    its own covariance, and so does what the platform may turn by itself.
     """
     rate, up = truth.earth_rate(local), truth.up
-    jacobian = np.vstack([-skew(rate.mean), -skew(local.gravity_m_s2 * up)])
+    jacobian = np.vstack([-skew(rate.mean + turn_rad_s), -skew(local.gravity_m_s2 * up)])
     covariance = jacobian @ truth.attitude_covariance_rad2 @ jacobian.T
-    covariance[:3, :3] += rate.covariance
+    covariance[:3, :3] += rate.covariance + turn.covariance(up)
     covariance[3:, 3:] += np.outer(up, up) * local.gravity_sigma_m_s2**2
     return Shared(
         up=up,
@@ -312,13 +349,33 @@ def _shared(truth: Truth, local: LocalEarth, zero_sigma_rad: float) -> Shared:
     )
 
 
-def _estimate(imu: ImuWindow, truth: Truth, local: LocalEarth, shared: Shared, asked: Collection[Triad]) -> ImuSolution:
+def _tipped(window: Window, gradienter: GradienterModel | None, truth: Truth, turn_rad_s: Array) -> Array:
+    """What the gyro means of a deck hold of its turn because its axis is another one than the readings alone said."""
+    if window.turn_rad_s is None or window.tilt is None or gradienter is None:
+        return np.zeros(3)
+    said = gradienter.vehicle_from_sensor @ up_in_sensor(gradienter.law, window.tilt.x_deg, window.tilt.y_deg)
+    return np.cross(np.cross(said, truth.up), turn_rad_s)
+
+
+def _estimate(
+    imu: ImuWindow,
+    truth: Truth,
+    local: LocalEarth,
+    shared: Shared,
+    asked: Collection[Triad],
+    tipped: Array,
+    powered_s: float,
+) -> ImuSolution:
     gyro = accel = None
     if "gyro" in asked and imu.refused("gyro") is None:
-        gyro = gyro_bias(np.array(imu.gyro_rad_s), truth.earth_rate(local).mean)
+        gyro = gyro_bias(np.array(imu.gyro_rad_s), _earth_seen(imu, truth, local) + tipped)
     if "accel" in asked and imu.refused("accel") is None:
         accel = accelerometer_bias(np.array(imu.accel_m_s2), truth.up, local.gravity_m_s2)
-    own = np.square([*imu.gyro_sigma_use_rad_s, *imu.accel_sigma_use_m_s2])
+    own = imu.covariance
+    if own is None:
+        own = np.diag(np.square([*imu.gyro_sigma_use_rad_s, *imu.accel_sigma_use_m_s2]))
+    covariance = shared.covariance + own
+    unseen = np.zeros(6) if imu.warming is None else imu.warming.unseen(powered_s)
     return ImuSolution(
         name=imu.name,
         samples=imu.samples,
@@ -327,12 +384,17 @@ def _estimate(imu: ImuWindow, truth: Truth, local: LocalEarth, shared: Shared, a
         accel_m_s2=accel,
         gyro_sigma_stat_rad_s=np.array(imu.gyro_sigma_stat_rad_s),
         accel_sigma_stat_m_s2=np.array(imu.accel_sigma_stat_m_s2),
-        covariance=shared.covariance + np.diag(own),
-        warnings=(*imu.warnings, *_hidden(imu, asked)),
+        covariance=covariance,
+        warm_up_variance=unseen,
+        warnings=(*imu.warnings, *untold(imu, asked), *widened(imu, asked, powered_s, np.diag(covariance))),
         dithered=imu.dithered,
     )
 
 
-def _hidden(imu: ImuWindow, asked: Collection[Triad]) -> list[str]:
-    """What this IMU's readings do not tell, or not well, of what is asked for."""
-    return [hidden.words for triad, hidden in imu.hidden.items() if triad in asked]
+def _earth_seen(imu: ImuWindow, truth: Truth, local: LocalEarth) -> Array:
+    """What the gyro means hold of the Earth's rate: all of it as the aircraft stood, or what turning left of it."""
+    if imu.by_earth is None or truth.heading_rad is None:
+        return truth.earth_rate(local).mean
+    c, s = math.cos(truth.heading_rad), math.sin(truth.heading_rad)
+    north, east, down = local.rate_ned_rad_s.tolist()
+    return np.asarray(imu.by_earth @ np.array([c * north + s * east, c * east - s * north, down]))

@@ -68,7 +68,9 @@ class Held(msgspec.Struct, frozen=True, kw_only=True):
     temperature_degc: float | None
     """Then."""
     sigma_use: Vector
-    """rad/s or m/s^2."""
+    """rad/s or m/s^2; what was promised."""
+    sigma: Vector
+    """The same without a warm-up to come, which moves old and new offsets alike: what is compared."""
     expected: Vector
     """Output minus truth while all is well: zero where the autopilot corrects, else the whole bias."""
     seen: bool
@@ -82,6 +84,8 @@ class Present(msgspec.Struct, frozen=True, kw_only=True):
 
     residual: Vector
     sigma_use: Vector
+    sigma: Vector
+    """Both as in `Held`."""
 
 
 class Finding(msgspec.Struct, frozen=True):
@@ -92,18 +96,18 @@ class Finding(msgspec.Struct, frozen=True):
 
 
 @functools.lru_cache(maxsize=128)
-def age_limit_s(model: AllanModel, sigma_use: Vector, averaged_s: float) -> float:
+def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
     """The horizon H at which the expected wandering, V(T, H) without its white part, reaches DRIFT_SIGMAS sigma_use.
 
     Args:
         model: of the sensor.
-        sigma_use: of the calibration, in the model's unit; the smallest axis counts.
+        sigma: of the calibration, as in `Held`, in the model's unit; the smallest axis counts.
         averaged_s: T, the length of its window.
 
     Returns:
         Seconds, at most a day (method section 2.2).
     """
-    allowed = (DRIFT_SIGMAS * min(sigma_use)) ** 2
+    allowed = (DRIFT_SIGMAS * min(sigma)) ** 2
 
     def drift(horizon_s: float) -> float:
         return float(floor_variance(model.flicker, model.walk, averaged_s, horizon_s))
@@ -153,7 +157,7 @@ def judge(
         if abs(change) > limits.max_temperature_change_k:
             warmer = "warmer" if change > 0 else "colder"
             found.append(Finding(Why.TEMPERATURE, f"imu {name}: {abs(change):.0f} K {warmer} than calibrated"))
-    limit_s = min(limits.max_age_s, age_limit_s(model, held.sigma_use, held.averaged_s))
+    limit_s = min(limits.max_age_s, age_limit_s(model, held.sigma, held.averaged_s))
     if (age_s := now_s - held.confirmed_s) > limit_s:
         found.append(Finding(Why.OLD, f"calibrated {age_s / 60:.0f} min ago, limit {limit_s / 60:.0f}"))
     return found
@@ -164,7 +168,7 @@ def worst_axis(held: Held, present: Present) -> float | None:
     beyond = [
         residual - expected
         for residual, expected, then, now in zip(
-            present.residual, held.expected, held.sigma_use, present.sigma_use, strict=True
+            present.residual, held.expected, held.sigma, present.sigma, strict=True
         )
         if abs(residual - expected) > RESIDUAL_SIGMAS * math.hypot(then, now)
     ]
@@ -180,8 +184,8 @@ def worth_writing(present: Present, held: Held | None, floor: float) -> bool:
         floor: what nobody needs bettered, in the same unit.
     """
     expected = held.expected if held is not None else (0.0, 0.0, 0.0)
-    then = held.sigma_use if held is not None else (0.0, 0.0, 0.0)
+    then = held.sigma if held is not None else (0.0, 0.0, 0.0)
     return any(
         abs(residual - wanted) > max(WORTH_SIGMAS * math.hypot(was, now), floor)
-        for residual, wanted, was, now in zip(present.residual, expected, then, present.sigma_use, strict=True)
+        for residual, wanted, was, now in zip(present.residual, expected, then, present.sigma, strict=True)
     )

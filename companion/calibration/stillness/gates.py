@@ -3,7 +3,7 @@
 The detector is the generalised likelihood ratio test of Skog, Haendel, Nilsson and Rantakokko (IEEE Trans. Biomed.
 Eng. 57(11), 2010) in its centred form: T = mean(sum((a - abar)^2 / s_a^2 + (w - wbar)^2 / s_w^2)), 6 (W - 1) / W when
 at rest, because before a calibration the biases are unknown. What the centred form cannot see, a slow steady turn,
-is left to gates on the means. Method section 3.
+is left to gates on the means, and to `turning`. Method section 3.
 
 One set of constants serves all sensors; nothing here is tuned to a recording. Three ideas make that possible:
 
@@ -27,6 +27,9 @@ import numpy as np
 
 from companion.calibration.noise.allan import NoiseProfile
 from companion.calibration.seconds.batch import Batch
+from companion.calibration.stillness.coarse import Steps
+from companion.calibration.stillness.own_noise import OwnNoise
+from companion.calibration.stillness.plausible import MOST_GYRO_RAD_S, unit_of_force
 from companion.physics.frames import Floats
 from companion.physics.units import DEG, MG
 
@@ -52,14 +55,6 @@ GYRO_STEP_RAD_S: Final = 0.05 * DEG
 ACCEL_STEP_M_S2: Final = 5.0 * MG
 """A second's mean against the start of the stretch: a tilt of 0.3 deg. Warming by 10 K moves consumer parts 2 mg."""
 
-GYRO_REST_RAD_S: Final = 0.5 * DEG
-"""Against the level of the last still stretch: a bias does not move that far within minutes, a steady turn that is
-slower needs twelve minutes for a circle."""
-
-REST_HELD_S: Final = 30
-"""So long a steady reading off the old level is believed to be a new bias: without this a shock to the sensor
-would lock the gate until a restart."""
-
 GYRO_BIAS_RAD_S: Final = 10.0 * DEG
 """Beyond any turn-on bias that a modern part specifies (typically 0.5 to 3 deg/s)."""
 
@@ -77,6 +72,8 @@ HEADING_STEP_DEG: Final = 3.0
 
 MIN_IMU_SAMPLES: Final = 4
 MAX_IMU_GAP_S: Final = 0.5
+_NO_END: Final = (60.0 * DEG,) * 3 + (14.0,) * 3
+"""No part's range ends below: readings of integers that pile up there are those of a sway that turns back."""
 STUCK_SAMPLES: Final = 10
 """Fewer may well be equal by chance on a quiet sensor with coarse steps."""
 
@@ -105,13 +102,13 @@ class Verdict(msgspec.Struct, frozen=True):
 STILL: Final = Verdict(still=True)
 
 
-def _words(what: str, found: float, allowed: float, unit: str) -> Verdict:
-    """'gyro fc 0.31 deg/s > 0.10', with as many digits as it takes to see the difference."""
+def _words(what: str, found: float, allowed: float, unit: str, hint: str = "") -> Verdict:
+    """'gyro fc 0.31 deg/s > 0.10' and a hint, with as many digits as it takes to see the difference."""
     for digits in (2, 3, 4):
         left, right = f"{found:.{digits}f}", f"{allowed:.{digits}f}"
         if left != right:
             break
-    return Verdict(still=False, words=f"{what} {left} {unit} > {right}", what=what)
+    return Verdict(still=False, words=f"{what} {left} {unit} > {right}{hint}", what=what)
 
 
 def _fault(words: str) -> Verdict:
@@ -145,6 +142,10 @@ def _beyond(values: list[float], reference: Sequence[Floats], chance: list[float
     return max(abs(value - other) - scatter * alone for value, other, alone in zip(values, others, chance, strict=True))
 
 
+def _is_within(batch: Batch) -> bool:
+    return bool((np.maximum(np.abs(batch.low), np.abs(batch.high)) < _NO_END).all())
+
+
 def _lower_quartile(freedom: int) -> float:
     """Lower quartile of a variance estimate over the variance (Wilson and Hilferty's chi-square)."""
     spread = 2.0 / (9.0 * freedom)
@@ -154,39 +155,46 @@ def _lower_quartile(freedom: int) -> float:
 class ImuGate:
     """The gate of one IMU: six channels, gyro in rad/s, then accelerometer in m/s^2, in any fixed axes."""
 
-    def __init__(self, name: str, profile: NoiseProfile, steps: tuple[float, float] = (0.0, 0.0)) -> None:
-        self._name = name
+    def __init__(
+        self,
+        name: str,
+        profile: NoiseProfile,
+        steps: tuple[float, float] = (0.0, 0.0),
+        own: OwnNoise | None = None,
+        *,
+        sways: bool = False,
+    ) -> None:
+        self._name, self._sways = name, sways
+        self._own = own or OwnNoise((profile.gyro.white, profile.accel.white))
         self._white = np.repeat([profile.gyro.white, profile.accel.white], 3)
-        self._steps = np.repeat(np.asarray(steps, dtype=np.float64), 3)
+        self._steps = Steps([steps[0]] * 3 + [steps[1]] * 3)
         self._learned: deque[Floats] = deque(maxlen=_LEARN_FROM)
         self._noise: Floats | None = None
-        self._rest: Floats | None = None
-        self._off_level = 0
         self.new_stretch()
 
     def new_stretch(self) -> None:
-        """The still stretch has ended: references start again. Noise and rest level stay known."""
+        """The still stretch has ended: references start again. The noise stays known."""
         self._recent: deque[Floats] = deque(maxlen=_RECENT)
         self._start: list[Floats] = []
 
     def forget_level(self) -> None:
         """The readings are not comparable with earlier ones: an offset was written, the owner restarted."""
-        self._rest = None
-        self._off_level = 0
+        self._own.clear()
         self.new_stretch()
 
-    def accept(self, batch: Batch, *, settled: bool) -> None:
-        """The second counts as still for all sources; `settled` when the stretch is long enough to be believed."""
+    def accept(self, batch: Batch) -> None:
+        """The second counts as still for all sources."""
         self._recent.append(batch.mean[:3])
         if len(self._start) < _REFERENCE:
             self._start.append(batch.mean[3:])
-        if settled:
-            self._rest = np.mean(self._recent, axis=0)
-            self._off_level = 0
 
     def judge(self, batch: Batch) -> Verdict:
         """Whether this second was still for this IMU; learns its noise on the way."""
-        return self._broken(batch) or self._moving(batch) or self._displaced(batch) or STILL
+        if (broken := self._broken(batch)) is not None:
+            return broken
+        self._steps.add(batch)
+        self._own.add(batch)
+        return self._moving(batch) or self._displaced(batch) or STILL
 
     def _broken(self, batch: Batch) -> Verdict | None:
         name = self._name
@@ -194,14 +202,14 @@ class ImuGate:
             return _fault(f"imu {name} sends {batch.n} Hz, needs {MIN_IMU_SAMPLES}")
         if batch.largest_gap_s > MAX_IMU_GAP_S:
             return _fault(f"imu {name} was silent for {batch.largest_gap_s:.1f} s > {MAX_IMU_GAP_S}")
-        if batch.clipped:
+        if batch.clipped and not (self._sways and _is_within(batch)):
             return _fault(f"imu {name} hits the end of its range")
         distinct = batch.distinct.tolist()
         if batch.n >= STUCK_SAMPLES and 1 in distinct:
-            same = [count == 1 and step == 0.0 for count, step in zip(distinct, self._steps.tolist(), strict=True)]
-            if all(same[:3]) or all(same[3:]):
-                part = "gyro" if all(same[:3]) else "accel"
-                return _fault(f"{part} {name} is stuck: {batch.n} equal readings")
+            same = [count == 1 and step == 0.0 for count, step in zip(distinct, self._steps.told, strict=True)]
+            for number, (part, triad, *_) in enumerate(_TRIADS):
+                if all(same[triad]) and not self._steps.excuse(batch, number):
+                    return _fault(f"{part} {name} is stuck: {batch.n} equal readings")
         return None
 
     def _moving(self, batch: Batch) -> Verdict | None:
@@ -211,40 +219,47 @@ class ImuGate:
         sigma2 = self._sigma2(floor, n)
         self._noise = None if sigma2 is None else np.array(sigma2)
         variance, white = batch.variance.tolist(), batch.white.tolist()
-        for part, triad, motion, vibration, unit, unit_name in _TRIADS:
+        for number, (part, triad, motion, vibration, unit, unit_name) in enumerate(_TRIADS):
+            own = self._own.known[number]
             noise = math.sqrt(floor[triad.start])
-            shaking = max(vibration, 1.5 * noise)
+            shaking = max(vibration, 1.5 * noise, 0.0 if own is None else 1.5 * own.rms)
             rest = (0.0, shaking**2)
             if sigma2 is not None:
                 known = _mean(sigma2[triad])
                 rest = (known, GLRT_RATIO * known)
             # A known noisy sensor behind a low-pass looks like slow motion, hence the profile's noise here too.
             found, allowed = _motion(variance[triad], white[triad], n, max(motion, noise), rest)
+            if own is not None:
+                allowed = math.sqrt(motion**2 + max(own.slow, 0.0) + _CHANCE * own.chance)
+            hint = self._own.hint(number)
             if found > allowed:
-                return _words(f"{part} {name}", found / unit, allowed / unit, unit_name)
+                return _words(f"{part} {name}", found / unit, allowed / unit, unit_name, hint)
             found = math.sqrt(_mean(variance[triad]))
             if found > shaking:
-                return _words(f"{part} {name} shakes", found / unit, shaking / unit, unit_name)
+                return _words(f"{part} {name} shakes", found / unit, shaking / unit, unit_name, hint)
         self._learned.append(batch.variance)
         return None if sigma2 is None else self._likelihood(variance, n, sigma2)
 
     def _sigma2(self, floor: list[float], n: int) -> list[float] | None:
         """Variance of one sample at rest, learned; None until there is enough to learn from."""
-        if len(self._learned) < _LEARNED_ENOUGH:
-            return None
-        ordered = np.sort(np.array(self._learned), axis=0)
-        below, share = divmod(0.25 * (len(ordered) - 1), 1.0)
-        low, high = ordered[int(below)], ordered[int(below) + 1]
-        quartile = (low + (high - low) * share) / _lower_quartile(n - 1)
-        # A truncated reading that toggles between two steps has up to a quarter of a step squared.
-        return [
-            max(learned, known + step * step / 4.0)
-            for learned, known, step in zip(quartile.tolist(), floor, self._steps.tolist(), strict=True)
-        ]
+        learned: list[float | None] = [None] * len(floor)
+        if len(self._learned) >= _LEARNED_ENOUGH:
+            ordered = np.sort(np.array(self._learned), axis=0)
+            below, share = divmod(0.25 * (len(ordered) - 1), 1.0)
+            low, high = ordered[int(below)], ordered[int(below) + 1]
+            learned[:] = ((low + (high - low) * share) / _lower_quartile(n - 1)).tolist()
+        for (_, triad, *_), own in zip(_TRIADS, self._own.known, strict=True):
+            if own is not None:
+                learned[triad] = own.variance.tolist()
+        # A reading that toggles between two steps has up to a quarter of a step squared.
+        least = [known + step * step / 4.0 for known, step in zip(floor, self._steps.sizes, strict=True)]
+        found = [max(each, bound) for each, bound in zip(learned, least, strict=True) if each is not None]
+        return found if len(found) == len(floor) else None
 
     def _likelihood(self, variance: list[float], n: int, sigma2: list[float]) -> Verdict | None:
         ratio = [found / known for found, known in zip(variance, sigma2, strict=True)]
-        allowed = GLRT_RATIO * (1.0 + _CHANCE * math.sqrt(2.0 / (6.0 * n)))
+        freedom = [n if own is None else min(own.freedom, n) for own in self._own.known]
+        allowed = GLRT_RATIO * (1.0 + _CHANCE * math.sqrt(sum(2.0 / each for each in freedom) / 12.0))
         # T / (6 (W - 1) / W), the variances having n - 1 in their denominators.
         if _mean(ratio) <= allowed:
             return None
@@ -260,15 +275,22 @@ class ImuGate:
         rate, force = mean[:3], mean[3:]
         size = math.sqrt(sum(each * each for each in force))
         if not abs(size - GRAVITY_M_S2) <= GRAVITY_GATE_M_S2:
-            return _fault(f"accel {name} reads {size:.1f} m/s^2, not gravity")
+            unit = unit_of_force(size)
+            return _fault(f"accel {name} reads {size:.1f} m/s^2, not gravity{f': in {unit}?' if unit else ''}")
         found = max(map(abs, rate))
+        if found > MOST_GYRO_RAD_S:
+            return _fault(f"gyro {name} reads {found / DEG:.0f} deg/s and nothing moves: deg/s for rad/s?")
         if found > GYRO_BIAS_RAD_S:
             return _words(f"gyro {name} turns or is biased by", found / DEG, GYRO_BIAS_RAD_S / DEG, "deg/s")
         # A few samples say little about their own scatter; what was learned says more.
         noise = batch.variance.tolist()
         if self._noise is not None:
             noise = list(map(max, noise, self._noise.tolist()))
-        chance = [_CHANCE * math.sqrt(each / batch.n) for each in noise]
+        scatter = [each / batch.n for each in noise]
+        for (_, triad, *_), own in zip(_TRIADS, self._own.known, strict=True):
+            if own is not None:
+                scatter[triad] = map(max, scatter[triad], own.density.tolist())
+        chance = [_CHANCE * math.sqrt(each) for each in scatter]
         if self._recent:
             found = _beyond(rate, self._recent, chance[:3])
             if found > GYRO_STEP_RAD_S:
@@ -276,21 +298,7 @@ class ImuGate:
             found = _beyond(force, self._start, chance[3:])
             if found > ACCEL_STEP_M_S2:
                 return _words(f"accel {name} tilted by", found / MG, ACCEL_STEP_M_S2 / MG, "mg")
-        return self._off_rest(rate)
-
-    def _off_rest(self, rate: list[float]) -> Verdict | None:
-        if self._rest is None:
-            return None
-        found = max(abs(each - rest) for each, rest in zip(rate, self._rest.tolist(), strict=True))
-        if found <= GYRO_REST_RAD_S:
-            self._off_level = 0
-            return None
-        self._off_level += 1
-        if self._off_level >= REST_HELD_S:
-            self._rest = None
-            self._off_level = 0
-            return None
-        return _words(f"gyro {self._name} turns by", found / DEG, GYRO_REST_RAD_S / DEG, "deg/s")
+        return None
 
 
 class PoseGate:

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from typing import Final
 
 import msgspec
+import numpy as np
 
 from companion.autopilot.firmware.firmwares import outcomes_of
 from companion.calibration.noise.allan import noise_profile
@@ -222,13 +223,15 @@ class InForce:
         )
         for triad, sigma, bias, residual in halves:
             key = (imu.name, triad)
-            if key not in self._held or sigma is None or bias is None:
+            settled = imu.settled_sigma(triad)
+            if key not in self._held or sigma is None or settled is None or bias is None:
                 continue
             found = Held(
                 calibrated_s=now_s,
                 confirmed_s=now_s,
                 temperature_degc=imu.temperature_degc,
                 sigma_use=sigma,
+                sigma=settled,
                 expected=_ZERO if corrected else bias,
                 # Of an IMU that is not in the autopilot's telemetry "stored" is all that can ever be known.
                 seen=outcomes_of(triad, imu.written) <= {"verified"} or not corrected,
@@ -288,7 +291,10 @@ class InForce:
         try:
             where = models.whereabouts(self._config, self._vehicle)
             poses = self._alignment.model(), models.compass_model(self._config.compass)
-            solution: Solution = await self._offload(lambda: solve(window, local_earth(where), *poses, self.what))
+            platform, any_bias = self._config.vehicle.platform, self._config.calibration.any_bias
+            solution: Solution = await self._offload(
+                lambda: solve(window, local_earth(where), *poses, self.what, platform, any_bias=any_bias)
+            )
         except CalibrationRefusedError:
             self._forget()
             return True
@@ -301,8 +307,12 @@ class InForce:
         for imu in solution.imus:
             if imu.temperature_degc is not None:
                 self._temperatures[imu.name] = imu.temperature_degc
-            found = ((imu.gyro_rad_s, imu.gyro_sigma_use_rad_s), (imu.accel_m_s2, imu.accel_sigma_use_m_s2))
-            for triad, (residual, sigma) in zip(_TRIADS, found, strict=True):
+            settled = np.sqrt(np.diag(imu.covariance))
+            found = (
+                (imu.gyro_rad_s, imu.gyro_sigma_use_rad_s, settled[:3]),
+                (imu.accel_m_s2, imu.accel_sigma_use_m_s2, settled[3:]),
+            )
+            for triad, (residual, sigma, compared) in zip(_TRIADS, found, strict=True):
                 key = (imu.name, triad)
                 if key in solution.unknown:
                     self._leave_out(key)
@@ -312,7 +322,7 @@ class InForce:
                     self._held[key] = Why.NEVER
                 if residual is None or key not in self._held:
                     continue
-                present = Present(residual=vector(residual), sigma_use=vector(sigma))
+                present = Present(residual=vector(residual), sigma_use=vector(sigma), sigma=vector(compared))
                 self._present[key] = present
                 self._confirm(key, present, imu.temperature_degc, end_s, averaged_s)
                 held = self._held[key]
@@ -347,6 +357,7 @@ class InForce:
                     confirmed_s=end_s,
                     temperature_degc=temperature_degc,
                     sigma_use=present.sigma_use,
+                    sigma=present.sigma,
                     expected=_ZERO,
                     seen=True,
                     averaged_s=averaged_s,

@@ -124,7 +124,7 @@ class Readiness:
         self, core: Core, conclusion: Conclusion, conductor: Conductor, in_force: InForce, automatic: Automatic
     ) -> None:
         self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
-        self._wanted = core.wanted
+        self._wanted, self._on_deck = core.wanted, core.config.vehicle.platform == "deck"
         self.in_force, self._automatic, self._conclusion = in_force, automatic, conclusion
         self._forecast = Forecast(core, conductor)
         self._answer = ArmAnswer("wait", "companion is starting")
@@ -161,7 +161,7 @@ class Readiness:
                 self.update()
                 await asyncio.sleep(0)  # a question that has come meanwhile is answered in between
                 # What a write under way makes of the output says nothing about what will be in force after it.
-                if not self._writing and await self.in_force.measure(loop.time()):
+                if not self._writing and await self._measured(loop.time()):
                     self.update()
                 self.turns += 1
             except Exception:
@@ -169,12 +169,23 @@ class Readiness:
                 logger.exception("looking whether it may arm failed")
             await asyncio.sleep(POLL_S)
 
+    async def _measured(self, now_s: float) -> bool:
+        """As `InForce.measure`, with the answer kept fresh while it takes its time: a deck may take seconds."""
+        measuring = asyncio.ensure_future(self.in_force.measure(now_s))
+        try:
+            while not (await asyncio.wait((measuring,), timeout=POLL_S))[0]:
+                self.update()
+        finally:
+            measuring.cancel()
+        return measuring.result()
+
     def update(self) -> None:
         """Work out the answer anew."""
         now_s = asyncio.get_running_loop().time()
         self.in_force.poll(writing=self._writing)
         if self.at_arm == "gate":
-            self._answer = self._judge(now_s)
+            answer = self._judge(now_s)
+            self._answer = self._swaying(answer, now_s) if self._on_deck else answer
         else:
             # Nothing is held back; what is said is the state that it would arm in.
             state, words = self.state(now_s)
@@ -213,6 +224,12 @@ class Readiness:
         if glance.moving or glance.steady_s < STEADY_S:
             return ArmAnswer.hold_still(STEADY_S - glance.steady_s)
         return ArmAnswer("accept", self.state(now_s)[1])
+
+    def _swaying(self, answer: ArmAnswer, now_s: float) -> ArmAnswer:
+        """The same on a deck, which nobody can hold still."""
+        if answer.hold_still_s is None:
+            return answer
+        return ArmAnswer("wait", f"wait: {answer.meanwhile or self._collector.status(now_s).measuring}")
 
     def until_calibrated_s(self, now_s: float) -> float:
         """Seconds of holding still until a calibration by itself would be in force."""

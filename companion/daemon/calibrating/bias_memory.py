@@ -69,7 +69,7 @@ class BiasMemory:
     ) -> None:
         config = core.config
         self._config, self._vehicle, self._imus = config, core.vehicle, imus
-        self._alignment, self._offload = alignment, core.offload
+        self._alignment, self._offload, self._collector = alignment, core.offload, core.collector
         self._sensors = {role.name: sensor for sensor in sensors for role in sensor.roles if role.kind == "imu"}
         self._sources = {imu.name: imu for imu in config.imu}
         self._store = BiasStore(config.storage.path)
@@ -213,8 +213,8 @@ class BiasMemory:
 
     def power_up(self, name: str, unix_s: float) -> PowerUp:
         """Since when the sensor of an IMU has been powered, at a wall clock time."""
-        boot_s = self._vehicle.boot.latest_s if name in self._imus else None
-        return PowerUp(host=self._host, since_unix_s=None if boot_s is None else round(unix_s - boot_s, 1))
+        up_s = self._collector.up_s(name)
+        return PowerUp(host=self._host, since_unix_s=None if up_s is None else round(unix_s - up_s, 1))
 
     def _session(self, name: str) -> str:
         """Another one as soon as the sensor may have been without power."""

@@ -50,6 +50,7 @@ class Conductor:
         self._vehicle, self._collector, self._say = core.vehicle, core.collector, core.say
         self._course, self._aligner, self._recovery, self._results = course, aligner, recovery, results
         self._has_gradienter = core.config.gradienter is not None
+        self._on_deck = core.config.vehicle.platform == "deck"
         self._starts = StartLimit()
         self._task: asyncio.Task[None] | None = None
         self.job: Job | None = None
@@ -123,6 +124,8 @@ class Conductor:
 
     def start_alignment(self, plan: Plan, requester: str, timeout_s: float) -> Job | Refusal:
         """Start measuring the gradienter's zero, or say why not."""
+        if self._on_deck:
+            return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
         refusal = self._refusal(requester, "there is no gradienter to align: none is configured")
         if refusal is not None:
             return refusal

@@ -20,7 +20,7 @@ from companion.calibration.collector.outlook import Settings, Status
 from companion.calibration.machine import Event, State
 from companion.calibration.means.windows import Window
 from companion.calibration.request import What
-from companion.calibration.solution.draft import Draft
+from companion.calibration.solution.draft import Draft, unseen_turn
 from companion.calibration.solution.history import Point
 from companion.calibration.solution.joint import Weighed, weigh
 from companion.calibration.solution.prior import Expectation
@@ -28,6 +28,7 @@ from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.calibration.solution.solve import Solution, solve
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity
+from companion.config.sections import Platform
 from companion.configured import models
 from companion.daemon.calibrating import held_back
 from companion.daemon.calibrating.alignment import AlignmentInForce
@@ -46,6 +47,10 @@ logger = logging.getLogger(__name__)
 
 WRONG_IMU_ATTEMPTS: Final = 3
 """Of three IMUs two may have been taken for the one that is meant."""
+_STARTED: Final[dict[Platform, str]] = {
+    "ground": "Calibration started: keep the aircraft still",
+    "deck": "Calibration started: the deck may sway",
+}
 _WATCHING: Final = "watching the telemetry take the new offsets"
 POLL_S: Final = 0.2
 """A complete second is looked at when it is; this is how often for whatever else may change."""
@@ -121,7 +126,7 @@ class Measuring:
                 )
                 self._check_imus(failures)
                 self.show(measuring=waiting_for is None)
-                words = waiting_for or f"still for {status.still_s:.0f} s, measuring"
+                words = waiting_for or status.measuring
                 job.progress(MEASURED_PERCENT * status.progress, words, hold_still_s)
                 if waiting_for is None and status.enough:
                     self._machine.on(Event.ENOUGH)
@@ -178,7 +183,11 @@ class Solving:
         config, offload, memory = self._core.config, self._core.offload, self._memory
         where = models.whereabouts(config, self._core.vehicle)
         poses = self._alignment.model(), models.compass_model(config.compass)
-        solution: Solution = await offload(lambda: solve(window, local_earth(where), *poses, job.what))
+        platform = config.vehicle.platform
+        any_bias = config.calibration.any_bias
+        solution: Solution = await offload(
+            lambda: solve(window, local_earth(where), *poses, job.what, platform, any_bias=any_bias)
+        )
         draft.alignment, draft.solution = self._alignment.used, solution
         draft.measured_s = (measured.start_s, measured.end_s)
         unix_s = draft.started_at.timestamp()
@@ -197,6 +206,9 @@ class Solving:
         draft.points = _less(memory.measured(solution, whole, weighed.doubts, started_at, unix_s), draft.held_back)
         for doubt in weighed.doubts:
             self._core.say(Severity.WARNING, doubt.words)
+        if not job.automatic:
+            for words in unseen_turn(weighed.solution):
+                self._core.say(Severity.NOTICE, words)
         if draft.held_back:
             what = held_back.in_words(draft.held_back)
             self._core.say(Severity.WARNING, f"Held back: {what}; calibrate on request to write it all the same")
@@ -206,8 +218,10 @@ class Solving:
         """The calibration has come to a good end."""
         points = draft.points
         if self._core.wanted.push and not job.automatic:
-            # Who has asked was told of every contradiction, and has what was measured in force: that is true now.
-            points = {name: point.as_chosen() for name, point in points.items()}
+            # Who has asked was told of every contradiction, and has what was measured in force: that is true now. But
+            # gyros that may have turned are no new ones.
+            told = draft.solution is not None and draft.solution.turn.by != "earlier calibrations"
+            points = {name: point.as_chosen(gyro=told) for name, point in points.items()}
         await self._memory.keep(points)
         if draft.held_back:
             draft.notes.append(f"{held_back.in_words(draft.held_back)} held back")
@@ -251,7 +265,7 @@ class Course:
             JobCancelledError: cancelled; likewise.
         """
         if not job.automatic:
-            self._core.say(Severity.NOTICE, "Calibration started: keep the aircraft still")
+            self._core.say(Severity.NOTICE, _STARTED[self._core.config.vehicle.platform])
         self._measuring.begin()
         for left in reversed(range(WRONG_IMU_ATTEMPTS)):
             try:

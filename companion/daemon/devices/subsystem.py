@@ -8,6 +8,9 @@ from collections.abc import Sequence
 
 from companion.autopilot.firmware.imu_calibration import accel_taken_off
 from companion.autopilot.firmware.px4 import SlotMemory
+from companion.calibration.means.pose import up_in_vehicle
+from companion.calibration.solution.site import IN_CONFIGURATION
+from companion.calibration.stillness.plausible import misplaced
 from companion.configured import models
 from companion.configured.models import Role, collect, serial_devices
 from companion.daemon.core import Core, Subsystem, Task
@@ -18,6 +21,7 @@ from companion.daemon.devices.sensors import SensorRole, SerialSensor
 from companion.daemon.devices.signing import LinkSigning
 from companion.formats import Object
 from companion.links.system.listeners import Listeners
+from companion.physics.units import G
 from companion.samples import Sample
 
 
@@ -66,11 +70,31 @@ class Devices(Subsystem):
             *self.imus.values(),
             *(role for sensor in self.sensors for role in sensor.roles),
         ]
+        devices = []
+        for device in found:
+            said = device.status() | counts.get(device.name, {})
+            if (words := self._misplaced(device.name)) is not None:
+                said |= {"good": False, "summary": f"{said['summary']}; {words}"}
+            devices.append(said)
         return {
-            "devices": [device.status() | counts.get(device.name, {}) for device in found],
+            "devices": devices,
             "profiles": models.profiles(self._core.config),
             "ground_stations": dict(zip(("good", "summary"), self.reach.text(), strict=True)),
         }
+
+    def _misplaced(self, name: str) -> str | None:
+        """Why an IMU's gravity lies along another axis than by the gradienter, in the last second; else None."""
+        config, collector = self._core.config, self._core.collector
+        tilt, model = collector.tilt_second(), models.gradienter_model(config.gradienter)
+        imu, batch = next((imu for imu in config.imu if imu.name == name), None), collector.imu_seconds().get(name)
+        if tilt is None or model is None or imu is None or batch is None or config.calibration.any_bias:
+            return None
+        try:
+            up = up_in_vehicle(model, *tilt.mean.tolist())
+        except ValueError:
+            return None
+        rotation = models.imu_input(imu, None).rotation
+        return misplaced(name, rotation @ batch.mean[3:], G * up, rotation, IN_CONFIGURATION.mounting)
 
     def tasks(self, *, ports: bool = True) -> Sequence[Task]:
         """As in the base class; without ports somebody else hands their bytes to `sensors`."""

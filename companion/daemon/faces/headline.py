@@ -51,6 +51,7 @@ class Headlines:
         self._vehicle, self._collector, self._conductor = core.vehicle, core.collector, conductor
         self._readiness, self._automatic = arming.readiness, arming.automatic
         self._devices, self._attitude = devices, attitude
+        self._on_deck = core.config.vehicle.platform == "deck"
 
     def now(self) -> Headline:
         """The headline of this moment."""
@@ -144,6 +145,8 @@ class Headlines:
             if (hold_s := glance.obstacle.hold_still_s) is not None:
                 return _hold_still(hold_s)
             return Headline("HOLD STILL", glance.obstacle.words, "wait")
+        if self._on_deck:
+            return Headline("WAIT", f"{words}: {self._collector.status(now_s).measuring}", "wait")
         left_s = self._readiness.until_calibrated_s(now_s)
         return Headline(f"HOLD STILL {left_s:.0f} s", f"{words}: it calibrates by itself", "wait")
 

@@ -40,6 +40,7 @@ logger = logging.getLogger(__name__)
 
 KEPT_S: Final = 5.0
 """A still window ends up to two seconds ago; with what came since the alignment is carried on to now."""
+_NO_STAND: Final = {False: "waiting for an alignment: hold still", True: "waiting for an alignment: not on a deck"}
 STOOD_S: Final = 7.0
 """How far back the seconds of an alignment may lie; five good ones are enough."""
 CHECK_EVERY_S: Final = 10.0
@@ -250,14 +251,15 @@ class Carrier:
         disarmed = self._vehicle.arm_state is ArmState.DISARMED
         # While nobody knows, what flight demands is right on the ground too; not so the other way round.
         self.phase = "ground" if disarmed else "flight"
-        self.still = disarmed and self._collector.glance(now_s).obstacle is None
+        on_deck = self._config.vehicle.platform == "deck"
+        self.still = disarmed and not on_deck and self._collector.glance(now_s).obstacle is None
         if not disarmed:
             self._recent.clear()
             return
         await self._follow_calibration()
         if self.estimator is None or not self.still:
             if self.estimator is not None and not self.estimator.aligned:
-                self.waiting_for = "waiting for an alignment: hold still"
+                self.waiting_for = _NO_STAND[on_deck]
             return
         lost = not self.estimator.aligned
         if self._wanted or lost or now_s - self._checked_s >= CHECK_EVERY_S:

@@ -144,7 +144,8 @@ class PoseNow:
             "heading_deg": None,
             "north": None,
             "source": "gradienter",
-            "still": self._core.collector.glance(now_s).obstacle is None,
+            "still": self._core.collector.glance(now_s).obstacle is None
+            and self._core.config.vehicle.platform == "ground",
         }
         if self._compass is not None and heading is not None and now_s - heading.t_s <= OLDEST_S:
             heading_deg = vehicle_heading_rad(self._compass, heading.heading_deg, up) / DEG

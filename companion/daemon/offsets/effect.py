@@ -35,6 +35,8 @@ from companion.samples import Vector
 
 VERIFY_MAX_S: Final = 60.0
 """How long the aircraft may move after the write before its effect counts as not seen."""
+VERIFY_ON_DECK_S: Final = 180.0
+"""The same where the deck may sway: there it takes the better part of a minute to see a step."""
 LOOK_S: Final = 10.0
 """Seconds that show a step, where a calibration must be still for longer."""
 LOOK_LONGER_S: Final = 30.0
@@ -59,6 +61,7 @@ class EffectWatch:
     def __init__(self, core: Core, px4: Px4Writes) -> None:
         self._core, self._vehicle, self._collector, self._px4 = core, core.vehicle, core.collector, px4
         self._profiles = {imu.name: imu.profile for imu in core.config.imu}
+        self._most_s = VERIFY_MAX_S if core.config.vehicle.platform == "ground" else VERIFY_ON_DECK_S
         self._look_s = min(LOOK_S, core.config.calibration.min_still_s)
 
     async def judge(
@@ -83,7 +86,7 @@ class EffectWatch:
             await asyncio.sleep(POLL_S)
         since_s = loop.time()
         verdicts: Verdicts | None = None
-        while (looked_s := loop.time() - since_s) < VERIFY_MAX_S:
+        while (looked_s := loop.time() - since_s) < self._most_s:
             go_on(words)
             if self._vehicle.arm_state is ArmState.ARMED:
                 return verdicts, "armed right after the write"
@@ -101,7 +104,7 @@ class EffectWatch:
                     if not words:
                         return verdicts, ""
             await asyncio.sleep(POLL_S)
-        return verdicts, f"not still within {VERIFY_MAX_S:.0f} s after the write ({words})"
+        return verdicts, f"not still within {self._most_s:.0f} s after the write ({words})"
 
     def _in_the_way(self, looked_s: float) -> str:
         """What is waited for before there is something to judge; empty when there is."""

@@ -35,6 +35,7 @@ from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.ekf import SETTLED_RAD_S, EkfWatch
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.solution.record import WrittenParameter
+from companion.config.sections import Platform
 from companion.daemon.offsets.ledger import Ledger
 from companion.errors import AutopilotError, AutopilotRebootedError, CompanionError, NotDisarmedError
 from companion.physics.units import DEG_H
@@ -69,9 +70,15 @@ class FirmwareCalibration:
     """Decides whether the firmware's gyro calibration is wanted, and writes around it."""
 
     def __init__(
-        self, vehicle: Vehicle, parameters: ParameterClient, writer: ParameterWriter, ledger: Ledger, ekf: EkfWatch
+        self,
+        vehicle: Vehicle,
+        parameters: ParameterClient,
+        writer: ParameterWriter,
+        ledger: Ledger,
+        ekf: EkfWatch,
+        platform: Platform,
     ) -> None:
-        self._vehicle, self._parameters = vehicle, parameters
+        self._vehicle, self._parameters, self._platform = vehicle, parameters, platform
         self._writer, self._ledger, self._ekf = writer, ledger, ekf
 
     async def prepare(self, gyros: Sequence[Change], warn: Callable[[str], None]) -> GyroParameters | None:
@@ -80,7 +87,8 @@ class FirmwareCalibration:
         Raises:
             AutopilotError: the autopilot does not answer.
         """
-        if self._vehicle.firmware != "ardupilot" or not gyros:
+        if self._vehicle.firmware != "ardupilot" or not gyros or self._platform == "deck":
+            # On a deck its mean of half a second is the deck's rate, and would be written to all its gyros.
             return None
         step = max(abs(change.after - change.before) for change in gyros)
         if step <= WORTH_RAD_S and (await self._ekf.bias_rad_s() or 0.0) <= SETTLED_RAD_S:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Final
 
@@ -123,7 +124,7 @@ class Planner:
                 calibration, None if gyro is None else vector(gyro), None if accel is None else vector(accel)
             )
             if push:
-                coarse_mg = float(found.accel_sigma_use_m_s2.max()) / MG if accel is not None else 0.0
+                coarse_mg = math.sqrt(np.diag(found.covariance)[3:].max()) / MG if accel is not None else 0.0
                 if coarse_mg > COARSE_ACCEL_MG:
                     draft.warn(
                         found.name,

@@ -31,7 +31,8 @@ class Offsets(Subsystem):
         self.writer = ParameterWriter(parameters, vehicle)
         self.rivalry = Rivalry(core, imus)
         px4 = Px4Writes(core.link, vehicle, self.writer, self.ledger, devices.slots, core.say)
-        self.firmware = FirmwareCalibration(vehicle, parameters, self.writer, self.ledger, EkfWatch(core.link, vehicle))
+        ekf, platform = EkfWatch(core.link, vehicle), config.vehicle.platform
+        self.firmware = FirmwareCalibration(vehicle, parameters, self.writer, self.ledger, ekf, platform)
         self.effect = EffectWatch(core, px4)
         self.planner = Planner(core, imus, devices.slots, self.rivalry)
         self.pusher = Pusher(core, imus, self.writer, self.ledger, px4, self.firmware, self.effect)

@@ -107,7 +107,8 @@ class Recorder(Subsystem):
         self._config, self._collector, self._journal = config, collector, collector.journal
         self._offload = core.offload
         self._alignment, self._conductor = calibrating.alignment, calibrating.conductor
-        self._past = Past(config.calibration.max_s, (imu.name for imu in config.imu if imu.source == "autopilot"))
+        autopilots = (imu.name for imu in config.imu if imu.source == "autopilot")
+        self._past = Past(models.longest_window_s(config), autopilots)
         self._folder = config.storage.path / "recordings"
         megabytes = config.storage.recordings_mb
         self._ring: Ring | None = None

@@ -42,6 +42,8 @@ class Decoder(ABC):
 
     device_clock_wraps_s: ClassVar[float | None] = None
     """`ImuSample.t_device_s` starts again at 0 after so long; None where the device has no clock, or it never does."""
+    clock_from_start: ClassVar[bool] = False
+    """Whether `ImuSample.t_device_s` counts from the device's start, by its documents."""
     sequence_modulus: ClassVar[int | None] = None
     """`ImuSample.sequence` counts modulo this; None where there is none, or it never wraps."""
 

@@ -197,6 +197,7 @@ class VectorNavDecoder(FrameDecoder):
     """VectorNav outputs; gives `ImuSample` and `MagSample` as far as a frame has them."""
 
     device_clock_wraps_s: ClassVar[float | None] = 2**64 / 1e9
+    clock_from_start: ClassVar[bool] = True
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:
         super().__init__(seconds_per_byte)

@@ -46,6 +46,7 @@ class XsensDecoder(FrameDecoder):
     """MTData2 messages; gives `ImuSample`, and `MagSample` with counts for want of a unit."""
 
     device_clock_wraps_s: ClassVar[float | None] = 2**32 / _TICKS_A_SECOND
+    clock_from_start: ClassVar[bool] = True
     sequence_modulus: ClassVar[int | None] = 2**16
 
     def __init__(self, seconds_per_byte: float = 0.0) -> None:

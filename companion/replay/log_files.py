@@ -1,9 +1,7 @@
-"""Long recordings of IMUs at rest as columns of numbers: our own recordings, and CSV logs of others."""
+"""Logs of IMUs in files of any kind as columns of numbers: our own recordings, and logs of others."""
 
 from __future__ import annotations
 
-import datetime
-import itertools
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -15,10 +13,10 @@ import numpy as np
 from companion.autopilot.telemetry import imu_messages
 from companion.config.sections import Config, Noise
 from companion.errors import StorageError
-from companion.physics.frames import Floats
 from companion.recording import topics
 from companion.recording.walk import Attachment, Message, Metadata, Recording, is_text
-from companion.replay.csv_log import NAME, read_arrays
+from companion.replay import autopilot_logs, csv_log
+from companion.replay.log import NAME, StillLog
 
 TRUNCATED: Final = frozenset(
     message.kind.message
@@ -34,45 +32,16 @@ CONTINUED_S: Final = 60.0
 """A recording that begins within so much of another's end, on the same clock, goes on with it."""
 
 
-class StillLog(msgspec.Struct, frozen=True, kw_only=True):
-    """One IMU in one session: a file, or several of which each goes on where the one before ends."""
-
-    imu: str
-    files: tuple[str, ...]
-    began_unix_s: float | None
-    t_s: Floats
-    """(n,) ascending."""
-    readings: Floats
-    """(n, 6): gyro in rad/s, accelerometer in m/s^2; axes as recorded."""
-    temperature_degc: Floats
-    """(n,); NaN where unknown."""
-    profile: str | Noise | None = None
-    """That of the configuration in force then."""
-    truncated: bool = False
-    """It came as integers only, which are left out."""
-    clock_offset_s: float | None = None
-    """UTC minus the recording's clock."""
-    breaks_s: tuple[float, ...] = ()
-    """When the readings became others by no noise: offsets were written, the device restarted."""
-
-    @property
-    def began_at(self) -> str | None:
-        """UTC."""
-        if self.began_unix_s is None:
-            return None
-        return datetime.datetime.fromtimestamp(self.began_unix_s, tz=datetime.UTC).isoformat(timespec="seconds")
-
-    def pieces(self, skip_s: float = 0.0) -> list[slice]:
-        """The samples between the breaks, in order; without the first `skip_s` of the session."""
-        if not len(self.t_s):
-            return []
-        first = int(np.searchsorted(self.t_s, self.t_s[0] + skip_s)) if skip_s else 0
-        cuts = [first, *(max(int(at), first) for at in np.searchsorted(self.t_s, sorted(self.breaks_s))), len(self.t_s)]
-        return [slice(start, end) for start, end in itertools.pairwise(cuts) if end > start]
-
-
-def read_logs(paths: Sequence[Path], columns: str | None = None, csv_name: str = NAME) -> list[StillLog]:
+def read_logs(
+    paths: Sequence[Path], columns: str | None = None, rate_hz: float | None = None, csv_name: str = NAME
+) -> list[StillLog]:
     """All IMUs in all files, one entry for each IMU and session.
+
+    Args:
+        paths: of any kind.
+        columns: as for `csv_log.read`, as the two that follow.
+        rate_hz: of CSV files.
+        csv_name: what the IMU of CSV files is called.
 
     Raises:
         StorageError: a file cannot be read, in one line.
@@ -80,17 +49,13 @@ def read_logs(paths: Sequence[Path], columns: str | None = None, csv_name: str =
     found: list[StillLog] = []
     for path in paths:
         try:
-            text = is_text(path)
+            text, autopilots = is_text(path), autopilot_logs.reader_of(path)
         except OSError as error:
             raise StorageError(f"{path}: cannot be read: {error.strerror or error}") from None
-        if text:
-            t_s, readings, temperature = read_arrays(path, columns)
-            found.append(
-                StillLog(
-                    imu=csv_name, files=(path.name,), began_unix_s=None,
-                    t_s=t_s, readings=readings, temperature_degc=temperature,
-                )
-            )  # fmt: skip
+        if autopilots is not None:
+            found += autopilots(path)
+        elif text:
+            found.append(csv_log.read(path, columns, rate_hz, csv_name))
         else:
             found += _read_recording(path)
     return _joined(found)

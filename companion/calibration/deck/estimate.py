@@ -1,0 +1,299 @@
+"""From the seconds of a deck to the same window as of a still stretch, so that everything after it is one path.
+
+An IMU's means in it are those that it would have at rest: at the gradienter's mean tilt, and under the Earth's rate
+alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.calibration.deck.fluid import Compared, Level, compare
+from companion.calibration.deck.smoother import Believed, Found, smooth
+from companion.calibration.deck.stream import ImuSecond, Surroundings
+from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
+from companion.calibration.means.windows import ImuInput, ImuWindow, Window
+from companion.calibration.noise.allan import PROFILES, floor_variance, slope_variance
+from companion.errors import CalibrationRefusedError
+from companion.physics.frames import Array, Floats, Matrix, vector
+from companion.physics.gradienter import up_in_sensor, up_jacobian
+from companion.physics.units import DEG, DEG_H, MG
+
+MIN_S: Final = 60
+"""Some waves: before it nothing is said to be enough."""
+MIN_LOOK_S: Final = 40
+"""A look at what a write has done; its sigma says how little that is."""
+MAX_S: Final = 1200
+SCALE_SIGMA: Final = 0.003
+"""Scale and cross-axis errors of common gyros (0.5 % at the most): so much of a steady turn may pass for a bias."""
+COMPASS_SHARE: Final = math.sqrt(0.5)
+"""Of a compass' sigma, the part that changes with the heading; the other part is the same on all headings."""
+FROZEN_S: Final = 20
+"""No sensor that is swayed says exactly the same for so long."""
+_SWAYS_RAD_S: Final = 0.3 * DEG
+"""Of roll and pitch, over such a while."""
+_SAME: Final = 1e-9
+_DITHERED: Final = 1.5
+"""Integers spread over so many steps by the swaying hide nothing."""
+_UNKNOWN_ACCEL_M_S2: Final = 50.0 * MG
+_LEAST_ACCEL_M_S2: Final = 0.1 * MG
+"""Of the comparison with the gradienter; what its zero is wrong by turns everything alike and comes in `solve`."""
+_MIDDLE: Final = 0.37
+"""Of K^2 T: what a slope, weighed most in its middle, misses of a bias that walks; no averaging takes it away."""
+_FLICKER_TO_COME: Final = 0.75
+"""Of B^2: what flicker does in the next minutes that its past does not tell. With what it did in the window, as a
+random walk of B / sqrt(T), it is the flicker's part of V(T, H)."""
+_GRAVITY_M_S2: Final = 9.8
+_TEMPERATURE_WARNING_K: Final = 3.0
+
+
+class Triads(msgspec.Struct, frozen=True):
+    """How far one IMU is: largest variances of the axes."""
+
+    gyro_use: float
+    gyro_white: float
+    """What more seconds take away."""
+    accel_use: float
+    accel_white: float
+
+
+class DeckFound(msgspec.Struct, frozen=True):
+    """A window, and how far it is."""
+
+    window: Window
+    triads: tuple[Triads, ...]
+
+
+class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
+    """An estimate that is due; `run` touches nothing that changes, and may be called in another thread."""
+
+    imus: Sequence[ImuInput]
+    seconds: Sequence[Sequence[ImuSecond]]
+    levels: Sequence[Mapping[int, Level]]
+    headings: Mapping[int, float]
+    slots: range
+    around: Surroundings
+    horizon_s: float
+    reference_deg: tuple[float, float] | None
+    """The tilt to give the accelerometers' means at, as the gradienter reads it; None: the mean of the window."""
+    since_s: float | None
+    """The window's own beginning, where it is not that of all seconds."""
+
+    def run(self) -> DeckFound | CalibrationRefusedError:
+        """Work it out: a third of a second for ten minutes of one IMU on a desktop."""
+        try:
+            return self._run()
+        except (CalibrationRefusedError, np.linalg.LinAlgError) as error:
+            return CalibrationRefusedError(str(error))
+
+    def _run(self) -> DeckFound:
+        around = self.around
+        readings = {slot: level.reading for levels in self.levels[:1] for slot, level in levels.items()}
+        frozen = self._frozen("gradienter", readings)
+        all_levels = [[one for slot, one in levels.items() if slot not in frozen] for levels in self.levels]
+        frozen = self._frozen("compass", {slot: np.array([heading]) for slot, heading in self.headings.items()})
+        headings = np.array([math.nan if slot in frozen else self.headings.get(slot, math.nan) for slot in self.slots])
+        reference = self.reference_deg
+        if around.gradienter is not None:
+            if any(len(levels) < MIN_LOOK_S // 2 for levels in all_levels):
+                raise CalibrationRefusedError(f"no reading from gradienter in {len(self.slots)} s")
+            if reference is None:
+                x, y = np.mean([one.reading for one in all_levels[0]], axis=0).tolist()
+                reference = (x, y)
+        found = [
+            self._imu(imu, seconds, levels, headings, reference)
+            for imu, seconds, levels in zip(self.imus, self.seconds, all_levels, strict=True)
+        ]
+        last = found[0][2] if found else None
+        window = Window(
+            start_s=float(self.slots[0]),
+            end_s=self.slots[-1] + 1.0,
+            imus=tuple(window for window, _, _ in found),
+            tilt=None
+            if reference is None
+            else TiltWindow(
+                x_deg=reference[0], y_deg=reference[1], x_sigma_deg=0.0, y_sigma_deg=0.0, temperature_degc=None
+            ),
+            heading=None if around.compass is None or last is None else self._heading(last, around.compass),
+            turn_rad_s=None if last is None else vector(_turn_rad_s(self.seconds[0], last)),
+        )
+        return DeckFound(window, tuple(triads for _, triads, _ in found))
+
+    def _frozen(self, name: str, readings: Mapping[int, Floats]) -> set[int]:
+        """Seconds in which a sensor said the same over and over while it was swayed.
+
+        Raises:
+            CalibrationRefusedError: so it does still.
+        """
+        if not self.imus:
+            return set()
+        rates = {one.slot: one.mean[:3] @ self.imus[0].rotation.T for one in self.seconds[0]}
+        found: set[int] = set()
+        for run in _runs(readings):
+            swayed = [rates[slot][:2] for slot in run if slot in rates]
+            if len(run) < FROZEN_S or not swayed or np.std(swayed, axis=0).max() < _SWAYS_RAD_S:
+                continue
+            if run[-1] >= self.slots[-1] - 1:
+                raise CalibrationRefusedError(f"{name} is stuck: the same for {len(run)} s while it sways")
+            found.update(run)
+        return found
+
+    def _imu(
+        self,
+        imu: ImuInput,
+        seconds: Sequence[ImuSecond],
+        levels: Sequence[Level],
+        headings: Floats,
+        reference: tuple[float, float] | None,
+    ) -> tuple[ImuWindow, Triads, Found]:
+        around, gradienter = self.around, self.around.gradienter
+        span_s = float(len(seconds))
+        compared = None if gradienter is None else compare(levels)
+        believed = self._believed(imu, seconds, reference, compared)
+        forward = np.array([1.0, 0.0, 0.0]) if around.compass is None else around.compass.vehicle_from_sensor[:, 0]
+        found = smooth([one.passage for one in seconds], headings, forward, believed)
+        direction, own = _felt(found, gradienter, reference, compared)
+        gyro_own = found.gyro_covariance
+        mean_rate = np.linalg.norm(_turn_rad_s(seconds, found))
+        steps = _hidden_steps(imu, seconds)
+        going_on = np.square(found.ramp_rad_s2 * self.horizon_s / 2.0) / 3.0
+        gyro, accel = imu.profile.gyro, imu.profile.accel
+        to_come = _FLICKER_TO_COME * gyro.flicker**2 + gyro.walk**2 * self.horizon_s / 3.0
+        # A random walk can be followed and flicker cannot: never better than a mean at rest.
+        at_rest = float(floor_variance(gyro.flicker, gyro.walk, span_s, self.horizon_s))
+        gyro_floor = np.maximum(to_come, at_rest - np.diag(gyro_own))
+        gyro_floor = gyro_floor + steps[:3] + going_on + (SCALE_SIGMA * mean_rate) ** 2
+        accel_floor = steps[3:] + float(floor_variance(accel.flicker, accel.walk, span_s, self.horizon_s))
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = gyro_own + np.diag(gyro_floor)
+        covariance[3:, 3:] = own + np.diag(accel_floor)
+        use = np.sqrt(np.diag(covariance))
+        temperatures = [one.temperature_degc for one in seconds if one.temperature_degc is not None]
+        window = ImuWindow(
+            name=imu.name,
+            samples=sum(one.samples for one in seconds),
+            duration_s=span_s,
+            gyro_rad_s=vector(found.gyro_rad_s),
+            accel_m_s2=vector(direction),
+            gyro_sigma_stat_rad_s=vector(np.sqrt(np.diag(gyro_own))),
+            accel_sigma_stat_m_s2=vector(np.sqrt(np.diag(own))),
+            gyro_sigma_use_rad_s=vector(use[:3]),
+            accel_sigma_use_m_s2=vector(use[3:]),
+            temperature_degc=float(np.mean(temperatures)) if temperatures else None,
+            warnings=tuple(_warnings(imu, found, temperatures)),
+            covariance=covariance,
+            by_earth=found.by_earth @ _level_axes(found.body_to_ned[-1]),
+        )
+        wandered = _MIDDLE * believed.gyro_walk**2 * span_s
+        whites = max(float(np.diag(gyro_own).max()) - wandered, 0.0), float(np.diag(own).max())
+        return window, Triads(float(use[:3].max() ** 2), whites[0], float(use[3:].max() ** 2), whites[1]), found
+
+    def _believed(
+        self,
+        imu: ImuInput,
+        seconds: Sequence[ImuSecond],
+        reference: tuple[float, float] | None,
+        compared: Compared | None,
+    ) -> Believed:
+        gradienter, compass = self.around.gradienter, self.around.compass
+        accel, accel_sigma = np.zeros(3), _UNKNOWN_ACCEL_M_S2
+        if gradienter is not None and compared is not None and reference is not None:
+            x, y = reference
+            off_x, off_y = (np.array(reference) - compared.difference_deg).tolist()
+            accel = _GRAVITY_M_S2 * (_up(gradienter, off_x, off_y) - _up(gradienter, x, y))
+            accel_sigma = _LEAST_ACCEL_M_S2
+        model = imu.profile.gyro
+        white = model.white
+        if imu.profile == PROFILES["unknown"]:
+            white = max(white, math.sqrt(float(np.mean([one.white2 for one in seconds]))))
+        slope = slope_variance(np.array(model.flicker), np.array(model.walk), float(len(seconds)))
+        return Believed(
+            accel_m_s2=accel,
+            accel_sigma_m_s2=accel_sigma,
+            compass_sigma_rad=0.0 if compass is None else compass.sigma_deg * COMPASS_SHARE * DEG,
+            gyro_white=white,
+            gyro_walk=math.hypot(model.walk, model.flicker / math.sqrt(len(seconds))),
+            gyro_slope=math.sqrt(float(slope)),
+            compass_lag_s=self.around.compass_lag_s,
+            accel_white=imu.profile.accel.white,
+        )
+
+    def _heading(self, found: Found, compass: CompassModel) -> HeadingWindow | None:
+        if not self.headings:
+            return None
+        pointing = found.body_to_ned[-1] @ compass.vehicle_from_sensor[:, 0]
+        return HeadingWindow(
+            heading_deg=math.atan2(pointing[1], pointing[0]) / DEG % 360.0, sigma_deg=found.heading_sigma_rad / DEG
+        )
+
+
+def _runs(readings: Mapping[int, Floats]) -> list[list[int]]:
+    """Seconds one after another with the same reading."""
+    found: list[list[int]] = []
+    last: Floats | None = None
+    for slot, reading in readings.items():
+        if last is None or np.abs(reading - last).max() > _SAME:
+            found.append([])
+        found[-1].append(slot)
+        last = reading
+    return found
+
+
+def _felt(
+    found: Found, gradienter: GradienterModel | None, reference: tuple[float, float] | None, compared: Compared | None
+) -> tuple[Array, Matrix]:
+    """The accelerometers' mean as it would be at rest at the reference's tilt, (3,), and its covariance (3, 3)."""
+    size = found.force_m_s2
+    if gradienter is None or reference is None or compared is None:
+        up = -found.body_to_ned[:, 2].mean(axis=0)
+        up /= np.linalg.norm(up)
+        return size * up, np.outer(up, up) * found.force_sigma_m_s2**2
+    x, y = (np.array(reference) - compared.difference_deg).tolist()
+    right, up = _up(gradienter, *reference), _up(gradienter, x, y)
+    by_reading = size * DEG * gradienter.vehicle_from_sensor @ up_jacobian(gradienter.law, x, y)
+    covariance = by_reading @ compared.covariance_deg2 @ by_reading.T
+    return size * up / float(up @ right), covariance + np.outer(right, right) * found.force_sigma_m_s2**2
+
+
+def _up(gradienter: GradienterModel, x_deg: float, y_deg: float) -> Array:
+    """(3,) up in the vehicle's axes by readings without an offset: which zero is in force is known later."""
+    return gradienter.vehicle_from_sensor @ up_in_sensor(gradienter.law, x_deg, y_deg)
+
+
+def _level_axes(body_to_ned: Matrix) -> Matrix:
+    """(3, 3) to NED from the level axes along the heading, to the right of it, and down."""
+    heading = math.atan2(body_to_ned[1, 0], body_to_ned[0, 0])
+    c, s = math.cos(heading), math.sin(heading)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _turn_rad_s(seconds: Sequence[ImuSecond], found: Found) -> Array:
+    """(3,) how fast it turned on the mean, in its own axes."""
+    whole = np.sum([one.passage.turn for one in seconds], axis=0)
+    turned = np.array([whole[2, 1] - whole[1, 2], whole[0, 2] - whole[2, 0], whole[1, 0] - whole[0, 1]]) / 2.0
+    return turned / sum(one.passage.span_s for one in seconds) - found.gyro_rad_s
+
+
+def _hidden_steps(imu: ImuInput, seconds: Sequence[ImuSecond]) -> Array:
+    """(6,) variance of what integers hide that the swaying does not spread; vehicle axes."""
+    steps = np.repeat([imu.gyro_step_rad_s, imu.accel_step_m_s2], 3)
+    means = np.array([one.mean for one in seconds])
+    spread = np.sqrt(means.var(axis=0) + np.mean([one.variance for one in seconds], axis=0))
+    hidden = np.where(spread < _DITHERED * steps, np.square(steps / 2.0), 0.0)
+    turn = np.square(imu.rotation)
+    return np.concatenate([turn @ hidden[:3], turn @ hidden[3:]])
+
+
+def _warnings(imu: ImuInput, found: Found, temperatures: list[float]) -> list[str]:
+    warnings = []
+    if found.ramp_rad_s2.any():
+        rate = float(np.abs(found.ramp_rad_s2).max()) / DEG_H
+        warnings.append(f"warm-up: gyro {imu.name} drifts {rate:.1f} deg/h per second")
+    if temperatures and (span := max(temperatures) - min(temperatures)) > _TEMPERATURE_WARNING_K:
+        warnings.append(f"temperature of imu {imu.name} moved by {span:.1f} K")
+    return warnings

@@ -1,0 +1,82 @@
+"""One second of a moving IMU, integrated: how far it has turned, and what it has felt, as functions of its bias.
+
+Rates are integrated sample by sample as rotations, so that coning (roll and pitch out of step turn the heading) and
+sculling are in the result and not in its error. Forster, Carlone, Dellaert, Scaramuzza, IEEE Trans. Robotics 33(1),
+2017, section VI, in matrices.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+
+from companion.physics.frames import Floats, Matrix
+
+
+class Passage(msgspec.Struct, frozen=True):
+    """From one knot to the next; "start" is the body's frame (FRD) at its beginning."""
+
+    span_s: float
+    turn: Matrix
+    """(3, 3) from the body's axes at the end to those at the start, as the gyros have it."""
+    turned: Matrix
+    """(3, 3) integral of that over the time, in s: a bias b turns the start by -turned @ b."""
+    velocity_m_s: Floats
+    """(3,) integral of the specific force in the axes of the start."""
+    velocity_by_bias: Matrix
+    """(3, 3) d velocity / d (gyro bias): m/s per rad/s."""
+
+
+def rotations(vectors: Floats) -> Floats:
+    """(n, 3, 3) matrices of rotation vectors (n, 3) in rad (Rodrigues)."""
+    angle2 = np.einsum("ni,ni->n", vectors, vectors)
+    angle = np.sqrt(angle2)
+    small = angle < 1e-4
+    divisor = np.where(small, 1.0, angle)
+    sine = np.where(small, 1.0 - angle2 / 6.0, np.sin(angle) / divisor)
+    cosine = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(angle)) / np.square(divisor))
+    cross = skews(vectors)
+    return np.asarray(np.eye(3) + sine[:, None, None] * cross + cosine[:, None, None] * (cross @ cross))
+
+
+def skews(vectors: Floats) -> Floats:
+    """(n, 3, 3) cross-product matrices of (n, 3)."""
+    found = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    found[:, 0, 1], found[:, 0, 2], found[:, 1, 2] = -z, y, -x
+    found[:, 1, 0], found[:, 2, 0], found[:, 2, 1] = z, -y, x
+    return found
+
+
+def running_products(turns: Floats) -> Floats:
+    """(n, 3, 3): the first, the first two, ... of (n, 3, 3) multiplied, in a few calls (Hillis and Steele's scan)."""
+    found, step = turns.copy(), 1
+    while step < len(found):
+        found[step:] = found[:-step] @ found[step:]
+        step *= 2
+    return found
+
+
+def passage(times_s: Floats, rates_rad_s: Floats, forces_m_s2: Floats) -> Passage:
+    """Integrate n + 1 samples, of which the first was the last one of the passage before (trapezoids).
+
+    Args:
+        times_s: (n + 1,) ascending, n at least 1.
+        rates_rad_s: (n + 1, 3) in the body's axes.
+        forces_m_s2: likewise.
+    """
+    steps = np.diff(times_s)
+    rates = (rates_rad_s[1:] + rates_rad_s[:-1]) / 2.0
+    turns = running_products(rotations(rates * steps[:, None]))
+    whole = np.concatenate([np.eye(3)[None], turns])
+    half = (whole[1:] + whole[:-1]) / 2.0 * steps[:, None, None]
+    turned = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(half, axis=0)])
+    felt = np.einsum("nij,nj->ni", whole, forces_m_s2)
+    by_bias = skews(felt) @ turned
+    return Passage(
+        span_s=float(times_s[-1] - times_s[0]),
+        turn=turns[-1],
+        turned=turned[-1],
+        velocity_m_s=((felt[1:] + felt[:-1]) / 2.0 * steps[:, None]).sum(axis=0),
+        velocity_by_bias=((by_bias[1:] + by_bias[:-1]) / 2.0 * steps[:, None, None]).sum(axis=0),
+    )

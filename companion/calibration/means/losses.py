@@ -1,0 +1,49 @@
+"""What of an IMU's seconds never came, and what came and says nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from companion.calibration.noise.robust import median
+from companion.calibration.seconds.batch import Batch
+from companion.errors import CalibrationRefusedError
+
+_LOST_REFUSAL: Final = 0.5
+_USUAL_SHARE: Final = 0.95
+"""A second that holds fewer samples than this share of the usual lost some; what is above is the grid's phase."""
+_AXIS: Final = "xyz"
+
+
+def refuse_broken(name: str, steps: tuple[float, float], batches: Sequence[Batch]) -> None:
+    """Nothing that is stuck or mostly lost is averaged; `steps` are those of a stream of integers, else 0.
+
+    Raises:
+        CalibrationRefusedError: an axis never changes, or most samples were lost.
+    """
+    low = np.min([batch.low for batch in batches], axis=0)
+    high = np.max([batch.high for batch in batches], axis=0)
+    for triad, part, step in ((0, "gyro", steps[0]), (3, "accel", steps[1])):
+        for axis in range(3):
+            if step == 0.0 and low[triad + axis] == high[triad + axis]:
+                raise CalibrationRefusedError(
+                    f"{part} {name} is stuck: axis {_AXIS[axis]} did not change in {len(batches)} s"
+                )
+    share = lost(batches)
+    if share > _LOST_REFUSAL:
+        raise CalibrationRefusedError(f"imu {name} lost {share:.0%} of its samples, more than {_LOST_REFUSAL:.0%}")
+
+
+def lost(batches: Sequence[Batch]) -> float:
+    """Share of the samples that never came: by the device's counter, else against the usual number in a second."""
+    usual = float(median([batch.n for batch in batches]))
+    missing = came = 0.0
+    for batch in batches:
+        came += batch.n
+        if batch.missing is not None:
+            missing += batch.missing
+        elif batch.n < _USUAL_SHARE * usual:
+            missing += usual - batch.n
+    return missing / (missing + came)

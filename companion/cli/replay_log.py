@@ -1,0 +1,177 @@
+"""`companion replay` of a log that is not one of ours: what to say of it, and what it gives."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from companion.cli import show
+from companion.cli.terminal import DONE, FAILED, print_json, print_lines, storage_path, within
+from companion.errors import ConfigError, StorageError
+from companion.physics.units import DEG_H, MG
+
+if TYPE_CHECKING:
+    from companion.replay.estimate import Given, Used
+    from companion.replay.log import StillLog
+    from companion.replay.windows import Windows
+
+MOST_LINES = 12
+"""Of pieces that were not used, for people; --json has them all."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """What only a log needs."""
+    log = parser.add_argument_group("for a log (docs/recording.md)")
+    add_table_options(log)
+    log.add_argument("--imu", metavar="NAME", help="which one, where there are several")
+    for name, least, most, words in (
+        ("--pitch-deg", -84.0, 84.0, "nose up"),
+        ("--roll-deg", -180.0, 180.0, "right side down"),
+        ("--heading-deg", -360.0, 360.0, "clockwise from true north"),
+        ("--latitude-deg", -90.0, 90.0, "north is positive"),
+        ("--longitude-deg", -180.0, 180.0, "east is positive; for a magnetic heading"),
+        ("--height-m", -500.0, 9000.0, "above mean sea level"),
+    ):
+        log.add_argument(name, type=within(least, most), metavar="M" if name.endswith("-m") else "DEG", help=words)
+    log.add_argument(
+        "--sigma-deg", type=within(1e-4, 45.0), default=0.05, metavar="DEG", help="of pitch and roll (default 0.05)"
+    )
+    log.add_argument("--heading-sigma-deg", type=within(1e-3, 180.0), default=3.0, metavar="DEG", help="default 3")
+    log.add_argument(
+        "--law", choices=("axis", "slope", "euler"), default="axis", help="of columns tilt_x, tilt_y (default axis)"
+    )
+    log.add_argument("--mounting", default="ROTATION_NONE", metavar="ROTATION", help="sensor to vehicle")
+    log.add_argument("--any-bias", action="store_true", help="take biases beyond what any part has (30 deg/s, 0.3 g)")
+    log.add_argument(
+        "--profile", metavar="PART", help="the sensor's model, such as icm42688p, or a saved profile's name or file"
+    )
+    log.add_argument(
+        "--powered",
+        type=within(0.0, 1e6),
+        default=0.0,
+        metavar="S",
+        help="for so long it had been switched on when the log began (default 0): what it may still warm up",
+    )
+    log.add_argument(
+        "--windows",
+        type=within(10.0, 3600.0),
+        metavar="S",
+        help="calibrate in every window of so many seconds, and hold sigma against what comes after",
+    )
+
+
+def add_table_options(parser: argparse._ActionsContainer) -> None:
+    """How a CSV file is to be read."""
+    parser.add_argument(
+        "--columns",
+        metavar="NAMES",
+        help="in place of the file's: t_s,gx_deg_s,gy_deg_s,gz_deg_s,ax_g,ay_g,az_g",
+    )
+    parser.add_argument(
+        "--rate", type=within(4.0, 10000.0), metavar="HZ", help="of a log without times, or in their place"
+    )
+
+
+def replay(options: argparse.Namespace) -> int:
+    """The biases that the estimator finds in it."""
+    from companion.replay.estimate import estimate
+
+    given = _given(options)
+    log = _log(options)
+    if options.windows is not None:
+        return _windows(options, log, given)
+    found = estimate(log, given)
+    if getattr(options, "json", False):
+        print_json({**msgspec.to_builtins(found.record), "log": msgspec.to_builtins(found.used)})
+    else:
+        print_lines(*show.record_lines(msgspec.to_builtins(found.record)), *used_lines(found.used))
+    return DONE if found.record.state == "done" else FAILED
+
+
+def _log(options: argparse.Namespace) -> StillLog:
+    from companion.replay.log_files import read_logs
+
+    logs = read_logs([options.file], options.columns, options.rate)
+    named = [log for log in logs if options.imu in (None, log.imu)]
+    if len(named) == 1:
+        return named[0]
+    names = ", ".join(log.imu for log in logs)
+    if named or options.imu is None:
+        raise ConfigError(f"{options.file}: found IMUs {names}; allowed: one; say which with --imu")
+    raise StorageError(f"no IMU {options.imu!r} in these files; there are: {names}")
+
+
+def _given(options: argparse.Namespace) -> Given:
+    from companion.replay.estimate import Given
+    from companion.rotations import ROTATIONS_DEG
+    from companion.storage.profiles import given_profile
+
+    if options.mounting not in ROTATIONS_DEG:
+        raise ConfigError(f"--mounting: found {options.mounting}; allowed: a MAVLink rotation such as ROTATION_YAW_90")
+    if (options.pitch_deg is None) != (options.roll_deg is None):
+        raise ConfigError("found only one of --pitch-deg and --roll-deg; allowed: both or neither")
+    wanted = options.profile
+    return Given(
+        pitch_deg=options.pitch_deg,
+        roll_deg=options.roll_deg,
+        heading_deg=options.heading_deg,
+        sigma_deg=options.sigma_deg,
+        heading_sigma_deg=options.heading_sigma_deg,
+        latitude_deg=options.latitude_deg,
+        longitude_deg=options.longitude_deg,
+        height_m=options.height_m,
+        law=options.law,
+        powered_s=options.powered,
+        mounting=options.mounting,
+        profile=None if wanted is None else given_profile(wanted, lambda: storage_path(options)),
+        any_bias=options.any_bias,
+    )
+
+
+def _windows(options: argparse.Namespace, log: StillLog, given: Given) -> int:
+    from companion.replay.windows import windows
+
+    found = windows(log, given, options.windows)
+    reason = "" if found.axes else "no two windows in a row that can be calibrated"
+    state = "done" if found.axes else "failed"
+    if getattr(options, "json", False):
+        said = {"left_out": log.left_out, "notes": log.notes}
+        print_json({"state": state, "reason": reason, "windows": msgspec.to_builtins(found), "log": said})
+    else:
+        print_lines(*window_lines(found), *(f"note: {note}" for note in log.notes))
+    if reason:
+        print_lines(f"companion: {reason}", error=True)
+    return DONE if found.axes else FAILED
+
+
+def window_lines(found: Windows) -> list[str]:
+    """How often sigma kept its word, axis by axis."""
+    lines = [f"windows of {found.length_s:g} s: {found.count}, calibrated: {found.done}"]
+    lines += [f"not calibrated: {each.count}: {each.why}" for each in found.refused[:MOST_LINES]]
+    for next_s, axes in itertools.groupby(found.axes, key=lambda each: each.next_s):
+        rows = list(axes)
+        lines.append(f"against the next {next_s:g} s, {rows[0].pairs} pairs:")
+        lines.append(f"{'':16} {'sigma_use':>10} {'rms error':>10} {'over sigma':>10} {'2 sigma':>8}")
+        for each in rows:
+            unit, name = (DEG_H, "deg/h") if each.axis.startswith("gyro") else (MG, "mg")
+            digits = 1 if name == "deg/h" else 3
+            figures = f"{each.sigma_use / unit:>10.{digits}f} {each.rms / unit:>10.{digits}f} {each.ratio:>10.2f}"
+            lines.append(f"{f'{each.axis}, {name}':16} {figures} {each.share:>8.1%}")
+    return lines
+
+
+def used_lines(used: Used) -> list[str]:
+    """Which stretch it was, and why not the rest."""
+    lines = []
+    if used.from_s is not None and used.to_s is not None:
+        lines.append(
+            f"used: {used.from_s:.0f} to {used.to_s:.0f} s of {used.seconds:.1f} s; {used.still_s} s of it at rest"
+        )
+    lines += [f"not used: {each.from_s:.0f} to {each.to_s:.0f} s: {each.why}" for each in used.unused[:MOST_LINES]]
+    if len(used.unused) > MOST_LINES:
+        lines.append(f"... and {len(used.unused) - MOST_LINES} more (--json has them all)")
+    lines += [f"left out: {count} lines {why}" for why, count in used.left_out.items()]
+    return [*lines, *(f"note: {note}" for note in used.notes)]

@@ -1,0 +1,351 @@
+"""The biases that the estimator finds in a log, from its longest still stretch; and which stretch that was."""
+
+from __future__ import annotations
+
+import datetime
+import itertools
+import math
+from collections.abc import Iterable, Iterator
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.calibration.collector.measurement import Measurement
+from companion.calibration.collector.outlook import Settings
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
+from companion.calibration.means.windows import ImuInput, Window
+from companion.calibration.noise.allan import noise_profile
+from companion.calibration.request import What
+from companion.calibration.solution.draft import Draft, in_words
+from companion.calibration.solution.record import Record
+from companion.calibration.solution.site import Remedies, Whereabouts, local_earth
+from companion.calibration.solution.solve import solve
+from companion.config.sections import Mounting, Noise
+from companion.errors import CalibrationRefusedError
+from companion.physics.frames import Floats, Matrix, rotation_matrix
+from companion.physics.gradienter import Law
+from companion.replay.log import Poses, StillLog
+from companion.samples import CompassSample, ImuSample, MagSample, TiltSample, Vector
+
+MIN_STILL_S: Final = 5.0
+MAX_STILL_S: Final = 3600.0
+# The collector drops the second in which a stream begins: here that is its first millisecond.
+_FIRST_S: Final = 999.999
+_REMEDIES: Final = Remedies(
+    "say --latitude-deg",
+    "say --height-m",
+    no_heading="no --heading-deg",
+    mounting="--mounting {}",
+    any_bias="--any-bias takes it",
+)
+_LONGER: Final = 1.02
+"""A window is chosen again when the stretch has grown by so much."""
+_AT_ONCE: Final = 4096
+_LOOK_S: Final = 300
+"""Verdicts are taken from the collector so often; it keeps twice as many."""
+
+
+class Given(msgspec.Struct, frozen=True, kw_only=True):
+    """What the log does not say itself: how the IMU stood, and where; None: not known, which widens the sigmas."""
+
+    pitch_deg: float | None = None
+    """Before a tilt in the log, as the heading likewise."""
+    roll_deg: float | None = None
+    heading_deg: float | None = None
+    """True."""
+    sigma_deg: float = 0.05
+    heading_sigma_deg: float = 3.0
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
+    height_m: float | None = None
+    powered_s: float = 0.0
+    """For so long the IMU had been switched on when the log began, at least."""
+    law: Law = "axis"
+    """Of a tilt in the log."""
+    mounting: Mounting = "ROTATION_NONE"
+    """IMU to vehicle FRD."""
+    profile: str | Noise | None = None
+    """The IMU's model, or figures learned, for its Allan figures."""
+    any_bias: bool = False
+    """Whether biases beyond what any part has are taken."""
+
+
+class Unused(msgspec.Struct, frozen=True):
+    """Seconds in a row that did not go into the means."""
+
+    from_s: float
+    to_s: float
+    why: str
+
+
+class Used(msgspec.Struct, frozen=True, kw_only=True):
+    """What of a log went into the means; times from its first sample on."""
+
+    files: tuple[str, ...]
+    seconds: float
+    from_s: float | None
+    """None: nothing was of use."""
+    to_s: float | None
+    still_s: int
+    """Seconds between them that count."""
+    unused: tuple[Unused, ...]
+    left_out: dict[str, int]
+    """Lines, by reason."""
+    notes: tuple[str, ...]
+    """What was taken for granted."""
+
+
+class Estimated(msgspec.Struct, frozen=True):
+    """What the estimator makes of a log."""
+
+    record: Record
+    used: Used
+
+
+def estimate(log: StillLog, given: Given, *, max_still_s: float = MAX_STILL_S) -> Estimated:
+    """The biases from the longest still stretch of a log."""
+    return _Pass(log, given, max_still_s).run()
+
+
+class _Streams:
+    """What goes into the collector beside the IMU, and how it is to be understood.
+
+    What is given on the command line stands for the whole log; a column of the same is then left out.
+    """
+
+    def __init__(self, log: StillLog, given: Given, rotation: Matrix) -> None:
+        poses = log.poses or Poses()
+        self.notes: list[str] = []
+        tilt_given = given.pitch_deg is not None and given.roll_deg is not None
+        heading_given = given.heading_deg is not None
+        self.tilt = self._unless("tilt", poses.tilt_deg, given=tilt_given)
+        self.heading = self._unless("heading", poses.heading_deg, given=heading_given)
+        self.field = self._unless("magnetic field", poses.field_gauss, given=heading_given)
+        if self.field is not None:
+            self.field = self.field @ rotation.T
+        self.gradienter = self.compass = None
+        if tilt_given or self.tilt is not None:
+            law: Law = "euler" if tilt_given else given.law
+            self.gradienter = GradienterModel(law, np.eye(3), (0.0, 0.0), given.sigma_deg)
+        elif self.field is not None:
+            self.notes.append("magnetic field left out: without a tilt it tells no heading")
+            self.field = None
+        if heading_given or self.heading is not None or self.field is not None:
+            self.compass = CompassModel(
+                magnetic=not heading_given and (self.heading is None or poses.magnetic),
+                vehicle_from_sensor=np.eye(3),
+                offset_deg=0.0,
+                sigma_deg=given.heading_sigma_deg,
+                prefers_field=self.heading is None,
+            )
+        self._poses = (self.tilt, self.heading, self.field)
+        # A tilt of the command line is the field's, too.
+        self._constant = TiltSample(0.0, given.roll_deg or 0.0, given.pitch_deg or 0.0) if tilt_given else None
+
+    def _unless(self, what: str, values: Floats | None, *, given: bool) -> Floats | None:
+        if given and values is not None:
+            self.notes.append(f"{what} in the log left out: it is given on the command line")
+            return None
+        return values
+
+    def collector(self, settings: Settings, imu: ImuInput) -> RollingCollector:
+        """One that expects what comes."""
+        field_by = None if self.field is None or self.compass is None else (self.compass, self.gradienter)
+        return RollingCollector(
+            settings,
+            [imu],
+            gradienter=self.tilt is not None,
+            compass=self.heading is not None or self.field is not None,
+            field_by=field_by,
+        )
+
+    def feed(self, collector: RollingCollector, at: int, now_s: float) -> None:
+        """What stands in line `at` of the log."""
+        if self.tilt is not None:
+            x_deg, y_deg = self.tilt[at].tolist()
+            if x_deg == x_deg and y_deg == y_deg:
+                collector.add_tilt(TiltSample(now_s, x_deg, y_deg))
+        if self.heading is not None and (heading_deg := float(self.heading[at])) == heading_deg:
+            collector.add_compass(CompassSample(now_s, heading_deg % 360.0))
+        if self.field is not None:
+            x, y, z = self.field[at].tolist()
+            if x == x and y == y and z == z:
+                if self._constant is not None:
+                    collector.add_tilt(msgspec.structs.replace(self._constant, t_s=now_s))
+                collector.add_field(MagSample(now_s, (x, y, z)))
+
+    @property
+    def any(self) -> bool:
+        """Whether there is anything to feed."""
+        return any(each is not None for each in self._poses)
+
+
+class _Pass:
+    """One log through one collector."""
+
+    def __init__(self, log: StillLog, given: Given, max_still_s: float) -> None:
+        self._log, self._given, self._max_still_s = log, given, max_still_s
+        rotation = rotation_matrix(given.mounting)
+        self._streams = _Streams(log, given, rotation)
+        settings = Settings(
+            min_still_s=MIN_STILL_S, max_s=max_still_s, target_gyro_sigma_rad_s=0.0, target_accel_sigma_m_s2=0.0
+        )
+        imu = ImuInput(name=log.imu, rotation=rotation, profile=noise_profile(given.profile or log.profile))
+        self._collector = self._streams.collector(settings, imu)
+        self._found: list[Measurement] = []
+        self._still_s = 0.0
+        self._obstacle = ""
+        self._verdicts: dict[int, tuple[str, str]] = {}
+        """By second, why it was not still, and without the figures of a movement; empty where it was."""
+        self._verdicts_from_s = 0.0
+
+    def run(self) -> Estimated:
+        """From its first sample to its last."""
+        log, collector = self._log, self._collector
+        draft = Draft(datetime.datetime.now(tz=datetime.UTC))
+        offset_s = _FIRST_S - float(log.t_s[0])
+        end_s = float(log.t_s[-1]) + offset_s
+        looked_s = _FIRST_S
+        add, feed, name = collector.add_imu, self._streams.feed if self._streams.any else None, log.imu
+        for at, (now_s, gyro, accel, degc) in enumerate(_rows(log, offset_s)):
+            # Whoever looks has not seen the sample yet that tells him that it is time to.
+            if now_s - looked_s >= 1.0:
+                looked_s = math.floor(now_s)
+                collector.tick(now_s)
+                self._look(now_s)
+            add(name, ImuSample(now_s, gyro, accel, degc))
+            if feed is not None:
+                feed(collector, at, now_s)
+        collector.tick(end_s + 0.3)
+        self._look(end_s + 0.3, last=True)
+        best, refused = _latest(self._found)
+        seconds = end_s - _FIRST_S
+        if best is None:
+            why = self._obstacle or self._unusable(seconds)
+            record = draft.record("failed", refused or f"no {MIN_STILL_S:.0f} s at rest in it: {why}", seconds)
+            return Estimated(record, self._used(None, seconds))
+        record = self._solved(draft, best[1], seconds)
+        return Estimated(record, self._used(best[0], seconds))
+
+    def _look(self, now_s: float, *, last: bool = False) -> None:
+        """At the end of a second: is it worth while to measure?"""
+        collector = self._collector
+        glance = collector.glance(now_s)
+        if glance.obstacle is not None:
+            if glance.obstacle.hold_still_s is None:
+                self._obstacle = glance.obstacle.words
+        elif glance.still_s >= MIN_STILL_S and glance.still_s > self._still_s * (1.0 if last else _LONGER):
+            self._found.append(self._aged(collector.measurement(now_s)))
+            self._still_s = glance.still_s
+        if last or now_s - self._verdicts_from_s >= _LOOK_S:
+            for slot, good, seen in collector.snapshot(self._verdicts_from_s, None).seconds:
+                said = next((each.verdict for each in seen if each.verdict.words), None)
+                words = "beginning" if said is None else said.words
+                kind = words if said is None or said.fault else "moving"
+                self._verdicts[slot] = ("", "") if good else (words, kind)
+            self._verdicts_from_s = now_s - 5.0
+
+    def _unusable(self, seconds: float) -> str:
+        """What is in the way where no second of it could be judged."""
+        (imu, *_) = self._collector.status(seconds + _FIRST_S).sources
+        worst = max(imu.dropped, key=lambda why: imu.dropped[why], default="")
+        return f"{imu.dropped[worst]} samples dropped: {worst}" if worst else f"it is {seconds:.1f} s long"
+
+    def _aged(self, measurement: Measurement) -> Measurement:
+        """With what is known of the time before the log, where nothing was silent since."""
+        begun_s = measurement.begun_s.get(self._log.imu, math.inf)
+        powered_s = self._given.powered_s
+        if self._log.clock_from_start:
+            powered_s = max(powered_s, float(self._log.t_s[0]))
+        if not powered_s or begun_s > math.ceil(_FIRST_S):
+            return measurement
+        return msgspec.structs.replace(measurement, begun_s={self._log.imu: begun_s - powered_s})
+
+    def _solved(self, draft: Draft, window: Window, seconds: float) -> Record:
+        given, streams = self._given, self._streams
+        if streams.gradienter is None:
+            draft.warnings.append("no accelerometer biases without --pitch-deg and --roll-deg")
+        source = None if given.latitude_deg is None and given.height_m is None else "command line"
+        date = draft.started_at.date()
+        where = Whereabouts(given.latitude_deg, given.longitude_deg, given.height_m, source, date)
+        what = What.GYROS if streams.gradienter is None else What.BOTH
+        try:
+            earth = local_earth(where, _REMEDIES)
+            posed, poses = _posed(window, given), (streams.gradienter, streams.compass)
+            draft.solution = solve(posed, earth, *poses, what, any_bias=given.any_bias)
+        except CalibrationRefusedError as error:
+            return draft.record("failed", str(error), seconds)
+        return draft.record("done", in_words(draft.solution), seconds)
+
+    # --- what of it was used
+
+    def _used(self, measurement: Measurement | None, seconds: float) -> Used:
+        slots = [] if measurement is None else measurement.slots
+        first = math.ceil(_FIRST_S)
+        elsewhere = "at rest, but another stretch is longer" if slots else "at rest, but not for long enough"
+        if len(slots) >= self._max_still_s:
+            elsewhere = "at rest, but the longest window is full"
+        whys: list[tuple[int, int, str, str]] = []
+        next_slot = first
+        for slot, (words, kind) in sorted(self._verdicts.items()):
+            if not first <= slot < seconds + _FIRST_S - 1.0:
+                continue
+            if slot > next_slot:
+                whys.append((next_slot - first, slot - first, "no samples", "no samples"))
+            next_slot = slot + 1
+            if not words and not (slots and slots[0] <= slot <= slots[-1]):
+                words = kind = elsewhere
+            whys.append((slot - first, next_slot - first, words, kind))
+        return Used(
+            files=self._log.files,
+            seconds=seconds,
+            from_s=float(slots[0] - first) if slots else None,
+            to_s=float(slots[-1] + 1 - first) if slots else None,
+            still_s=len(slots),
+            unused=tuple(_in_rows(whys)),
+            left_out=self._log.left_out,
+            notes=(*self._log.notes, *self._streams.notes),
+        )
+
+
+def _in_rows(whys: Iterable[tuple[int, int, str, str]]) -> Iterator[Unused]:
+    """Seconds in a row that are out for reasons alike, in the words of the first."""
+    for kind, group in itertools.groupby(whys, key=lambda each: each[3]):
+        some = list(group)
+        if kind:
+            yield Unused(float(some[0][0]), float(some[-1][1]), some[0][2])
+
+
+def _rows(log: StillLog, offset_s: float) -> Iterator[tuple[float, Vector, Vector, float | None]]:
+    """Time, rates, forces and temperature, a sample at a time."""
+    for at in range(0, len(log.t_s), _AT_ONCE):
+        part = slice(at, at + _AT_ONCE)
+        times = (log.t_s[part] + offset_s).tolist()
+        degrees = log.temperature_degc[part].tolist()
+        for now_s, (gx, gy, gz, ax, ay, az), degc in zip(times, log.readings[part].tolist(), degrees, strict=True):
+            yield now_s, (gx, gy, gz), (ax, ay, az), None if degc != degc else degc
+
+
+def _latest(found: list[Measurement]) -> tuple[tuple[Measurement, Window] | None, str]:
+    """The latest that gives a window, and that; where none does, why the very latest gives none."""
+    refused = ""
+    for each in reversed(found):
+        try:
+            return (each, each.window()), ""
+        except CalibrationRefusedError as error:
+            refused = refused or str(error)
+    return None, refused
+
+
+def _posed(window: Window, given: Given) -> Window:
+    """The window with what was given in the place of gradienter and compass."""
+    tilt, heading = window.tilt, window.heading
+    if given.pitch_deg is not None and given.roll_deg is not None:
+        tilt = TiltWindow(
+            x_deg=given.roll_deg, y_deg=given.pitch_deg, x_sigma_deg=0.0, y_sigma_deg=0.0, temperature_degc=None
+        )
+    if given.heading_deg is not None:
+        heading = HeadingWindow(heading_deg=given.heading_deg, sigma_deg=0.0)
+    return msgspec.structs.replace(window, tilt=tilt, heading=heading)

@@ -1,0 +1,77 @@
+"""One IMU's log as columns of numbers, whatever kind of file it came from."""
+
+from __future__ import annotations
+
+import datetime
+import itertools
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.config.sections import Noise
+from companion.physics.frames import Floats
+
+NAME: Final = "imu"
+"""What the IMU of a log that names none is called."""
+
+LAST_S: Final = 1e11
+"""The latest time, by any clock."""
+
+
+class Poses(msgspec.Struct, frozen=True, kw_only=True):
+    """What else was logged beside an IMU, line by line; NaN where a line says nothing."""
+
+    tilt_deg: Floats | None = None
+    """(n, 2): a gradienter's readings, in the vehicle's axes and by its own law."""
+    heading_deg: Floats | None = None
+    """(n,)."""
+    magnetic: bool = False
+    """Whether the heading is from magnetic north."""
+    field_gauss: Floats | None = None
+    """(n, 3), in the IMU's axes."""
+
+
+class StillLog(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU in one session: a file, or several of which each goes on where the one before ends."""
+
+    imu: str
+    files: tuple[str, ...]
+    began_unix_s: float | None
+    t_s: Floats
+    """(n,) ascending."""
+    readings: Floats
+    """(n, 6): gyro in rad/s, accelerometer in m/s^2; axes as recorded."""
+    temperature_degc: Floats
+    """(n,); NaN where unknown."""
+    profile: str | Noise | None = None
+    """That of the configuration in force then."""
+    truncated: bool = False
+    """It came as integers only, which are left out."""
+    clock_offset_s: float | None = None
+    """UTC minus the recording's clock."""
+    breaks_s: tuple[float, ...] = ()
+    """When the readings became others by no noise: offsets were written, the device restarted."""
+
+    notes: tuple[str, ...] = ()
+    """What was taken for granted, or is strange."""
+    left_out: dict[str, int] = {}
+    """Lines that do not count, by reason."""
+    poses: Poses | None = None
+    clock_from_start: bool = False
+    """Whether its times count from when the autopilot was switched on."""
+
+    @property
+    def began_at(self) -> str | None:
+        """UTC."""
+        if self.began_unix_s is None:
+            return None
+        return datetime.datetime.fromtimestamp(self.began_unix_s, tz=datetime.UTC).isoformat(timespec="seconds")
+
+    def pieces(self, skip_s: float = 0.0) -> list[slice]:
+        """The samples between the breaks, in order; without the first `skip_s` of the session."""
+        if not len(self.t_s):
+            return []
+        first = int(np.searchsorted(self.t_s, self.t_s[0] + skip_s)) if skip_s else 0
+        cuts = [first, *(max(int(at), first) for at in np.searchsorted(self.t_s, sorted(self.breaks_s))), len(self.t_s)]
+        return [slice(start, end) for start, end in itertools.pairwise(cuts) if end > start]

@@ -1,0 +1,186 @@
+"""Does sigma keep its word on this sensor? Every window of a long still log is calibrated by itself, as after a start.
+
+What it finds is held against what the windows after it find: the biases' difference has to come out within 2 sigma in
+95 of 100 cases. How the sensor lay is the same in both, so that it cancels: the pose counts as known, and sigma is the
+sensor's alone. Where it was moved in between, windows are not compared.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.calibration.noise.robust import median
+from companion.calibration.solution.record import ImuRecord
+from companion.errors import StorageError
+from companion.physics.frames import Floats, roll_pitch_from_up, rotation_matrix
+from companion.physics.units import DEG
+from companion.replay.estimate import Given, estimate
+from companion.replay.log import StillLog
+
+MOST_WINDOWS: Final = 100_000
+"""Eleven days of the shortest; a clock that jumps makes more."""
+PAUSE_S: Final = 3.0
+"""A sensor that was silent for longer may have been switched off."""
+HORIZON_S: Final = 180.0
+"""What sigma_use speaks of."""
+_AXES: Final = ("gyro x", "gyro y", "gyro z", "accel x", "accel y", "accel z")
+_SAME_RAD: Final = 1.0 * DEG
+"""More than any bias drifts by: gravity from elsewhere is another pose."""
+_EXACT_DEG: Final = 1e-4
+_LATITUDE_DEG: Final = 45.0
+"""Any: the Earth's rate cancels, too."""
+
+
+class Refused(msgspec.Struct, frozen=True):
+    """Windows without a result, for reasons that differ in figures only."""
+
+    count: int
+    why: str
+    """Of the first."""
+
+
+class AxisKept(msgspec.Struct, frozen=True, kw_only=True):
+    """How often one axis came out as was said, rad/s or m/s^2."""
+
+    axis: str
+    next_s: float
+    """So long after the window."""
+    pairs: int
+    sigma_use: float
+    """Median."""
+    rms: float
+    """Of the difference."""
+    ratio: float
+    """Rms of the difference over its sigma; 1 where sigma is right."""
+    share: float
+    """Within 2 sigma; that what comes after has white noise of its own is allowed for."""
+
+
+class Windows(msgspec.Struct, frozen=True, kw_only=True):
+    """A log cut into windows side by side."""
+
+    length_s: float
+    count: int
+    done: int
+    refused: tuple[Refused, ...]
+    axes: tuple[AxisKept, ...]
+    """None where fewer than two windows in a row gave a result."""
+
+
+class _Found(msgspec.Struct, frozen=True):
+    """(6,) each: gyro in rad/s, accelerometer in m/s^2."""
+
+    bias: Floats
+    stat: Floats
+    use: Floats
+
+
+def windows(log: StillLog, given: Given, length_s: float) -> Windows:
+    """Calibrate in every window of so many seconds."""
+    posed, force = given, np.zeros(3)
+    found: list[_Found | None] = []
+    whys: list[str] = []
+    begin_s = float(log.t_s[0])
+    starts_s = np.concatenate(([begin_s], log.t_s[1:][np.diff(log.t_s) > PAUSE_S]))
+    count = math.floor((float(log.t_s[-1]) - begin_s) / length_s + 1e-6)
+    if count > MOST_WINDOWS:
+        raise StorageError(f"{log.files[0]}: {count} windows from its first to its last time; allowed: {MOST_WINDOWS}")
+    edges = np.searchsorted(log.t_s, begin_s + length_s * np.arange(count + 1))
+    for start, end in itertools.pairwise(edges.tolist()):
+        if end - start < 2:
+            found.append(None)
+            whys.append("no samples")
+            continue
+        part = msgspec.structs.replace(
+            log, t_s=log.t_s[start:end], readings=log.readings[start:end],
+            temperature_degc=log.temperature_degc[start:end], poses=None,
+        )  # fmt: skip
+        here = part.readings[:, 3:].mean(axis=0)
+        if not here @ force >= math.cos(_SAME_RAD) * np.linalg.norm(here) * np.linalg.norm(force) > 0.0:
+            posed, force = _posed(here, given), here
+            found.append(None)
+        # What was switched on before the window says how far a warm-up may still go.
+        at = int(np.searchsorted(starts_s, log.t_s[start], side="right")) - 1
+        powered_s = float(log.t_s[start] - starts_s[at]) + (posed.powered_s if at == 0 else 0.0)
+        record = estimate(part, msgspec.structs.replace(posed, powered_s=powered_s), max_still_s=length_s).record
+        imu = record.imus[0] if record.imus else None
+        one = None if imu is None else _found(imu)
+        found.append(one)
+        if one is None:
+            whys.append(record.reason if imu is None else "; ".join(imu.warnings))
+    spans = sorted({1, math.ceil(HORIZON_S / length_s)})
+    return Windows(
+        length_s=length_s,
+        count=count,
+        done=count - len(whys),
+        refused=_counted(whys),
+        axes=tuple(each for span in spans for each in _kept(found, span, span * length_s)),
+    )
+
+
+def _posed(force: Floats, given: Given) -> Given:
+    """With a pose by that specific force (3,), and a place, for whatever was not said, all of it without doubt."""
+    mean = rotation_matrix(given.mounting) @ force
+    roll_rad, pitch_rad = roll_pitch_from_up(mean / np.linalg.norm(mean))
+    return msgspec.structs.replace(
+        given,
+        pitch_deg=pitch_rad / DEG if given.pitch_deg is None else given.pitch_deg,
+        roll_deg=roll_rad / DEG if given.roll_deg is None else given.roll_deg,
+        heading_deg=given.heading_deg or 0.0,
+        sigma_deg=_EXACT_DEG,
+        heading_sigma_deg=_EXACT_DEG,
+        latitude_deg=_LATITUDE_DEG if given.latitude_deg is None else given.latitude_deg,
+        height_m=given.height_m or 0.0,
+    )
+
+
+def _found(imu: ImuRecord) -> _Found | None:
+    gyro = (imu.gyro_bias_rad_s, imu.gyro_sigma_stat_rad_s, imu.gyro_sigma_use_rad_s)
+    accel = (imu.accel_bias_m_s2, imu.accel_sigma_stat_m_s2, imu.accel_sigma_use_m_s2)
+    if None in gyro or None in accel:
+        return None
+    bias, stat, use = (np.array([*(one or ()), *(other or ())]) for one, other in zip(gyro, accel, strict=True))
+    return _Found(bias, stat, use)
+
+
+def _counted(whys: Sequence[str]) -> tuple[Refused, ...]:
+    """Reasons without their figures, the commonest first."""
+    kinds: dict[str, list[str]] = {}
+    for why in whys:
+        kinds.setdefault(re.sub(r"\d+(\.\d+)?", "", why), []).append(why)
+    return tuple(sorted((Refused(len(each), each[0]) for each in kinds.values()), key=lambda each: -each.count))
+
+
+def _kept(found: Sequence[_Found | None], span: int, next_s: float) -> list[AxisKept]:
+    """Every window against the mean of the `span` ones after it."""
+    misses, uses, sigmas = [], [], []
+    for at, one in enumerate(found):
+        after = [each for each in found[at + 1 : at + 1 + span] if each is not None]
+        if one is None or len(after) < span:
+            continue
+        misses.append(one.bias - np.mean([each.bias for each in after], axis=0))
+        own = np.mean([np.square(each.stat) for each in after], axis=0) / span
+        uses.append(one.use)
+        sigmas.append(np.sqrt(np.square(one.use) + own))
+    if not misses:
+        return []
+    miss, sigma, use = np.array(misses), np.array(sigmas), np.array(uses)
+    return [
+        AxisKept(
+            axis=axis,
+            next_s=next_s,
+            pairs=len(miss),
+            sigma_use=float(median(use[:, column])),
+            rms=float(np.sqrt(np.square(miss[:, column]).mean())),
+            ratio=float(np.sqrt(np.square(miss[:, column] / sigma[:, column]).mean())),
+            share=float((np.abs(miss[:, column]) <= 2.0 * sigma[:, column]).mean()),
+        )
+        for column, axis in enumerate(_AXES)
+    ]

@@ -1,0 +1,214 @@
+"""Calibrations on a deck in waves: the errors, the sigmas, and what the noise that is known exactly would allow.
+
+What the sensors say is made sample by sample by the simulator; the seconds go into `Deck` as they do in the daemon, its
+windows into `solve`. The bound is that of least squares with the sea's true spectrum in place of a fitted one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from companion.calibration.deck.deck import Deck
+from companion.calibration.deck.stream import Surroundings
+from companion.calibration.means.pose import CompassModel, GradienterModel
+from companion.calibration.means.windows import ImuInput, Window
+from companion.calibration.noise.allan import PROFILES, floor_variance, noise_profile
+from companion.calibration.request import What
+from companion.calibration.seconds.batch import summary, unrolled
+from companion.calibration.solution.site import local_earth
+from companion.calibration.solution.solve import solve
+from companion.errors import CalibrationRefusedError
+from sim.accuracy.stand import ACCEL_BIAS_M_S2, GRAVITY_ANOMALY_M_S2, GYRO_BIAS_RAD_S, NEXT_S, AnomalousSite
+from sim.aircraft import Pose, VirtualAircraft
+from sim.devices import Gradienter
+from sim.earth import STANDARD_GRAVITY_M_S2, Array
+from sim.experiments.still import whereabouts
+from sim.imu_model import PARTS, ImuModel
+from sim.motions import Motion, SlowTurn
+from sim.scenario import site_at
+from sim.sea import DAY_S, SURGE, SWELL, Sea, Wave
+
+RATE_HZ: Final = 200
+TILT_HZ: Final = 10
+HEADING_HZ: Final = 8
+TILT_SIGMA_DEG: Final = 0.01
+TILT_NOISE_DEG: Final = 0.001
+LAG_S: Final = 0.4
+COMPASS_SIGMA_DEG: Final = 1.0
+COMPASS_NOISE_DEG: Final = 0.5
+_BEFORE_S: Final = 20.0
+_CHUNK_S: Final = 30
+
+
+@dataclass(frozen=True, slots=True)
+class Voyage:
+    """What an aircraft on a deck goes through."""
+
+    waves: tuple[Wave, ...] = SWELL
+    turn_deg_s: float = 0.3
+    part: str = "icm42688p"
+    latitude_deg: float = 45.0
+    compass_sigma_deg: float = COMPASS_SIGMA_DEG
+    gyro_axes_sigma: float = 0.0029
+    """Scale and cross-axis errors of the gyros, one sigma: 0.5 % at the most, each as likely."""
+    gyro_bias_rad_s: float = GYRO_BIAS_RAD_S
+    """One sigma."""
+
+    def motions(self, seed: int) -> list[Motion]:
+        """From before the beginning on, for all day."""
+        found: list[Motion] = []
+        if self.waves:
+            found.append(Sea(start_s=-_BEFORE_S, waves=self.waves, seed=seed))
+        if self.turn_deg_s:
+            found.append(SlowTurn(start_s=-_BEFORE_S, duration_s=DAY_S, rate_deg_s=self.turn_deg_s))
+        return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DeckRun:
+    """Errors against the mean bias of the next minutes and sigmas, (spans, 6): rad/s, m/s^2, vehicle FRD."""
+
+    error: Array
+    sigma: Array
+
+
+def sail(voyage: Voyage, spans_s: Sequence[int], seed: int) -> DeckRun:
+    """One aircraft with one IMU, calibrated after so many seconds each (ascending)."""
+    random = np.random.default_rng([seed, 51])
+    pitch, roll = random.normal(size=2) * 2.0
+    pose = Pose(float(pitch), float(roll), float(random.uniform(0.0, 360.0)))
+    anomaly = float(np.random.default_rng([seed, 52]).normal()) * GRAVITY_ANOMALY_M_S2
+    site = AnomalousSite(**dataclasses.asdict(site_at(voyage.latitude_deg, 10.0, 100.0)), anomaly_m_s2=anomaly)
+    aircraft = VirtualAircraft(pose, site, motions=voyage.motions(seed))
+    axes = random.normal(size=6) * voyage.gyro_axes_sigma
+    imu = ImuModel(
+        aircraft,
+        voyage.part,
+        seed=int(random.integers(2**62)),
+        gyro_bias_rad_s=(random.normal(size=3) * voyage.gyro_bias_rad_s).tolist(),
+        accel_bias_m_s2=(random.normal(size=3) * ACCEL_BIAS_M_S2).tolist(),
+        gyro_scale=axes[:3].tolist(),
+        gyro_misalignment_rad=axes[3:].tolist(),
+    )
+    tilt = GradienterModel("axis", np.eye(3), (0.0, 0.0), TILT_SIGMA_DEG)
+    compass = CompassModel(
+        magnetic=True, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=voyage.compass_sigma_deg
+    )
+    around = Surroundings(gradienter=tilt, gradienter_lag_s=LAG_S, compass=compass, compass_lag_s=0.0)
+    deck = Deck(around)
+    taken = ImuInput(
+        name="imu", rotation=np.eye(3), profile=noise_profile(voyage.part if voyage.part in PROFILES else "icm42688p")
+    )
+    deck.set_imu(taken)
+    feed(deck, imu, spans_s[-1] + 1, random, voyage.compass_sigma_deg)
+    errors, sigmas = [], []
+    for span in spans_s:
+        found = deck.work(range(1, 1 + span), NEXT_S).run()
+        if isinstance(found, CalibrationRefusedError):
+            raise found
+        error, sigma = _against_the_truth(found.window, imu, around)
+        errors.append(error)
+        sigmas.append(sigma)
+    return DeckRun(np.array(errors), np.array(sigmas))
+
+
+def feed(deck: Deck, imu: ImuModel, seconds: int, random: np.random.Generator, compass_sigma_deg: float) -> None:
+    """So many seconds of an IMU, a gradienter and a compass, from the first on."""
+    headings, tilts = _headings(imu.aircraft, seconds, random, compass_sigma_deg), _tilts(imu.aircraft, seconds, random)
+    for first in range(0, seconds, _CHUNK_S):
+        count = min(_CHUNK_S, seconds - first)
+        times = first + (np.arange(count * RATE_HZ) + 0.5) / RATE_HZ
+        rows = imu.read(times, 1.0 / RATE_HZ)
+        for slot in range(first, first + count):
+            here = slice((slot - first) * RATE_HZ, (slot - first + 1) * RATE_HZ)
+            deck.take_imu("imu", summary(slot, times[here], rows[here]), times[here], rows[here])
+            at = slot + np.arange(TILT_HZ) / TILT_HZ
+            seen = tilts[slot * TILT_HZ : (slot + 1) * TILT_HZ]
+            deck.take_tilt(summary(slot, at, seen), at, seen)
+            at = slot + np.arange(HEADING_HZ) / HEADING_HZ
+            turned = unrolled(headings[slot * HEADING_HZ : (slot + 1) * HEADING_HZ, None])
+            deck.take_heading(summary(slot, at, turned, circle=True), at, turned)
+
+
+def _headings(aircraft: VirtualAircraft, seconds: int, random: np.random.Generator, sigma_deg: float) -> Array:
+    """Magnetic, degrees: half of the error's variance is the same on all headings, half goes with them (iron)."""
+    times = np.arange(seconds * HEADING_HZ) / HEADING_HZ
+    true = np.array([aircraft.angles_rad(t_s)[2] for t_s in times.tolist()])
+    constant, sine, cosine = random.normal(size=3) * sigma_deg * math.sqrt(0.5)
+    error = constant + sine * np.sin(true) + cosine * np.cos(true)
+    noise = random.normal(size=len(times)) * COMPASS_NOISE_DEG
+    shown: Array = np.round(np.degrees(true) - aircraft.site.declination_deg + error + noise, 1) % 360.0
+    return shown
+
+
+def _tilts(aircraft: VirtualAircraft, seconds: int, random: np.random.Generator) -> Array:
+    """What the fluid shows, degrees: as `Gradienter` has it, for all times at once."""
+    step_s, each = 0.01, round(100 / TILT_HZ)
+    times = np.arange(-10.0, seconds, step_s)
+    felt = np.concatenate(
+        [Gradienter(aircraft).tilt_deg(part) for part in np.array_split(times, len(times) // 2000 + 1)]
+    )
+    keep = math.exp(-step_s / LAG_S)
+    x, y = felt[0].tolist()
+    shown = []
+    for felt_x, felt_y in felt.tolist():
+        x, y = felt_x + keep * (x - felt_x), felt_y + keep * (y - felt_y)
+        shown.append((x, y))
+    zero = random.normal(size=2) * TILT_SIGMA_DEG
+    found = np.array(shown[round(10.0 / step_s) :: each])
+    return np.asarray(np.round(found + zero + random.normal(size=found.shape) * TILT_NOISE_DEG, 3))
+
+
+def _against_the_truth(window: Window, imu: ImuModel, around: Surroundings) -> tuple[Array, Array]:
+    solution = solve(
+        window, local_earth(whereabouts(imu.aircraft.site)), around.gradienter, around.compass, What.BOTH, "deck"
+    )
+    found = solution.imus[0]
+    assert found.gyro_rad_s is not None
+    assert found.accel_m_s2 is not None
+    truth = imu.mean_bias(window.end_s, window.end_s + NEXT_S)
+    error = np.concatenate([found.gyro_rad_s - truth.gyro_rad_s, found.accel_m_s2 - truth.accel_m_s2])
+    return error, np.concatenate([found.gyro_sigma_use_rad_s, found.accel_sigma_use_m_s2])
+
+
+def bound(voyage: Voyage, span_s: int) -> Array:
+    """(6,) the least rms error against the next minutes: what the noise would allow somebody who knew its spectrum.
+
+    Seconds of tilt with the sea's covariance, headings with the compass' noise, constant part and iron, the gyros'
+    white noise; and what no measurement here tells: V(T, H), scale and cross-axis errors, the gradienter's zero,
+    the anomaly of gravity.
+    """
+    times = np.arange(span_s) + 0.5
+    apart = times[:, None] - times
+    spec = PARTS[voyage.part]
+    walk = spec.gyro.white**2 * np.minimum(times[:, None], times)
+    surge = np.zeros_like(apart)
+    for wave in voyage.waves:
+        omega = 2.0 * math.pi * wave.frequency_hz
+        height = (math.radians(wave.sway_deg) * SURGE) ** 2 / 2.0
+        surge += height * np.exp(-np.square(wave.spread * omega * apart) / 2.0) * np.cos(omega * apart)
+    level = surge + walk + np.eye(span_s) * (spec.accel.white / STANDARD_GRAVITY_M_S2) ** 2
+    across = _slope_variance(np.column_stack([np.ones(span_s), times]), level)
+    heading = walk + np.eye(span_s) * math.radians(COMPASS_NOISE_DEG) ** 2 / HEADING_HZ
+    iron = voyage.compass_sigma_deg * math.radians(1.0) * math.sqrt(0.5)
+    turned = math.radians(voyage.turn_deg_s) * times
+    ahead = np.column_stack([np.sin(turned), np.cos(turned)])
+    heading += iron**2 * ahead @ ahead.T
+    upright = _slope_variance(np.column_stack([np.ones(span_s), times]), heading)
+    gyro = floor_variance(spec.gyro.flicker, spec.gyro.walk, span_s, NEXT_S)
+    gyro = gyro + (voyage.gyro_axes_sigma * math.radians(voyage.turn_deg_s)) ** 2
+    accel = floor_variance(spec.accel.flicker, spec.accel.walk, span_s, NEXT_S) + spec.accel.white**2 / span_s
+    zero = (STANDARD_GRAVITY_M_S2 * math.radians(TILT_SIGMA_DEG)) ** 2
+    return np.sqrt(
+        [across + gyro, across + gyro, upright + gyro, zero + accel, zero + accel, accel + GRAVITY_ANOMALY_M_S2**2]
+    )
+
+
+def _slope_variance(regressors: Array, covariance: Array) -> float:
+    return float(np.linalg.inv(regressors.T @ np.linalg.solve(covariance, regressors))[1, 1])

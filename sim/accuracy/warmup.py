@@ -1,0 +1,133 @@
+"""Parts that warm up: by ramps, and by the curve of a box that was just switched on; judged by the next minute."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from companion.calibration.means.windows import ImuInput, Window
+from companion.calibration.noise.allan import NoiseProfile, allan_model, noise_profile
+from companion.errors import CalibrationRefusedError
+from sim.accuracy.experiments import FIELD_HEADING_DEG, FIELD_TILT_DEG, SPANS_S
+from sim.accuracy.stand import (
+    GRAVITY_ANOMALY_M_S2,
+    POSTURES,
+    STEADY_DEGC,
+    References,
+    Stand,
+    biases,
+    collected,
+    samples,
+    sigmas_use,
+    sites,
+    solved,
+    stand,
+)
+from sim.aircraft import warming
+from sim.earth import Array
+from sim.imu_model import DEG_H, PARTS, UG
+
+NEXT_MINUTE_S: Final = 60.0
+WARMING: Final = ("adis16405", "icm42688p", "bmi088", "vn100")
+RAMPS: Final = (0.3, 1.0, 3.0, 10.0)
+"""Of the gyros, (deg/h)/s; the accelerometers' are what the same change of temperature makes."""
+CURVES_S: Final = (60.0, 300.0, 1200.0)
+"""Time constants."""
+CURVE_K: Final = 20.0
+LATE_S: Final = (5.0, 120.0)
+"""After the switch-on, when the stream begins."""
+ON_S: Final = (0.0, 600.0, 3600.0)
+"""For how long a part at a steady temperature has been on already."""
+VN100: Final = (allan_model(8.9 * DEG_H, 5.0 * DEG_H), allan_model(99.0 * UG, 40.0 * UG))
+"""The catalogue has none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What its temperature does, and what is known of that."""
+
+    thermometer: bool
+    ramp_deg_h_s: float = 0.0
+    curve_s: float = 0.0
+    late_s: float = 0.0
+    on_s: float = 0.0
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether it neither warms nor cools."""
+        return not self.ramp_deg_h_s and not self.curve_s
+
+    def temperature(self, per_kelvin_rad_s: float) -> Callable[[float], float]:
+        """By aircraft time."""
+        if self.curve_s:
+            curve = warming(STEADY_DEGC - CURVE_K, STEADY_DEGC, self.curve_s)
+            return lambda t_s: curve(t_s + self.late_s)
+        rate = self.ramp_deg_h_s * DEG_H / per_kelvin_rad_s
+        return lambda t_s: STEADY_DEGC + rate * t_s
+
+
+def cases() -> tuple[Case, ...]:
+    """All of the table, in its order."""
+    found: list[Case] = []
+    for seen in (False, True):
+        found += [Case(seen, on_s=on_s) for on_s in (ON_S if not seen else ON_S[:1])]
+        found += [Case(seen, ramp_deg_h_s=ramp) for ramp in RAMPS]
+        found += [Case(seen, curve_s=curve_s, late_s=late_s) for curve_s in CURVES_S for late_s in LATE_S]
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WarmRun:
+    """Errors against the mean bias of the next minute, sigma_use, and the warm-up's part of that; (spans, 6)."""
+
+    error: Array
+    sigma: Array
+    warm_up: Array
+
+
+def warm(part: str, case: Case, seed: int, number: int) -> WarmRun:
+    """One stand of this part in this case."""
+    posture, site = POSTURES[number % 3], sites()[number % len(sites())]
+    standing = stand(
+        part,
+        posture,
+        site,
+        (seed, 5, WARMING.index(part), cases().index(case), number),
+        anomaly_m_s2=GRAVITY_ANOMALY_M_S2,
+        temperature_degc=case.temperature(PARTS[part].gyro.per_kelvin),
+    )
+    profile = NoiseProfile("vn100", *VN100) if part == "vn100" else noise_profile(part)
+    taken = ImuInput(name="imu", rotation=standing.imu.mounting, profile=profile)
+    times, rows = samples(standing, SPANS_S[-1])
+    references = References.drawn(FIELD_TILT_DEG, FIELD_HEADING_DEG, standing.random)
+    error: list[Array] = []
+    sigma: list[Array] = []
+    warm_up: list[Array] = []
+    for window in _windows(standing, taken, times, rows, thermometer=case.thermometer):
+        if window is None:
+            for each in (error, sigma, warm_up):
+                each.append(np.full(6, np.nan))
+            continue
+        on = {name: age_s + case.on_s for name, age_s in window.powered_s.items()}
+        imu = solved(standing, msgspec.structs.replace(window, powered_s=on), references).imus[0]
+        error.append(biases(imu) - standing.bias(window.end_s, window.end_s + NEXT_MINUTE_S))
+        sigma.append(sigmas_use(imu))
+        warm_up.append(np.sqrt(imu.warm_up_variance))
+    return WarmRun(np.array(error), np.array(sigma), np.array(warm_up))
+
+
+def _windows(standing: Stand, taken: ImuInput, times: Array, rows: Array, *, thermometer: bool) -> list[Window | None]:
+    """One of each span; None from where on it is refused: what drifts too fast is no still stretch."""
+    for count in range(len(SPANS_S), 0, -1):
+        spans = SPANS_S[:count]
+        until = times < 1.0 + spans[-1]
+        try:
+            found = collected(standing, taken, times[until], rows[until], spans, thermometer=thermometer)
+        except CalibrationRefusedError:
+            continue
+        return [*found, *[None] * (len(SPANS_S) - count)]
+    return [None] * len(SPANS_S)

@@ -1,0 +1,188 @@
+"""A calibration on a deck, from the request to offsets seen in the telemetry: the whole daemon on virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from companion.calibration.deck.estimate import DeckWork
+from companion.calibration.request import What
+from companion.calibration.solution.record import Record
+from companion.component.service import Refusal
+from companion.daemon.calibrating.align_steps import Plan
+from sim.imu_model import DEG_H, MG
+from sim.motions import SlowTurn
+from sim.sea import DAY_S, Sea, Wave
+from tests.e2e.test_arm_gate import AUTHORISED_BY_US, texts, try_to_arm
+from tests.e2e.test_calibration import started
+from tests.e2e.test_record_replay import replayed, ring, same
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+DECK = '[vehicle]\nplatform = "deck"\n'
+BOAT = (Sea(start_s=-20.0, waves=(Wave(0.2, 5.0), Wave(0.05, 1.0)), seed=4),)
+TURNING = (*BOAT, SlowTurn(start_s=-20.0, duration_s=DAY_S, rate_deg_s=0.3))
+
+
+def boat(folder: Path, motions: Any = TURNING, more: str = DECK, **rest: Any) -> Rig:
+    rig = Rig(folder, more=more, imu_rate_hz=50.0, **rest)
+    for motion in motions:
+        rig.aircraft.add(motion)
+    return rig
+
+
+def test_a_boat_is_calibrated_while_it_sways_and_turns(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with boat(tmp_path).running() as rig:
+            await rig.ready()
+            rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=20 * DEG_H, target_accel_sigma_m_s2=0.5 * MG)
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", 900.0))
+            result = await job.finished
+            record = job.record
+            assert record is not None
+            assert result.outcome == "done", result
+            imu = record.imus[0]
+            assert {one.outcome for one in imu.written.values()} == {"verified"}
+            assert imu.gyro_sigma_use_rad_s is not None
+            assert max(imu.gyro_sigma_use_rad_s) <= 20 * DEG_H
+            left = rig.double.residual(1, rig.now_s)
+            assert np.abs(left.gyro_rad_s).max() < 40 * DEG_H
+            assert np.abs(left.accel_m_s2).max() < 1.0 * MG
+            # The firmware's own gyro calibration would have taken the deck's rate for the bias of every gyro.
+            assert rig.double.parameters.values["INS_GYR2OFFS_X"] == 0.0
+
+    run_virtual(main())
+
+
+def test_px4_on_a_boat_is_calibrated_by_itself_and_then_arms(tmp_path: Path) -> None:
+    async def main() -> None:
+        # Its own gyro calibration would take the boat's turn for a bias.
+        parameters = {**AUTHORISED_BY_US, "IMU_GYRO_CAL_EN": 0.0}
+        async with boat(tmp_path, firmware="px4", at_arm="gate", parameters=parameters).running() as rig:
+            await rig.ready()
+            rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=20 * DEG_H, target_accel_sigma_m_s2=0.5 * MG)
+            readiness = rig.service.arming.readiness
+            said: set[str] = set()
+
+            def accepts() -> bool:
+                answer = readiness.answer()
+                said.add(answer.words)
+                return answer.verdict == "accept"
+
+            await rig.until(lambda: readiness.answer().words.startswith("wait: measured"), 30.0)
+            assert await try_to_arm(rig) == 1
+            assert "Not armed: wait: measured" in texts(rig)
+            await rig.until(accepts, 200.0)
+            # Nobody can hold a boat still, and a sway that turns back is no end of a range.
+            assert not any("still" in words or "range" in words for words in said), said
+            left = rig.px4.residual(1, rig.now_s)
+            assert np.abs(left.gyro_rad_s).max() < 40 * DEG_H
+            assert np.abs(left.accel_m_s2).max() < 1.0 * MG
+            assert await try_to_arm(rig) == 0
+            assert "Armed: calibrated" in texts(rig)
+
+    run_virtual(main())
+
+
+def test_the_gate_answers_while_a_small_board_works_for_seconds(tmp_path: Path) -> None:
+    async def slow(function: Any, *arguments: Any) -> Any:
+        if isinstance(getattr(function, "__self__", None), DeckWork):
+            await asyncio.sleep(4.0)
+        return function(*arguments)
+
+    async def main() -> None:
+        rig = boat(tmp_path, at_arm="gate")
+        rig.offload = slow
+        async with rig.running():
+            await rig.ready()
+            said = set()
+            for _ in range(450):
+                await asyncio.sleep(0.2)
+                said.add(rig.service.arming.readiness.answer().words)
+            assert not any("busy" in words for words in said), said
+            assert any(words.startswith("wait: sigma") for words in said), said
+
+    run_virtual(main())
+
+
+SECOND = """
+[[imu]]
+name = "fc2"
+source = "autopilot"
+instance = 2
+profile = "icm42688p"
+"""
+
+
+def test_three_imus_on_a_boat_are_each_calibrated(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with boat(tmp_path, more=DECK + SECOND, own_imu=True).running() as rig:
+            await rig.ready()
+            rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=25 * DEG_H, target_accel_sigma_m_s2=0.5 * MG)
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", 900.0))
+            result = await job.finished
+            assert result.outcome == "done", result
+            assert job.record is not None
+            models = {"fc": rig.models[0], "fc2": rig.models[1], "own": rig.own_model}
+            assert {imu.name for imu in job.record.imus} == set(models)
+            for imu in job.record.imus:
+                truth = models[imu.name].mean_bias(
+                    rig.aircraft.time_at(rig.now_s) - 60.0, rig.aircraft.time_at(rig.now_s)
+                )
+                assert imu.gyro_bias_rad_s is not None
+                assert imu.accel_bias_m_s2 is not None
+                assert np.abs(np.subtract(imu.gyro_bias_rad_s, truth.gyro_rad_s)).max() < 60 * DEG_H
+                assert np.abs(np.subtract(imu.accel_bias_m_s2, truth.accel_m_s2)).max() < 1.0 * MG
+
+    run_virtual(main())
+
+
+def test_a_replay_on_a_deck_gives_the_same_records(tmp_path: Path) -> None:
+    """Also from a file of the ring that begins with what the deck has known for minutes."""
+
+    async def main() -> list[Record]:
+        async with boat(tmp_path, more=f"{DECK}[push]\nparameters = false\n", recordings_mb=64).running() as rig:
+            await rig.ready()
+            rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=20 * DEG_H, target_accel_sigma_m_s2=0.5 * MG)
+            for _ in range(2):
+                job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", 300.0))
+                result = await job.finished
+                assert result.outcome == "done", result
+                await asyncio.sleep(40.0)
+        return rig.service.calibrating.store.history()[::-1]
+
+    records = run_virtual(main())
+    assert len(records) == 2
+    spans_s = []
+    for path, record in zip(ring(tmp_path), records, strict=False):
+        result = replayed(path)
+        same(result, [record])
+        spans_s.append(result.calibrations[0].record.imus[0].samples / 50.0)
+    # More than the ground's longest stretch and what its gates learn from: 30 and 65 s.
+    assert spans_s[1] > 95.0
+
+
+def test_where_the_ground_is_meant_the_words_name_the_deck(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with boat(tmp_path, BOAT, more="").running() as rig:
+            await rig.ready()
+            job = started(rig.service.calibrating.conductor.start_calibration(What.BOTH, "test", 60.0))
+            result = await job.finished
+            assert result.outcome == "failed"
+            assert "deck" in result.reason
+
+    run_virtual(main())
+
+
+def test_no_zero_of_a_gradienter_is_measured_on_a_deck(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with boat(tmp_path).running() as rig:
+            await rig.ready()
+            refused = rig.service.calibrating.conductor.start_alignment(Plan("zero"), "test", 60.0)
+            assert isinstance(refused, Refusal)
+            assert "ashore" in refused.reason
+
+    run_virtual(main())

@@ -1,0 +1,213 @@
+"""The smoother of a deck, against the simulator's truth."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from companion.calibration.deck.deck import Deck
+from companion.calibration.deck.estimate import DeckFound
+from companion.calibration.deck.fluid import Fluid, Level, readings_deg
+from companion.calibration.deck.passage import passage, rotations, running_products
+from companion.calibration.deck.stream import Surroundings
+from companion.calibration.deck.waves import fit_waves, whitened
+from companion.calibration.means.pose import CompassModel, GradienterModel
+from companion.calibration.means.windows import ImuInput
+from companion.calibration.noise.allan import PROFILES
+from companion.calibration.seconds.batch import summary
+from companion.errors import CalibrationRefusedError
+from companion.physics.gradienter import Law, readings_from_up
+from sim.accuracy.deck import Voyage, feed, sail
+from sim.aircraft import Pose, Site, VirtualAircraft
+from sim.earth import Array, body_from_ned
+from sim.imu_model import DEG_H, MG, ImuModel
+from sim.motions import SlowTurn
+from sim.sea import DAY_S, Sea, Wave
+
+UNITS = np.array([DEG_H] * 3 + [MG] * 3)
+AROUND = Surroundings(
+    gradienter=GradienterModel("axis", np.eye(3), (0.0, 0.0), 0.01),
+    gradienter_lag_s=0.4,
+    compass=CompassModel(magnetic=True, vehicle_from_sensor=np.eye(3), offset_deg=0.0, sigma_deg=1.0),
+    compass_lag_s=0.0,
+)
+
+
+def attitude(aircraft: VirtualAircraft, t_s: float) -> Array:
+    """Body to NED."""
+    return body_from_ned(*aircraft.angles_rad(t_s)).T
+
+
+def test_a_second_of_a_sea_turns_as_the_aircraft_has_turned() -> None:
+    # A steep sea: five seconds of it cone by far more than the tolerance.
+    sea = Sea(waves=(Wave(0.5, 15.0),), seed=2)
+    aircraft = VirtualAircraft(Pose(3.0, -2.0, 40.0), Site(latitude_deg=90.0), motions=[sea])
+    times = 20.0 + np.arange(1001) / 200.0
+    rates, forces = aircraft.truth(times)
+    # At the pole the Earth turns about the vertical alone.
+    earth = np.array([body_from_ned(*aircraft.angles_rad(t))[:, 2] for t in times.tolist()]) * -7.292115e-5
+    found = passage(times, rates - earth, forces)
+    turn = attitude(aircraft, 20.0).T @ attitude(aircraft, 25.0)
+    assert math.degrees(math.acos((np.trace(turn) - 1.0) / 2.0)) > 3.0
+    assert math.degrees(np.linalg.norm(turn - found.turn)) < 1e-3
+    # The bias that is put in comes out as its derivatives say.
+    bias = np.radians([0.05, -0.04, 0.03])
+    biased = passage(times, rates - earth + bias, forces)
+    corrected = rotations(-(biased.turned @ bias)[None])[0] @ biased.turn
+    assert math.degrees(np.linalg.norm(corrected - found.turn)) < 0.02 * math.degrees(np.linalg.norm(bias)) * 5.0
+    change = biased.velocity_m_s + biased.velocity_by_bias @ bias - found.velocity_m_s
+    assert np.linalg.norm(change) < 0.02 * np.linalg.norm(biased.velocity_m_s - found.velocity_m_s)
+
+
+def test_running_products_are_products() -> None:
+    turns = rotations(np.random.default_rng(1).normal(size=(13, 3)))
+    whole = np.eye(3)
+    for turn, found in zip(turns, running_products(turns), strict=True):
+        whole = whole @ turn
+        assert np.allclose(whole, found)
+
+
+@pytest.mark.parametrize("law", ["axis", "slope", "euler"])
+def test_laws_are_those_of_the_gradienter(law: Law) -> None:
+    for x, y, z in np.array([0.0, 0.0, -4.0]) + np.random.default_rng(3).normal(size=(20, 3)):
+        up = np.array([x, y, z])
+        assert np.allclose(readings_deg(law, up[None])[0], readings_from_up(law, up / np.linalg.norm(up)))
+
+
+def test_the_fluid_follows_as_a_first_order_lag_does() -> None:
+    model = GradienterModel("axis", np.eye(3), (0.0, 0.0), 0.01)
+    times = np.arange(4000) / 200.0
+    roll = np.radians(5.0) * np.sin(2.0 * math.pi * 0.2 * times)
+    forces = 9.8 * np.column_stack([np.zeros_like(roll), -np.sin(roll), -np.cos(roll)])
+    shown = Fluid(model, 0.4).follow(times, forces)[:, 0]
+    phase = 2.0 * math.pi * 0.2 * 0.4
+    expected = 5.0 / math.hypot(1.0, phase) * np.sin(2.0 * math.pi * 0.2 * times - math.atan(phase))
+    assert np.abs(shown - expected)[1000:].max() < 0.01
+
+
+def test_whitened_waves_are_white_and_their_mean_is_known_better() -> None:
+    random = np.random.default_rng(7)
+    off = []
+    for _ in range(40):
+        times = np.arange(200.0)
+        wave = sum(np.sin(2.0 * math.pi * f * times + p) for f, p in random.uniform([0.15, 0.0], [0.25, 6.3], (12, 2)))
+        series = wave + 0.05 * random.normal(size=200)
+        white = whitened(np.column_stack([np.ones(200), series]), fit_waves([series - series.mean()]))
+        information = white[:, 0] @ white[:, 0]
+        assert information**-0.5 < 0.2 * series.std() / math.sqrt(200.0)
+        off.append(white[:, 0] @ white[:, 1] / information * math.sqrt(information))
+    assert np.square(off).mean() < 1.5
+
+
+@pytest.mark.parametrize(
+    ("voyage", "gyro_deg_h", "accel_mg"),
+    [
+        (Voyage(), 40.0, 1.0),
+        (Voyage(waves=(), turn_deg_s=0.0), 25.0, 0.8),
+        (Voyage(waves=(Wave(0.1, 8.0),), turn_deg_s=-0.5, part="bmi088"), 60.0, 1.0),
+    ],
+    ids=["sea", "still", "swell"],
+)
+def test_two_minutes_give_biases_within_what_is_claimed(voyage: Voyage, gyro_deg_h: float, accel_mg: float) -> None:
+    for seed in range(3):
+        found = sail(voyage, [120], seed)
+        error, sigma = found.error[0] / UNITS, found.sigma[0] / UNITS
+        assert np.abs(error / sigma).max() < 4.0
+        assert np.abs(error[:3]).max() < gyro_deg_h
+        assert np.abs(error[3:5]).max() < accel_mg
+        assert sigma[:3].max() < gyro_deg_h
+
+
+def test_what_goes_up_comes_down_and_the_vertical_accelerometer_is_known_by_it() -> None:
+    found = [sail(Voyage(), [120], seed) for seed in range(20, 26)]
+    error, sigma = (np.array([getattr(one, name)[0][5] for one in found]) / MG for name in ("error", "sigma"))
+    assert sigma.max() < 0.06
+    assert 0.25 < np.sqrt(np.square(error / sigma).mean()) < 1.6
+
+
+@pytest.mark.parametrize("stuck", ["gradienter", "compass"])
+def test_a_sensor_that_repeats_itself_on_a_swaying_deck_is_named(stuck: str) -> None:
+    deck = Deck(AROUND)
+    deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["icm42688p"]))
+    aircraft = VirtualAircraft(Pose(), Site(latitude_deg=45.0), motions=Voyage().motions(8))
+    imu = ImuModel(aircraft, "icm42688p", seed=8)
+    feed(deck, imu, 91, np.random.default_rng(8), 1.0)
+    assert isinstance(deck.work(range(1, 91), 180.0).run(), DeckFound)
+    for slot in range(65, 91):
+        if stuck == "compass":
+            deck._headings[slot] = deck._headings[65]
+        else:
+            level = deck._streams["imu"].levels[slot]
+            first = deck._streams["imu"].levels[65].reading
+            off = level.difference + first - level.reading
+            deck._streams["imu"].levels[slot] = Level(first, off, level.slope)
+    found = deck.work(range(1, 91), 180.0).run()
+    assert isinstance(found, CalibrationRefusedError)
+    assert str(found) == f"{stuck} is stuck: the same for 26 s while it sways"
+
+
+def test_windows_end_the_more_rarely_the_longer_they_are() -> None:
+    deck = Deck(Surroundings(gradienter=None, gradienter_lag_s=0.0, compass=None, compass_lag_s=0.0))
+    deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["unknown"]))
+    ends = []
+    for slot in range(1500):
+        times = slot + np.arange(4) / 4.0
+        rows = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -9.8], (4, 1))
+        deck.take_imu("imu", summary(slot, times, rows), times, rows)
+        slots = deck.slots()
+        assert len(slots) <= 1200
+        ends.append(slots.stop)
+    assert sorted(ends[20:]) == ends[20:]
+    steps = np.diff(sorted(set(ends[20:])))
+    assert steps[:10].max() == 10
+    assert steps[-10:].min() == 60
+
+
+def quiet_second(slot: int, begin: float = 0.0) -> tuple[Array, Array]:
+    times = slot + begin + np.arange(round((1.0 - begin) * 100)) / 100.0
+    rows = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, -9.8], (len(times), 1))
+    return times, rows
+
+
+def test_a_gap_begins_the_seconds_anew() -> None:
+    deck = Deck(Surroundings(gradienter=None, gradienter_lag_s=0.0, compass=None, compass_lag_s=0.0))
+    deck.set_imu(ImuInput(name="imu", rotation=np.eye(3), profile=PROFILES["unknown"]))
+    for slot in range(25):
+        times, rows = quiet_second(slot)
+        deck.take_imu("imu", summary(slot, times, rows), times, rows)
+    assert deck.slots() == range(1, 20)
+    times, rows = quiet_second(25, begin=0.7)
+    deck.take_imu("imu", summary(25, times, rows), times, rows)
+    assert deck.seconds == 0
+    for slot in range(26, 41):
+        times, rows = quiet_second(slot)
+        deck.take_imu("imu", summary(slot, times, rows), times, rows)
+    assert deck.slots() == range(26, 40)
+
+
+def test_half_a_circle_leaves_no_part_of_the_earths_rate() -> None:
+    # On the equator the Earth's rate lies in the horizon, and comes from ahead at first and from astern at last; near
+    # the pole it stands upright. What else makes an error is the same at both.
+    def error(latitude_deg: float) -> Array:
+        voyage = Voyage(waves=(), turn_deg_s=1.5, part="perfect", gyro_axes_sigma=0.0, latitude_deg=latitude_deg)
+        return np.array(sail(voyage, [120], 1).error[0][:2]) / DEG_H
+
+    assert np.abs(error(0.0) - error(80.0)).max() < 0.3
+    # And that is the gradienter's zero (1 sigma: 0.01 deg): so far the turn's axis is off.
+    assert np.abs(error(0.0)).max() < 3.0 * math.radians(0.01) * 1.5 * 3600.0
+
+
+def test_a_turn_is_of_the_deck_and_not_of_the_gyros() -> None:
+    slow = SlowTurn(start_s=-20.0, duration_s=DAY_S, rate_deg_s=0.05)
+    assert slow.euler_rad(np.array([100.0]))[1][0, 2] == pytest.approx(math.radians(0.05))
+    found = sail(Voyage(waves=(Wave(0.2, 1.0),), turn_deg_s=0.05), [120], 5)
+    assert abs(found.error[0][2]) < 0.2 * math.radians(0.05)
+
+
+def test_what_a_firmwares_own_calibration_leaves_on_a_boat_is_found_as_well_as_a_small_bias() -> None:
+    large, small = (sail(voyage, (60,), 3) for voyage in (Voyage(gyro_bias_rad_s=math.radians(3.0)), Voyage()))
+    np.testing.assert_allclose(large.error / UNITS, small.error / UNITS, atol=3.0)
+    np.testing.assert_allclose(large.error[:, 3:] / MG, small.error[:, 3:] / MG, atol=0.15)
+    np.testing.assert_allclose(large.sigma, small.sigma, rtol=0.2)

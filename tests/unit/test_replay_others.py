@@ -1,0 +1,486 @@
+"""Logs as apps and loggers write them, made from a simulated IMU whose biases are known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from companion.cli import main as companion
+from companion.replay.csv_log import read
+from sim.aircraft import Pose, VirtualAircraft
+from sim.imu_model import DEG_H, MG, ImuModel
+from sim.scenario import site_at
+from tests.support.made_noise import Floats
+
+G = 9.80665
+DEG = 180.0 / np.pi
+SECONDS, RATE_HZ, BEGIN_S = 30, 100, 3.0
+POSE = Pose(pitch_deg=5.0, roll_deg=-3.0, heading_deg=40.0)
+WHERE = ["--pitch-deg", "5", "--roll-deg", "-3", "--heading-deg", "40", "--latitude-deg", "40", "--height-m", "50"]
+
+
+@pytest.fixture(scope="module")
+def still() -> tuple[Floats, ImuModel]:
+    """(n, 7): time and readings in SI units, and the IMU."""
+    model = ImuModel(
+        VirtualAircraft(POSE, site_at(40.0, 116.0, 50.0)),
+        "bmi088",
+        seed=5,
+        gyro_bias_rad_s=[value * DEG_H for value in (1800.0, -900.0, 400.0)],
+        accel_bias_m_s2=[value * MG for value in (12.4, -8.1, 5.9)],
+    )
+    times = BEGIN_S + np.arange(SECONDS * RATE_HZ) / RATE_HZ
+    return np.column_stack([times, model.read(times, 1.0 / RATE_HZ)]), model
+
+
+def joined(rows: Sequence[Sequence[object]], separator: str = ",") -> str:
+    return "".join(separator.join(map(str, row)) + "\n" for row in rows)
+
+
+def phyphox(data: Floats) -> str:
+    """Semicolons, decimal commas, quoted names with the unit in brackets, and a column of no use."""
+    text = '"Time (s)";"Gyroscope x (rad/s)";"Gyroscope y (rad/s)";"Gyroscope z (rad/s)";'
+    text += (
+        '"Acceleration x (m/s^2)";"Acceleration y (m/s^2)";"Acceleration z (m/s^2)";"Absolute acceleration (m/s^2)"\n'
+    )
+    rows = [[f"{value:.9E}".replace(".", ",") for value in (*row, float(np.linalg.norm(row[4:])))] for row in data]
+    return text + joined(rows, ";")
+
+
+def xsens(data: Floats) -> str:
+    """Remarks, tabs, a counter, names without units, time in ticks, angles of its own filter, a tab at the end."""
+    text = "// Start Time: Unknown\n// Update Rate: 100.0Hz\n"
+    text += "PacketCounter\tTime_ms\tAcc_X\tAcc_Y\tAcc_Z\tGyr_X\tGyr_Y\tGyr_Z\tRoll\tPitch\tYaw\t\n"
+    rows = [
+        [number % 65536, f"{row[0] * 1e3:.0f}", *(f"{v:.6f}" for v in (*row[4:], *row[1:4])), "-3.1", "5.2", "12", ""]
+        for number, row in enumerate(data)
+    ]
+    return text + joined(rows, "\t")
+
+
+def serial(data: Floats) -> str:
+    """A sketch's boot message, millis(), deg/s and g without a unit, blanks between the numbers."""
+    text = "MPU ready\n\nmillis gx gy gz ax ay az temp\n"
+    rows = [
+        [f"{row[0] * 1e3:.0f}", *(f"{v * DEG:.4f}" for v in row[1:4]), *(f"{v / G:.6f}" for v in row[4:]), "31.2"]
+        for row in data
+    ]
+    return text + joined(rows, "  ")
+
+
+def spreadsheet(data: Floats) -> str:
+    """Names, then a row of units; micro-seconds since 1970; empty cells and NaN now and then; quotes."""
+    text = "sep=,\ntimestamp,gyro_x,gyro_y,gyro_z,acc_x,acc_y,acc_z,temperature,remark,\n"
+    text += "[us],[dps],[dps],[dps],[mg],[mg],[mg],[degC],,\n"
+    rows = []
+    for number, row in enumerate(data):
+        cells = [
+            f"{round(1.7e15 + row[0] * 1e6)}",
+            *(f'"{v * DEG:.6f}"' for v in row[1:4]),
+            *(f"{v * 1e3 / G:.4f}" for v in row[4:]),
+            "" if number % 10 else "24.5",
+            "",
+            "",
+        ]
+        if number % 100 == 50:
+            cells[2] = "NaN"
+        if number % 100 == 70:
+            cells[5] = ""
+        rows.append(cells)
+    return text + joined(rows)
+
+
+def dated(data: Floats) -> str:
+    """Dates and times of day; names with the unit at their end."""
+    text = "time;gyro_x_dps;gyro_y_dps;gyro_z_dps;accel_x_g;accel_y_g;accel_z_g\n"
+    begin = np.datetime64("2026-05-01T12:00:00", "ms")
+    rows = [
+        [
+            str(begin + np.timedelta64(round(row[0] * 1e3), "ms")),
+            *(f"{v * DEG:.6f}" for v in row[1:4]),
+            *(f"{v / G:.7f}" for v in row[4:]),
+        ]
+        for row in data
+    ]
+    return text + joined(rows, ";")
+
+
+KINDS: dict[str, Callable[[Floats], str]] = {
+    "phyphox": phyphox, "xsens": xsens, "serial": serial, "spreadsheet": spreadsheet, "dated": dated,
+}  # fmt: skip
+
+
+def replay(capsys: pytest.CaptureFixture[str], path: Path, *more: str) -> tuple[int, dict[str, Any]]:
+    code = companion(["replay", str(path), "--json", *more])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "log.csv"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def assert_near(imu: dict[str, Any], model: ImuModel) -> None:
+    true = model.mean_bias(BEGIN_S, BEGIN_S + SECONDS)
+    gyro = np.subtract(imu["gyro_bias_rad_s"], true.gyro_rad_s)
+    accel = np.subtract(imu["accel_bias_m_s2"], true.accel_m_s2)
+    assert (np.abs(gyro) / imu["gyro_sigma_use_rad_s"]).max() < 3.5
+    assert (np.abs(accel) / imu["accel_sigma_use_m_s2"]).max() < 3.5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_biases_are_found_whoever_wrote_the_log(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel], kind: str
+) -> None:
+    data, model = still
+    code, record = replay(capsys, written(tmp_path, KINDS[kind](data)), *WHERE, "--profile", "bmi088")
+    assert (code, record["state"]) == (0, "done"), record["reason"]
+    assert_near(record["imus"][0], model)
+    used = record["log"]
+    # All but the seconds in which it begins and ends.
+    assert used["from_s"] <= 1.0
+    assert used["to_s"] >= SECONDS - 1.5
+    assert used["seconds"] == pytest.approx(SECONDS, abs=0.1)
+
+
+def test_what_was_taken_for_granted_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
+) -> None:
+    _, record = replay(capsys, written(tmp_path, serial(still[0])), *WHERE)
+    assert [note.partition(", by")[0].partition(", gravity")[0] for note in record["log"]["notes"]] == [
+        "ax, ay, az: taken for g",
+        "gx, gy, gz: taken for deg_s",
+    ]
+    assert record["imus"][0]["temperature_degc"] == pytest.approx(31.2)
+
+
+def test_lines_without_a_number_are_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
+) -> None:
+    _, record = replay(capsys, written(tmp_path, spreadsheet(still[0])), *WHERE)
+    assert record["log"]["left_out"] == {"without a number in each of gx, gy, gz, ax, ay, az": 2 * SECONDS}
+    assert record["imus"][0]["temperature_degc"] == pytest.approx(24.5)
+    assert companion(["replay", str(tmp_path / "log.csv"), *WHERE]) == 0
+    assert "left out: 60 lines without a number in each of gx" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_log_without_times_has_a_rate(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel], named: bool
+) -> None:
+    data, model = still
+    names = "gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2"
+    path = written(tmp_path, (names + "\n" if named else "") + joined(data[:, 1:].tolist()))
+    more = [] if named else ["--columns", names]
+    assert companion(["replay", str(path), *WHERE, *more]) == 1
+    assert "a log without time: --rate HZ" in capsys.readouterr().err
+    code, record = replay(capsys, path, *WHERE, *more, "--rate", "100")
+    assert code == 0
+    assert_near(record["imus"][0], model)
+
+
+def test_equal_times_are_spread_and_repeated_lines_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
+) -> None:
+    """A clock of whole tenths of a second, and every tenth line twice."""
+    data, model = still
+    rows = [[f"{np.floor(row[0] * 10.0) / 10.0:.1f}", *row[1:].tolist()] for row in data]
+    doubled = [row for number, row in enumerate(rows) for _ in range(2 if number % 10 == 4 else 1)]
+    head = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n"
+    path = written(tmp_path, head + joined(doubled))
+    log = read(path)
+    np.testing.assert_allclose(log.t_s, data[:, 0], atol=1e-6)
+    np.testing.assert_array_equal(log.readings, data[:, 1:])
+    assert log.left_out == {"repeated: time and readings of the line before": len(data) // 10}
+    code, record = replay(capsys, path, *WHERE)
+    assert code == 0
+    assert_near(record["imus"][0], model)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda data: data * [1e-9, *[1.0] * 6], "it is 0.0 s long"),
+        (
+            lambda data: np.where([1, 0, 0, 0, 1, 1, 1], data, 1e9),
+            "2999 samples dropped: not a believable number",
+        ),
+    ],
+)
+def test_a_log_of_which_nothing_can_be_judged_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel],
+    change: Callable[[Floats], Floats], said: str,
+) -> None:  # fmt: skip
+    head = "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n"
+    text = head + joined([[f"{value:.17g}" for value in row] for row in change(still[0])])
+    code, record = replay(capsys, written(tmp_path, text))
+    assert code == 1
+    assert record["reason"] == f"no 5 s at rest in it: {said}"
+
+
+def test_a_counter_of_32_bits_goes_on_behind_its_end(tmp_path: Path, still: tuple[Floats, ImuModel]) -> None:
+    data, _ = still
+    stamps = (np.round(data[:, 0] * 1e6).astype(np.int64) + 2**32 - 15_000_000) % 2**32
+    rows = [[int(stamp), *row[1:].tolist()] for stamp, row in zip(stamps, data, strict=True)]
+    log = read(written(tmp_path, "micros,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n" + joined(rows)))
+    np.testing.assert_allclose(np.diff(log.t_s), 0.01, atol=2e-6)
+
+
+HEADS = {
+    "rad_s": "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2,lamp",
+    "deg_s": "t_s,gx_deg_s,gy_deg_s,gz_deg_s,ax_m_s2,ay_m_s2,az_m_s2,lamp",
+    "g": "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_g,ay_g,az_g,lamp",
+}
+
+
+@pytest.mark.parametrize(
+    ("said", "rate", "force", "words", "remedy"),
+    [
+        ("rad_s", DEG, 1.0, "deg_s named rad_s?", "t_s,gx_deg_s,gy_deg_s,gz_deg_s,ax_m_s2,ay_m_s2,az_m_s2,-"),
+        ("rad_s", 1.0, 1 / G, "the unit is g", "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_g,ay_g,az_g,-"),
+        ("g", 1.0, 1.0, "the unit is m_s2", "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2,-"),
+        ("g", 1.0, 1e3 / G, "the unit is mg", "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_mg,ay_mg,az_mg,-"),
+    ],
+)
+@pytest.mark.parametrize("command", ["replay", "profile"])
+def test_a_unit_that_the_size_contradicts_is_named_with_its_remedy(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    still: tuple[Floats, ImuModel],
+    command: str,
+    said: str,
+    rate: float,
+    force: float,
+    words: str,
+    remedy: str,
+) -> None:
+    data, model = still
+    scaled = data * [1.0, rate, rate, rate, force, force, force]
+    path = written(tmp_path, HEADS[said] + "\n" + joined([[*row, 1] for row in scaled.tolist()]))
+    assert companion([command, str(path)]) == 1
+    told = capsys.readouterr()
+    assert words in told.err
+    assert told.err.count("\n") == 1
+    assert told.err.rstrip().endswith(f"--columns {remedy}")
+    assert told.out == ""
+    if command == "replay":
+        # What it says to type is right.
+        code, record = replay(capsys, path, *WHERE, "--columns", remedy)
+        assert code == 0
+        assert_near(record["imus"][0], model)
+
+
+@pytest.mark.parametrize("part", ["icm42688p", "bmi088", "adis16470", "adis16405"])
+@pytest.mark.parametrize(("said", "truth"), [("rad_s", "deg_s"), ("deg_s", "rad_s"), ("", "rad_s"), ("", "deg_s")])
+def test_degrees_and_radians_of_every_part_are_told_apart(tmp_path: Path, part: str, said: str, truth: str) -> None:
+    """Never silently: refused, said in a note, or recognised where the names leave it open."""
+    model = ImuModel(VirtualAircraft(POSE, site_at(40.0, 116.0, 50.0)), part, seed=8)
+    times = np.arange(20 * 200) / 200.0
+    readings = model.read(times, 1.0 / 200.0)
+    readings[:, :3] *= DEG if truth == "deg_s" else 1.0
+    names = "".join(f",g{axis}{'_' * bool(said)}{said}" for axis in "xyz") + ",ax_m_s2,ay_m_s2,az_m_s2\n"
+    path = written(tmp_path, "t_s" + names + joined(np.column_stack([times, readings]).tolist()))
+    if said == "rad_s":
+        with pytest.raises(Exception, match="deg_s named rad_s"):
+            read(path)
+        return
+    log = read(path)
+    if said == "deg_s":
+        assert any("rad_s named deg_s? Then: --columns t_s,gx_rad_s" in note for note in log.notes)
+    else:
+        assert any(f"taken for {truth}" in note for note in log.notes)
+
+
+@pytest.mark.parametrize("part", ["icm42688p", "bmi088", "adis16470", "adis16405"])
+def test_what_is_named_rightly_is_not_doubted(tmp_path: Path, part: str) -> None:
+    model = ImuModel(VirtualAircraft(POSE, site_at(40.0, 116.0, 50.0)), part, seed=9)
+    times = np.arange(20 * 200) / 200.0
+    rows = np.column_stack([times, model.read(times, 1.0 / 200.0)]).tolist()
+    path = written(tmp_path, "t_s,gx_rad_s,gy_rad_s,gz_rad_s,ax_m_s2,ay_m_s2,az_m_s2\n" + joined(rows))
+    assert read(path).notes == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda data: data - [0, 0, 0, 0, *data[:, 4:].mean(axis=0)], "gravity taken off by an app, perhaps"),
+        (lambda data: data * [1, 1, 1, 1, 1670, 1670, 1670], "raw counts, perhaps"),
+    ],
+)
+def test_what_is_no_specific_force_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel], change: Any, words: str
+) -> None:
+    path = written(tmp_path, HEADS["rad_s"].removesuffix(",lamp") + "\n" + joined(change(still[0]).tolist()))
+    assert companion(["replay", str(path)]) == 1
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            "t,gx,gy,gz,ax,ay,az\n1,0,0,0,0,0,-9.8\n2,0,0,0,0,0,-9.8\n",
+            "their noise does not tell; name them: --columns",
+        ),
+        (
+            "t_s,gx,gy,gz,ax,ay,az\n1,0,0,0,0,0,-5\n2,0,0,0,0,0,-5\n",
+            "ax, ay, az say no unit, and gravity reads 5: not in",
+        ),
+        (
+            "t (min),gx,gy,gz,ax,ay,az\n1,0,0,0,0,0,-5\n",
+            "line 1: found unit 'min' of column t (min); allowed: s, ms, us",
+        ),
+        ("nothing\nof use\n", "line 2: no column for t, gx, gy, gz, ax, ay, az in of, use"),
+        ("a\n" * 70, "no line of numbers among the first 60"),
+        (HEADS["rad_s"] + "\n", "no line of numbers in it"),
+    ],
+)
+def test_what_cannot_be_told_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, words: str
+) -> None:
+    path = written(tmp_path, text)
+    assert companion(["replay", str(path)]) == 1
+    said = capsys.readouterr()
+    assert words in said.err
+    assert said.err.count("\n") == 1
+
+
+def test_which_stretch_was_used_and_why_not_the_rest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
+) -> None:
+    """8 s at rest, 4 s in the hand, 18 s at rest."""
+    data = still[0].copy()
+    data[800:1200, 1:4] += np.random.default_rng(1).normal(0.0, 0.3, (400, 3))
+    path = written(tmp_path, HEADS["rad_s"].removesuffix(",lamp") + "\n" + joined(data.tolist()))
+    _, record = replay(capsys, path, *WHERE, "--profile", "bmi088")
+    used = record["log"]
+    assert 12.0 <= used["from_s"] <= 13.0
+    assert 29.0 <= used["to_s"] <= 30.0
+    whys = {why["why"].partition(" imu")[0]: (why["from_s"], why["to_s"]) for why in used["unused"]}
+    # Its seconds begin with its first sample, the collector's a millisecond later.
+    assert whys["at rest, but another stretch is longer"][1] in {7.0, 8.0}
+    assert whys["gyro"][0] in {7.0, 8.0}
+    assert companion(["replay", str(path), *WHERE, "--profile", "bmi088"]) == 0
+    said = capsys.readouterr().out
+    assert "used: 12 to " in said
+    assert "not used: 0 to 7 s: at rest, but another stretch is longer" in said
+    assert "not used: 7 to 12 s: gyro imu" in said
+
+
+def with_poses(still: tuple[Floats, ImuModel], columns: Mapping[str, Sequence[str]]) -> str:
+    """The IMU's columns in SI units, and others that are filled in every tenth line."""
+    names = HEADS["rad_s"].removesuffix(",lamp") + "".join(f",{name}" for name in columns)
+    rows = [
+        [*row, *(values[number % len(values)] if number % 10 == 0 else "" for values in columns.values())]
+        for number, row in enumerate(still[0].tolist())
+    ]
+    return names + "\n" + joined(rows)
+
+
+# The simulated aircraft's pose as a gradienter of the law "axis" shows it: right side down and nose up.
+TILT = {"tilt_x_deg": ["-2.9885", "-2.9885", "-2.9884"], "tilt_y_deg": ["5.0001", "4.9999"]}
+
+
+def field_ut() -> list[float]:
+    """Of the Earth at 40 N 116 E, some 54 uT 59 deg down and 7.5 deg west, in the vehicle's axes by three rotations."""
+    from scipy.spatial.transform import Rotation
+
+    strength, dip, west = 54.4, np.radians(58.9), np.radians(7.5)
+    ned = strength * np.array([np.cos(dip) * np.cos(west), -np.cos(dip) * np.sin(west), np.sin(dip)])
+    body = Rotation.from_euler("ZYX", [POSE.heading_deg, POSE.pitch_deg, POSE.roll_deg], degrees=True)
+    return [float(value) for value in body.inv().apply(ned)]
+
+
+PLACE = ["--latitude-deg", "40", "--longitude-deg", "116", "--height-m", "50"]
+
+
+@pytest.mark.parametrize(
+    ("columns", "more", "sigma_deg"),
+    [
+        ({"heading_deg": ["40.0", "40.1", "39.9"]}, [], 0.2),
+        ({"heading_magnetic_deg": ["47.5", "47.6", "47.4"]}, [], 1.0),
+        ({f"m{axis}_ut": [f"{value:.3f}"] for axis, value in zip("xyz", field_ut(), strict=True)}, [], 1.0),
+        ({f"mag_{axis}": [f"{value * 10:.2f}"] for axis, value in zip("xyz", field_ut(), strict=True)}, [], 1.0),
+    ],
+    ids=["true", "magnetic", "field", "field by size"],
+)
+def test_tilt_and_heading_of_the_log_take_the_place_of_the_options(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    still: tuple[Floats, ImuModel],
+    columns: Mapping[str, Sequence[str]],
+    more: list[str],
+    sigma_deg: float,
+) -> None:
+    path = written(tmp_path, with_poses(still, {**TILT, **columns}))
+    code, record = replay(capsys, path, *PLACE, *more, "--profile", "bmi088", "--heading-sigma-deg", "0.2")
+    assert (code, record["state"]) == (0, "done"), record["reason"]
+    pose = record["pose"]
+    assert pose["theta_deg"] == pytest.approx(POSE.pitch_deg, abs=0.01)
+    assert pose["gamma_deg"] == pytest.approx(POSE.roll_deg, abs=0.01)
+    assert pose["psi_deg"] == pytest.approx(POSE.heading_deg, abs=sigma_deg)
+    assert_near(record["imus"][0], still[1])
+    # With a tilt that was told, the field alone gives the heading as well.
+    if "mx_ut" in columns:
+        _, told = replay(capsys, path, *PLACE, "--pitch-deg", "5", "--roll-deg", "-3")
+        assert told["pose"]["psi_deg"] == pytest.approx(pose["psi_deg"], abs=0.05)
+        assert "tilt in the log left out: it is given on the command line" in told["log"]["notes"]
+
+
+def test_the_field_is_turned_by_the_mounting(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
+) -> None:
+    """The board's x points to the right, its y backward."""
+    data, model = still
+    turned = np.column_stack([data[:, 0], data[:, 2], -data[:, 1], data[:, 3], data[:, 5], -data[:, 4], data[:, 6]])
+    x, y, z = field_ut()
+    columns = {"mx_ut": [f"{y:.3f}"], "my_ut": [f"{-x:.3f}"], "mz_ut": [f"{z:.3f}"]}
+    path = written(tmp_path, with_poses((turned, model), {**TILT, **columns}))
+    code, record = replay(capsys, path, *PLACE, "--mounting", "ROTATION_YAW_90")
+    assert code == 0
+    assert record["pose"]["psi_deg"] == pytest.approx(POSE.heading_deg, abs=1.0)
+    assert_near(record["imus"][0], model)
+
+
+def test_a_field_without_a_tilt_is_said_to_be_of_no_use(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
+) -> None:
+    columns = {f"m{axis}_ut": [f"{value:.3f}"] for axis, value in zip("xyz", field_ut(), strict=True)}
+    code, record = replay(capsys, written(tmp_path, with_poses(still, columns)), *PLACE)
+    assert code == 0
+    assert record["pose"]["psi_deg"] is None
+    assert record["log"]["notes"] == ["magnetic field left out: without a tilt it tells no heading"]
+
+
+def test_a_tilt_that_moves_is_no_rest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel]
+) -> None:
+    swinging = [f"{-3.0 + np.sin(number / 50.0):.3f}" for number in range(len(still[0]))]
+    path = written(tmp_path, with_poses(still, {"tilt_x_deg": swinging, "tilt_y_deg": ["5.0"]}))
+    code, record = replay(capsys, path, *PLACE)
+    assert code == 1
+    assert "gradienter" in record["reason"]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+def test_letters_of_any_office_program_are_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], still: tuple[Floats, ImuModel], encoding: str
+) -> None:
+    data, model = still
+    head = "t [s];gx [°/s];gy [°/s];gz [°/s];ax [m/s²];ay [m/s²];az [m/s²];T [°C];Größe\n"
+    rows = [[row[0], *(v * DEG for v in row[1:4]), *row[4:], 21.5, 1] for row in data.tolist()]
+    path = tmp_path / "log.csv"
+    path.write_bytes((head + joined(rows, ";")).encode(encoding))
+    code, record = replay(capsys, path, *WHERE, "--profile", "bmi088")
+    assert code == 0
+    assert_near(record["imus"][0], model)
+    # What a terminal cannot show does not stop it from saying so.
+    path.write_bytes((head.replace("gx", "Größe") + joined(rows, ";")).encode(encoding))
+    assert companion(["replay", str(path)]) == 1
+    assert "no column for gx in t [s]" in capsys.readouterr().err
