@@ -161,7 +161,7 @@ def in_words(solution: Solution | None) -> str:
     gyros = [imu.gyro_sigma_use_rad_s for imu in solution.imus if imu.gyro_rad_s is not None]
     accels = [imu.accel_sigma_use_m_s2 for imu in solution.imus if imu.accel_m_s2 is not None]
     if gyros:
-        # Warming is told by the hundred; its decimals would push the milli-g off a STATUSTEXT.
+        # Without decimals, so that it stays one STATUSTEXT.
         sigma_deg_h = np.max(gyros) / DEG_H
         parts.append(f"{sigma_deg_h:.0f} deg/h warming" if _warms(solution) else f"{sigma_deg_h:.1f} deg/h")
     if accels:

@@ -239,10 +239,10 @@ class ImuLevel:
         white = float(np.sqrt(np.square(down) @ np.square(slope.white[:3])))
         step = None
         if kind.gyro_step_rad_s == 0.0 and len(self._older) + len(slots) >= RESTED_S + LEVEL_S:
-            before = [second.rows[:3] @ down for second in self._older]
+            older = np.array([second.rows for second in self._older]).reshape(-1, 6)
             step = _step(
                 np.array([*(second.slot for second in self._older), *slots.tolist()], dtype=np.float64),
-                np.array([*before, *(rows[:, :3] @ down)]),
+                np.concatenate([older, rows])[:, :3] @ down,
                 white,
                 kind.gyro,
                 len(slots),

@@ -51,8 +51,8 @@ CLEARED_S: Final = 10
 """So many seconds say whether the level is the one before."""
 HINT_SIGMAS: Final = 2.0
 """And one that may be chance that of its own window."""
-GROWN: Final = 60
-"""A stretch of two minutes and more is looked at again once it has grown by this part: a log may have an hour."""
+GROWN: Final = 30
+"""A stretch of a minute and more is looked at again once it has grown by this part: a log may have an hour."""
 CHANGED_RAD_S: Final = 0.5 * DEG
 CHANGED_HELD_S: Final = 30
 """A gyro that is so far off its level by itself, by a shock, is believed after so long."""
