@@ -259,6 +259,8 @@ def main(argv: Sequence[str]) -> int:
         scenario.autopilot.require_signatures(key, int((time.time() - 1420070400) * 1e5))
         text += "# It wants signatures: put the passphrase into a file (chmod 600), and below [mavlink]\n"
         text += '# signing_key_file = "/path/of/that/file"\n'
+    if arguments.motion != "still":
+        text += '# What it stands on moves: it waits, and says so, unless [vehicle] says platform = "deck"\n'
     text += configuration(scenario, directory=directory, udp=udp)
     hands = Hands(scenario.aircraft, placement_deg=0.02, seed=arguments.seed) if arguments.hands else None
     try:
