@@ -20,7 +20,7 @@ help:
 	@echo 'make check   formatting, lint, types, import directions'
 	@echo 'make format  put the code into the one format'
 	@echo 'make bench   speed, as ratios within one run'
-	@echo 'make accuracy  how good a calibration is, beside the bound and what else is done (about four minutes on two cores)'
+	@echo 'make accuracy  how good a calibration is, beside the bound and what else is done (about ten minutes on two cores)'
 	@echo 'make campaign  every fault in every phase of a calibration (about 6 minutes on two cores)'
 	@echo 'make deb     a Debian package for machines like this one, in dist/'
 	@echo 'make deb-test  try that package in a clean root (as root; a minute or two)'
