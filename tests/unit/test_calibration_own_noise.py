@@ -199,6 +199,18 @@ def test_gusts_about_one_axis_are_never_learned(low_hz: float, high_hz: float, r
         assert known is None or known.rms < 0.1 * rms_deg_s * DEG
 
 
+@pytest.mark.parametrize("rms_deg_s", [0.1, 0.2])
+def test_bursts_in_all_axes_are_never_learned(rms_deg_s: float) -> None:
+    """White and round as noise is, one second in ten: a hand at the wing, a motor that starts. Noise is steady."""
+    t_s, readings = filtered(150, 100, ICM42688P, 1e6, 1, 22)
+    burst = np.floor(t_s) % 10 == 3
+    readings[burst, :3] += np.random.default_rng(24).normal(0.0, rms_deg_s * DEG, (int(burst.sum()), 3))
+    own = OwnNoise()
+    for batch in seconds_of(t_s, readings):
+        own.add(batch)
+        assert own.known[0] is None or own.known[0].rms < 0.1 * rms_deg_s * DEG
+
+
 def test_more_than_any_part_has_is_never_learned_but_by_whoever_says_that_it_is_at_rest() -> None:
     noisy = (1.6 * 0.07 * DEG, 1.6 * MG)
     t_s, readings = filtered(120, 100, noisy, 10.0, 1, 9)
