@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from companion.calibration.alignment.faces import Face, faces
 from companion.calibration.collector.rolling import RollingCollector
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import MG
@@ -110,6 +111,56 @@ def test_imu_tk_intervals_are_really_still(xsens: tuple[Recording, Played]) -> N
     ]
     residual = off_gravity(np.array(poses), fit(np.array(poses), 9))
     assert float(np.sqrt(np.mean(np.square(residual)))) < 0.15 * MG
+
+
+def stood(xsens: tuple[Recording, Played]) -> list[Face]:
+    """The still intervals; a mean is good for its scatter from second to second."""
+    counts, played = xsens
+    found = []
+    for start, end in played.stretches:
+        if end - start < 4.0:
+            continue
+        inside = [
+            counts.accel[(counts.t_s >= at) & (counts.t_s < at + 1.0)].mean(axis=0) for at in np.arange(start, end)
+        ]
+        means = (np.array(inside) - COUNTS[0]) * COUNTS[1]
+        found.append(Face(means.mean(axis=0), means.std(axis=0, ddof=1) / math.sqrt(len(means)) + 0.02 * MG))
+    return found
+
+
+COUNTS = (32768.0, 0.0024)
+"""The middle of the range and about m/s^2 a count, as the recording's origin says."""
+
+
+def test_imu_tk_stands_give_what_imu_tks_own_method_gives(xsens: tuple[Recording, Played]) -> None:
+    """The triangular matrix of Tedaldi et al. and the symmetric one differ by a rotation, which no length tells."""
+    stands = stood(xsens)
+    found = faces(stands, G_IMU_TK, 0.0)
+    kept = [k for k in range(len(stands)) if k not in found.left_out]
+    assert len(kept) >= 34
+    theirs = fit(np.array([stands[k].accel_m_s2 for k in kept]), 9)
+    xy, xz, yz = theirs[6:]
+    triangular = np.array([[1.0, xy, xz], [0.0, 1.0, yz], [0.0, 0.0, 1.0]]) * theirs[3:6]
+    sx, sy, sz, shear_xy, shear_xz, shear_yz = found.figures[3:]
+    response = np.array([[1 + sx, shear_xy, shear_xz], [shear_xy, 1 + sy, shear_yz], [shear_xz, shear_yz, 1 + sz]])
+    np.testing.assert_allclose(np.linalg.inv(response @ response), triangular.T @ triangular, atol=4e-4)
+    np.testing.assert_allclose(found.figures[:3] / MG, theirs[:3] / MG, atol=0.5)
+    assert found.sigma[:3].max() < 0.3 * MG
+    assert float(np.sqrt(np.mean(np.square(found.off_m_s2[kept])))) < 0.15 * MG
+
+
+def test_imu_tk_stands_foretell_one_another(xsens: tuple[Recording, Played]) -> None:
+    """Half of the stands calibrate, the other half judges."""
+    stands = stood(xsens)
+    for part in (0, 1):
+        found = faces(stands[part::2], G_IMU_TK, 0.0)
+        sx, sy, sz, xy, xz, yz = found.figures[3:]
+        response = np.array([[1 + sx, xy, xz], [xy, 1 + sy, yz], [xz, yz, 1 + sz]])
+        others = np.array([stand.accel_m_s2 for stand in stands[1 - part :: 2]])
+        lengths = np.linalg.norm(np.linalg.solve(response, (others - found.figures[:3]).T), axis=0)
+        assert float(np.median(np.abs(lengths - G_IMU_TK))) < 0.2 * MG
+        before = np.linalg.norm(others, axis=1) - G_IMU_TK
+        assert float(np.median(np.abs(before))) > 10.0 * MG
 
 
 # --------------------------------------------------------------------------------------------------- PX4 hardware

@@ -126,7 +126,7 @@ def align(
     complaint, checked = _worst(residual, scaled @ inverse, scaled, rows, model)
     covariance = np.zeros((model.size, model.size))
     # More scatter than chance makes of the sigmas widens them; less of it proves nothing.
-    spread = chi_square / freedom if freedom > 0 and chi_square > _by_chance(freedom) else 1.0
+    spread = chi_square / freedom if freedom > 0 and chi_square > by_chance(freedom) else 1.0
     sigma = model.sigma[sought]
     covariance[np.ix_(sought, sought)] = spread * inverse * np.outer(sigma, sigma)
     return Alignment(
@@ -170,7 +170,7 @@ def in_words(complaint: Complaint) -> str:
     return f"the stands do not fit what is known of the sensors ({by}): begin again"
 
 
-def _by_chance(freedom: int) -> float:
+def by_chance(freedom: int) -> float:
     """The 99 % point of chi square (Wilson and Hilferty, PNAS 17, 684, 1931)."""
     part = 2.0 / (9.0 * freedom)
     return float(freedom * (1.0 - part + 2.326 * math.sqrt(part)) ** 3)
