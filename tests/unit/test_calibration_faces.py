@@ -150,7 +150,9 @@ def test_what_the_biases_do_until_they_are_used_widens_theirs_alone() -> None:
 
 
 def test_readings_that_are_no_gravity_are_refused() -> None:
-    stands = [Face(np.array(force), np.full(3, NOISE)) for force in ((30.0, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.2))]
+    stands = [
+        Face(np.array(force), np.full(3, NOISE)) for force in ((30.0, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.2))
+    ]
     with pytest.raises(CalibrationRefusedError, match="no gravity"):
         solved(stands)
 

@@ -166,9 +166,7 @@ def _fit(stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, flo
     raise CalibrationRefusedError("the accelerometers' readings are no gravity: is every stand still?")
 
 
-def _linearised(
-    force: Matrix, variance: Matrix, at: Array, gravity_m_s2: float, prior: Array
-) -> tuple[Array, Matrix]:
+def _linearised(force: Matrix, variance: Matrix, at: Array, gravity_m_s2: float, prior: Array) -> tuple[Array, Matrix]:
     """Residuals over sigma, measured minus foretold, and the derivatives of what is foretold times the prior sigmas."""
     inverse = np.linalg.inv(np.eye(3) + _symmetric(at))
     inside = (force - at[BIAS]) @ inverse
