@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import asyncio
 import dataclasses
 import datetime
 import faulthandler
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from companion.cli import logs, show
 from companion.cli.terminal import DONE, FAILED, USAGE, AddCommand, config_path, load_config, print_json, print_lines
-from companion.errors import CompanionError, ConfigError, LinkError, StorageError
+from companion.errors import CompanionError, ConfigError, StorageError
 
 if TYPE_CHECKING:
     from companion.installation.install import Step, Target
@@ -82,19 +81,12 @@ async def ports(options: argparse.Namespace) -> int:
 
 async def _listen(wanted: Sequence[str], found: Sequence[SerialPort]) -> dict[str, Heard | str]:
     """Who speaks on each port, or why that is not known."""
-    from companion.links.serial.listening import listen
+    from companion.links.serial.listening import listen_to_all, ports_to_try
 
-    async def one(port: str) -> Heard | str:
-        try:
-            return await listen(port)
-        except LinkError as error:
-            return str(error)
-
-    # What is said to a console's port is a login, and what comes from it is no sensor.
-    names = list(wanted) or [port.stable_name or port.device for port in found if not port.is_console]
+    names = list(wanted) or ports_to_try(found)
     if names:
         print_lines(f"listening to {', '.join(names)}: up to half a minute", error=True)
-    return dict(zip(names, await asyncio.gather(*map(one, names)), strict=True))
+    return await listen_to_all(names)
 
 
 def _heard(heard: Heard | str) -> dict[str, object]:
@@ -109,6 +101,7 @@ def _heard(heard: Heard | str) -> dict[str, object]:
         "kinds": list(candidate.kinds) if candidate is not None else [],
         "frames": candidate.accepted if candidate is not None else 0,
         "stranger": heard.stranger,
+        "autopilot": None if heard.heartbeat is None else dataclasses.asdict(heard.heartbeat),
         "bytes": heard.bytes_heard,
     }
 
@@ -164,9 +157,7 @@ async def check(options: argparse.Namespace) -> int:
             }
         )
     else:
-        width = max(len(finding.name) for finding in findings)
-        for finding in findings:
-            print_lines(f"{'ok ' if finding.good else 'BAD'}  {finding.name:{width}}  {finding.words}")
+        print_lines(*show.finding_lines(findings))
     return DONE if good else FAILED
 
 
@@ -195,8 +186,7 @@ def _tell(options: argparse.Namespace, steps: Iterable[Step]) -> int:
     done: list[Step] = []
     for step in steps:
         done.append(step)
-        line = f"{step.outcome:9}  {step.what}" + (f": {step.words}" if step.words else "")
-        print_lines(line, error=as_json)
+        print_lines(step.line(dry_run=options.dry_run), error=as_json)
     failed = [step for step in done if step.outcome == "failed"]
     if as_json:
         reason = "; ".join(f"{step.what}: {step.words}" for step in failed)

@@ -11,6 +11,7 @@ from companion.calibration.solution.record import Magnetic
 from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
+    from companion.daemon.process.check import Finding
     from companion.links.serial.listening import Heard
     from companion.links.serial.ports import SerialPort
     from companion.protocols.guess import Candidate, Line
@@ -212,6 +213,12 @@ def _bias_lines(calibration: Object | None) -> list[str]:
 
 def _held_back(imu: Object, triad: str) -> str:
     return "  held back: not written" if triad in imu.get("held_back", ()) else ""
+
+
+def finding_lines(findings: Sequence[Finding]) -> list[str]:
+    """What a check has found, one line each."""
+    width = max(len(finding.name) for finding in findings)
+    return [f"{'ok ' if finding.good else 'BAD'}  {finding.name:{width}}  {finding.words}" for finding in findings]
 
 
 def history_lines(numbers: Sequence[int], records: Sequence[Object], armings: Sequence[Object]) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import json
 import math
 import sys
@@ -79,12 +80,21 @@ def config_path(options: argparse.Namespace) -> Path:
 
 
 class Parser(argparse.ArgumentParser):
-    """Says a usage error in one line."""
+    """Says a usage error in one line, and what was probably meant."""
 
     def error(self, message: str) -> NoReturn:
         """Say a usage error in one line."""
         print_lines(f"{self.prog}: {message} (see {self.prog} --help)", error=True)
         self.exit(USAGE)
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Name the nearest command or choice, as the configuration does for its keys."""
+        if action.choices is None or value in action.choices:
+            return
+        choices = list(map(str, action.choices))
+        near = difflib.get_close_matches(str(value), choices, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"allowed: {', '.join(choices)}"
+        raise argparse.ArgumentError(action, f"found {str(value)!r}; {hint}")
 
 
 def within(least: float, most: float, kind: type[float] = float, unit: str = "") -> Callable[[str], float]:

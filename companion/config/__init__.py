@@ -59,7 +59,7 @@ def load(path: Path, saved: Saved | None = None) -> Config:
         with path.open("rb") as file:
             text = file.read(MOST_BYTES + 1).decode()
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; give another with -c FILE") from None
+        raise ConfigError(f"{path}: no such file: companion setup makes it (or give another with -c FILE)") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
     return parse(text, str(path), saved)

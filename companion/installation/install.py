@@ -6,6 +6,7 @@ can be done again and again.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import os
 import re
@@ -113,6 +114,17 @@ class Step:
     outcome: Outcome
     words: str = ""
 
+    def line(self, *, dry_run: bool = False) -> str:
+        """For people."""
+        outcome = _WOULD.get(self.outcome, self.outcome) if dry_run else self.outcome
+        return f"{outcome:{13 if dry_run else 9}}  {self.what}" + (f": {self.words}" if self.words else "")
+
+
+_WOULD: Final[dict[Outcome, str]] = {
+    "written": "would write", "updated": "would update", "removed": "would remove", "done": "would do",
+}  # fmt: skip
+"""What is said of a step that a dry run leaves out; what is only found is said as ever."""
+
 
 @dataclass(frozen=True, slots=True)
 class Target:
@@ -139,6 +151,10 @@ class Target:
         """Where a file goes."""
         base = str(self.prefix).lstrip("/") if shipped.target.startswith("lib/") else "etc/companion"
         return self.root / base / shipped.target
+
+
+PREFIX: Final = Path("/usr/local")
+_HERE: Final = Target(Path("/"), PREFIX, EXECUTABLE)
 
 
 def own_executable() -> str:
@@ -168,12 +184,25 @@ def install(target: Target, run: Run | None = None) -> Iterator[Step]:
     if edited:
         yield Step(str(configuration), "kept", "yours; what is new is in companion.toml.sample")
     elif found == sample:
-        yield Step(str(configuration), "unchanged", "still the sample: it has to be edited")
+        yield Step(str(configuration), "unchanged", "still the sample: companion setup fills it in")
     else:
         outcome: Outcome = "written" if found is None else "updated"
-        yield _write(target, configuration, sample, outcome, "the sample: it has to be edited")
+        yield _write(target, configuration, sample, outcome, "the sample: companion setup fills it in")
     if target.is_this_machine:
         yield from _activate(target, run or _run, edited=edited)
+
+
+def start_service(run: Run | None = None) -> Iterator[Step]:
+    """Have this machine's service run with the configuration that is there now, and at every boot.
+
+    Raises:
+        CompanionError: as `install`.
+    """
+    if (Path(sys.prefix) / PACKAGED).exists():
+        for command in ("enable", "restart"):
+            yield _command(_HERE, run or _run, "systemctl", command, "companion.service")
+        return
+    yield from install(dataclasses.replace(_HERE, executable=own_executable()), run)
 
 
 def uninstall(target: Target, run: Run | None = None) -> Iterator[Step]:
@@ -185,7 +214,7 @@ def uninstall(target: Target, run: Run | None = None) -> Iterator[Step]:
     if target.is_this_machine:
         _check_not_packaged("sudo apt remove companion")
         _check_user(target, "uninstall-service")
-        if _systemd_runs():
+        if systemd_runs():
             yield _command(target, run or _run, "systemctl", "disable", "--now", "companion.service")
     for shipped in OURS:
         yield _take(target, target.path(shipped), is_untouched, "changed by hand")
@@ -283,7 +312,7 @@ def unreachable(path: Path) -> str | None:
 
 
 def _activate(target: Target, run: Run, *, edited: bool) -> Iterator[Step]:
-    if not _systemd_runs():
+    if not systemd_runs():
         yield Step("systemd", "skipped", "does not run here: nothing was started")
         return
     yield from _reload(target, run)
@@ -291,12 +320,11 @@ def _activate(target: Target, run: Run, *, edited: bool) -> Iterator[Step]:
         yield _command(target, run, "systemctl", "enable", "companion.service")
         yield _command(target, run, "systemctl", "restart", "companion.service")
     else:
-        words = "edit /etc/companion/companion.toml, then: sudo systemctl enable --now companion"
-        yield Step("companion.service", "skipped", f"not started: {words}")
+        yield Step("companion.service", "skipped", "not started: sudo companion setup fills the configuration in first")
 
 
 def _reload(target: Target, run: Run) -> Iterator[Step]:
-    if not _systemd_runs():
+    if not systemd_runs():
         return
     yield _command(target, run, "systemctl", "daemon-reload")
     yield _command(target, run, "systemctl", "restart", "systemd-modules-load.service")
@@ -308,7 +336,8 @@ def _reload(target: Target, run: Run) -> Iterator[Step]:
         yield _command(target, run, "udevadm", "trigger", *subsystems)
 
 
-def _systemd_runs() -> bool:
+def systemd_runs() -> bool:
+    """Whether there is anybody to start a service."""
     return Path("/run/systemd/system").is_dir()
 
 

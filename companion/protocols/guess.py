@@ -106,7 +106,7 @@ def strangers(data: bytes) -> str | None:
         return "a login console or kernel messages"
     if _MODEM.search(data):
         return "AT commands, as ModemManager sends them"
-    if _is_mavlink(data):
+    if is_mavlink(data):
         return "MAVLink: an autopilot or its radio, which belongs into [mavlink]"
     return None
 
@@ -130,7 +130,7 @@ def banner_in(data: bytes) -> str:
     return ""
 
 
-def _is_mavlink(data: bytes) -> bool:
+def is_mavlink(data: bytes) -> bool:
     """A few packets in a row, each of which begins where the one before ends."""
     for start in range(len(data)):
         at = start

@@ -187,7 +187,8 @@ def test_nobody_there() -> None:
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["fly"], "invalid choice"),
+        (["fly"], "allowed: status"),
+        (["calibrat"], "did you mean calibrate?"),
         (["status", "--url", "udp://x"], "udpin:HOST:PORT"),
         (["params", "CMP_PUSH"], "NAME=VALUE"),
         (["params", "CMP_PUSH=nan"], "NAME=VALUE"),

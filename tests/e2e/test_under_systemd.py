@@ -85,8 +85,8 @@ def test_the_life_of_the_service(tmp_path: Path) -> None:
 async def installed(machine: Machine, configuration: str) -> None:
     # Without a configuration of its owner's nothing is started.
     _, out, _ = await machine.run(*INSTALL)
-    assert f"written    {CONFIGURATION}: the sample: it has to be edited" in out
-    assert "not started: edit" in out
+    assert f"written    {CONFIGURATION}: the sample: companion setup fills it in" in out
+    assert "not started: sudo companion setup" in out
     assert (await machine.show("companion", "ActiveState"))["ActiveState"] == "inactive"
     await machine.write(CONFIGURATION, configuration)
     _, out, _ = await machine.run(*INSTALL)

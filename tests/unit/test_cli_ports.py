@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+from collections.abc import Sequence
 
 import pytest
 
@@ -33,7 +34,7 @@ def test_consoles_are_left_alone_and_ports_go_by_their_lasting_names(monkeypatch
     heard = listening.Heard(Line(9600, "none"), Candidate("x", ("compass",), 4, 0), None, 99)
     opened: list[str] = []
 
-    async def listen(port: str) -> listening.Heard:
+    async def listen(port: str, first: Sequence[Line] = ()) -> listening.Heard:
         opened.append(port)
         return heard
 

@@ -113,7 +113,7 @@ def test_the_command_says_line_by_line_what_it_does(tmp_path: Path, capsys: pyte
     words = ["install-service", "--root", str(tmp_path), "--prefix", "/usr", "--executable", EXECUTABLE]
     assert cli.main([*words, "--dry-run"]) == 0
     told = capsys.readouterr()
-    assert f"written    {tmp_path}/usr/lib/systemd/system/companion.service" in told.out.splitlines()
+    assert f"would write    {tmp_path}/usr/lib/systemd/system/companion.service" in told.out.splitlines()
     assert "nothing was changed" in told.err
     assert cli.main([*words, "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)

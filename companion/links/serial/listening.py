@@ -16,16 +16,18 @@ from typing import Final
 
 from companion.errors import LinkError
 from companion.links.serial.port import SerialOpener, close_serial
-from companion.links.serial.ports import ROOT, find_holders
+from companion.links.serial.ports import ROOT, SerialPort, find_holders
 from companion.protocols.guess import (
     ENOUGH_BYTES,
     Candidate,
     Line,
+    is_mavlink,
     likeliest,
     lines_to_try,
     plain_share,
     strangers,
 )
+from companion.protocols.heartbeat import Heartbeat, heartbeats
 
 SILENT_S: Final = 3.0
 """How long the first setting is listened to before the port is called silent: a talker is seen at every speed."""
@@ -35,7 +37,8 @@ LINE_MOST_S: Final = 2.5
 FEW_BYTES: Final = 100
 PARITY_BAUDS: Final = 4
 """Speeds at which the parities are tried: those whose bytes looked most like text."""
-_MOST_BYTES: Final = 16384
+_MOST_BYTES: Final = 131072
+"""More than 921600 baud bring in the time."""
 _LOOK_S: Final = 0.1
 
 
@@ -49,6 +52,37 @@ class Heard:
     stranger: str | None
     """Who it is when it is no sensor, in a few words."""
     bytes_heard: int
+    heartbeat: Heartbeat | None = None
+    """Of the autopilot that speaks there."""
+
+
+def ports_to_try(found: Sequence[SerialPort]) -> list[str]:
+    """All ports, each by its best name, but a console's: what is said there is a login, and no sensor."""
+    return [port.stable_name or port.device for port in found if not port.is_console]
+
+
+async def listen_to_all(
+    names: Sequence[str], first: Sequence[Line] = (), tell: Callable[[str, Heard | str], None] | None = None
+) -> dict[str, Heard | str]:
+    """Who speaks on each port, or why that is not known; all at the same time.
+
+    Args:
+        names: the ports.
+        first: as for `listen`.
+        tell: is told of each as soon as it is known.
+    """
+
+    async def one(port: str) -> Heard | str:
+        found: Heard | str
+        try:
+            found = await listen(port, first)
+        except LinkError as error:
+            found = str(error)
+        if tell is not None:
+            tell(port, found)
+        return found
+
+    return dict(zip(names, await asyncio.gather(*map(one, names)), strict=True))
 
 
 async def listen(path: str, first: Sequence[Line] = (), root: Path = ROOT) -> Heard:
@@ -74,6 +108,10 @@ async def listen(path: str, first: Sequence[Line] = (), root: Path = ROOT) -> He
                 continue  # a speed that this driver does not know
             raise
         heard += len(data)
+        if senders := heartbeats(data):
+            speaker = senders[0]
+            autopilot = speaker if speaker.is_autopilot else None
+            return Heard(line, None, f"MAVLink: {speaker}, which belongs into [mavlink]", heard, autopilot)
         if (found := likeliest(data)) is not None:
             return Heard(line, found, None, heard)
         if (stranger := strangers(data)) is not None:
@@ -94,17 +132,22 @@ async def _bytes_at(path: str, line: Line, most_s: float) -> bytes:
     loop.add_reader(descriptor, _reader(descriptor, data, ended))
     try:
         since_s = loop.time()
-        looked = 0
+        looked, mavlink = 0, False
         while not ended.is_set():
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(ended.wait(), _LOOK_S)
             past_s = loop.time() - since_s
             if len(data) > looked:
                 looked = len(data)
-                found = likeliest(bytes(data))
-                if (found is not None and found.sure) or (found is None and looked >= ENOUGH_BYTES):
+                heard = bytes(data)
+                mavlink = mavlink or is_mavlink(heard)
+                if any(one.is_autopilot for one in heartbeats(heard)):
                     break
-            if past_s >= most_s or (past_s >= LINE_S and len(data) >= FEW_BYTES):
+                found = None if mavlink else likeliest(heard)
+                if not mavlink and (found.sure if found is not None else looked >= ENOUGH_BYTES):
+                    break
+            # An autopilot's heartbeat comes once a second, however much else it says.
+            if past_s >= most_s or (past_s >= LINE_S and len(data) >= FEW_BYTES and not mavlink):
                 break
     finally:
         loop.remove_reader(descriptor)

@@ -1,0 +1,91 @@
+"""Questions to a person at a terminal, one at a time; or to nobody, who takes what stands in brackets."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from collections.abc import Callable
+from typing import Final
+
+from companion.cli.terminal import print_lines
+from companion.config.words import shown
+from companion.errors import CompanionError, ConfigError
+
+_MOST_BYTES: Final = 4096
+
+
+class Asking:
+    """Asks on stdout, takes answers from stdin.
+
+    Args:
+        yes: ask nobody.
+        error: whether questions go to stderr, because stdout is for JSON.
+    """
+
+    def __init__(self, *, yes: bool, error: bool) -> None:
+        self.yes, self._error = yes, error
+        self._rest = b""
+
+    def say(self, *lines: str) -> None:
+        """Tell something."""
+        print_lines(*lines, error=self._error)
+
+    async def ask(self, question: str, now: str, put: Callable[[str], None], hint: str = "") -> None:
+        """Ask until `put` takes the answer; an empty one is what holds now.
+
+        Raises:
+            CompanionError: there is nobody to answer any more.
+        """
+        self.say("", question, *([f"  {hint}"] if hint else []))
+        while True:
+            print_lines(f"  [{now}] >" if now else "  >", error=self._error, end=" ")
+            answer = now if self.yes else (await self._line()).strip() or now
+            if self.yes or not sys.stdin.isatty():
+                self.say(answer)
+            try:
+                put(answer)
+            except ConfigError as error:
+                self.say(f"  {error}")
+                if self.yes:
+                    raise
+            else:
+                return
+
+    async def agrees(self, question: str, *, by_default: bool = True) -> bool:
+        """Ask what is answered by yes or no."""
+        found = by_default
+
+        def put(words: str) -> None:
+            nonlocal found
+            if words.lower() not in ("y", "yes", "n", "no"):
+                raise ConfigError(f"found {shown(words)}; allowed: yes or no")
+            found = words.lower().startswith("y")
+
+        await self.ask(question, "yes" if by_default else "no", put)
+        return found
+
+    async def _line(self) -> str:
+        """The next line that is typed. Ctrl-C ends the waiting at once, which it would not in `input`."""
+        while b"\n" not in self._rest and len(self._rest) < _MOST_BYTES:
+            chunk = await _read(sys.stdin.fileno())
+            if not chunk:
+                self.say("")
+                raise CompanionError("nobody answers (with --yes what stands in brackets is taken)")
+            self._rest += chunk
+        line, _, self._rest = self._rest.partition(b"\n")
+        return line.decode(errors="replace")
+
+
+async def _read(descriptor: int) -> bytes:
+    loop = asyncio.get_running_loop()
+    ready = asyncio.Event()
+    try:
+        loop.add_reader(descriptor, ready.set)
+    except PermissionError:
+        return os.read(descriptor, _MOST_BYTES)  # a file, which is always ready
+    try:
+        await ready.wait()
+    finally:
+        loop.remove_reader(descriptor)
+    return os.read(descriptor, _MOST_BYTES)

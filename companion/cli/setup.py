@@ -1,0 +1,345 @@
+"""`companion setup`: from what is connected, and three answers, to a configuration that works."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import dataclasses
+import os
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+from companion import config
+from companion.cli.asking import Asking
+from companion.cli.show import finding_lines
+from companion.cli.terminal import DONE, FAILED, AddCommand, config_path, load_config, print_json
+from companion.config.sections import Config
+from companion.config.words import shown
+from companion.errors import CompanionError, ConfigError, DaemonDeniedError, DaemonUnreachableError
+from companion.installation import install as installing
+from companion.links.mavlink.listening import USUAL_PORTS
+from companion.links.serial.listening import ports_to_try
+from companion.links.serial.ports import ROOT, list_ports, resolve
+from companion.protocols.registry import Kind
+from companion.setup import keeping
+from companion.setup.document import active_lines
+from companion.setup.draft import Draft
+from companion.setup.survey import Survey, survey
+
+KINDS: Final[tuple[Kind, ...]] = ("gradienter", "compass", "imu")
+WITHOUT: Final = {
+    "gradienter": "no gradienter: gyros only (it may be connected later: companion setup again)",
+    "compass": "no compass: the gyros' sigmas are a little wider",
+}
+CHECK_S: Final = 5.0
+
+
+def add_command(add: AddCommand) -> None:
+    """Add it to the parser of the command line."""
+    parser = add("setup", setup, "find autopilot and sensors, ask what cannot be found out, write the configuration")
+    parser.add_argument(
+        "ports", nargs="*", metavar="PORT", help="serial ports to listen to (default: all that nobody holds)"
+    )
+    parser.add_argument("--yes", action="store_true", help="ask nothing: take what would stand in brackets")
+    parser.add_argument("--mavlink", metavar="URL", help="where the autopilot is; otherwise it is looked for")
+    parser.add_argument(
+        "--udp", type=_udp_port, action="append", metavar="PORT",
+        help=f"a UDP port to listen to, instead of {', '.join(map(str, USUAL_PORTS))}; may be given again",
+    )  # fmt: skip
+    parser.add_argument("--platform", metavar="WHERE", help="ground or deck")
+    parser.add_argument("--law", metavar="LAW", help="of the gradienter: axis, slope or euler")
+    parser.add_argument(
+        "--mounting", action="append", default=[], metavar="DEVICE=HOW",
+        help="of gradienter, compass or imu: degrees clockwise from above, ROLL,PITCH,YAW, or ROTATION_...",
+    )  # fmt: skip
+    parser.add_argument("--no-check", action="store_true", help="write the file only")
+    parser.add_argument("--no-service", action="store_true", help="do not offer to start it at every boot")
+
+
+def _udp_port(text: str) -> int:
+    if not text.isdigit() or not 1 <= int(text) <= 65535:
+        raise argparse.ArgumentTypeError(f"found {text!r}; allowed: a port from 1 to 65535")
+    return int(text)
+
+
+async def setup(options: argparse.Namespace) -> int:
+    """`companion setup`."""
+    as_json = getattr(options, "json", False)
+    session = _Session(options, Asking(yes=options.yes, error=as_json))
+    try:
+        await session.run()
+    except asyncio.CancelledError:
+        session.asking.say("", f"ended: {session.so_far}")
+        raise
+    except CompanionError as error:
+        kind = ConfigError if isinstance(error, ConfigError) else CompanionError
+        raise kind(f"{error}; {session.so_far}") from None
+    if as_json:
+        print_json(session.answer)
+    return DONE if session.answer["state"] != "failed" else FAILED
+
+
+class _Session:
+    """One run of it."""
+
+    def __init__(self, options: argparse.Namespace, asking: Asking) -> None:
+        self.asking = asking
+        self.so_far = "nothing was written"
+        self._options = options
+        self._path = config_path(options)
+        self.answer: dict[str, Any] = {
+            "state": "done", "reason": "", "file": str(self._path), "kept": None, "heard": {}, "guessed": [],
+            "configuration": {}, "findings": None, "steps": None, "next": [],
+        }  # fmt: skip
+
+    async def run(self) -> None:
+        """The whole of it.
+
+        Raises:
+            CompanionError: it cannot go on; `so_far` says what has become of the file.
+        """
+        say = self.asking.say
+        keeping.check_writable(self._path)
+        draft = await self._begin()
+        if draft.is_new and os.geteuid() != 0 and self._path != config.DEFAULT_PATH:
+            draft.keep_beside(self._path)
+        given = self._given()
+        found = await self._listen()
+        await self._take_autopilot(draft, found)
+        for kind in KINDS:
+            await self._take_device(draft, found, kind)
+        await self._ask(draft, given)
+        draft.parsed()
+        text = draft.result()
+        self.answer |= {"guessed": sorted(draft.guessed), "configuration": draft.wanted}
+        changed = not self._path.exists() or text != draft.text
+        if changed:
+            say("", f"{self._path} will say (and, as comments, all defaults):", "")
+            say(*(f"    {line}" if line else "" for line in active_lines(text)))
+            if not await self.asking.agrees("Write it?"):
+                raise CompanionError("not wanted")
+            self._write(text)
+        else:
+            say("", f"{self._path} says all this already.")
+            self.answer["state"] = "unchanged"
+            self.so_far = f"{self._path} is as it was"
+        await self._finish()
+
+    async def _begin(self) -> Draft:
+        try:
+            draft = keeping.begin(self._path)
+        except ConfigError as error:
+            if self.asking.yes:
+                raise
+            self.asking.say(str(error))
+            if not await self.asking.agrees("Begin anew? The old file is kept beside it.", by_default=False):
+                raise CompanionError("that file has to be mended first") from None
+            return Draft(keeping.sample(), is_new=True)
+        if not draft.is_new:
+            self.asking.say(f"{self._path} is there: what it says holds where you answer nothing else.")
+        return draft
+
+    def _given(self) -> dict[str, str]:
+        """Answers from the command line, by question."""
+        options = self._options
+        given = {"vehicle.platform": options.platform, "gradienter.law": options.law}
+        for words in options.mounting:
+            device, _, how = words.partition("=")
+            if device not in KINDS or not how:
+                raise ConfigError(f"--mounting: found {shown(words)}; allowed: gradienter=..., compass=... or imu=...")
+            given[f"{device}.mounting"] = how
+        return {key: words for key, words in given.items() if words is not None}
+
+    async def _listen(self) -> Survey:
+        """Everything that can be listened to; not a byte is sent."""
+        options = self._options
+        ports = [*map(_absolute, options.ports)] or ports_to_try(list_ports())
+        udp = tuple(options.udp or USUAL_PORTS)
+        self.asking.say(
+            f"Listening to {len(ports)} serial port{'' if len(ports) == 1 else 's'} and UDP"
+            f" {', '.join(map(str, udp))}: up to half a minute.",
+            "Nothing is sent. (Opening a port restarts an Arduino.)",
+            "",
+        )
+
+        def tell(place: str, words: str) -> None:
+            self.answer["heard"][place] = words
+            self.asking.say(f"  {place}: {words}")
+
+        found = await survey(ports, udp, tell)
+        self.asking.say("", "Enter takes what stands in [brackets]; Ctrl-C ends, and nothing is written.")
+        return found
+
+    async def _take_autopilot(self, draft: Draft, found: Survey) -> None:
+        """Its url: as it was where it is heard there or held by somebody, else where one is heard, else as typed."""
+        say, heard = self.asking.say, found.autopilots
+        if self._options.mavlink is not None:
+            draft.take_url(self._options.mavlink)
+        elif draft.url is not None and (not heard or any(one.url == draft.url for one in heard)):
+            say(f"Autopilot: {draft.url}, as it was")
+        elif draft.url is not None:
+            say(f"The autopilot is not heard at {draft.url}.")
+            one = await self._choose("Autopilot", [*(each.url for each in heard), draft.url])
+            draft.take_url(one)
+        elif heard:
+            url = await self._choose("Autopilot", [each.url for each in heard])
+            draft.take_url(url)
+        elif self.asking.yes:
+            raise CompanionError(
+                "no autopilot was heard (its port's protocol MAVLink 2? TX to RX? --mavlink URL names its place)"
+            )
+        else:
+            say(
+                "No autopilot was heard. Has it power? Is its port set to MAVLink 2? TX to RX, RX to TX, ground?",
+                "Where is it: serial:/dev/serial0:921600, udpin:0.0.0.0:14550, or tcp:HOST:PORT?",
+            )
+            await self.asking.ask("Autopilot", "", draft.take_url)
+
+    async def _take_device(self, draft: Draft, found: Survey, kind: Kind) -> None:
+        """One that is heard, in the place of one that is not; one that is held by somebody stays."""
+        section, heard = draft.section(kind), found.devices(kind)
+        if section is not None:
+            again = [one for one in heard if _same(one.port, section.get("port", ""))]
+            away = [one for one in heard if not again]
+            if not away:
+                if again:
+                    draft.take(dataclasses.replace(again[0], port=section["port"]))
+                self.asking.say(f"{kind.capitalize()}: {section['protocol']} at {section['port']}, as it was")
+                return
+            heard = away
+            self.asking.say(f"The {kind} is not heard at {section['port']}.")
+        if not heard:
+            if kind in WITHOUT:
+                self.asking.say(WITHOUT[kind].capitalize())
+            return
+        names = [str(one) for one in heard] + ([section["port"]] if section is not None else [])
+        chosen = await self._choose(kind.capitalize() if kind != "imu" else "Own IMU", names)
+        draft_from = next((one for one in heard if str(one) == chosen), None)
+        if draft_from is not None:
+            draft.take(draft_from)
+
+    async def _choose(self, what: str, names: Sequence[str]) -> str:
+        """One of several; of one nobody is asked."""
+        if len(names) == 1:
+            self.asking.say(f"{what}: {names[0]}")
+            return names[0]
+        self.asking.say(*(f"  {number}. {name}" for number, name in enumerate(names, 1)))
+        chosen = names[0]
+
+        def put(words: str) -> None:
+            nonlocal chosen
+            if not words.isdigit() or not 1 <= int(words) <= len(names):
+                raise ConfigError(f"found {shown(words)}; allowed: 1 to {len(names)}")
+            chosen = names[int(words) - 1]
+
+        await self.asking.ask(f"{what}: which?", "1", put)
+        return chosen
+
+    async def _ask(self, draft: Draft, given: dict[str, str]) -> None:
+        questions = list(draft.questions())
+        strange = given.keys() - {question.key for question in questions} - {"vehicle.platform"}
+        if strange:
+            raise ConfigError(f"{', '.join(sorted(strange))}: there is no such device to say it of")
+        for question in questions:
+            if question.key in given:
+                try:
+                    question.put(given[question.key])
+                except ConfigError as error:
+                    raise ConfigError(f"{question.key}: {error}") from None
+                self.asking.say(f"{question.words} {given[question.key]}")
+            elif not self.asking.yes:
+                await self.asking.ask(question.words, question.now, question.put, question.hint)
+            else:
+                guess = " (a guess)" if question.key in draft.guessed else ""
+                self.asking.say(f"{question.words} {question.now}{guess}")
+
+    def _write(self, text: str) -> None:
+        kept = keeping.put(self._path, text)
+        self.so_far = f"{self._path} is written"
+        self.asking.say(f"Written: {self._path}" + (f" (the old one: {kept.name})" if kept is not None else ""))
+        self.answer["kept"] = None if kept is None else str(kept)
+
+    async def _finish(self) -> None:
+        """Check it, offer the service, tell the next step."""
+        from companion.daemon.faces.control import ask
+
+        parsed = load_config(self._options, profiles=True)
+        try:
+            async for _ in ask(parsed.control.path, {"command": "status"}):
+                pass
+            runs = True
+        except DaemonDeniedError:
+            runs = True
+        except DaemonUnreachableError:
+            runs = False
+        good = True
+        if not runs and not self._options.no_check:
+            good = await self._check(parsed)
+        started = await self._service(runs=runs)
+        steps = list(_next_steps(parsed, self._command, runs=runs, started=started, good=good))
+        self.answer["next"] = steps
+        self.asking.say("", "Next:", *(f"  {number}. {step}" for number, step in enumerate(steps, 1)))
+
+    @property
+    def _command(self) -> str:
+        """How to call the companion with this file."""
+        return "companion" if self._path == config.DEFAULT_PATH else f"companion -c {self._path}"
+
+    async def _check(self, parsed: Config) -> bool:
+        """As `companion check` does: it speaks with autopilot and sensors as the daemon will, and writes nothing."""
+        from companion.daemon.process.check import run_check
+
+        self.asking.say("", "Checking (it speaks with all of them now, and changes nothing):")
+        findings = await run_check(parsed, CHECK_S)
+        self.asking.say(*finding_lines(findings))
+        bad = [f"{finding.name}: {finding.words}" for finding in findings if not finding.good]
+        self.answer["findings"] = [dataclasses.asdict(finding) for finding in findings]
+        if bad:
+            self.answer |= {"state": "failed", "reason": "; ".join(bad)}
+        return not bad
+
+    async def _service(self, *, runs: bool) -> bool:
+        """Whether it now runs as a service with this file."""
+        if self._path != config.DEFAULT_PATH or self._options.no_service or not installing.systemd_runs():
+            return False
+        what = "Restart the companion with it?" if runs else "Start the companion now, and at every boot?"
+        if not await self.asking.agrees(what):
+            return False
+        steps = []
+        try:
+            for step in installing.start_service():
+                steps.append(step)
+                self.asking.say(step.line())
+        except CompanionError as error:
+            steps.append(installing.Step("service", "failed", str(error)))
+            self.asking.say(str(error))
+        self.answer["steps"] = [dataclasses.asdict(step) for step in steps]
+        failed = [f"{step.what}: {step.words}" for step in steps if step.outcome == "failed"]
+        if failed:
+            self.answer |= {"state": "failed", "reason": "; ".join(failed)}
+        return not failed
+
+
+def _next_steps(parsed: Config, command: str, *, runs: bool, started: bool, good: bool) -> Iterator[str]:
+    if not good:
+        yield f"mend what is BAD above, then: {command} check"
+    service = command == "companion"
+    if runs and not started:
+        how = "sudo systemctl restart companion" if service else "end it, and start it again"
+        yield f"{how}   (it still runs with the old configuration)"
+    elif not started and service:
+        yield "sudo companion install-service   (starts it now, and at every boot)"
+    elif not started:
+        yield f"{command} run   (leave it running, and go on in another terminal)"
+    if parsed.gradienter is not None:
+        yield f"{command} align zero   (once: the gradienter's zero)"
+    yield f"{command} calibrate --wait   (disarmed, standing still, hands off)"
+
+
+def _absolute(port: str) -> str:
+    return os.path.abspath(port)
+
+
+def _same(port: str, other: str) -> bool:
+    """Whether two names are one device."""
+    return resolve(ROOT, port) == resolve(ROOT, other)

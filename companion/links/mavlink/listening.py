@@ -1,0 +1,71 @@
+"""Listening on a UDP port for MAVLink, without a word: which autopilot sends there, itself or by a router."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+from dataclasses import dataclass
+from typing import Any, Final
+
+from companion.errors import LinkError
+from companion.protocols.heartbeat import Heartbeat, heartbeats
+
+USUAL_PORTS: Final = (14540, 14550, 14551)
+"""PX4's for companions, the ground stations', and the second one that routers are usually given."""
+LISTEN_S: Final = 3.0
+"""Two heartbeats, and one that is lost."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeardUdp:
+    """What came to a UDP port."""
+
+    port: int
+    senders: tuple[Heartbeat, ...]
+    """Autopilots first."""
+    datagrams: int
+    from_here: bool
+    """Whether all of them came from this computer."""
+
+    @property
+    def autopilot(self) -> Heartbeat | None:
+        """The first one that speaks there."""
+        return next((one for one in self.senders if one.is_autopilot), None)
+
+
+async def listen_udp(port: int, *, host: str = "0.0.0.0", seconds: float = LISTEN_S) -> HeardUdp:  # noqa: S104
+    """Take what comes to a port until an autopilot is heard, or the time is over; nothing is sent.
+
+    Raises:
+        LinkError: the port cannot be opened; mostly because another program has it.
+    """
+    heard = _Heard()
+    try:
+        transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(lambda: heard, local_addr=(host, port))
+    except OSError as error:
+        raise LinkError(f"UDP {port}: {error.strerror or error}") from None
+    try:
+        async with asyncio.timeout(seconds):
+            await heard.enough.wait()
+    except TimeoutError:
+        pass
+    finally:
+        transport.close()
+    return HeardUdp(
+        port, tuple(sorted(heard.senders, key=lambda one: not one.is_autopilot)), heard.datagrams, heard.from_here
+    )
+
+
+class _Heard(asyncio.DatagramProtocol):
+    def __init__(self) -> None:
+        self.enough = asyncio.Event()
+        self.senders: dict[Heartbeat, None] = {}
+        self.datagrams = 0
+        self.from_here = True
+
+    def datagram_received(self, data: bytes, addr: tuple[Any, ...]) -> None:
+        self.datagrams += 1
+        self.from_here &= ipaddress.ip_address(addr[0]).is_loopback
+        self.senders |= dict.fromkeys(heartbeats(data))
+        if any(one.is_autopilot for one in self.senders):
+            self.enough.set()

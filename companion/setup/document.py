@@ -1,0 +1,172 @@
+"""The configuration file as a text that people read: values are changed in it, comments and all else stay.
+
+What is written is the sample configuration with values in it, or the owner's own file with other values: a commented
+line of the sample becomes a line that counts, a section that is commented out is switched on.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from companion.errors import CompanionError
+
+Table = dict[str, Any]
+
+_HEADER: Final = re.compile(r"(?P<off>#?)(?P<list>\[)?\[(?P<name>\w+)\]\]?\s*(?:#.*)?$")
+_KEY: Final = re.compile(r"(?:(?P<off>#)|\s*)(?P<key>\w+)\s*=.*?(?P<comment>\s+#[^\"']*)?$")
+
+
+@dataclass
+class _Block:
+    """A section's lines, its header the first; or what stands before all sections."""
+
+    name: str
+    on: bool
+    lines: list[str]
+
+    def last_key(self) -> int:
+        """The index of the last line that is a key, on or off, or the header."""
+        keys = [index for index, line in enumerate(self.lines) if index and _KEY.match(line)]
+        return keys[-1] if keys else 0
+
+    def set(self, key: str, value: Any) -> None:
+        """Let the section say so; None: let it say nothing of it."""
+        places = [(index, match) for index, line in enumerate(self.lines) if (match := _KEY.match(line))]
+        mine = sorted(
+            ((match["off"] is not None, index, match) for index, match in places if match["key"] == key),
+            key=lambda one: one[:2],
+        )
+        if value is None:
+            for off, index, _ in mine:
+                self.lines[index] = self.lines[index] if off else f"#{self.lines[index].lstrip()}"
+        elif mine:
+            _, index, match = mine[0]
+            self.lines[index] = f"{key} = {toml(value)}{match['comment'] or ''}"
+        else:
+            self.lines.insert(self.last_key() + 1, f"{key} = {toml(value)}")
+
+
+def toml(value: Any) -> str:
+    """A value as TOML has it: texts, numbers, truths, and lists of them."""
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml, value))}]"
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else repr(value)
+
+
+def render(text: str, wanted: Mapping[str, Any]) -> str:
+    """The text, changed so far that it says what is wanted; lines that say so already stay as they are.
+
+    Args:
+        text: of a file that can be read.
+        wanted: sections by name, each a table, or a list of tables.
+
+    Raises:
+        CompanionError: it is written in a way in which single lines cannot be changed.
+    """
+    blocks = list(_blocks(text))
+    now = tomllib.loads(text)
+    for name, section in wanted.items():
+        if isinstance(section, list):
+            _set_list(blocks, name, now.get(name, []), section)
+        else:
+            _set_table(_section(blocks, name), now.get(name, {}), section)
+    result = "\n".join(line for block in blocks for line in block.lines) + "\n"
+    try:
+        if tomllib.loads(result) == wanted:
+            return result
+    except tomllib.TOMLDecodeError:
+        pass
+    raise CompanionError("the file is not written line by line, so it cannot be changed line by line")
+
+
+def active_lines(text: str) -> list[str]:
+    """What counts of a file, each line below the comment that explains it."""
+    shown: list[str] = []
+    blocks = list(_blocks(text))
+    for before, block in itertools.pairwise(blocks):
+        if not block.on or not any(_is_on(line) for line in block.lines[1:]):
+            continue
+        shown += ["", *_comment_above(before.lines, len(before.lines)), block.lines[0]]
+        for index, line in enumerate(block.lines[1:], 1):
+            if _is_on(line):
+                shown += [*_comment_above(block.lines, index), line]
+    return shown[1:]
+
+
+def _is_on(line: str) -> bool:
+    match = _KEY.match(line)
+    return match is not None and match["off"] is None
+
+
+def _comment_above(lines: Sequence[str], end: int) -> list[str]:
+    """The comment that ends right before a line."""
+    begin = end
+    while begin and lines[begin - 1].startswith("# "):
+        begin -= 1
+    return list(lines[begin:end])
+
+
+def _blocks(text: str) -> Iterator[_Block]:
+    block = _Block("", on=False, lines=[])
+    for line in text.rstrip("\n").split("\n"):
+        if match := _HEADER.fullmatch(line):
+            yield block
+            block = _Block(match["name"], on=not match["off"], lines=[])
+        block.lines.append(line)
+    yield block
+
+
+def _section(blocks: list[_Block], name: str) -> _Block:
+    """The table of that name: one that is on, else one that is switched on, else a new one at the end."""
+    if (found := _first(blocks, name, on=True) or _switched_on(blocks, name)) is not None:
+        return found
+    blocks[-1].lines.append("")
+    blocks.append(_Block(name, on=True, lines=[f"[{name}]"]))
+    return blocks[-1]
+
+
+def _first(blocks: Sequence[_Block], name: str, *, on: bool) -> _Block | None:
+    return next((block for block in blocks if block.name == name and block.on == on), None)
+
+
+def _switched_on(blocks: Sequence[_Block], name: str) -> _Block | None:
+    if (block := _first(blocks, name, on=False)) is not None:
+        block.on, block.lines[0] = True, block.lines[0].removeprefix("#")
+    return block
+
+
+def _set_list(blocks: list[_Block], name: str, now: Sequence[Table], wanted: Sequence[Table]) -> None:
+    """Change the tables that are there, and add those that are not."""
+    there = [block for block in blocks if block.name == name and block.on]
+    for index, table in enumerate(wanted):
+        if index < len(there):
+            _set_table(there[index], now[index], table)
+            continue
+        # The commented table of the sample is a device on a port, and stands behind all others.
+        block = _switched_on(blocks, name) if "port" in table else None
+        _set_table(block or _behind(blocks, name), {}, table)
+
+
+def _behind(blocks: list[_Block], name: str) -> _Block:
+    """A new table of a list, behind the last one that is on."""
+    last = max((index for index, block in enumerate(blocks) if block.name == name and block.on), default=-1)
+    before = blocks[last]
+    cut = before.last_key() + 1
+    fresh = _Block(name, on=True, lines=[f"[[{name}]]", *before.lines[cut:]])
+    before.lines[cut:] = [""]
+    blocks.insert(last + 1 if last >= 0 else len(blocks), fresh)
+    return fresh
+
+
+def _set_table(block: _Block, now: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    for key in now.keys() - wanted.keys():
+        block.set(key, None)
+    for key, value in wanted.items():
+        if key not in now or now[key] != value:
+            block.set(key, value)

@@ -1,0 +1,212 @@
+"""The configuration that is being made: the file as it is, or the sample, with what was heard and answered in it."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import math
+import re
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, get_args
+
+from companion import config
+from companion.config.sections import Config, Law, Platform
+from companion.config.words import shown
+from companion.errors import CompanionError, ConfigError
+from companion.protocols.registry import PROTOCOLS, Kind
+from companion.rotations import ROTATIONS_DEG
+from companion.setup.document import Table, render
+from companion.setup.survey import FoundDevice
+
+UNDOCUMENTED_LAW: Final = "axis"
+"""What is taken where no document says it and nobody answers; it is then said to be a guess."""
+_LASTING: Final = {"name", "source", "mounting", "profile", "autopilot_instance"}
+"""What stays when another make of device takes a section over."""
+_NAMES: Final[dict[Kind, str]] = {"gradienter": "gradienter", "compass": "compass", "imu": "companion's own IMU"}
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """One of the things that cannot be found out."""
+
+    key: str
+    """As in the file: gradienter.law."""
+    words: str
+    hint: str
+    now: str
+    """The answer that holds if none is given."""
+    put: Callable[[str], None]
+    """Take an answer; raises ConfigError, in one line, where it is none."""
+
+
+@dataclass
+class Draft:
+    """A file on its way to another content.
+
+    Args:
+        text: as it is, or the sample.
+        is_new: it is the sample, whose values nobody has meant.
+    """
+
+    text: str
+    is_new: bool
+    wanted: Table = field(init=False)
+    guessed: set[str] = field(init=False, default_factory=set)
+    """Keys that nobody has said and no document tells."""
+
+    def __post_init__(self) -> None:
+        self.wanted = tomllib.loads(self.text)
+
+    def result(self) -> str:
+        """The text that it has become.
+
+        Raises:
+            CompanionError: single lines of it cannot be changed.
+        """
+        return render(self.text, self.wanted)
+
+    def parsed(self) -> Config:
+        """The configuration that it has become.
+
+        Raises:
+            ConfigError: in one line, what is wrong.
+        """
+        # Names of saved profiles are for the daemon to look up.
+        return config.parse(self.result(), "answer", lambda _: None)
+
+    @property
+    def url(self) -> str | None:
+        """The autopilot's, where somebody has said it."""
+        return None if self.is_new else str(self.wanted["mavlink"]["url"])
+
+    def take_url(self, url: str) -> None:
+        """The autopilot is there.
+
+        Raises:
+            ConfigError: nothing can be.
+        """
+        self._put("mavlink", "url", url)
+        self.is_new = False
+
+    def keep_beside(self, path: Path) -> None:
+        """Let records and socket lie beside the file: where the service has them its owner may not write."""
+        folder = path.absolute().parent
+        self._put("storage", "directory", str(folder / "companion-state"))
+        self._put("control", "socket", str(folder / "companion.sock"))
+
+    def section(self, kind: Kind) -> Table | None:
+        """What there is of a device: of IMUs the first on a port of its own."""
+        if kind == "imu":
+            return next((imu for imu in self.wanted["imu"] if imu.get("source") == "serial"), None)
+        found: Table | None = self.wanted.get(kind)
+        return found
+
+    def take(self, found: FoundDevice) -> None:
+        """Let a device have its section; of another make than before it brings nothing of that along."""
+        section = self.section(found.kind)
+        if section is None:
+            section = {"name": "own", "source": "serial"} if found.kind == "imu" else {}
+            if found.kind == "imu":
+                self.wanted["imu"].append(section)
+            else:
+                self.wanted[found.kind] = section
+        elif section.get("protocol") != found.protocol:
+            for key in section.keys() - _LASTING:
+                del section[key]
+        section |= {"port": found.port, "protocol": found.protocol, "baud": found.line.baud}
+        if found.kind != "imu":
+            section["parity"] = found.line.parity
+        if found.kind == "gradienter" and "law" not in section:
+            known = PROTOCOLS["gradienter"][found.protocol].law
+            section["law"] = known or UNDOCUMENTED_LAW
+            if known is None:
+                self.guessed.add("gradienter.law")
+
+    def questions(self) -> Iterator[Question]:
+        """What has to be asked, with the answer that holds at present."""
+        yield Question(
+            "vehicle.platform",
+            "Where is it calibrated: on the ground, or on a deck (a boat)?",
+            "",
+            self.wanted.get("vehicle", {}).get("platform", "ground"),
+            lambda words: self._put("vehicle", "platform", _one_of(words, get_args(Platform)), "ground"),
+        )
+        if (gradienter := self.section("gradienter")) is not None:
+            known = PROTOCOLS["gradienter"][gradienter["protocol"]].law
+            yield Question(
+                "gradienter.law",
+                "What do the gradienter's two readings mean: axis, slope or euler?",
+                f"Its documents say {known}."
+                if known
+                else "Its data sheet tells, or docs/calibration.md. A wrong one costs milli-g.",
+                gradienter["law"],
+                lambda words: self._put("gradienter", "law", _one_of(words, get_args(Law))),
+            )
+        kinds: Sequence[Kind] = ("gradienter", "compass", "imu")
+        for kind in kinds:
+            if (section := self.section(kind)) is not None:
+                yield Question(
+                    f"{kind}.mounting",
+                    f"How is the {_NAMES[kind]} turned in the aircraft, seen from above: 0, 90, 180 or 270?",
+                    "Degrees clockwise; 0: its front is to the aircraft's front. Or ROLL PITCH YAW, or ROTATION_...",
+                    mounting_words(section.get("mounting", "ROTATION_NONE")),
+                    functools.partial(self._put_mounting, kind),
+                )
+
+    def _put_mounting(self, kind: Kind, words: str) -> None:
+        self._put(kind, "mounting", _mounting(words), "ROTATION_NONE")
+
+    def _put(self, name: str, key: str, value: Any, default: Any = None) -> None:
+        """Let a section say it; what holds anyway need not be said."""
+        before = copy.deepcopy(self.wanted)
+        section = self.section("imu") if name == "imu" else self.wanted.get(name)
+        if value != default or key in (section or {}):
+            (self.wanted.setdefault(name, {}) if section is None else section)[key] = value
+            self._check(before)
+        self.guessed.discard(f"{name}.{key}")
+
+    def _check(self, before: Table) -> None:
+        try:
+            self.parsed()
+        except CompanionError as error:
+            self.wanted = before
+            raise ConfigError(str(error).removeprefix("answer: ")) from None
+
+
+def _one_of(words: str, allowed: Sequence[str]) -> str:
+    """The choice that begins so."""
+    found = [choice for choice in allowed if words and choice.startswith(words.strip().lower())]
+    if len(found) != 1:
+        raise ConfigError(f"found {shown(words)}; allowed: {', '.join(allowed)}")
+    return found[0]
+
+
+def _mounting(words: str) -> str | list[float]:
+    """A mounting as it is typed: an angle, three of them, or a rotation's name."""
+    name = words.strip().upper().replace(" ", "_")
+    for candidate in (name, f"ROTATION_{name}"):
+        if candidate in ROTATIONS_DEG:
+            return candidate
+    try:
+        angles = [float(word) for word in re.split(r"[,\s]+", words.strip("[] "))]
+    except ValueError:
+        angles = []
+    if len(angles) == 1:
+        angles = [0.0, 0.0, angles[0]]
+    if len(angles) != 3 or not all(map(math.isfinite, angles)):
+        raise ConfigError(f"found {shown(words)}; allowed: an angle, ROLL PITCH YAW in degrees, or a ROTATION_...")
+    named = (f"ROTATION_YAW_{angles[2] % 360:g}" if angles[2] % 360 else "ROTATION_NONE") if not any(angles[:2]) else ""
+    return named if named in ROTATIONS_DEG else angles
+
+
+def mounting_words(mounting: Any) -> str:
+    """A mounting as `Question.put` takes it."""
+    if not isinstance(mounting, str):
+        return " ".join(f"{angle:g}" for angle in mounting)
+    if mounting == "ROTATION_NONE":
+        return "0"
+    yaw = mounting.removeprefix("ROTATION_YAW_")
+    return yaw if yaw.isdigit() else mounting

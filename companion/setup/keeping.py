@@ -1,0 +1,70 @@
+"""The configuration file on disk: what is there, and how another content takes its place without losing the old one."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from companion import config
+from companion.errors import CompanionError, ConfigError
+from companion.installation import install as installing
+from companion.setup.draft import Draft
+from companion.storage.state import read_regular, write_atomically
+
+
+def sample() -> str:
+    """The sample configuration that this companion brings."""
+    return installing.content(installing.CONFIGURATION).decode()
+
+
+def begin(path: Path) -> Draft:
+    """The configuration as it is; the sample where there is none, or only the sample.
+
+    Raises:
+        ConfigError: there is one, and it cannot be used; in one line.
+    """
+    try:
+        text = read_regular(path, config.MOST_BYTES).decode()
+    except FileNotFoundError:
+        return Draft(sample(), is_new=True)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from None
+    if text == sample():
+        return Draft(text, is_new=True)
+    config.parse(text, str(path), lambda _: None)
+    return Draft(text, is_new=False)
+
+
+def check_writable(path: Path) -> None:
+    """Whether the file may be written, before anybody is asked anything.
+
+    Raises:
+        CompanionError: it may not; says what to type.
+    """
+    folder = path.parent
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
+        raise CompanionError(
+            f"{path} is not yours to write: sudo companion setup, or companion -c FILE setup for a file of your own"
+        )
+
+
+def put(path: Path, text: str) -> Path | None:
+    """Write the file at once and whole; where the old content went, None if there was none.
+
+    Raises:
+        StorageError: it cannot be written; then the old one is still there.
+    """
+    # What is behind a link is replaced, not the link.
+    path = path.resolve()
+    kept, mode = None, installing.MODE
+    if path.exists():
+        kept = next(
+            name for number in range(1, 1000) if not (name := path.with_name(f"{path.name}.old{number}")).exists()
+        )
+        mode = stat.S_IMODE(path.stat().st_mode)
+        write_atomically(kept, path.read_bytes(), mode=mode)
+    write_atomically(path, text.encode(), mode=mode)
+    return kept

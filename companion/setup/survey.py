@@ -1,0 +1,124 @@
+"""What is connected: autopilots on serial and UDP ports, devices on serial ports. Only listens, never says a byte."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from companion.errors import LinkError
+from companion.links.mavlink.listening import HeardUdp, listen_udp
+from companion.links.serial.listening import Heard, listen_to_all
+from companion.protocols.guess import Line
+from companion.protocols.heartbeat import Heartbeat
+from companion.protocols.registry import Kind, main_kind
+
+AUTOPILOT_LINES: Final = tuple(Line(baud, "none") for baud in (57600, 921600, 115200))
+"""ArduPilot's usual speed, PX4's TELEM 2's, and what both are set to by hand; believed first on every port."""
+
+
+@dataclass(frozen=True, slots=True)
+class FoundAutopilot:
+    """An autopilot, and how to reach it."""
+
+    url: str
+    who: Heartbeat
+
+    def __str__(self) -> str:
+        """For people."""
+        return f"{self.who}: {self.url}"
+
+
+@dataclass(frozen=True, slots=True)
+class FoundDevice:
+    """A device on a serial port."""
+
+    port: str
+    protocol: str
+    line: Line
+    kind: Kind
+    """What it is bought as."""
+    also: tuple[Kind, ...]
+    """What else it can serve as, at a pinch."""
+
+    def __str__(self) -> str:
+        """For people."""
+        return f"{self.protocol}: {self.port}, {self.line}"
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What was heard on every port that was listened to."""
+
+    serial: dict[str, Heard | str]
+    """By port; words: why it was not listened to."""
+    udp: dict[int, HeardUdp | str]
+
+    @property
+    def autopilots(self) -> list[FoundAutopilot]:
+        """Those on wires of their own first."""
+        wired = [
+            FoundAutopilot(f"serial:{port}:{heard.line.baud}", heard.heartbeat)
+            for port, heard in self.serial.items()
+            if not isinstance(heard, str) and heard.heartbeat is not None and heard.line is not None
+        ]
+        return wired + [
+            FoundAutopilot(f"udpin:{'127.0.0.1' if heard.from_here else '0.0.0.0'}:{port}", heard.autopilot)  # noqa: S104
+            for port, heard in self.udp.items()
+            if not isinstance(heard, str) and heard.autopilot is not None
+        ]
+
+    def devices(self, kind: Kind) -> list[FoundDevice]:
+        """Those that are bought as this."""
+        found = []
+        for port, heard in self.serial.items():
+            if isinstance(heard, str) or heard.candidate is None or heard.line is None:
+                continue
+            protocol, kinds = heard.candidate.protocol, heard.candidate.kinds
+            main = main_kind(protocol)
+            if main == kind:
+                also = tuple(each for each in kinds if each != main)
+                found.append(FoundDevice(port, protocol, heard.line, main, also))
+        return found
+
+
+Tell = Callable[[str, str], None]
+"""Is told what was heard at a place, in words."""
+
+
+async def survey(ports: Sequence[str], udp: Sequence[int], tell: Tell) -> Survey:
+    """Listen to all at the same time; half a minute at the most."""
+
+    async def one(port: int) -> HeardUdp | str:
+        found: HeardUdp | str
+        try:
+            found = await listen_udp(port)
+        except LinkError as error:
+            found = str(error)
+        tell(f"UDP {port}", _in_words(found))
+        return found
+
+    serial, datagrams = await asyncio.gather(
+        listen_to_all(ports, AUTOPILOT_LINES, lambda port, found: tell(port, _in_words(found))),
+        asyncio.gather(*(one(port) for port in udp)),
+    )
+    return Survey(serial, dict(zip(udp, datagrams, strict=True)))
+
+
+def _in_words(found: Heard | HeardUdp | str) -> str:
+    if isinstance(found, str):
+        return f"left alone: {found}"
+    if isinstance(found, HeardUdp):
+        if found.senders:
+            return "; ".join(map(str, found.senders))
+        return "silent" if not found.datagrams else "something that is no MAVLink"
+    if found.heartbeat is not None:
+        return f"{found.heartbeat} ({found.line})"
+    if found.candidate is not None:
+        return f"{found.candidate.protocol}, a device for {main_kind(found.candidate.protocol)} ({found.line})"
+    if found.stranger is not None:
+        return found.stranger
+    return (
+        "silent (power? wires? some devices only answer)" if not found.bytes_heard else "nothing known; levels? wires?"
+    )

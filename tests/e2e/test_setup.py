@@ -1,0 +1,341 @@
+"""`companion setup` at a terminal and by a script: simulated devices on UARTs, both autopilots on UDP and on a wire."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import socket
+import sys
+import termios
+import tomllib
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.firmware.double import AutopilotDouble
+from sim.pty_device import PtyDevice, reader_setting
+from sim.scenario import demo
+from sim.uart import Setting, heard
+from sim.udp import open_udp
+from tests.support.chatter import Chatter
+from tests.support.terminal import CTRL_C, CTRL_D, Terminal
+
+Firmware = Literal["ardupilot", "px4"]
+LINES = {"gradienter": Setting(9600, "none"), "compass": Setting(19200, "none"), "imu": Setting(115200, "none")}
+
+
+def free_udp() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+class Bench:
+    """Simulated devices on ports below a folder, an autopilot, and how to call the command."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.file, self.udp = folder, folder / "companion.toml", free_udp()
+        self.told: list[bytes] = []
+        """All that the autopilot was sent."""
+
+    def words(self, *ports: str, silent: int = 0) -> list[str]:
+        """Arguments: these ports, and the autopilot's UDP port or one where nobody is."""
+        paths = [str(self.folder / port) for port in ports]
+        return ["-c", str(self.file), "setup", *paths, "--udp", str(silent or self.udp)]
+
+    def configuration(self) -> dict[str, Any]:
+        """What the file says."""
+        return tomllib.loads(self.file.read_text())
+
+    def left(self) -> set[str]:
+        """Files beside the ports."""
+        return {path.name for path in self.folder.iterdir() if path.is_file() and path.name not in LINES}
+
+
+@contextlib.asynccontextmanager
+async def bench(folder: Path, *, firmware: Firmware = "ardupilot", on_wire: bool = False) -> AsyncIterator[Bench]:
+    """The demonstration's aircraft: devices as from the factory, the autopilot on UDP or on a serial port."""
+    made, scenario = Bench(folder), demo(firmware=firmware)
+    loop = asyncio.get_running_loop()
+    scenario.aircraft.begin(loop.time())
+    autopilot, receive = scenario.autopilot, scenario.autopilot.receive
+
+    def told(data: bytes, t_s: float) -> None:
+        made.told.append(data)
+        receive(data, t_s)
+
+    autopilot.receive = told  # type: ignore[method-assign]
+    async with contextlib.AsyncExitStack() as stack:
+        for name, device in scenario.ports.items():
+            await stack.enter_async_context(PtyDevice(device, folder / name, line=LINES[name]))
+        if on_wire:
+            await stack.enter_async_context(wired(autopilot, folder / "telem", Setting(57600, "none")))
+        else:
+            stack.callback((await open_udp(autopilot, target=("127.0.0.1", made.udp))).close)
+        running = asyncio.create_task(autopilot.run())
+        try:
+            yield made
+        finally:
+            running.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await running
+
+
+@contextlib.asynccontextmanager
+async def wired(autopilot: AutopilotDouble, path: Path, line: Setting) -> AsyncIterator[None]:
+    """The autopilot's telemetry port as a UART of this speed."""
+    wire = Chatter(path, lambda _: b"")
+    wire.plug(path)
+    loop = asyncio.get_running_loop()
+
+    def send(data: bytes) -> None:
+        with contextlib.suppress(OSError):
+            os.write(wire.master, heard(data, line, reader_setting(wire.master)))
+
+    async def listen() -> None:
+        while True:
+            with contextlib.suppress(OSError):
+                autopilot.receive(os.read(wire.master, 4096), loop.time())
+            await asyncio.sleep(0.01)
+
+    autopilot.attach(send)
+    listening = asyncio.create_task(listen())
+    try:
+        yield
+    finally:
+        listening.cancel()
+        autopilot.attach(None)
+        wire.unplug()
+
+
+async def answered(terminal: Terminal, *answers: str) -> None:
+    """Each of the five questions, in their order."""
+    questions = ("on the ground", "axis, slope or euler", "gradienter turned", "compass turned", "own IMU turned")
+    for question, words in zip(questions, answers, strict=True):
+        await terminal.answer(question, words)
+
+
+async def by_script(made: Bench, *words: str) -> tuple[int, Any, str]:
+    """Exit code, the JSON object, and what people are told."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "companion", *words, "--yes", "--json",
+        stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}, cwd=made.folder,
+    )  # fmt: skip
+    out, err = await process.communicate()
+    return await process.wait(), json.loads(out) if out else None, err.decode()
+
+
+def test_a_person_answers_and_has_a_configuration_that_works(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with bench(tmp_path) as made, Terminal(made.words(*LINES), tmp_path) as terminal:
+            said = await terminal.says("Ctrl-C ends")
+            assert made.told == [], "it only listens"
+            assert f"UDP {made.udp}: ArduPilot, system 1" in said
+            await answered(terminal, "", "eu", "180", "0", "yaw 90")
+            shown = await terminal.says(r"Write it\?")
+            assert "# What its two readings mean" in shown
+            await terminal.answer("", "")
+            checked = await terminal.says("Next:")
+            assert await terminal.ended() == 0, terminal.screen
+            assert "BAD" not in checked
+            assert "calibrate --wait" in terminal.screen
+            assert made.configuration()["mavlink"]["url"] == f"udpin:127.0.0.1:{made.udp}"
+            assert made.configuration()["gradienter"] == {
+                "port": str(tmp_path / "gradienter"), "protocol": "inclinometer_xy", "law": "euler", "baud": 9600,
+                "parity": "none", "mounting": "ROTATION_YAW_180",
+            }  # fmt: skip
+            assert made.configuration()["compass"]["protocol"] == "hmr3300"
+            assert made.configuration()["compass"]["baud"] == 19200
+            assert made.configuration()["imu"][1]["mounting"] == "ROTATION_YAW_90"
+            assert made.left() == {"companion.toml"}
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+def test_a_script_has_gyros_of_an_autopilot_on_a_wire_alone(tmp_path: Path, firmware: Firmware) -> None:
+    async def main() -> None:
+        async with bench(tmp_path, firmware=firmware, on_wire=True) as made:
+            code, answer, told = await by_script(made, *made.words("telem"), "--platform", "deck")
+            name = {"ardupilot": "ArduPilot", "px4": "PX4"}[firmware]
+            assert answer["heard"][str(tmp_path / "telem")] == f"{name}, system 1 (57600 8N1)"
+            assert code == 0, told
+            assert made.configuration()["mavlink"]["url"] == f"serial:{tmp_path}/telem:57600"
+            assert made.configuration()["vehicle"]["platform"] == "deck"
+            assert made.configuration().keys() & {"gradienter", "compass"} == set()
+            assert (answer["state"], answer["reason"], answer["guessed"]) == ("done", "", [])
+            assert [finding["name"] for finding in answer["findings"] if not finding["good"]] == []
+            assert "no gradienter: gyros only" in told.lower()
+            assert answer["next"][-1].split("   ")[0] == f"companion -c {made.file} calibrate --wait"
+
+    asyncio.run(main())
+
+
+def test_nothing_but_heartbeats_at_the_last_speed_is_enough(tmp_path: Path) -> None:
+    codec = mavlink.MAVLink(None, srcSystem=3, srcComponent=1)
+    frame = bytes(codec.heartbeat_encode(2, 3, 0, 0, 3).pack(codec))
+
+    async def main() -> None:
+        made = Bench(tmp_path)
+        line = Setting(460800, "none")
+        async with Chatter(tmp_path / "telem", lambda _: frame, rate_hz=1.0, line=line):
+            code, answer, told = await by_script(made, *made.words("telem"), "--no-check")
+            assert code == 0, told
+            assert answer["configuration"]["mavlink"]["url"] == f"serial:{tmp_path}/telem:460800"
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("at", [0, 1, 3, 6])
+def test_whoever_ends_it_at_any_question_leaves_all_as_it_was(tmp_path: Path, at: int) -> None:
+    async def main() -> None:
+        async with bench(tmp_path) as made, Terminal(made.words(*LINES), tmp_path) as terminal:
+            if at:
+                await terminal.says("Ctrl-C ends")
+                for _ in range(at - 1):
+                    await terminal.answer("")
+                await terminal.says("> ")
+                terminal.types(CTRL_D if at == 3 else CTRL_C)
+            else:
+                await terminal.says("Listening")
+                terminal.types(CTRL_C)
+            assert await terminal.ended() == 1, terminal.screen
+            await terminal.says("nothing was written")
+            assert "Traceback" not in terminal.screen
+            assert made.left() == set()
+            assert made.told == []
+
+    asyncio.run(main())
+
+
+def test_bad_answers_get_one_line_each_and_are_asked_again(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with bench(tmp_path) as made, Terminal([*made.words("gradienter"), "--no-check"], tmp_path) as terminal:
+            for question, *bad in (
+                ("on the ground", "water"),
+                ("axis, slope or euler", "x" * 3000, "\x1b[2J"),
+                ("gradienter turned", "90 0", "ROTATION_ROLL_180"),
+                (r"Write it\?", "perhaps"),
+            ):
+                await terminal.says(f"(?s){question}.*?> ")
+                for words in bad:
+                    terminal.types(f"{words}\n")
+                    complaint = await terminal.says("\n  .*found .*; allowed.*\n")
+                    assert len(complaint.splitlines()[-1]) < 250
+                    await terminal.says("> ")
+                terminal.types("\n")
+            assert await terminal.ended() == 0
+            assert made.configuration()["gradienter"]["law"] == "axis"
+
+    asyncio.run(main())
+
+
+def test_again_it_reads_what_is_there_and_keeps_the_old_file(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with bench(tmp_path) as made:
+            first = [*made.words("gradienter"), "--no-check"]
+            assert (await by_script(made, *first, "--law", "slope"))[0] == 0
+            made.file.write_text(made.file.read_text().replace('"slope"', '"slope"  # by two positions') + "# mine\n")
+            made.file.chmod(0o600)
+            before = made.file.read_bytes()
+            code, answer, _ = await by_script(made, *first)
+            assert (code, answer["state"], answer["kept"]) == (0, "unchanged", None)
+            assert made.file.read_bytes() == before
+            async with Terminal(first, tmp_path) as terminal:
+                await terminal.answer("on the ground", "deck")
+                await terminal.answer("axis, slope or euler")
+                await terminal.answer("gradienter turned")
+                await terminal.answer(r"Write it\?")
+                assert await terminal.ended() == 0, terminal.screen
+            assert made.configuration()["vehicle"]["platform"] == "deck"
+            assert 'law = "slope"  # by two positions\n' in made.file.read_text()
+            assert made.file.read_text().endswith("# mine\n")
+            assert made.file.stat().st_mode & 0o777 == 0o600
+            assert made.file.with_name("companion.toml.old1").read_bytes() == before
+            assert made.left() == {"companion.toml", "companion.toml.old1"}
+
+    asyncio.run(main())
+
+
+def test_what_is_configured_and_silent_today_stays(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with bench(tmp_path) as made:
+            assert (await by_script(made, *made.words(*LINES), "--no-check"))[0] == 0
+            before = made.file.read_bytes()
+        # The bench is switched off: no port, no autopilot.
+        code, answer, told = await by_script(made, *made.words(*LINES), "--no-check")
+        assert (code, answer["state"]) == (0, "unchanged"), told
+        assert made.file.read_bytes() == before
+
+    asyncio.run(main())
+
+
+def test_a_port_that_somebody_holds_is_not_opened(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with bench(tmp_path) as made:
+            holder = os.open(tmp_path / "gradienter", os.O_RDWR | os.O_NOCTTY)
+            taken = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            taken.bind(("0.0.0.0", 0))
+            try:
+                speed = termios.tcgetattr(holder)
+                number = str(taken.getsockname()[1])
+                code, answer, _ = await by_script(
+                    made, *made.words("gradienter", "compass"), "--udp", number, "--no-check"
+                )
+                assert code == 0
+                port = str(tmp_path / "gradienter")
+                assert f"process {os.getpid()}" in answer["heard"][port]
+                assert answer["heard"][f"UDP {number}"] == f"left alone: UDP {number}: Address already in use"
+                assert termios.tcgetattr(holder) == speed
+                assert "gradienter" not in made.configuration()
+            finally:
+                os.close(holder)
+                taken.close()
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        ([], "no autopilot was heard"),
+        (["--mavlink", "udpin:nowhere"], "'mavlink.url': found 'udpin:nowhere'"),
+        (["--mavlink", "udpin:0.0.0.0:14550", "--law", "axis"], "gradienter.law: there is no such device"),
+        (["--mavlink", "udpin:0.0.0.0:14550", "--mounting", "hat=90"], "--mounting: found 'hat=90'"),
+        (["--mavlink", "udpin:0.0.0.0:14550", "--platform", "sea"], "vehicle.platform: found 'sea'"),
+    ],
+)
+def test_a_script_that_cannot_go_on_writes_nothing(tmp_path: Path, words: list[str], reason: str) -> None:
+    async def main() -> None:
+        made = Bench(tmp_path)
+        code, _, told = await by_script(made, *made.words("nobody"), *words)
+        assert code in (1, 2)
+        assert reason in told.splitlines()[-1]
+        assert told.splitlines()[-1].endswith("nothing was written")
+        assert made.left() == set()
+
+    asyncio.run(main())
+
+
+def test_a_damaged_file_is_not_replaced_unasked(tmp_path: Path) -> None:
+    async def main() -> None:
+        made = Bench(tmp_path)
+        made.file.write_text("[mavlnk]\n")
+        code, _, told = await by_script(made, *made.words("nobody"), "--mavlink", "udpin:0.0.0.0:14550")
+        assert code == 2
+        assert "did you mean 'mavlink'?; nothing was written" in told
+        async with Terminal([*made.words("nobody"), "--mavlink", "udpin:0.0.0.0:14550", "--no-check"], tmp_path) as one:
+            await one.answer("Begin anew", "yes")
+            await one.answer("on the ground")
+            await one.answer(r"Write it\?")
+            assert await one.ended() == 0
+        assert made.configuration()["mavlink"]["url"] == "udpin:0.0.0.0:14550"
+        assert made.file.with_name("companion.toml.old1").read_text() == "[mavlnk]\n"
+
+    asyncio.run(main())
