@@ -19,8 +19,11 @@ from sim.earth import angles_of, axis_rotation, body_from_ned
 from sim.motions import Handling, Turn
 
 TAKES_S: Final = 6.0
-HELP: Final = "turn DEG | tilt PITCH ROLL | back | bump PITCH ROLL"
-_EXAMPLES: Final = "turn 180: clockwise on its spot; tilt 20 0: nose up; back: onto its spot; bump 0.3 0: the spot tips"
+HELP: Final = "turn DEG | tilt PITCH ROLL | hold PITCH ROLL | spot PITCH ROLL | back | bump PITCH ROLL"
+_EXAMPLES: Final = (
+    "turn 180: clockwise on its spot; tilt 20 0: nose up; hold 0 180: on its back, whatever the spot; spot 3 0:"
+    " onto another one, which slopes; back: onto its spot; bump 0.3 0: the spot tips"
+)
 
 
 class Hands:
@@ -59,6 +62,19 @@ class Hands:
         attitude = axis_rotation(0, -math.radians(roll_deg)) @ axis_rotation(1, -math.radians(pitch_deg)) @ attitude
         return self._go(t_s, attitude)
 
+    def hold(self, t_s: float, pitch_deg: float, roll_deg: float) -> float:
+        """Prop it up anywhere, in any orientation: nose up, right side down, from the horizon."""
+        return self._go(t_s, self._held(pitch_deg, roll_deg))
+
+    def spot(self, t_s: float, pitch_deg: float, roll_deg: float) -> float:
+        """Put it onto another spot, on which it stands like this at first."""
+        self._spot, self._turned_deg = self._held(pitch_deg, roll_deg), 0.0
+        return self.back(t_s)
+
+    def _held(self, pitch_deg: float, roll_deg: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+        """As it heads now."""
+        return body_from_ned(*(math.radians(a) for a in (roll_deg, pitch_deg, self._now.heading_deg)))
+
     def bump(self, pitch_deg: float, roll_deg: float) -> None:
         """Tip the spot itself, nose up and right side down as the aircraft was at first; seen at the next placing."""
         tipped = axis_rotation(0, -math.radians(roll_deg)) @ axis_rotation(1, -math.radians(pitch_deg))
@@ -91,6 +107,10 @@ class Hands:
                 self.turn(t_s, figures[0])
             elif word == "tilt" and len(figures) == 2:
                 self.tilt(t_s, figures[0], figures[1])
+            elif word == "hold" and len(figures) == 2:
+                self.hold(t_s, figures[0], figures[1])
+            elif word == "spot" and len(figures) == 2:
+                self.spot(t_s, figures[0], figures[1])
             elif word == "back" and not figures:
                 self.back(t_s)
             elif word == "bump" and len(figures) == 2:

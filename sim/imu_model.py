@@ -214,6 +214,7 @@ class ImuModel:
         gyro_bias_rad_s, accel_bias_m_s2: bias at aircraft time 0 and reference temperature.
         gyro_scale, accel_scale: relative scale errors of the three axes.
         gyro_misalignment_rad, accel_misalignment_rad: small rotation of the triad.
+        accel_shear: how far x and y, x and z, y and z are from square.
         mounting_deg: roll, pitch, yaw of the sensor's axes seen from the vehicle's (a MAVLink rotation's angles).
         thermometer_off_k: what its own thermometer shows too much.
     """
@@ -230,6 +231,7 @@ class ImuModel:
         accel_scale: Sequence[float] = (0.0, 0.0, 0.0),
         gyro_misalignment_rad: Sequence[float] = (0.0, 0.0, 0.0),
         accel_misalignment_rad: Sequence[float] = (0.0, 0.0, 0.0),
+        accel_shear: Sequence[float] = (0.0, 0.0, 0.0),
         mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
         thermometer_off_k: float = 0.0,
     ) -> None:
@@ -250,7 +252,7 @@ class ImuModel:
         self._seen: Truth | None = None
         self._ideal = np.zeros(6)
         self._gyro_matrix = _response(gyro_scale, gyro_misalignment_rad) @ self.mounting.T
-        self._accel_matrix = _response(accel_scale, accel_misalignment_rad) @ self.mounting.T
+        self._accel_matrix = _response(accel_scale, accel_misalignment_rad, accel_shear) @ self.mounting.T
 
     def turn_on(self, gyro_bias_rad_s: Sequence[float] | Array, accel_bias_m_s2: Sequence[float] | Array) -> None:
         """Another power-up: the bias begins elsewhere."""
@@ -284,6 +286,11 @@ class ImuModel:
         """The same turned into the vehicle's FRD."""
         gyro, accel = self.true_bias(t_s)
         return Bias(self.mounting @ gyro, self.mounting @ accel)
+
+    def in_accel_axes(self, force_m_s2: Array) -> Array:
+        """What the accelerometers make of a specific force (3,) in the vehicle's axes, without bias and noise."""
+        result: Array = self._accel_matrix @ force_m_s2
+        return result
 
     def error_in_vehicle(self, t_s: float) -> Bias:
         """All of the reading that is not truth, scale and misalignment included, without noise, in vehicle FRD."""
@@ -346,8 +353,13 @@ def _thin(t_s: Array) -> Array:
     return np.linspace(t_s[0], t_s[-1], max(2, int((t_s[-1] - t_s[0]) / SLOW_STEP_S) + 2))
 
 
-def _response(scale: Sequence[float], misalignment_rad: Sequence[float]) -> Array:
+def _response(
+    scale: Sequence[float], misalignment_rad: Sequence[float], shear: Sequence[float] = (0.0, 0.0, 0.0)
+) -> Array:
     x, y, z = misalignment_rad
     skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    result: Array = np.diag(1.0 + np.asarray(scale, dtype=np.float64)) @ (np.eye(3) - skew)
+    xy, xz, yz = shear
+    stretch = np.diag(1.0 + np.asarray(scale, dtype=np.float64))
+    stretch += np.array([[0.0, xy, xz], [xy, 0.0, yz], [xz, yz, 0.0]])
+    result: Array = stretch @ (np.eye(3) - skew)
     return result

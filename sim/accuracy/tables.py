@@ -8,6 +8,8 @@ from typing import Any, Final
 import numpy as np
 
 from sim.accuracy import deck_tables, paper, turning, warmup_table
+from sim.accuracy.by_hand import table as by_hand_table
+from sim.accuracy.by_hand.stands import BY_HAND, by_hand
 from sim.accuracy.experiments import (
     FIELD_HEADING_DEG,
     FIELD_TILT_DEG,
@@ -51,7 +53,8 @@ def report(
 
     Args:
         runs: stands with white noise; a fifth of it of every part, a hundredth of it in every case of a warm-up, a
-            twentieth for every step of noise under integers, a thirty-second of every rate of a ground that turns.
+            twentieth for every step of noise under integers, a thirty-second of every rate of a ground that turns,
+            a tenth of it aircraft that are turned by hand.
         seed: of everything.
         only: of `cli.SECTIONS`.
         jobs: processes.
@@ -90,6 +93,11 @@ def report(
         each = max(runs // 32, 2)
         progress(f"turning: {each} stands of each of {len(turning.RATES_DEG_S)} rates")
         found["turning"] = turning.section(each, seed, jobs)
+    if "by-hand" in only:
+        each = max(runs // 10, 1)
+        progress(f"by hand: {each} aircraft of each of {len(BY_HAND)} parts")
+        boards = [(part, seed, number) for part in BY_HAND for number in range(each)]
+        found["by-hand"] = by_hand_table.section(many(by_hand, boards, jobs), each)
     if "paper" in only:
         found["paper"] = _paper(errata(seed, 400))
     return found

@@ -35,6 +35,8 @@ SPOT_W_LIMIT: Final = 3.9
 DETERMINED: Final = 0.2
 """A figure counts as determined where its sigma is below this share of what was known before."""
 _LEAST_REDUNDANCY: Final = 1e-3
+MOST_TURNED_DEG: Final = 30.0
+"""Of an IMU against the base: more is another orientation than the one configured."""
 LEVEL: Final = -DOWN
 
 
@@ -61,7 +63,7 @@ class ImuAlignment:
     shear: Figures
     """xy, xz, yz."""
     misalignment_rad: Figures
-    """Small rotation from the gradienter's axes to this IMU's."""
+    """Rotation vector from the axes of gradienter and base to this IMU's."""
     gyro_bias_rad_s: Figures
 
 
@@ -116,6 +118,10 @@ def align(
     try:
         at = model.begin([_first_attitude(law, vehicle_from_sensor, stand) for stand in stands])
         at, residual, scaled, rows = _solve(model, at)
+        for name, imu in zip(model.names, at.imus, strict=True):
+            turned_deg = abs(math.remainder(float(np.linalg.norm(imu[Part.MISALIGNMENT])) / DEG, 360.0))
+            if turned_deg > MOST_TURNED_DEG:
+                raise ValueError(f"imu {name} would sit turned by {turned_deg:.0f} deg")
     except (ValueError, np.linalg.LinAlgError) as error:
         raise CalibrationRefusedError(
             f"the readings do not belong together ({error}): check the gradienter's law and mounting"
@@ -266,20 +272,8 @@ def _imu(model: Model, at: Unknowns, covariance: Matrix, k: int) -> ImuAlignment
 
 
 def _level_bias(model: Model, at: Unknowns, k: int) -> tuple[Array, Matrix]:
-    """Reading minus gravity of a level aircraft, and its derivatives; to first order in scale, shear, misalignment.
+    """Reading minus gravity of a level aircraft, and its derivatives.
 
     Gravity is what the place says, as in a calibration: where it is off, so is that.
     """
-    gravity, up = at.gravity_m_s2, LEVEL
-    by = np.zeros((3, model.size))
-    by[:, model.imu(k, Part.MISALIGNMENT)] = gravity * skew(up)
-    by[:, model.imu(k, Part.SCALE)] = gravity * np.diag(up)
-    by[:, model.imu(k, Part.SHEAR)] = gravity * np.array(
-        [[up[1], up[2], 0.0], [up[0], 0.0, up[2]], [0.0, up[0], up[1]]]
-    )
-    by[:, model.imu(k, Part.ACCEL_BIAS)] = np.eye(3)
-    by[:, model.gravity] = up[:, None]
-    value = np.sum(
-        [by[:, model.imu(k, part)] @ at.imus[k, part] for part in Part if part is not Part.GYRO_BIAS], axis=0
-    )
-    return value, by
+    return model.reading(at, k, LEVEL) - model.ground.gravity_m_s2 * LEVEL, model.reading_by(at, k, LEVEL)

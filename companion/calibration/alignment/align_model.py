@@ -1,14 +1,14 @@
 """The model behind `align`: what every reading of every stand should be, and how it changes with what is sought.
 
 A *stand* is one still window. Sought are, for all stands together: the gradienter's zero; for every IMU its
-misalignment against the gradienter, accelerometer scale, shear and bias, and gyro bias; gravity and the Earth's rate
+misalignment against the base, accelerometer scale, shear and bias, and gyro bias; gravity and the Earth's rate
 within what the place leaves open; the plane of the spot; and how the aircraft stood each time.
 
 With u = C_k (0, 0, -1) (up in the vehicle), g, and the Earth's rate W in the ground frame (NED, or, without a north,
 turned about the vertical):
 
     gradienter     reading = law(M^T u) + zero                          M: vehicle from sensor
-    accelerometer  f = (I + S) (I - [m x]) g u + b                      S: scale on the diagonal, shear beside it
+    accelerometer  f = (I + S) exp(-[m x]) g u + b                      S: scale on the diagonal, shear beside it
     gyro           w = C_k W + b_w
     compass        heading of C_k
     spot           down of the vehicle, seen from the ground, is the normal of the spot: C_k^T z = n + placement
@@ -56,12 +56,13 @@ class ImuStand:
 class Stand:
     """One still window.
 
-    `heading_rad` counts from the same north in all stands, which need not be the true one (`Ground.north_known`).
+    `heading_rad` counts from the same north in all stands, which need not be the true one. Counted by a gyro, it is
+    not wrapped: then it tells by how much the gyro has turned since the first stand (`Priors.turn_scale`).
     """
 
     imus: tuple[ImuStand, ...]
     tilt_deg: tuple[float, float] | None
-    """The gradienter's readings less the configured offset; None where it was out of its range."""
+    """The gradienter's readings less the configured offset; None where it was out of its range, or there is none."""
     tilt_sigma_deg: tuple[float, float]
     heading_rad: float
     heading_sigma_rad: float
@@ -92,6 +93,8 @@ class Priors:
     misalignment_deg: float = 1.0
     accel_bias_m_s2: float = 30.0 * MG
     gyro_bias_rad_s: float = 5.0 * DEG
+    turn_scale: float = 0.0
+    """Of a gyro by which all headings were counted, the same in all of them."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -121,6 +124,7 @@ class Unknowns:
     spot: Array
     gravity_m_s2: float
     rate_rad_s: Array
+    turn_scale: float
     attitudes: list[Matrix]
     """C_k, body from ground."""
     imus: Array
@@ -138,15 +142,17 @@ class Model:
         self.names = [imu.name for imu in stands[0].imus]
         count = len(self.names)
         self.offset, self.spot, self.gravity, self.rate = slice(0, 2), slice(2, 4), slice(4, 5), slice(5, 8)
-        self._poses = 8
-        self._first_imu = 8 + 3 * len(stands)
+        self.turn = slice(8, 9)
+        self._poses = 9
+        self._first_imu = self._poses + 3 * len(stands)
         self.size = self._first_imu + 15 * count
         sigma = np.full(self.size, _ANYHOW_RAD)
-        sigma[self.offset] = priors.offset_deg * DEG
+        sigma[self.offset] = priors.offset_deg * DEG if any(stand.tilt_deg is not None for stand in stands) else 0.0
         if not any(stand.on_spot for stand in stands):
             sigma[self.spot] = 0.0
         sigma[self.gravity] = ground.gravity_sigma_m_s2
         sigma[self.rate] = np.sqrt(np.diag(ground.rate_covariance))
+        sigma[self.turn] = priors.turn_scale
         self.damped = 3 * len(stands) + (2 if sigma[2] > 0.0 else 0)
         """How many parameters only the readings determine."""
         each = [
@@ -181,6 +187,7 @@ class Model:
             spot=np.mean(spots, axis=0)[:2] if spots else np.zeros(2),
             gravity_m_s2=self.ground.gravity_m_s2,
             rate_rad_s=self.ground.rate_rad_s.copy(),
+            turn_scale=0.0,
             attitudes=list(attitudes),
             imus=np.zeros((len(self.names), len(Part), 3)),
         )
@@ -191,6 +198,7 @@ class Model:
         at.spot = at.spot + by[self.spot]
         at.gravity_m_s2 += float(by[self.gravity][0])
         at.rate_rad_s = at.rate_rad_s + by[self.rate]
+        at.turn_scale += float(by[self.turn][0])
         for k in range(len(self.stands)):
             at.attitudes[k] = _turned(-by[self.pose(k)]) @ at.attitudes[k]
         at.imus += by[self._first_imu :].reshape(at.imus.shape)
@@ -201,6 +209,7 @@ class Model:
         values[self.offset] = at.offset_rad
         values[self.gravity] = at.gravity_m_s2 - self.ground.gravity_m_s2
         values[self.rate] = at.rate_rad_s - self.ground.rate_rad_s
+        values[self.turn] = at.turn_scale
         values[self._first_imu :] = at.imus.ravel()
         return values
 
@@ -220,12 +229,7 @@ class Model:
             for i, imu in enumerate(stand.imus):
                 self._accelerometer(rows, at, (k, i), imu, up)
                 self._gyro(rows, at, (k, i), imu)
-            forward = attitude.T[:, 0]
-            turn = attitude.T @ -skew(np.array([1.0, 0.0, 0.0]))
-            across = forward[0] ** 2 + forward[1] ** 2
-            off = math.remainder(stand.heading_rad - math.atan2(forward[1], forward[0]), 2.0 * math.pi)
-            by = rows.add(Row("compass", k + 1), np.array([off]), np.array([stand.heading_sigma_rad]))
-            by[:, self.pose(k)] = (forward[0] * turn[1] - forward[1] * turn[0]) / max(across, 1e-6)
+            self._heading(rows, at, k)
             if stand.on_spot:
                 placement = np.full(2, self.priors.placement_deg * DEG)
                 by = rows.add(Row("spot", k + 1), at.spot - (attitude.T @ DOWN)[:2], placement)
@@ -243,6 +247,17 @@ class Model:
                 by[0, part] = 1.0
         return rows.stacked()
 
+    def _heading(self, rows: _Rows, at: Unknowns, k: int) -> None:
+        stand, attitude = self.stands[k], at.attitudes[k]
+        forward = attitude.T[:, 0]
+        turn = attitude.T @ -skew(np.array([1.0, 0.0, 0.0]))
+        across = forward[0] ** 2 + forward[1] ** 2
+        counted = stand.heading_rad * (1.0 - at.turn_scale)
+        off = math.remainder(counted - math.atan2(forward[1], forward[0]), 2.0 * math.pi)
+        by = rows.add(Row("compass", k + 1), np.array([off]), np.array([stand.heading_sigma_rad]))
+        by[:, self.pose(k)] = (forward[0] * turn[1] - forward[1] * turn[0]) / max(across, 1e-6)
+        by[:, self.turn] = stand.heading_rad
+
     def _gradienter(self, rows: _Rows, at: Unknowns, k: int, up: Array) -> None:
         stand = self.stands[k]
         if stand.tilt_deg is None:
@@ -258,17 +273,26 @@ class Model:
 
     def _accelerometer(self, rows: _Rows, at: Unknowns, where: tuple[int, int], imu: ImuStand, up: Array) -> None:
         k, i = where
-        stretch = np.eye(3) + np.diag(at.imus[i, Part.SCALE]) + np.tensordot(at.imus[i, Part.SHEAR], _SHEAR, axes=1)
-        aligned = up - np.cross(at.imus[i, Part.MISALIGNMENT], up)
-        gravity = at.gravity_m_s2
-        read = imu.accel_m_s2 - stretch @ aligned * gravity - at.imus[i, Part.ACCEL_BIAS]
+        read = imu.accel_m_s2 - self.reading(at, i, up)
         by = rows.add(Row("accelerometer", k + 1, imu.name), read, imu.accel_sigma_m_s2)
-        by[:, self.pose(k)] = gravity * stretch @ (np.eye(3) - skew(at.imus[i, Part.MISALIGNMENT])) @ skew(up)
-        by[:, self.imu(i, Part.MISALIGNMENT)] = gravity * stretch @ skew(up)
-        by[:, self.imu(i, Part.SCALE)] = gravity * np.diag(aligned)
-        by[:, self.imu(i, Part.SHEAR)] = gravity * (_SHEAR @ aligned).T
-        by[:, self.imu(i, Part.ACCEL_BIAS)] = np.eye(3)
+        by += self.reading_by(at, i, up)
+        by[:, self.pose(k)] = at.gravity_m_s2 * _response(at, i) @ skew(up)
+
+    def reading(self, at: Unknowns, imu: int, up: Array) -> Array:
+        """What the accelerometers of an IMU, counted from 0, read where `up` is up in the vehicle; (3,)."""
+        return np.asarray(_response(at, imu) @ up * at.gravity_m_s2 + at.imus[imu, Part.ACCEL_BIAS])
+
+    def reading_by(self, at: Unknowns, imu: int, up: Array) -> Matrix:
+        """How that changes with everything but the attitude, (3, size)."""
+        misalignment, gravity = at.imus[imu, Part.MISALIGNMENT], at.gravity_m_s2
+        stretch, aligned = _stretch(at, imu), _turned(-misalignment) @ up
+        by = np.zeros((3, self.size))
+        by[:, self.imu(imu, Part.MISALIGNMENT)] = gravity * stretch @ skew(aligned) @ _jacobian(-misalignment)
+        by[:, self.imu(imu, Part.SCALE)] = gravity * np.diag(aligned)
+        by[:, self.imu(imu, Part.SHEAR)] = gravity * (_SHEAR @ aligned).T
+        by[:, self.imu(imu, Part.ACCEL_BIAS)] = np.eye(3)
         by[:, self.gravity] = (stretch @ aligned)[:, None]
+        return by
 
     def _gyro(self, rows: _Rows, at: Unknowns, where: tuple[int, int], imu: ImuStand) -> None:
         k, i = where
@@ -301,6 +325,16 @@ class _Rows:
         return np.concatenate(residuals), np.vstack(derivatives), self._labels
 
 
+def _stretch(at: Unknowns, imu: int) -> Matrix:
+    return np.asarray(
+        np.eye(3) + np.diag(at.imus[imu, Part.SCALE]) + np.tensordot(at.imus[imu, Part.SHEAR], _SHEAR, axes=1)
+    )
+
+
+def _response(at: Unknowns, imu: int) -> Matrix:
+    return _stretch(at, imu) @ _turned(-at.imus[imu, Part.MISALIGNMENT])
+
+
 def _turned(vector_rad: Array) -> Matrix:
     """Rodrigues: the rotation exp([v x])."""
     angle = float(np.linalg.norm(vector_rad))
@@ -308,3 +342,16 @@ def _turned(vector_rad: Array) -> Matrix:
     if angle < 1e-8:
         return np.eye(3) + cross
     return np.asarray(np.eye(3) + math.sin(angle) / angle * cross + (1.0 - math.cos(angle)) / angle**2 * cross @ cross)
+
+
+def _jacobian(vector_rad: Array) -> Matrix:
+    """How exp([v x]) turns on when v grows: exp([(v + d) x]) = exp([(J d) x]) exp([v x]) to first order in d."""
+    angle = float(np.linalg.norm(vector_rad))
+    cross = skew(vector_rad)
+    if angle < 1e-6:
+        return np.eye(3) + cross / 2.0
+    return np.asarray(
+        np.eye(3)
+        + (1.0 - math.cos(angle)) / angle**2 * cross
+        + (angle - math.sin(angle)) / angle**3 * cross @ cross
+    )

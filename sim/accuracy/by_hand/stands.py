@@ -1,0 +1,238 @@
+"""One aircraft of which nothing is known: turned on spots, then propped up twelve times; what is found, and by others."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Final
+
+import numpy as np
+
+from companion.calibration.alignment.align_model import Ground, ImuStand, Stand
+from companion.calibration.alignment.faces import Face, faces
+from companion.calibration.alignment.spot import mounting, turned
+from companion.calibration.collector.outlook import Settings
+from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.means.windows import ImuInput, ImuWindow
+from companion.calibration.noise.allan import noise_profile
+from companion.calibration.solution.site import LocalEarth, local_earth
+from companion.samples import ImuSample
+from sim.accuracy.by_hand import rivals
+from sim.accuracy.stand import GRAVITY_ANOMALY_M_S2, NEXT_S, RATE_HZ, AnomalousSite, sites
+from sim.aircraft import Pose, Site, VirtualAircraft
+from sim.earth import Array
+from sim.experiments.still import whereabouts
+from sim.hands import Hands
+from sim.imu_model import DEG_H, MG, ImuModel
+
+BY_HAND: Final = ("icm42688p", "bmi088", "adis16470")
+STAND_S: Final = 12
+PLACEMENT_DEG: Final = 0.02
+PROPPED_DEG: Final = 5.0
+"""One sigma by which hands miss a face, about each axis."""
+SLOPE_DEG: Final = 3.0
+"""Of the ground on which it is propped."""
+SLOPES_DEG: Final = (0.5, 1.5, 5.0)
+"""Of the spots on which it is turned."""
+TURNS: Final = ((2, 0.5), (2, 1.5), (2, 5.0), (4, 0.5), (4, 1.5), (4, 5.0))
+"""Headings and slope."""
+COUNTED_DEG: Final = 0.5
+COUNTED_SCALE: Final = 0.01
+"""Of a turn, counted by the gyros: what is left of each, and what the scale makes of all."""
+_HEADINGS: Final = (0.0, 90.0, 180.0, 270.0, 360.0)
+_FACES: Final = ((90, 0), (-90, 0), (0, -90), (0, 90), (0, 180), (0, 0))
+"""Pitch and roll; up is +x, -x, +y, -y, +z, -z."""
+_EDGES: Final = ((45, 0), (-45, 0), (0, 45), (0, -135), (45, 90), (-45, 90))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandRun:
+    """Errors of one aircraft, and sigmas, in SI units; biases against their mean over the next three minutes."""
+
+    faces: Array
+    """(9,) bias, scale, shear."""
+    faces_sigma: Array
+    faces_checked: bool
+    """No stand was left out or in doubt."""
+    rivals: Array
+    """(imu_tk, ArduPilot, PX4; bias and scale (6))."""
+    turn: Array
+    """(TURNS, 2) level bias ahead and to the right."""
+    turn_sigma: Array
+    slope: Array
+    """(TURNS) of the spot, rad."""
+    level: Array
+    """(2,) roll and pitch of the board, on the steepest spot."""
+    level_sigma: Array
+    level_firmware: Array
+    """(2,) likewise of a level calibration there, with biases and scales known exactly."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stood:
+    """One stand, as measured."""
+
+    window: ImuWindow
+    rows: Array
+    """Readings of the accelerometers (n, 3)."""
+    counted_rad: float = 0.0
+    """How far it was turned on its spot, by the gyros."""
+
+    def face(self) -> Face:
+        return Face(np.array(self.window.accel_m_s2), np.array(self.window.accel_sigma_use_m_s2))
+
+    def on_spot(self) -> Stand:
+        window = self.window
+        means = ImuStand(
+            "imu",
+            np.array(window.accel_m_s2),
+            np.array(window.accel_sigma_use_m_s2),
+            np.array(window.gyro_rad_s),
+            np.array(window.gyro_sigma_use_rad_s),
+        )
+        sigma_deg = COUNTED_DEG if self.counted_rad else 0.01
+        return Stand((means,), None, (1.0, 1.0), self.counted_rad, math.radians(sigma_deg), on_spot=True)
+
+
+class _Aircraft:
+    """An autopilot's board, put in by eye and never calibrated; somebody who moves it; and its collector."""
+
+    def __init__(self, part: str, seed: int, number: int) -> None:
+        self.random = np.random.default_rng([seed, 6, BY_HAND.index(part), number])
+        draw = self.random.normal
+        self.site = sites()[number % len(sites())]
+        here = AnomalousSite(**asdict(self.site), anomaly_m_s2=float(draw() * GRAVITY_ANOMALY_M_S2))
+        self.gravity_m_s2 = here.gravity_m_s2
+        self.scale, self.shear = draw(size=3) * 0.005, draw(size=3) * 0.003
+        roll, pitch, yaw = (draw(size=3) * [1.0, 1.0, 2.0]).tolist()
+        self.aircraft = VirtualAircraft(Pose(heading_deg=float(self.random.uniform(0.0, 360.0))), here)
+        self.imu = ImuModel(
+            self.aircraft,
+            part,
+            seed=int(self.random.integers(2**62)),
+            gyro_bias_rad_s=(draw(size=3) * 100.0 * DEG_H).tolist(),
+            accel_bias_m_s2=(draw(size=3) * 20.0 * MG).tolist(),
+            accel_scale=self.scale.tolist(),
+            accel_shear=self.shear.tolist(),
+            mounting_deg=(roll, pitch, yaw),
+        )
+        self.hands = Hands(self.aircraft, placement_deg=PLACEMENT_DEG, seed=int(self.random.integers(2**31)))
+        self.taken = ImuInput(name="imu", rotation=np.eye(3), profile=noise_profile(part))
+        self.t_s = 0.0
+
+    def stand(self, move: Callable[[float], float], counted_rad: float = 0.0) -> _Stood:
+        """Move it, and measure."""
+        begin_s = math.ceil(move(self.t_s) + 1.0)
+        times = begin_s + 0.5 + (np.arange(round((STAND_S + 0.5) * RATE_HZ)) + 0.5) / RATE_HZ
+        rows = self.imu.read(times, 1.0 / RATE_HZ)
+        wanted = Settings(
+            min_still_s=float(STAND_S),
+            max_s=float(STAND_S),
+            target_gyro_sigma_rad_s=0.0,
+            target_accel_sigma_m_s2=0.0,
+            horizon_s=NEXT_S,
+        )
+        collector = RollingCollector(wanted, [self.taken], gradienter=False, compass=False)
+        for t_s, (p, q, r, x, y, z) in zip(times.tolist(), rows.tolist(), strict=True):
+            collector.add_imu("imu", ImuSample(t_s, (p, q, r), (x, y, z), None))
+        self.t_s = begin_s + STAND_S + 1.3
+        collector.tick(self.t_s)
+        return _Stood(collector.window(self.t_s).imus[0], rows[:, 3:], counted_rad)
+
+    def propped(self, pitch_deg: float, roll_deg: float) -> _Stood:
+        """By hand, on a slope that falls to any side."""
+        azimuth = self.random.uniform(0.0, 2.0 * math.pi)
+        off = self.random.normal(size=2) * PROPPED_DEG + SLOPE_DEG * np.array([math.cos(azimuth), math.sin(azimuth)])
+        return self.stand(lambda t_s: self.hands.hold(t_s, pitch_deg + float(off[0]), roll_deg + float(off[1])))
+
+    def on_spot(self, slope_deg: float) -> list[_Stood]:
+        """Four quarter turns and the way on to the first heading, on a slope that falls to any side."""
+        azimuth = self.random.uniform(0.0, 2.0 * math.pi)
+        pitch, roll = slope_deg * math.cos(azimuth), slope_deg * math.sin(azimuth)
+        found = [self.stand(lambda t_s: self.hands.spot(t_s, pitch, roll))]
+        scale = 1.0 + self.random.normal() * COUNTED_SCALE
+        for quarters in range(1, 5):
+            counted_deg = 90.0 * quarters * scale + self.random.normal() * COUNTED_DEG
+            found.append(self.stand(lambda t_s: self.hands.turn(t_s, 90.0), math.radians(counted_deg)))
+        return found
+
+    def level_reading(self, bias: Array) -> Array:
+        """What the accelerometers read of a level aircraft with these biases."""
+        level = VirtualAircraft(Pose(), self.aircraft.site)
+        return self.imu.in_accel_axes(level.truth_at(0.0).force_m_s2) + bias
+
+
+@functools.cache
+def _local(site: Site) -> LocalEarth:
+    return local_earth(whereabouts(site))
+
+
+def _ground(site: Site) -> Ground:
+    """With no north."""
+    local = _local(site)
+    rate = local.rate_in_body(np.eye(3), heading_known=False)
+    return Ground(local.gravity_m_s2, local.gravity_sigma_m_s2, rate.mean, rate.covariance)
+
+
+def by_hand(part: str, seed: int, number: int) -> HandRun:
+    """One aircraft with this part."""
+    here = _Aircraft(part, seed, number)
+    spots = {slope: here.on_spot(slope) for slope in SLOPES_DEG}
+    held = [here.propped(*pose) for pose in (*_FACES, *_EDGES)]
+    bias = here.imu.mean_bias(here.t_s, here.t_s + NEXT_S).accel_m_s2
+    local, ground = _local(here.site), _ground(here.site)
+    known = faces(
+        [one.face() for one in held], local.gravity_m_s2, local.gravity_sigma_m_s2, wander_m_s2=_wander(held)
+    )
+    truth = np.concatenate([bias, here.scale, here.shear])
+    sides = [one.rows for one in held[:6]]
+    others = (
+        rivals.imu_tk([one.rows for one in held], local.gravity_m_s2),
+        rivals.ardupilot(sides),
+        rivals.px4(sides),
+    )
+    read = here.level_reading(bias)
+    level_bias = read + np.array([0.0, 0.0, here.gravity_m_s2])
+    turns = {
+        (headings, slope): turned([one.on_spot() for one in _chosen(spots[slope], headings)], ground)
+        for headings, slope in TURNS
+    }
+    steepest = turns[4, max(SLOPES_DEG)]
+    board, true_board = mounting(steepest.imus[0], known, np.eye(3)), _tilt((read - bias) / (1.0 + here.scale))
+    first = spots[max(SLOPES_DEG)][0].rows[: rivals.ARDUPILOT_READINGS].mean(axis=0)
+    return HandRun(
+        faces=known.figures - truth,
+        faces_sigma=known.sigma,
+        faces_checked=not known.left_out and not known.in_doubt,
+        rivals=np.array([np.concatenate(one) for one in others]) - truth[:6],
+        turn=np.array([found.imus[0].level_bias_m_s2[:2] for found in turns.values()]) - level_bias[:2],
+        turn_sigma=np.array(
+            [np.sqrt(np.diag(found.imus[0].level_covariance_m2_s4))[:2] for found in turns.values()]
+        ),
+        slope=np.radians([found.slope_deg - slope for (_, slope), found in turns.items()]),
+        level=np.array([board.roll_rad, board.pitch_rad]) - true_board,
+        level_sigma=board.sigma_rad,
+        level_firmware=_tilt((first - bias) / (1.0 + here.scale)) - true_board,
+    )
+
+
+def _chosen(stands: list[_Stood], headings: int) -> list[_Stood]:
+    """Of five: there, turned by half a turn, and on to the first again; or the four quarters."""
+    return stands[::2] if headings == 2 else stands[:4]
+
+
+def _wander(stands: list[_Stood]) -> Array:
+    """What the bias of the next minutes is away from that of a stand, (3,)."""
+    use, stat = (
+        np.array([getattr(one.window, name) for one in stands])
+        for name in ("accel_sigma_use_m_s2", "accel_sigma_stat_m_s2")
+    )
+    return np.asarray(np.sqrt(np.maximum(use**2 - stat**2, 0.0).mean(axis=0)))
+
+
+def _tilt(force: Array) -> Array:
+    """Roll and pitch of corrected accelerometers."""
+    x, y, z = force
+    return np.array([math.atan2(-y, -z), math.atan2(x, math.hypot(y, z))])

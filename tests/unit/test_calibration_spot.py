@@ -1,0 +1,175 @@
+"""Level without a gradienter: the simulator's aircraft turned on a spot, and how its board sits."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from companion.calibration.alignment.align import Alignment, in_words
+from companion.calibration.alignment.align_model import Ground, ImuStand, Stand
+from companion.calibration.alignment.faces import Face, Faces, faces
+from companion.calibration.alignment.spot import ALONE, mounting, turned
+from companion.physics.frames import rotation_matrix
+from companion.physics.units import DEG, DEG_H, MG
+from sim.aircraft import Pose, VirtualAircraft
+from sim.hands import Hands
+from sim.imu_model import ImuModel
+from sim.scenario import site_at
+
+Floats = NDArray[np.float64]
+
+SITE = site_at(47.0, 11.0, 600.0)
+G = SITE.gravity_m_s2
+HALF = (0.0, 180.0, 360.0)
+QUARTERS = (0.0, 90.0, 180.0, 270.0)
+TWELVE = [(90, 0), (-90, 0), (0, -90), (0, 90), (0, 180), (0, 0), (45, 0), (-45, 0), (0, 45), (0, -135), (45, 90), (-45, 90)]
+BOARD_DEG = (1.2, -0.8, 0.0)
+SIGMA = 0.02 * MG
+
+
+def model(aircraft: VirtualAircraft, board_deg: tuple[float, float, float] = BOARD_DEG) -> ImuModel:
+    return ImuModel(
+        aircraft,
+        "perfect",
+        accel_bias_m_s2=(np.array([25.0, -40.0, 12.0]) * MG).tolist(),
+        accel_scale=(0.004, -0.006, 0.003),
+        gyro_bias_rad_s=(np.array([120.0, -80.0, 60.0]) * DEG_H).tolist(),
+        mounting_deg=board_deg,
+    )
+
+
+def on_spot(
+    slope_deg: tuple[float, float], headings_deg: tuple[float, ...], *, bumped: int | None = None, counted: float = 1.0
+) -> list[Stand]:
+    """Stands without noise; headings counted by a gyro whose scale is `counted`."""
+    aircraft = VirtualAircraft(Pose(slope_deg[0], slope_deg[1], 70.0), SITE)
+    hands, imu, stands, t_s = Hands(aircraft), model(aircraft), [], 0.0
+    for k, heading in enumerate(headings_deg):
+        if k == bumped:
+            hands.bump(0.3, 0.0)
+        if k:
+            t_s = hands.turn(t_s, heading - headings_deg[k - 1])
+        read = imu.expected(t_s + 1.0)
+        means = ImuStand("fc", read[3:], np.full(3, SIGMA), read[:3], np.full(3, 5.0 * DEG_H))
+        sigma_deg = 0.5 if k else 0.01
+        stands.append(Stand((means,), None, (1.0, 1.0), heading * counted * DEG, sigma_deg * DEG, on_spot=True))
+    return stands
+
+
+def solved(stands: list[Stand]) -> Alignment:
+    across = 7.292115e-5 * math.cos(47.0 * DEG)
+    rate = np.array([0.0, 0.0, -7.292115e-5 * math.sin(47.0 * DEG)])
+    return turned(stands, Ground(G, 3e-4, rate, np.diag([across**2 / 2.0, across**2 / 2.0, 1e-18])))
+
+
+def level_bias() -> Floats:
+    aircraft = VirtualAircraft(Pose(), SITE)
+    return np.asarray(model(aircraft).expected(0.0)[3:] + [0.0, 0.0, G])
+
+
+@pytest.mark.parametrize("headings", [HALF, QUARTERS], ids=["half", "quarters"])
+@pytest.mark.parametrize("slope_deg", [(0.0, 0.0), (0.4, -0.3), (3.0, 4.0), (-5.0, 0.0)])
+def test_level_bias_and_slope_are_found_on_any_slope(
+    slope_deg: tuple[float, float], headings: tuple[float, ...]
+) -> None:
+    found = solved(on_spot(slope_deg, headings))
+    assert found.complaint is None
+    assert found.checked
+    # What the priors of bias and board leave of it is far below what marks can do.
+    np.testing.assert_allclose(found.imus[0].level_bias_m_s2[:2] / MG, level_bias()[:2] / MG, atol=0.05)
+    steepest = math.degrees(math.acos(math.cos(slope_deg[0] * DEG) * math.cos(slope_deg[1] * DEG)))
+    assert found.slope_deg == pytest.approx(steepest, abs=0.03)
+    sigma = np.sqrt(np.diag(found.imus[0].level_covariance_m2_s4))[:2] / MG
+    assert sigma.max() < (0.26 if headings == QUARTERS or max(map(abs, slope_deg)) < 1.0 else 0.75)
+
+
+def test_a_gyro_that_counts_a_turn_wrong_costs_quarters_little_and_is_in_the_sigma_of_half_a_turn() -> None:
+    """1.5 % of half a turn is 2.7 deg: 2 mg on 5 deg of slope, if it were believed."""
+    for headings in (HALF, QUARTERS):
+        imu = solved(on_spot((5.0, 0.0), headings, counted=1.015)).imus[0]
+        off = np.abs(imu.level_bias_m_s2 - level_bias())[:2]
+        sigma = np.sqrt(np.diag(imu.level_covariance_m2_s4))[:2]
+        assert (off < 2.0 * sigma).all()
+        assert off.max() / MG < (0.05 if headings == QUARTERS else 1.5)
+
+
+@pytest.mark.parametrize("headings", [HALF, QUARTERS], ids=["half", "quarters"])
+def test_a_spot_that_moved_is_named_in_words_that_know_no_gradienter(headings: tuple[float, ...]) -> None:
+    found = solved(on_spot((0.5, 0.5), headings, bumped=2))
+    assert found.complaint is not None
+    words = in_words(found.complaint)
+    assert "the spot moved" in words
+    assert "gradienter" not in words
+
+
+def held(board_deg: tuple[float, float, float], orientation: str = "ROTATION_NONE") -> Faces:
+    stands = []
+    for k, (pitch, roll) in enumerate(TWELVE):
+        aircraft = VirtualAircraft(Pose(pitch + 3.0 * math.sin(k), roll + 4.0 * math.cos(k), 30.0 * k), SITE)
+        # In the sensor's axes, as `ImuModel` gives them.
+        stands.append(Face(model(aircraft, board_deg).expected(0.0)[3:], np.full(3, SIGMA)))
+    return faces(stands, G, 0.0)
+
+
+def test_the_boards_tilt_is_found_on_a_slope() -> None:
+    found = solved(on_spot((3.0, -4.0), QUARTERS))
+    board = mounting(found.imus[0], held(BOARD_DEG), np.eye(3))
+    # The board is turned against the base: level looks as if the aircraft were tilted the other way round.
+    level = rotation_matrix(BOARD_DEG).T @ np.array([0.0, 0.0, -1.0])
+    assert board.roll_rad / DEG == pytest.approx(math.degrees(math.atan2(-level[1], -level[2])), abs=0.003)
+    assert board.pitch_rad / DEG == pytest.approx(math.degrees(math.asin(level[0])), abs=0.003)
+    assert board.sigma_rad.max() / DEG < 0.03
+
+
+def test_the_orientation_of_a_turned_board_is_taken_off() -> None:
+    """What an autopilot sends is in the aircraft's axes; `faces` is of the sensor's."""
+    orientation = rotation_matrix("ROTATION_YAW_90")
+    known = held((0.0, 0.0, 0.0))
+    level = solved(on_spot((1.0, 1.0), QUARTERS)).imus[0]
+    bias, scale = known.figures[:3], known.figures[3:6]
+    tilt = np.array([math.sin(2.0 * DEG), 0.0, -math.cos(2.0 * DEG)])
+    read = orientation @ ((1.0 + scale) * (orientation.T @ tilt * G) + bias)
+    nose_up = dataclasses.replace(level, level_bias_m_s2=read + np.array([0.0, 0.0, G]))
+    board = mounting(nose_up, known, orientation)
+    assert board.pitch_rad / DEG == pytest.approx(2.0, abs=1e-3)
+    assert board.roll_rad / DEG == pytest.approx(0.0, abs=1e-3)
+
+
+def test_the_covariance_of_the_tilt_is_that_of_what_it_is_made_of() -> None:
+    """Against drawing biases and readings at random."""
+    level, known = solved(on_spot((0.5, 0.0), QUARTERS)).imus[0], held(BOARD_DEG)
+    said = mounting(level, known, np.eye(3)).sigma_rad
+    rng = np.random.default_rng(4)
+    drawn = []
+    for _ in range(400):
+        figures = rng.multivariate_normal(known.figures, known.covariance)
+        bias = rng.multivariate_normal(level.level_bias_m_s2, level.level_covariance_m2_s4)
+        one = mounting(
+            dataclasses.replace(level, level_bias_m_s2=bias), dataclasses.replace(known, figures=figures), np.eye(3)
+        )
+        drawn.append([one.roll_rad, one.pitch_rad])
+    np.testing.assert_allclose(np.std(drawn, axis=0), said, rtol=0.15)
+
+
+def test_priors_hold_boards_that_were_put_in_by_eye() -> None:
+    assert ALONE.misalignment_deg >= 5.0
+    tilted = solved(on_spot((2.0, 1.0), QUARTERS))
+    assert tilted.imus[0].misalignment_rad.sigma.max() > 1.0 * DEG, "a spot does not tell a bias from a tilted board"
+
+
+def test_hands_hold_it_in_any_orientation_and_put_it_onto_another_spot() -> None:
+    aircraft = VirtualAircraft(Pose(1.0, 2.0, 40.0), SITE)
+    hands = Hands(aircraft)
+    end_s = hands.hold(0.0, 0.0, 180.0)
+    np.testing.assert_allclose(aircraft.truth_at(end_s + 1.0).force_m_s2, [0.0, 0.0, G], atol=1e-9)
+    end_s = hands.hold(end_s + 2.0, -90.0, 0.0)
+    np.testing.assert_allclose(aircraft.truth_at(end_s + 1.0).force_m_s2, [-G, 0.0, 0.0], atol=1e-9)
+    end_s = hands.spot(end_s + 2.0, 3.0, 0.0)
+    assert aircraft.pose_at(end_s + 1.0).pitch_deg == pytest.approx(3.0)
+    end_s = hands.turn(end_s + 2.0, 180.0)
+    assert aircraft.pose_at(end_s + 1.0).pitch_deg == pytest.approx(-3.0)
+    assert "on its back" in hands.obey("hold 1", 0.0)
