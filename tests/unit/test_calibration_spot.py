@@ -26,7 +26,20 @@ SITE = site_at(47.0, 11.0, 600.0)
 G = SITE.gravity_m_s2
 HALF = (0.0, 180.0, 360.0)
 QUARTERS = (0.0, 90.0, 180.0, 270.0)
-TWELVE = [(90, 0), (-90, 0), (0, -90), (0, 90), (0, 180), (0, 0), (45, 0), (-45, 0), (0, 45), (0, -135), (45, 90), (-45, 90)]
+TWELVE = [
+    (90, 0),
+    (-90, 0),
+    (0, -90),
+    (0, 90),
+    (0, 180),
+    (0, 0),
+    (45, 0),
+    (-45, 0),
+    (0, 45),
+    (0, -135),
+    (45, 90),
+    (-45, 90),
+]
 BOARD_DEG = (1.2, -0.8, 0.0)
 SIGMA = 0.02 * MG
 
@@ -68,7 +81,7 @@ def solved(stands: list[Stand]) -> Alignment:
 
 def level_bias() -> Floats:
     aircraft = VirtualAircraft(Pose(), SITE)
-    return np.asarray(model(aircraft).expected(0.0)[3:] + [0.0, 0.0, G])
+    return np.asarray(model(aircraft).expected(0.0)[3:] + np.array([0.0, 0.0, G]))
 
 
 @pytest.mark.parametrize("headings", [HALF, QUARTERS], ids=["half", "quarters"])

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from companion.calibration.alignment.align_model import DOWN, Ground, Model, Part, Priors, Row, Stand, Unknowns
 from companion.errors import CalibrationRefusedError
-from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, skew
+from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up
 from companion.physics.gradienter import Law, up_in_sensor
 from companion.physics.units import DEG, MG
 

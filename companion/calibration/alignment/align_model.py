@@ -351,7 +351,5 @@ def _jacobian(vector_rad: Array) -> Matrix:
     if angle < 1e-6:
         return np.eye(3) + cross / 2.0
     return np.asarray(
-        np.eye(3)
-        + (1.0 - math.cos(angle)) / angle**2 * cross
-        + (angle - math.sin(angle)) / angle**3 * cross @ cross
+        np.eye(3) + (1.0 - math.cos(angle)) / angle**2 * cross + (angle - math.sin(angle)) / angle**3 * cross @ cross
     )

@@ -1,12 +1,12 @@
 """Level without a gradienter: an aircraft that is turned on one spot, and what its accelerometers read there.
 
 The slope of the spot changes its sign in the aircraft when that is turned by half a turn, a bias does not. What comes
-out is relative to the base that it is turned on: the *effective* bias of the level aircraft, the bias proper and how the
-board sits in the aircraft in one. With the bias proper known from elsewhere (`faces`) the rest is how the board sits.
+out is relative to the base that it is turned on: the *effective* bias of the level aircraft, the bias proper and how
+the board sits in the aircraft in one. With the bias proper known from elsewhere (`faces`) the rest is how it sits.
 
 How well it is told hangs on how well the spot is met again (`Priors.placement_deg`), and on a slope on how well it is
-known how far the aircraft was turned: g sin(slope) / 2 for each radian of a half turn, 0.76 mg for each degree on 5 deg of
-slope. Quarter turns tell their angles themselves, for their readings lie on a circle.
+known how far the aircraft was turned: g sin(slope) / 2 for each radian of a half turn, 0.76 mg for each degree on
+5 deg of slope. Quarter turns tell their angles themselves, for their readings lie on a circle.
 """
 
 from __future__ import annotations

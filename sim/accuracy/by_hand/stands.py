@@ -1,4 +1,4 @@
-"""One aircraft of which nothing is known: turned on spots, then propped up twelve times; what is found, and by others."""
+"""One aircraft of which nothing is known: turned on spots, propped up twelve times; what is found, and by others."""
 
 from __future__ import annotations
 
@@ -183,9 +183,7 @@ def by_hand(part: str, seed: int, number: int) -> HandRun:
     held = [here.propped(*pose) for pose in (*_FACES, *_EDGES)]
     bias = here.imu.mean_bias(here.t_s, here.t_s + NEXT_S).accel_m_s2
     local, ground = _local(here.site), _ground(here.site)
-    known = faces(
-        [one.face() for one in held], local.gravity_m_s2, local.gravity_sigma_m_s2, wander_m_s2=_wander(held)
-    )
+    known = faces([one.face() for one in held], local.gravity_m_s2, local.gravity_sigma_m_s2, wander_m_s2=_wander(held))
     truth = np.concatenate([bias, here.scale, here.shear])
     sides = [one.rows for one in held[:6]]
     others = (
@@ -208,9 +206,7 @@ def by_hand(part: str, seed: int, number: int) -> HandRun:
         faces_checked=not known.left_out and not known.in_doubt,
         rivals=np.array([np.concatenate(one) for one in others]) - truth[:6],
         turn=np.array([found.imus[0].level_bias_m_s2[:2] for found in turns.values()]) - level_bias[:2],
-        turn_sigma=np.array(
-            [np.sqrt(np.diag(found.imus[0].level_covariance_m2_s4))[:2] for found in turns.values()]
-        ),
+        turn_sigma=np.array([np.sqrt(np.diag(found.imus[0].level_covariance_m2_s4))[:2] for found in turns.values()]),
         slope=np.radians([found.slope_deg - slope for (_, slope), found in turns.items()]),
         level=np.array([board.roll_rad, board.pitch_rad]) - true_board,
         level_sigma=board.sigma_rad,

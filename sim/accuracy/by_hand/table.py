@@ -33,8 +33,9 @@ def section(runs: list[HandRun], each: int) -> Section:
     for make in (_turns, _faces, _level):
         lines += [*make(parts, figures, claims), ""]
     lines += [
-        f"{STAND_S} s each; turned on marks that are met to {PLACEMENT_DEG:g} deg, and counted by the gyros (1 %, 0.5 deg);",
-        f"propped up within {PROPPED_DEG:g} deg on ground that slopes by {SLOPE_DEG:g}. Biases against their mean over the next 3 min.",
+        f"{STAND_S} s each; turned on marks met to {PLACEMENT_DEG:g} deg, and counted by the gyros (1 %, 0.5 deg);",
+        f"propped up within {PROPPED_DEG:g} deg on ground that slopes by {SLOPE_DEG:g}.",
+        "Biases against their mean over the next 3 min.",
         "New boards: bias 20 mg, scale 0.5 %, shear 0.3 %, put in within 1 deg (each 1 sigma), gravity 30 mGal off.",
         "imu_tk: 100 readings of each stand. ArduPilot, PX4: the six sides among them, as they accept them.",
     ]
@@ -108,7 +109,7 @@ def _faces(parts: dict[str, list[HandRun]], figures: dict[str, Any], claims: lis
 
 def _level(parts: dict[str, list[HandRun]], figures: dict[str, Any], claims: list[Claim]) -> list[str]:
     lines = [
-        "the board against the base, on 5 deg of slope: rms deg, 2 sigma cover; a level calibration of the firmwares there",
+        "the board against the base, on 5 deg of slope: rms deg, 2 sigma cover; a firmware's own level there",
         "",
     ]
     for part, runs in parts.items():
