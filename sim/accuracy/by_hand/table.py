@@ -36,8 +36,8 @@ def section(runs: list[HandRun], each: int) -> Section:
         f"{STAND_S} s each; turned on marks met to {PLACEMENT_DEG:g} deg, and counted by the gyros (1 %, 0.5 deg);",
         f"propped up within {PROPPED_DEG:g} deg on ground that slopes by {SLOPE_DEG:g}.",
         "Biases against their mean over the next 3 min.",
-        "New boards: bias 20 mg, scale 0.5 %, shear 0.3 %, put in within 1 deg (each 1 sigma), gravity 30 mGal off.",
-        "imu_tk: 100 readings of each stand. ArduPilot, PX4: the six sides among them, as they accept them.",
+        "New boards: bias 20 mg, scale 0.5 %, shear 0.3 %, put in within 1 deg; gravity 30 mGal off (1 sigma).",
+        "imu_tk: 100 readings of each stand. ArduPilot, PX4: the six sides among them.",
     ]
     return Section(f"By hand, without a gradienter ({each} aircraft of each part)", lines, figures, claims)
 
@@ -54,12 +54,12 @@ def _covers(words: str, errors: Array, sigmas: Array, claims: list[Claim]) -> Fi
 
 def _turns(parts: dict[str, list[HandRun]], figures: dict[str, Any], claims: list[Claim]) -> list[str]:
     lines = [
-        "horizontal bias of the level aircraft, rms mg, mean sigma, 2 sigma cover; slope, rms deg",
+        "headings: horizontal bias when level, rms mg, mean sigma, 2 sigma cover; slope, rms deg",
         "",
-        f"{'headings, slope':17}" + "".join(f"{part:>30}" for part in parts),
+        f"{'on a slope of':14}" + "".join(f"{part:>27}" for part in parts),
     ]
     for row, (headings, slope) in enumerate(TURNS):
-        line = f"{headings}, {slope:3.1f} deg       "
+        line = f"{headings} on {slope:3.1f} deg "
         for part, runs in parts.items():
             error, sigma = _stack(runs, "turn")[:, row], _stack(runs, "turn_sigma")[:, row]
             found = rms(error).times(1.0 / MG)
@@ -72,7 +72,7 @@ def _turns(parts: dict[str, list[HandRun]], figures: dict[str, Any], claims: lis
                 "covered": share,
                 "slope_deg": off,
             }
-            line += f"{found.value:10.3f}{mean:7.3f}{share.value:5.0f} %{off.value:6.3f}"
+            line += f"{found.value:8.3f}{mean:6.3f}{share.value:5.0f} %{off.value:6.3f}"
             if row in _DETERMINED:
                 claims.append(Claim(f"turn, {part}, {headings} on {slope:g} deg: rms", "mg", found, TURN_MG))
         lines.append(line)
@@ -85,7 +85,7 @@ def _faces(parts: dict[str, list[HandRun]], figures: dict[str, Any], claims: lis
     lines = [
         "twelve stands: bias, rms mg, and scale, rms %",
         "",
-        f"{'':12}" + "".join(f"{name:>18}" for name in _METHODS) + f"{'sigma':>18}{'2 sigma':>9}",
+        f"{'':12}" + "".join(f"{name:>15}" for name in _METHODS) + f"{'sigma':>15}{'2 sigma':>8}",
     ]
     for part, runs in parts.items():
         errors, sigma = _stack(runs, "faces"), _stack(runs, "faces_sigma")
@@ -94,14 +94,14 @@ def _faces(parts: dict[str, list[HandRun]], figures: dict[str, Any], claims: lis
         for name, error in zip(_METHODS, each, strict=True):
             bias, scale = rms(error[:, _BIAS]).times(1.0 / MG), rms(error[:, _SCALE]).times(100.0)
             figures.setdefault("faces", {}).setdefault(part, {})[name] = {"bias_mg": bias, "scale_percent": scale}
-            line += f"{bias.value:10.3f}{scale.value:8.4f}"
+            line += f"{bias.value:8.3f}{scale.value:7.4f}"
             if name == _METHODS[0]:
                 claims.append(Claim(f"faces, {part}: bias, rms", "mg", bias, BIAS_MG))
                 claims.append(Claim(f"faces, {part}: scale, rms", "%", scale, SCALE_PERCENT))
         share = _covers(f"faces, {part}", errors, sigma, claims)
         checked = Figure(100.0 * float(_stack(runs, "faces_checked").mean()), 0.0)
         figures["faces"][part] |= {"covered": share, "no_stand_blamed": checked}
-        line += f"{sigma[:, _BIAS].mean() / MG:10.3f}{100.0 * sigma[:, _SCALE].mean():8.4f}{share.value:7.0f} %"
+        line += f"{sigma[:, _BIAS].mean() / MG:8.3f}{100.0 * sigma[:, _SCALE].mean():7.4f}{share.value:6.0f} %"
         claims.append(Claim(f"faces, {part}: no good stand blamed", "%", checked, 100.0, 98.0))
         lines.append(line)
     return lines
