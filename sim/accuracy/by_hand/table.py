@@ -36,7 +36,7 @@ def section(runs: list[HandRun], each: int) -> Section:
         f"{STAND_S} s each; turned on marks met to {PLACEMENT_DEG:g} deg, and counted by the gyros (1 %, 0.5 deg);",
         f"propped up within {PROPPED_DEG:g} deg on ground that slopes by {SLOPE_DEG:g}.",
         "Biases against their mean over the next 3 min.",
-        "New boards: bias 20 mg, scale 0.5 %, shear 0.3 %, put in within 1 deg; gravity 30 mGal off (1 sigma).",
+        "New boards: bias 20 mg, scale 0.5 %, shear 0.3 %, put in within 1 deg, gravity 30 mGal off.",
         "imu_tk: 100 readings of each stand. ArduPilot, PX4: the six sides among them.",
     ]
     return Section(f"By hand, without a gradienter ({each} aircraft of each part)", lines, figures, claims)
