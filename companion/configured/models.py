@@ -19,13 +19,12 @@ from companion.calibration.noise.allan import noise_profile
 from companion.calibration.solution.record import AlignmentUsed
 from companion.calibration.solution.site import Whereabouts
 from companion.calibration.stillness.stretch import AT_ONCE, Lag
-from companion.config.sections import Compass, Config, Gradienter, GradienterProtocol, Imu, Noise
+from companion.config.sections import Compass, Config, Gradienter, GradienterProtocol, Imu
 from companion.links.serial.bytestream import PortSettings
 from companion.physics.frames import rotation_matrix
 from companion.physics.units import DEG_H, MG
 from companion.protocols.registry import PROTOCOLS, Kind, ProtocolInfo, part_for
 from companion.samples import CompassSample, ImuSample, MagSample, Sample, TiltSample
-from companion.storage.profiles import ProfileStore
 
 IMU_RATE_HZ: Final = 100.0
 """Rate asked of the autopilot for each IMU where the connection does not limit it; its own filters pass 20 Hz."""
@@ -58,31 +57,6 @@ def settings(config: Config) -> Settings:
         target_accel_sigma_m_s2=wanted.target_accel_sigma_mg * MG,
         dither=config.push.dither and config.push.parameters,
     )
-
-
-def profile_in_words(profile: str | Noise | None) -> str:
-    """Whose noise figures an IMU's sigmas are made of."""
-    if isinstance(profile, Noise):
-        return f"{profile.name}, {profile.origin}"
-    return "none: sigmas are those of the worst common parts" if profile is None else f"{profile}, of the catalogue"
-
-
-def profiles(config: Config) -> list[dict[str, object]]:
-    """Whose noise figures the sigmas of each IMU are made of, for `companion status`."""
-    store = ProfileStore(config.storage.path)
-    found: list[dict[str, object]] = []
-    for imu in config.imu:
-        fitted = imu.profile.name if isinstance(imu.profile, Noise) else None
-        found.append(
-            {
-                "imu": imu.name,
-                "name": fitted or imu.profile,
-                "fitted": fitted is not None,
-                "file": None if fitted is None else str(store.path(fitted)),
-                "summary": profile_in_words(imu.profile),
-            }
-        )
-    return found
 
 
 def imu_rate_hz(config: Config) -> float:

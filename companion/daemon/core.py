@@ -17,6 +17,7 @@ from companion.calibration.means.windows import Window
 from companion.component.statustext import Severity, StatusText, Weight
 from companion.config.sections import AtArm, Config
 from companion.configured import models
+from companion.configured.profiles import Profiles
 from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
 from companion.links.system.listeners import Listeners
@@ -68,6 +69,7 @@ class Core:
     link: MavlinkLink
     vehicle: Vehicle
     parameters: ParameterClient
+    profiles: Profiles
     collector: RecordedCollector
     texts: StatusText
     machine: Machine
@@ -95,6 +97,7 @@ class Core:
             link,
             vehicle,
             parameters,
+            Profiles(config),
             collector,
             StatusText(link),
             Machine(),

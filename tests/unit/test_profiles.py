@@ -15,7 +15,7 @@ from companion.calibration.noise.allan import PROFILES, AllanModel, noise_profil
 from companion.cli import main as companion
 from companion.config import parse
 from companion.config.sections import Config, Noise
-from companion.configured import models
+from companion.configured.profiles import Profiles
 from companion.errors import ConfigError, StorageError
 from companion.recording import journal, topics
 from companion.recording.files import Beginning, RecordingFile, versions
@@ -96,7 +96,7 @@ def test_a_damaged_or_newer_one_is_refused_in_one_line(
     assert words in str(refused.value)
     # All but the daemon's own start, which no file may prevent: then with the figures of the worst parts, and a word.
     config = parse(SMALLEST.format("mine"), "x.toml", lambda folder: ProfileStore(tmp_path, forgiving=True))
-    assert models.profile_in_words(config.imu[0].profile).startswith("mine, which cannot be used")
+    assert str(Profiles(config).status()[0]["summary"]).startswith("mine, which cannot be used")
     instead, worst = noise_profile(config.imu[0].profile), noise_profile(None)
     assert (instead.gyro, instead.accel) == (worst.gyro, worst.accel)
     (said,) = caplog.messages
@@ -128,7 +128,8 @@ def test_a_saved_name_brings_its_figures_along(tmp_path: Path) -> None:
     assert isinstance(profile, Noise)
     noise = noise_profile(profile)
     assert (noise.name, noise.gyro, noise.accel) == ("mine", GYRO, ACCEL)
-    assert models.profile_in_words(profile) == "mine, learned from 1.5 h at rest in 1 recording, saved 2026-11-21"
+    (shown,) = Profiles(config).status()
+    assert shown["summary"] == "mine, learned from 1.5 h at rest in 1 recording, saved 2026-11-21"
     # As a recording takes it along: a replay elsewhere has the figures.
     assert msgspec.json.decode(msgspec.json.encode(config), type=Config) == config
 
@@ -196,7 +197,7 @@ def test_learned_saved_and_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[
     config = parse(toml.read_text(encoding="utf-8"), "x.toml", ProfileStore)
     assert noise_profile(config.imu[0].profile).gyro == profile.gyro
     # Whose figures they are, for `companion status`.
-    (shown,) = models.profiles(config)
+    (shown,) = Profiles(config).status()
     assert (shown["imu"], shown["name"], shown["fitted"]) == (config.imu[0].name, "mine", True)
     assert shown["file"] == str(tmp_path / "profiles" / "mine.json")
     assert str(shown["summary"]).startswith("mine, learned from 0.5 h at rest in 1 recording, saved ")

@@ -18,7 +18,7 @@ from companion.calibration.deck.smoother import Believed, Found, smooth
 from companion.calibration.deck.stream import ImuSecond, Surroundings
 from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.calibration.means.windows import ImuInput, ImuWindow, Window
-from companion.calibration.noise.allan import PROFILES, floor_variance, slope_variance
+from companion.calibration.noise.allan import floor_variance, slope_variance
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Floats, Matrix, vector
 from companion.physics.gradienter import up_in_sensor, up_jacobian
@@ -186,6 +186,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
             accel_sigma_use_m_s2=vector(use[3:]),
             temperature_degc=float(np.mean(temperatures)) if temperatures else None,
             warnings=tuple(_warnings(imu, found, temperatures)),
+            named=imu.profile.is_named,
             covariance=covariance,
             by_earth=found.by_earth @ _level_axes(found.body_to_ned[-1]),
         )
@@ -209,7 +210,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
             accel_sigma = _LEAST_ACCEL_M_S2
         model = imu.profile.gyro
         white = model.white
-        if imu.profile == PROFILES["unknown"]:
+        if not imu.profile.is_named:
             white = max(white, math.sqrt(float(np.mean([one.white2 for one in seconds]))))
         slope = slope_variance(np.array(model.flicker), np.array(model.walk), float(len(seconds)))
         return Believed(

@@ -21,7 +21,6 @@ from companion.calibration.means.quantised import EDGE_RMS
 from companion.calibration.means.warming import Warming, warming
 from companion.calibration.noise.allan import (
     FLOOR_OF_FLICKER,
-    PROFILES,
     NoiseProfile,
     allan_variance,
     floor_variance,
@@ -40,7 +39,6 @@ WHITE_SHARE: Final = 0.09
 _ALLAN_SPANS: Final = 5
 _LOST_WARNING: Final = 0.01
 _TEMPERATURE_WARNING_K: Final = 3.0
-_AXIS: Final = "xyz"
 _ALLAN_SIGNIFICANT: Final = 3.0
 """ADEV^2 at T/5 over what white noise explains: the upper 5 % point with its about four degrees of freedom."""
 
@@ -105,7 +103,8 @@ class ImuWindow(msgspec.Struct, frozen=True, kw_only=True):
     hidden: dict[Triad, Hidden] = {}
     """By triad, where the noise spreads the integers too little for a mean."""
     dithered: bool = False
-    """Its means come from a dither, in which the telemetry followed every step of the offsets."""
+    named: bool = True
+    """Its means come from a dither, in which the telemetry followed every step of the offsets; its part is known."""
     covariance: NDArray[np.float64] | None = None
     by_earth: NDArray[np.float64] | None = None
     """Of a deck: 6x6 of all axes; and 3x3, what the gyro means hold of the Earth's rate (ahead, right, down)."""
@@ -198,7 +197,7 @@ def estimates(
     flicker = np.repeat([model.flicker for model in models], 3)
     walk = np.repeat([model.walk for model in models], 3)
     # The profile of an unknown part has the floor of the worst, behind which every warm-up would hide.
-    named = np.repeat([imu.profile != PROFILES["unknown"] for imu in imus], 6)
+    named = np.repeat([imu.profile.is_named for imu in imus], 6)
     wander = np.where(named, slope_variance(flicker, walk, end_s - slots[0]), 0.0)
     mean, leverage, slope, level, hidden = _levelled(slots, values, end_s, whole, wander)
     measured = np.maximum(white_noise(slots, level), whole.least)
@@ -331,6 +330,7 @@ def _imu_estimate(
         temperature_degc=float(np.mean(temperatures)) if temperatures else None,
         warnings=tuple(_warnings(imu, batches, gyro, accel, temperatures, rejected)),
         hidden=_hidden(imu, gyro, accel),
+        named=imu.profile.is_named,
         mounting=(vector(rotation[0]), vector(rotation[1]), vector(rotation[2])),
         warming=warming(
             rotation,
@@ -374,7 +374,7 @@ def _hidden(imu: ImuInput, gyro: Estimate, accel: Estimate) -> dict[Triad, Hidde
 
 
 def _axes(which: NDArray[np.bool_]) -> str:
-    return "".join(axis for axis, is_it in zip(_AXIS, which.tolist(), strict=True) if is_it)
+    return "".join(axis for axis, is_it in zip("xyz", which.tolist(), strict=True) if is_it)
 
 
 def _warnings(

@@ -54,6 +54,11 @@ class NoiseProfile(msgspec.Struct, frozen=True):
     warm_up: tuple[float, float] = WARM_UP
     """By how much the biases of gyro and accelerometer may move from cold to warm, two sigma."""
 
+    @property
+    def is_named(self) -> bool:
+        """Whether it is that of some part, and not of the worst common ones."""
+        return self != PROFILES["unknown"]
+
 
 def allan_model(white: float, floor: float) -> AllanModel:
     """A model from a data sheet's two figures: white noise N and the Allan floor A (0.664 B)."""

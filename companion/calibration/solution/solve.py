@@ -41,6 +41,7 @@ from companion.calibration.solution import magnetic
 from companion.calibration.solution.believable import believable, untold, widened
 from companion.calibration.solution.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site
 from companion.calibration.solution.site import LocalEarth, Uncertain
+from companion.calibration.solution.widened import without_heading
 from companion.calibration.turning.watch import Turn
 from companion.config.sections import Platform
 from companion.errors import CalibrationRefusedError
@@ -209,9 +210,8 @@ def solve(
             )
         warnings.append("no gradienter: gyros only, accelerometers not calibrated")
     if compass is None:
-        warnings.append(
-            f"{local.remedies.no_heading}: the horizontal part of the Earth's rate is unknown, gyro sigma widened"
-        )
+        unknown_heading = local.rate_in_body(np.eye(3), heading_known=False).covariance
+        warnings += without_heading(window.imus, unknown_heading, local.remedies.no_heading)
     truth = truth_of(window, gradienter, compass, local, warnings)
     believed = window.imus if any_bias else believable(window.imus, truth.up, local)
     sailing = np.zeros(3) if window.turn_rad_s is None else np.array(window.turn_rad_s)

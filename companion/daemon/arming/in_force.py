@@ -115,7 +115,7 @@ class InForce:
                 if not any(finding.why is held for finding in found):
                     found += self._held_back.left_of((name, triad), [Finding(held, held.value)])
                 continue
-            profile = noise_profile(self._sources[name].profile)
+            profile = noise_profile(self._core.profiles.of(name))
             against = judge(
                 triad,
                 name,

@@ -69,6 +69,7 @@ class BiasMemory:
     ) -> None:
         config = core.config
         self._config, self._vehicle, self._imus = config, core.vehicle, imus
+        self._profiles = core.profiles
         self._alignment, self._offload, self._collector = alignment, core.offload, core.collector
         self._sensors = {role.name: sensor for sensor in sensors for role in sensor.roles if role.kind == "imu"}
         self._sources = {imu.name: imu for imu in config.imu}
@@ -136,7 +137,7 @@ class BiasMemory:
             zero=self._zero(),
         )
         earlier = self._known[name].points if name in self._known else ()
-        profile = noise_profile(self._sources[name].profile)
+        profile = noise_profile(self._profiles.of(name))
         gyro, accel = self._reference(name, "gyro"), self._reference(name, "accel")
         return ExpectedImu(
             name=name,

@@ -16,6 +16,7 @@ import numpy as np
 
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, rivals_of
+from companion.autopilot.firmware.parts import part_of
 from companion.autopilot.firmware.px4 import SlotMemory
 from companion.autopilot.telemetry.imu_stream import ImuStream, StreamKind
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle, VehicleEvent
@@ -71,7 +72,7 @@ class AutopilotImu:
         """Told of every sample that counts, before the collector: for what must not wait."""
         self.on_read: Listeners[ImuCalibration | None, ImuCalibration] = Listeners()
         """Told of every reading: what was read before, unless we have written since, and what is in force now."""
-        self._imu, self._slots = imu, slots
+        self._slots, self._profiles = slots, core.profiles
         self._vehicle, self._parameters, self._collector = core.vehicle, core.parameters, core.collector
         self._known: ImuCalibration | None = None
         """What was read last, unless we have written since."""
@@ -139,8 +140,10 @@ class AutopilotImu:
             return False  # we have begun to write meanwhile: nobody knows which of them this still is
         known, self._known = self._known, fresh
         self.calibration, self.problem, self.failures = fresh, "", 0
-        if self._grid != (grid := (fresh.gyro_grid_rad_s, fresh.accel_grid_m_s2)):
-            self._grid = grid
+        part = part_of(self._vehicle.firmware, fresh.gyro_id, fresh.accel_id)
+        is_other_part = self._profiles.found(self.name, part)
+        if is_other_part or self._grid != (fresh.gyro_grid_rad_s, fresh.accel_grid_m_s2):
+            self._grid = (fresh.gyro_grid_rad_s, fresh.accel_grid_m_s2)
             self._kind_changed(self.stream.kind)
         self.on_read.tell(known, fresh)
         now_s = asyncio.get_running_loop().time()
@@ -168,7 +171,7 @@ class AutopilotImu:
 
     def _kind_changed(self, kind: StreamKind | None) -> None:
         message = None if kind is None else kind.message
-        self._collector.set_imu(models.imu_input(self._imu, kind, self._grid), message)
+        self._collector.set_imu(models.imu_input(self._profiles.imu(self.name), kind, self._grid), message)
 
     def _invalidate(self, why: str) -> None:
         self.calibration = None

@@ -78,7 +78,7 @@ class Devices(Subsystem):
             devices.append(said)
         return {
             "devices": devices,
-            "profiles": models.profiles(self._core.config),
+            "profiles": self._core.profiles.status(),
             "ground_stations": dict(zip(("good", "summary"), self.reach.text(), strict=True)),
         }
 

@@ -283,7 +283,7 @@ class Carrier:
             self.waiting_for = "waiting for a calibration"
             return
         local = self._local = await self._offload(local_earth, models.whereabouts(self._config, self._vehicle))
-        settings = settings_of(self.imu, found, local, self.gyro_step_rad_s)
+        settings = settings_of(self._core.profiles.imu(self.imu.name), found, local, self.gyro_step_rad_s)
         if settings is None:
             self.estimator, self.waiting_for = None, "waiting for a calibration of the gyros"
         elif self.estimator is None:

@@ -78,7 +78,7 @@ class Ditherer:
         self._allowed, self._wanted = core.config.push.dither, core.wanted
         self._vehicle, self._parameters, self._collector = core.vehicle, core.parameters, core.collector
         self._machine, self._imus, self._writer, self._ledger = core.machine, imus, writer, ledger
-        self._profiles = {imu.name: noise_profile(imu.profile) for imu in core.config.imu}
+        self._profiles = core.profiles
         self._horizon_s = 180.0
 
     async def refine(self, window: Window, job: Job, draft: Draft) -> Window:
@@ -128,7 +128,7 @@ class Ditherer:
         await imu.refresh()
         if imu.in_force.offsets != work.before:
             raise AutopilotError(f"imu {work.name}: somebody changed its offsets while they were dithered")
-        return combine(done, work.steps_si, self._profiles[window.name], self._horizon_s)
+        return combine(done, work.steps_si, noise_profile(self._profiles.of(window.name)), self._horizon_s)
 
     async def _steps(self, work: _Work, job: Job) -> list[Step]:
         """All steps, and the old values again."""

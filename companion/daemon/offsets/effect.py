@@ -60,7 +60,7 @@ class EffectWatch:
 
     def __init__(self, core: Core, px4: Px4Writes) -> None:
         self._core, self._vehicle, self._collector, self._px4 = core, core.vehicle, core.collector, px4
-        self._profiles = {imu.name: imu.profile for imu in core.config.imu}
+        self._profiles = core.profiles
         self._most_s = VERIFY_MAX_S if core.config.vehicle.platform == "ground" else VERIFY_ON_DECK_S
         self._look_s = min(LOOK_S, core.config.calibration.min_still_s)
 
@@ -131,7 +131,7 @@ class EffectWatch:
         on_the_way = OnTheWay(
             self._px4.seen_far(target.calibration), *step_from_far(target.calibration, target.changes)
         )
-        profile = self._profiles[target.name]
+        profile = self._profiles.of(target.name)
         return judge_vectors(sides, target.calibration, list(target.changes), target.kind, profile, on_the_way)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from companion.config.sections import Config
-from companion.configured.models import cannot_work, doubtful, profile_in_words, serial_devices
+from companion.configured.models import cannot_work, doubtful, serial_devices
 from companion.daemon.devices.sensor_health import ABSENT
 from companion.daemon.faces.control import ask, process_behind
 from companion.daemon.process.service import Service
@@ -225,7 +225,7 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
     if (mqtt := status["mqtt"]) is not None:
         findings.append(Finding("mqtt", good=mqtt["good"], words=mqtt["summary"]))
     # Whose noise figures an IMU's sigmas are made of.
-    findings += [Finding(f"profile {imu.name}", good=True, words=profile_in_words(imu.profile)) for imu in config.imu]
+    findings += [Finding(f"profile {one['imu']}", good=True, words=one["summary"]) for one in status["profiles"]]
     if config.push.attitude != "off" and is_running:
         findings.append(await _heading(config))
     if config.calibration.at_arm == "gate":

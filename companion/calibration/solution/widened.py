@@ -1,0 +1,30 @@
+"""What made the gyros' sigma wide: a heading that nobody knows, or a part that nobody has named."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from companion.calibration.means.windows import ImuWindow
+from companion.physics.frames import Matrix
+
+
+def without_heading(imus: Sequence[ImuWindow], earth_covariance: Matrix, no_heading: str) -> list[str]:
+    """Warnings of gyros whose heading is not known: each names the larger of the two.
+
+    Args:
+        imus: as measured.
+        earth_covariance: (3, 3) of what is not known of the Earth's rate, (rad/s)^2.
+        no_heading: why there is none, in a few words.
+    """
+    earth = float(np.diag(earth_covariance).max())
+    by_part = [imu.name for imu in imus if not imu.named and float(np.square(imu.gyro_sigma_use_rad_s).max()) > earth]
+    found = [
+        f"imu {name}: gyro sigma is that of the worst common parts: say its part (profile), or learn it (companion"
+        " profile)"
+        for name in by_part
+    ]
+    if len(by_part) < len(imus):
+        found.append(f"{no_heading}: the horizontal part of the Earth's rate is unknown, gyro sigma widened")
+    return found

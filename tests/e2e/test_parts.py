@@ -1,0 +1,164 @@
+"""Whose noise figures an IMU's sigmas are made of, where nobody has configured any: the part's, by its device ids."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+import pytest
+
+from companion.autopilot.firmware.parts import part_of
+from companion.calibration.noise.allan import noise_profile
+from companion.calibration.request import What
+from companion.calibration.solution.record import ImuRecord
+from companion.config import parse
+from companion.config.sections import Noise
+from companion.daemon.process.check import run_check
+from sim.imu_model import DEG_H
+from tests.e2e.test_calibration import calibrated
+from tests.support.rig import GYRO_BIAS_DEG_H, Rig
+from tests.support.virtual_time import run_virtual
+
+SPI_1 = 0x0A
+"""Type of bus and number, the lower byte of a device id."""
+
+
+def device_id(kind: int, address: int = 1) -> int:
+    """As both firmwares make it."""
+    return kind << 16 | address << 8 | SPI_1
+
+
+@pytest.mark.parametrize(
+    ("firmware", "gyro", "accel", "part"),
+    [
+        ("ardupilot", 0x2B, 0x2B, "bmi088"),
+        ("ardupilot", 0x34, 0x34, "icm42688p"),
+        ("ardupilot", 0x31, 0x31, "adis16470"),
+        ("px4", 0x26, 0x26, "icm42688p"),
+        ("px4", 0x66, 0x6A, "bmi088"),
+        ("px4", 0x58, 0x58, "adis16470"),
+        # The same numbers mean other parts to the other firmware, and simulators are no part.
+        ("px4", 0x2B, 0x2B, None),
+        ("ardupilot", 0x26, 0x26, None),
+        ("ardupilot", 0x2A, 0x2A, None),
+        ("px4", 0x14, 0x14, None),
+        # Two chips of one IMU, and a firmware that nobody knows.
+        ("ardupilot", 0x2B, 0x34, None),
+        ("px4", 0x66, 0x66, None),
+        ("other", 0x2B, 0x2B, None),
+    ],
+)
+def test_a_part_is_known_by_the_device_type_of_its_firmware(
+    firmware: Any, gyro: int, accel: int, part: str | None
+) -> None:
+    assert part_of(firmware, device_id(gyro), device_id(accel, 2)) == part
+
+
+def test_what_is_not_known_is_no_part() -> None:
+    assert part_of(None, device_id(0x2B), device_id(0x2B)) is None
+    assert part_of("ardupilot", None, device_id(0x2B)) is None
+    assert part_of("px4", 0, 0) is None
+
+
+class Found(NamedTuple):
+    """How a calibration of the gyros ended, and what was said of the profile."""
+
+    imu: ImuRecord
+    warnings: tuple[str, ...]
+    summary: str
+    by_device_id: bool
+
+
+def ids(firmware: str, gyro: int, accel: int) -> dict[str, float]:
+    names = ("INS_GYR_ID", "INS_ACC_ID") if firmware == "ardupilot" else ("CAL_GYRO0_ID", "CAL_ACC0_ID")
+    return dict(zip(names, (device_id(gyro), device_id(accel, 2)), strict=True))
+
+
+def gyros(folder: Path, profile: str | Noise | None, *, compass: bool = True, **rig: Any) -> Found:
+    """One calibration of a BMI088's gyros, with this in the configuration."""
+    found: list[Found] = []
+
+    async def main() -> None:
+        # Nothing is written: the double's own gyro calibration would put its own device id back.
+        made = Rig(folder, part="bmi088", imus=1, more="[push]\nparameters = false", **rig)
+        configured = msgspec.structs.replace(made.config.imu[0], profile=profile)
+        made.config = msgspec.structs.replace(made.config, imu=[configured])
+        if not compass:
+            made.config = msgspec.structs.replace(made.config, compass=None)
+            del made.devices["compass"]
+        async with made.running() as running:
+            await running.ready()
+            result, record = await calibrated(running, What.GYROS)
+            assert result.outcome == "done", result
+            (shown,) = running.service.status()["profiles"]
+            warnings = (*record.warnings, *record.imus[0].warnings)
+            found.append(Found(record.imus[0], warnings, shown["summary"], shown["by_device_id"]))
+
+    run_virtual(main())
+    return found[0]
+
+
+def sigma_deg_h(found: Found) -> float:
+    assert found.imu.gyro_sigma_use_rad_s is not None
+    return float(np.max(found.imu.gyro_sigma_use_rad_s)) / DEG_H
+
+
+def test_the_part_named_by_the_autopilot_brings_its_profile(tmp_path: Path) -> None:
+    parameters = ids("ardupilot", 0x2B, 0x2B)
+    unnamed = gyros(tmp_path / "a", None)
+    by_itself = gyros(tmp_path / "b", None, parameters=parameters)
+    configured = gyros(tmp_path / "c", "bmi088")
+    assert unnamed.summary == "none: sigmas are those of the worst common parts"
+    assert by_itself.summary == "bmi088, of the catalogue, by its device id"
+    assert configured.summary == "bmi088, of the catalogue"
+    assert [one.by_device_id for one in (unnamed, by_itself, configured)] == [False, True, False]
+    assert sigma_deg_h(by_itself) == pytest.approx(sigma_deg_h(configured), rel=0.05)
+    assert sigma_deg_h(by_itself) < 0.6 * sigma_deg_h(unnamed)
+    assert by_itself.imu.gyro_bias_rad_s is not None
+    off = np.abs(np.array(by_itself.imu.gyro_bias_rad_s) / DEG_H - GYRO_BIAS_DEG_H)
+    assert np.all(off < 3.5 * sigma_deg_h(by_itself))
+
+
+def test_what_is_configured_holds_whatever_the_ids_say(tmp_path: Path) -> None:
+    parameters = ids("ardupilot", 0x34, 0x34)
+    worst = gyros(tmp_path / "a", "unknown", parameters=parameters)
+    assert worst.summary == "unknown, of the catalogue"
+    learned = noise_profile("adis16405")
+    saved = Noise(
+        name="mine",
+        gyro=msgspec.structs.astuple(learned.gyro),
+        accel=msgspec.structs.astuple(learned.accel),
+        origin="learned from 9.0 h at rest",
+    )
+    mine = gyros(tmp_path / "b", saved, parameters=parameters)
+    without = gyros(tmp_path / "c", saved)
+    assert mine.summary == "mine, learned from 9.0 h at rest"
+    assert sigma_deg_h(mine) == sigma_deg_h(without)
+
+
+def test_the_warning_names_what_made_the_sigma(tmp_path: Path) -> None:
+    """Unknown part: 30 deg/h of Allan floor at the least; unknown heading at 40 degrees north: 8 deg/h rms."""
+    unnamed = gyros(tmp_path / "a", None, compass=False)
+    named = gyros(tmp_path / "b", None, compass=False, parameters=ids("ardupilot", 0x2B, 0x2B))
+    profile, heading = "gyro sigma is that of the worst common parts", "horizontal part of the Earth's rate"
+    assert any(profile in words for words in unnamed.warnings)
+    assert not any(heading in words for words in unnamed.warnings)
+    assert any(heading in words for words in named.warnings)
+    assert not any(profile in words for words in named.warnings)
+
+
+def test_check_says_it(tmp_path: Path) -> None:
+    config = parse('[mavlink]\nurl = "udpout:127.0.0.1:9"\n[[imu]]\nname = "fc"\nsource = "autopilot"\n', "x.toml")
+    config = msgspec.structs.replace(
+        config,
+        control=msgspec.structs.replace(config.control, socket=str(tmp_path / "s")),
+        storage=msgspec.structs.replace(config.storage, directory=str(tmp_path)),
+    )
+
+    async def main() -> None:
+        (said,) = [one for one in await run_check(config, 0.1) if one.name == "profile fc"]
+        assert said.words == "none: sigmas are those of the worst common parts"
+
+    run_virtual(main())
