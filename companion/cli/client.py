@@ -119,20 +119,21 @@ def _number(value: float | None) -> str:
 
 def add_command(add: AddCommand) -> None:
     """Add it to the parser of the command line."""
-    parser = add("align", align, "measure the gradienter's zero (turn by 180 degrees), or how it sits (tilts)")
+    parser = add("align", align, "measure the gradienter's zero (by turning), how it sits, or the accelerometers")
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
         "what",
         nargs="?",
-        choices=("zero", "tilts"),
-        metavar="zero|tilts",
-        help="zero: on one spot; tilts: that, and 4 tilts",
+        choices=("zero", "tilts", "faces"),
+        metavar="zero|tilts|faces",
+        help="zero: on one spot; tilts: that, and 4 tilts; faces: accelerometers, about 12 stands on any side",
     )
     what.add_argument("--show", action="store_true", help="the alignment that is kept")
     what.add_argument("--forget", action="store_true", help="go back to the configuration's zero and sigma")
     parser.add_argument(
         "--headings", type=int, choices=(2, 4), default=2, help="zero: 2: there, turned, back; 4: every 90 deg"
     )
+    parser.add_argument("--write", action="store_true", help="faces: write bias and scale to the autopilot")
     parser.add_argument("--timeout", type=seconds, metavar="S", help="give up after so long (default 900)")
 
 
@@ -140,6 +141,8 @@ async def align(options: argparse.Namespace) -> int:
     """`companion align`; Ctrl-C cancels it in the daemon too."""
     action = "show" if options.show else "forget" if options.forget else options.what
     wanted = {"command": "align", "action": action, "headings": options.headings}
+    if options.write:
+        wanted["write"] = True
     if options.timeout is not None:
         wanted["timeout_s"] = options.timeout
     reply = await request(options, wanted, {"command": "cancel"})
@@ -148,9 +151,28 @@ async def align(options: argparse.Namespace) -> int:
     if reply["kind"] != "error":
         state = answer["state"].upper()
         lines = [f"{state}: {answer['reason']}" if answer["reason"] else state]
-        lines += alignment_lines(answer["alignment"]) if answer["alignment"] else []
+        found = answer["alignment"]
+        if found:
+            lines += faces_lines(found) if found.get("kind") == "faces" else alignment_lines(found)
     good = answer.get("state") in ("done", "in force") or (action == "show" and answer.get("state") != "refused")
     return finish(options, reply, answer, lines, good=good)
+
+
+def faces_lines(record: Object) -> list[str]:
+    """Accelerometers as a person reads them: what was found, and what became of the parameters."""
+    lines = [f"measured {record['measured_at'][:19]} UTC in {len(record['stands'])} stands"]
+    for imu in record["imus"]:
+        lines.append(f"{imu['name']}: stands miss gravity by {imu['scatter_mg']:.2f} mg")
+        for words, unit, key, form, scale in (
+            ("accel bias", "mg", "accel_bias_mg", "+.3f", 1.0),
+            ("accel scale", "%", "accel_scale", "+.4f", 0.01),
+            ("accel shear", "%", "accel_shear", "+.4f", 0.01),
+        ):
+            found = imu[key]
+            lines.append(f"  {words:16} {unit:6} {show.axes(found['value'], found['sigma'], form, scale)}")
+        for name, written in imu["written"].items():
+            lines.append(f"  {name:18} {written['before']:+.6f} -> {written['after']:+.6f}  {written['outcome']}")
+    return lines + [f"warning: {words}" for words in record["warnings"]]
 
 
 def alignment_lines(record: Object) -> list[str]:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from companion.calibration.alignment.align_record import AlignmentRecord
+from companion.calibration.alignment.faces_record import FacesRecord
 from companion.calibration.request import What
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.record import Record, WrittenParameter
@@ -16,8 +17,12 @@ from companion.samples import Triad
 
 ALIGNMENT: Final = "gradienter alignment"
 """The kind of job that calibrates nothing."""
+FACES: Final = "measurement on all sides"
+"""The kind of job that measures accelerometers in any orientation."""
+BY_STANDS: Final = (ALIGNMENT, FACES)
+"""Those that are not calibrations."""
 
-Product = Record | AlignmentRecord | dict[str, WrittenParameter]
+Product = Record | AlignmentRecord | FacesRecord | dict[str, WrittenParameter]
 
 
 class JobCancelledError(Exception):

@@ -286,7 +286,7 @@ def test_a_list_from_before_there_were_checksums_goes_on(tmp_path: Path) -> None
         (Changed("SENS_IMU_AUTOCAL", before=0.5, after=0.0), "SENS_IMU_AUTOCAL = 0.5"),
         (Changed("ARMING_CHECK", before=0.0, after=1.0), "'ARMING_CHECK': not a parameter that the companion writes"),
         (Changed("A" * 40, before=0.0, after=1.0), "'A{40}': not a parameter that the companion writes"),
-        (Changed("INS_ACCSCAL_X", before=1.0, after=1.0), "'INS_ACCSCAL_X': not a parameter that the companion writes"),
+        (Changed("INS_ACC_X", before=1.0, after=1.0), "'INS_ACC_X': not a parameter that the companion writes"),
         (Changed("VISO_TYPE", before=0.0, after=1.0), "'VISO_TYPE': not a parameter that the companion writes"),
     ],
 )

@@ -90,6 +90,8 @@ _ACCEL_M_S2: Final = MAX_ACCEL_OFFSET_M_S2 + MAX_ACCEL_RESIDUAL_M_S2 + 0.4
 
 GYRO_OFFSET: Final = Range(-_GYRO_RAD_S, _GYRO_RAD_S, unit="rad/s")
 ACCEL_OFFSET: Final = Range(-_ACCEL_M_S2, _ACCEL_M_S2, unit="m/s^2")
+ACCEL_SCALE: Final = Range(0.5, 2.0)
+"""With others nothing is calibrated."""
 _CALTEMP: Final = Range(-300.0, 200.0, unit="deg C")
 """-300: not known."""
 _DEVICE_ID: Final = Range(0.0, 2.0**24, whole=True)
@@ -97,7 +99,11 @@ _SWITCH: Final = Range(0.0, 255.0, whole=True)
 
 
 def _offsets(names: ImuParameters) -> dict[str, Range]:
-    return {**dict.fromkeys(names.gyro_offset, GYRO_OFFSET), **dict.fromkeys(names.accel_offset, ACCEL_OFFSET)}
+    return {
+        **dict.fromkeys(names.gyro_offset, GYRO_OFFSET),
+        **dict.fromkeys(names.accel_offset, ACCEL_OFFSET),
+        **dict.fromkeys(names.accel_scale, ACCEL_SCALE),
+    }
 
 
 def _ardupilot() -> dict[str, Range]:

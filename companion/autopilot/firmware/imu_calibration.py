@@ -283,14 +283,50 @@ def vector_changes(names: tuple[str, str, str], before: Vector, after: Vector, f
     return list(map(Change, names, before, after, vias))
 
 
-def output_step(calibration: ImuCalibration, changes: Sequence[Change]) -> tuple[Vector, Vector]:
-    """By how much the output must move when the changes are in force: gyro rad/s, accelerometer m/s^2, vehicle FRD."""
+def whole_accelerometer(calibration: ImuCalibration, bias_m_s2: Vector, scale: Vector) -> list[Change]:
+    """Offsets and scales that take a bias and a scale error out of the output, both of it as it is, in the IMU's axes.
+
+    Of output = (1 + scale) truth + bias: offset + bias / accel_scale, and accel_scale / (1 + scale).
+
+    Raises:
+        CalibrationRefusedError: a value that is not plausible, see the limits at the top.
+    """
+    names, number = calibration.parameters, calibration.instance
+    before = np.asarray(calibration.accel_scale)
+    offset = _vector(np.asarray(calibration.accel_offset_m_s2) + np.asarray(bias_m_s2) / before)
+    _require_plausible("accelerometer offset", offset, MAX_ACCEL_OFFSET_M_S2, 1.0, "m/s^2", number)
+    after = _vector(before / (1.0 + np.asarray(scale)))
+    low, high = ACCEL_SCALE_RANGE
+    for axis, value in zip(_AXES, after, strict=True):
+        if not low <= value <= high:
+            raise CalibrationRefusedError(
+                f"IMU {number}: accelerometer scale {axis} is {value:.3g}, allowed are {low} to {high}"
+            )
+    return [
+        *map(Change, names.accel_offset, calibration.accel_offset_m_s2, offset),
+        *map(Change, names.accel_scale, calibration.accel_scale, after),
+    ]
+
+
+def output_step(
+    calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector = (0.0, 0.0, 0.0)
+) -> tuple[Vector, Vector]:
+    """By how much the output must move when the changes are in force: gyro rad/s, accelerometer m/s^2, vehicle FRD.
+
+    Args:
+        calibration: in force before them.
+        changes: of whatever is calibrated.
+        accel_m_s2: the accelerometers' output before them, which a change of scale stretches.
+    """
     names = calibration.parameters
     by_name = {change.parameter: change.after - change.before for change in changes}
-    gyro = np.array([by_name.get(name, 0.0) for name in names.gyro_offset])
-    accel = np.array([by_name.get(name, 0.0) for name in names.accel_offset])
-    rotation = calibration.orientation
-    return vector(-rotation @ gyro), vector(-rotation @ (np.asarray(calibration.accel_scale) * accel))
+    gyro, accel, stretch = (
+        np.array([by_name.get(name, 0.0) for name in each])
+        for each in (names.gyro_offset, names.accel_offset, names.accel_scale)
+    )
+    rotation, scale = calibration.orientation, np.asarray(calibration.accel_scale)
+    unscaled = rotation.T @ np.asarray(accel_m_s2) / scale
+    return vector(-rotation @ gyro), vector(rotation @ (stretch * unscaled - (scale + stretch) * accel))
 
 
 def whole_bias(

@@ -63,6 +63,7 @@ class Faces:
     covariance: Matrix
     """(9, 9)."""
     gravity_m_s2: float
+    gravity_sigma_m_s2: float
     up: Matrix
     """(stands, 3), up in the sensor's axes, corrected."""
     left_out: tuple[int, ...]
@@ -119,6 +120,7 @@ def faces(
         figures=fit.figures,
         covariance=covariance,
         gravity_m_s2=gravity_m_s2,
+        gravity_sigma_m_s2=gravity_sigma_m_s2,
         up=inside / lengths[:, None],
         left_out=tuple(sorted(left_out)),
         off_m_s2=lengths - gravity_m_s2,

@@ -51,15 +51,18 @@ def missing(found: Faces, vehicle_from_sensor: Matrix) -> Missing | None:
         found: from the stands so far.
         vehicle_from_sensor: 3x3, the mounting of the accelerometers that `found` speaks of.
     """
-    wanted = np.concatenate([np.full(3, ENOUGH_BIAS_M_S2), np.full(3, ENOUGH_SCALE), np.full(3, np.inf)])
+    # No stand tells by how much gravity is not what the place says: that much of the scale stays open.
+    scale = np.hypot(ENOUGH_SCALE, found.gravity_sigma_m_s2 / found.gravity_m_s2)
+    wanted = np.concatenate([np.full(3, ENOUGH_BIAS_M_S2), np.full(3, scale), np.full(3, np.inf)])
     share = found.sigma / wanted
     open_figures = share > 1.0
     unchecked = len(found.up) - len(found.left_out) < FIGURES + LEAST_SPARE
-    if not open_figures.any() and not unchecked:
+    if not open_figures.any() and not unchecked and not found.in_doubt:
         return None
     told = {side: _told(found, up) for side, up in _not_seen(found, vehicle_from_sensor)}
     if not open_figures.any():
-        return Missing(max(told, key=lambda side: float(told[side].sum())), "nothing checks the other stands yet")
+        words = "a stand does not fit, one more tells which" if found.in_doubt else "nothing checks the others yet"
+        return Missing(max(told, key=lambda side: float(told[side].sum())), words)
     side = max(told, key=lambda side: float(told[side][open_figures].sum()))
     return Missing(side, _figure(found, int(np.argmax(np.where(open_figures, told[side] * share, 0.0)))))
 
@@ -72,6 +75,7 @@ def seen_before(found: Faces, up: Array) -> int | None:
         up: likewise in the sensor's axes, (3,), of length 1.
     """
     near = found.up @ up
+    near[list(found.left_out)] = -1.0
     nearest = int(np.argmax(near))
     return nearest if near[nearest] > np.cos(np.radians(SAME_DEG)) else None
 
@@ -84,9 +88,10 @@ def _not_seen(found: Faces, vehicle_from_sensor: Matrix) -> list[tuple[str, Arra
         for a, b in itertools.combinations(faces, 2)
         if not faces[a] @ faces[b]
     }
+    kept = np.delete(found.up, found.left_out, axis=0)
     for sides in (faces, edges):
         turned = [(name, vehicle_from_sensor.T @ up) for name, up in sides.items()]
-        new = [(name, up) for name, up in turned if (found.up @ up).max() < np.cos(np.radians(FACE_DEG))]
+        new = [(name, up) for name, up in turned if (kept @ up).max() < np.cos(np.radians(FACE_DEG))]
         if new:
             return new
     return [(name, vehicle_from_sensor.T @ up) for name, up in {**faces, **edges}.items()]

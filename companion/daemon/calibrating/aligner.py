@@ -6,7 +6,6 @@ one person alone can do it with the ground station's voice or the page; the comm
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 import datetime
 import math
@@ -22,33 +21,24 @@ from companion.calibration.machine import Event
 from companion.calibration.means.pose import GradienterModel, up_in_vehicle, vehicle_heading_rad
 from companion.calibration.means.windows import Window
 from companion.calibration.solution.site import LocalEarth, local_earth
-from companion.component.statustext import Severity
 from companion.configured import models
 from companion.daemon.calibrating import align_steps
 from companion.daemon.calibrating.align_steps import Plan, Seen
 from companion.daemon.calibrating.alignment import AlignmentInForce
-from companion.daemon.calibrating.course import POLL_S, Measuring
+from companion.daemon.calibrating.course import Measuring
+from companion.daemon.calibrating.stands import Asked, Stands
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG
 
-STAND_S: Final = 12.0
-"""Seconds of stillness for each stand: averaging beyond 10 s buys an accelerometer nothing (method section 2.3)."""
-SETTLE_S: Final = 1.0
 READING_SIGMA_DEG: Final = 0.005
 """What one mean of a gradienter is good for besides its zero (the gradienter noise of method section 3's table)."""
 GYRO_TURN_SIGMA_DEG: Final = 3.0
 """Sigma of a half turn by the gyros alone: scale errors of 1 %, and an axis that is not vertical."""
 SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
-
-ARMED: Final = "armed during the alignment; the earlier one stays in force"
-
-
-def _changed(name: str) -> CalibrationRefusedError:
-    return CalibrationRefusedError(f"the offsets of imu {name} were changed in between: align again")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +48,6 @@ class _Taken:
     window: Window
     seen: Seen
     heading_sigma_deg: float
-    offsets: dict[str, dict[str, float]]
 
 
 class Aligner:
@@ -72,9 +61,8 @@ class Aligner:
         alignment: AlignmentInForce,
     ) -> None:
         self._core, self._config, self._vehicle, self._collector = core, core.config, core.vehicle, core.collector
-        self._offload, self._say = core.offload, core.say
-        self._machine, self._imus, self._measuring, self._alignment = core.machine, imus, measuring, alignment
-        self._stand_s = max(STAND_S, core.config.calibration.min_still_s)
+        self._offload, self._machine, self._alignment = core.offload, core.machine, alignment
+        self._stands = Stands(core, imus, measuring)
 
     async def run(self, job: Job, plan: Plan) -> str:
         """Measure all stands, work out, keep; returns the result in one line.
@@ -90,15 +78,13 @@ class Aligner:
         local: LocalEarth | None = None
         taken: list[_Taken] = []
         result: Alignment | None = None
+        self._stands.begin()
         while len(taken) < plan.total:
             taken.append(await self._stand(job, plan, model, taken))
             self._machine.on(Event.ENOUGH)
             if len(taken) >= min(3, plan.total):
                 # What does not fit is said at once, not after five more stands.
-                for name, imu in self._imus.items():
-                    # Somebody may have changed its offsets without a word.
-                    if not await imu.refresh():
-                        raise _changed(name)
+                await self._stands.check_offsets()
                 where = models.whereabouts(self._config, self._vehicle)
                 local = await self._offload(local_earth, where)
                 result = await self._offload(self._solve, plan, model, taken, local)
@@ -124,52 +110,16 @@ class Aligner:
             CalibrationRefusedError: armed, out of time, or what was measured before is void.
             JobCancelledError: cancelled.
         """
-        loop = asyncio.get_running_loop()
-        number, seen = len(taken) + 1, [one.seen for one in taken]
-        wish = align_steps.request(plan, seen)
-        self._say(Severity.NOTICE, f"Align {number}/{plan.total}: {wish}")
-        # Whoever asks may yet put it down on a better spot: what was before that does not count.
-        since_s = taken[-1].window.end_s if taken else loop.time()
-        moved, why = not taken, ""
-        while True:
-            now_s = loop.time()
-            status, waiting_for, hold_still_s = await self._measuring.read_state(job, ARMED)
-            self._check_offsets(taken)
-            moving = self._collector.glance(now_s).moving
-            if moving:
-                moved, since_s = True, now_s
-            still_s = min(status.still_s, now_s - since_s - SETTLE_S)
-            share = min(max(still_s, 0.0) / self._stand_s, 1.0) if moved and waiting_for is None else 0.0
-            if not moved:
-                words = f"{why or f'{number - 1} done. Now {wish}'}; waiting for it to move"
-            elif waiting_for is not None:
-                # Once it stands again, what to do is said by itself.
-                words = waiting_for if hold_still_s is not None else f"{why or wish}; {waiting_for}"
-            else:
-                words = f"measuring, {max(still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
-            self._measuring.show(measuring=share > 0.0)
-            job.progress(100.0 * (number - 1 + share) / plan.total, f"{number} of {plan.total}: {words}")
-            if moved and waiting_for is None and still_s >= self._stand_s:
-                found = await self._measure(model, taken, since_s)
-                objection = align_steps.objection(plan, seen, found.seen)
-                if objection is None:
-                    return found
-                moved, why = False, objection
-                self._measuring.show(measuring=False)
-                self._say(Severity.NOTICE, f"Align: {objection}")
-            await job.pause(POLL_S)
+        seen = [one.seen for one in taken]
 
-    def _check_offsets(self, taken: list[_Taken]) -> None:
-        """Raises CalibrationRefusedError where what was measured before is void."""
-        for name, offsets in self._offsets().items() if taken else ():
-            if taken[0].offsets.get(name, offsets) != offsets:
-                raise _changed(name)
+        def take(window: Window) -> tuple[_Taken, str | None]:
+            found = self._taken(model, taken, window)
+            return found, align_steps.objection(plan, seen, found.seen)
 
-    def _offsets(self) -> dict[str, dict[str, float]]:
-        return {name: imu.calibration.offsets for name, imu in self._imus.items() if imu.calibration is not None}
+        asked = Asked(len(taken) + 1, plan.total, align_steps.request(plan, seen))
+        return await self._stands.next(job, asked, take)
 
-    async def _measure(self, model: GradienterModel, taken: list[_Taken], since_s: float) -> _Taken:
-        window = await self._core.window(since_s=since_s + SETTLE_S)
+    def _taken(self, model: GradienterModel, taken: list[_Taken], window: Window) -> _Taken:
         if window.tilt is None:
             raise CalibrationRefusedError("no reading of the gradienter in this stand")
         try:
@@ -185,7 +135,7 @@ class Aligner:
             sigma = GYRO_TURN_SIGMA_DEG
         else:
             heading, sigma = 0.0, 0.1  # north is where it points first
-        return _Taken(window, Seen(up, heading), sigma, self._offsets())
+        return _Taken(window, Seen(up, heading), sigma)
 
     def _turned_deg(self, before: Window, now: Window) -> float:
         """By the gyros: the first IMU's means, second by second, about down."""

@@ -25,9 +25,10 @@ from companion.daemon.calibrating.align_steps import Plan
 from companion.daemon.calibrating.aligner import Aligner
 from companion.daemon.calibrating.bias_memory import Results, has_written
 from companion.daemon.calibrating.course import Course
+from companion.daemon.calibrating.facing import Facing
 from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
 from companion.daemon.core import Core
-from companion.daemon.job import ALIGNMENT, Job, JobCancelledError
+from companion.daemon.job import ALIGNMENT, FACES, Job, JobCancelledError
 from companion.daemon.offsets.ledger import Recovery
 from companion.errors import CompanionError
 from companion.links.system.listeners import Listeners
@@ -43,12 +44,14 @@ class Conductor:
         core: Core,
         course: Course,
         aligner: Aligner,
+        facing: Facing,
         recovery: Recovery,
         results: Results,
     ) -> None:
         self._machine, self._wanted, self._only_listening = core.machine, core.wanted, core.only_listening
         self._vehicle, self._collector, self._say = core.vehicle, core.collector, core.say
-        self._course, self._aligner, self._recovery, self._results = course, aligner, recovery, results
+        self._course, self._aligner, self._facing = course, aligner, facing
+        self._recovery, self._results = recovery, results
         self._has_gradienter = core.config.gradienter is not None
         self._on_deck = core.config.vehicle.platform == "deck"
         self._starts = StartLimit()
@@ -131,6 +134,18 @@ class Conductor:
             return refusal
         job = Job(ALIGNMENT, What.BOTH, requester, asyncio.get_running_loop().time() + timeout_s)
         return self._start(job, Event.REQUEST, self._align(job, plan))
+
+    def start_faces(self, requester: str, timeout_s: float, *, write: bool) -> Job | Refusal:
+        """Start measuring the accelerometers in stands of any orientation, or say why not."""
+        if self._on_deck:
+            return Refusal("other", "accelerometers are not measured on a deck that moves: align ashore")
+        refusal = self._refusal(requester)
+        if refusal is None and (missing := self._facing.why_not(write=write)) is not None:
+            refusal = Refusal("other", missing)
+        if refusal is not None:
+            return refusal
+        job = Job(FACES, What.ACCELEROMETERS, requester, asyncio.get_running_loop().time() + timeout_s)
+        return self._start(job, Event.REQUEST, self._face(job, write=write))
 
     def start_undo(self, requester: str, *, force: bool = False) -> Job | Refusal:
         """Start putting back the values from before the last calibration, or say why not (see `Recovery.undo`)."""
@@ -238,6 +253,9 @@ class Conductor:
 
     async def _align(self, job: Job, plan: Plan) -> None:
         self._end(job, await _result(job, self._aligner.run(job, plan)))
+
+    async def _face(self, job: Job, *, write: bool) -> None:
+        self._end(job, await _result(job, self._facing.run(job, write=write)))
 
     # --- an undo
 

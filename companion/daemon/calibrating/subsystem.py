@@ -17,10 +17,12 @@ from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.calibrating.bias_memory import BiasMemory, Results
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.course import Course, Measuring, Solving
+from companion.daemon.calibrating.facing import Facing
+from companion.daemon.calibrating.stands import Stands
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
-from companion.daemon.job import ALIGNMENT, Job
+from companion.daemon.job import Job
 from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.push import Conclusion
 from companion.daemon.offsets.subsystem import Offsets
@@ -56,8 +58,9 @@ class Calibrating(Subsystem):
         self.conclusion = Conclusion(core, offsets.effect, offsets.firmware)
         course = Course(core, measuring, self.solving, ditherer, offsets.planner, offsets.pusher, self.conclusion)
         aligner = Aligner(core, imus, measuring, self.alignment)
+        facing = Facing(core, imus, Stands(core, imus, measuring), offsets.pusher)
         self._results = Results(core, self.store, self.memory)
-        self.conductor = Conductor(core, course, aligner, offsets.recovery, self._results)
+        self.conductor = Conductor(core, course, aligner, facing, offsets.recovery, self._results)
 
     def load(self) -> None:  # noqa: D102 - as in the base class
         self.alignment.load()
@@ -127,7 +130,7 @@ class Calibrating(Subsystem):
         else:
             job = self._start_alignment(request, face)
             async for reply in self._progress(job):
-                yield {**reply, "job": ALIGNMENT}
+                yield {**reply, "job": job.kind}
             result = job.finished.result()
             yield {
                 "kind": "result",
@@ -150,6 +153,9 @@ class Calibrating(Subsystem):
         action, headings = request.get("action"), request.get("headings", 2)
         timeout_s = request.get("timeout_s")
         timeout_s = ALIGN_TIMEOUT_S if timeout_s is None else timeout_s
+        if action == "faces" and is_time_limit(timeout_s):
+            write = request.get("write") is True
+            return _accepted(self.conductor.start_faces(f"{face} align", float(timeout_s), write=write))
         if action not in ("zero", "tilts") or headings not in (2, HEADINGS) or not is_time_limit(timeout_s):
             raise CalibrationRefusedError(f"align: {request} is not understood")
         return _accepted(self.conductor.start_alignment(Plan(action, headings), f"{face} align", float(timeout_s)))

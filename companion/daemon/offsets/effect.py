@@ -195,7 +195,7 @@ def judge_vectors(
     Where the output was seen to follow a far value and then to leave it as it had to, the new one is in use, however
     small the change as a whole.
     """
-    gyro_step, accel_step = output_step(calibration, changes)
+    gyro_step, accel_step = output_step(calibration, changes, sides.before.accel_m_s2)
     names, noise = calibration.parameters, noise_profile(profile)
     spans_s = (sides.before.duration_s, sides.after.duration_s)
     gyro_flicker, accel_flicker = (math.inf, math.inf) if profile is not None else ORDINARY_FLICKER

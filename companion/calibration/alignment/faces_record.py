@@ -1,0 +1,90 @@
+"""The record of accelerometers measured in stands of any orientation.
+
+Its keys are a surface that others rely on, like the alignment's.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from companion.calibration.alignment.align import DETERMINED
+from companion.calibration.alignment.align_record import Determined
+from companion.calibration.alignment.faces import (
+    BIAS,
+    PRIOR_BIAS_M_S2,
+    PRIOR_SCALE,
+    PRIOR_SHEAR,
+    SCALE,
+    SHEAR,
+    Faces,
+)
+from companion.calibration.solution.record import WrittenParameter
+from companion.physics.frames import vector
+from companion.physics.units import MG
+from companion.samples import Vector
+
+FORMAT_VERSION = 1
+
+
+class FaceRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """One stand: up in the aircraft's axes, forward, right, down."""
+
+    up: Vector
+    seconds: float
+
+
+class FacesImuRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU, in its own axes, of its output as it was: what the autopilot takes off already is not in it."""
+
+    name: str
+    temperature_degc: float | None
+    accel_bias_mg: Determined
+    accel_scale: Determined
+    accel_shear: Determined
+    """xy, xz, yz; no firmware takes it off."""
+    left_out: tuple[int, ...]
+    """Stands, from 1, that do not fit the others."""
+    scatter_mg: float
+    """Rms by which the stands' readings, corrected, miss the length of gravity."""
+    written: dict[str, WrittenParameter]
+    """Empty where nothing was to be written."""
+
+
+class FacesRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """Finished."""
+
+    format_version: int = FORMAT_VERSION
+    kind: Literal["faces"] = "faces"
+    measured_at: str
+    """UTC, ISO 8601; the host's clock."""
+    gravity_m_s2: float
+    stands: tuple[FaceRecord, ...]
+    imus: tuple[FacesImuRecord, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def faces_imu_record(
+    name: str, found: Faces, temperature_degc: float | None, written: dict[str, WrittenParameter]
+) -> FacesImuRecord:
+    """One IMU in the units that people know."""
+    kept = [k for k in range(len(found.off_m_s2)) if k not in found.left_out]
+    return FacesImuRecord(
+        name=name,
+        temperature_degc=temperature_degc,
+        accel_bias_mg=_determined(found, BIAS, MG, PRIOR_BIAS_M_S2),
+        accel_scale=_determined(found, SCALE, 1.0, PRIOR_SCALE),
+        accel_shear=_determined(found, SHEAR, 1.0, PRIOR_SHEAR),
+        left_out=tuple(k + 1 for k in found.left_out),
+        scatter_mg=round(float(np.sqrt(np.mean(np.square(found.off_m_s2[kept])))) / MG, 4),
+        written=written,
+    )
+
+
+def _determined(found: Faces, part: slice, unit: float, before: float) -> Determined:
+    sigma = found.sigma[part]
+    x, y, z = (bool(one < DETERMINED * before) for one in sigma)
+    value = vector(np.round(found.figures[part] / unit, 7))
+    return Determined(value=value, sigma=vector(np.round(sigma / unit, 7)), known=(x, y, z))

@@ -1,0 +1,229 @@
+"""Accelerometers of the autopilot from stands in any orientation: measured, said, and written where that was asked for.
+
+It needs neither a gradienter nor a level spot. Every stand says what is still missing; it ends by itself.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from companion.autopilot.firmware.imu_calibration import output_step, whole_accelerometer
+from companion.calibration.alignment.faces import BIAS, SCALE, Face, Faces, faces
+from companion.calibration.alignment.faces_record import FaceRecord, FacesRecord, faces_imu_record
+from companion.calibration.alignment.missing import missing, seen_before
+from companion.calibration.machine import Event
+from companion.calibration.means.windows import ImuWindow, Window
+from companion.calibration.solution.draft import Draft
+from companion.calibration.solution.site import LocalEarth, local_earth
+from companion.calibration.solution.solve import ImuSolution
+from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
+from companion.component.statustext import Severity
+from companion.configured import models
+from companion.daemon.calibrating.stands import Asked, Stands
+from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.job import Job
+from companion.daemon.offsets.plan import Plan, Target
+from companion.daemon.offsets.push import Pusher
+from companion.errors import CalibrationRefusedError
+from companion.physics.frames import Array, vector
+from companion.physics.units import MG
+
+EXPECTED: Final = 12
+"""How many stands it takes, about."""
+MOST: Final = 24
+_FIRST: Final = "any side down, propped up, hands off"
+_WATCHING: Final = "watching the telemetry take the new offsets"
+
+
+class _Known(NamedTuple):
+    """What the stands so far tell."""
+
+    by_imu: dict[str, Faces]
+    wish: str | None
+    """The stand that is missing, in words; None where nothing is."""
+
+
+class Facing:
+    """Measures accelerometers so; who may start it is the conductor's."""
+
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], stands: Stands, pusher: Pusher) -> None:
+        self._core, self._machine, self._imus = core, core.machine, imus
+        self._stands, self._pusher = stands, pusher
+
+    def why_not(self, *, write: bool) -> str | None:
+        """Why there is nothing to measure, or nothing could be written; None where all is well."""
+        if not self._imus:
+            return "there is no IMU of the autopilot to measure: none is configured"
+        if write and not self._core.wanted.push:
+            return "nothing is written while push.parameters is false"
+        if write and self._core.vehicle.firmware == "px4":
+            return "scales are not written to PX4: align faces without --write shows them"
+        return None
+
+    async def run(self, job: Job, *, write: bool) -> str:
+        """Measure stand after stand, work out, write; returns the result in one line.
+
+        Raises:
+            CompanionError: it failed, and why; what was written is back, or it is said what is not.
+            JobCancelledError: cancelled; likewise.
+        """
+        windows: list[Window] = []
+        known = _Known({}, _FIRST)
+        local: LocalEarth | None = None
+        self._stands.begin()
+        while known.wish is not None and len(windows) < MOST:
+            if windows:
+                self._machine.on(Event.MOVED)
+            windows.append(await self._next(job, known, len(windows) + 1))
+            self._machine.on(Event.ENOUGH)
+            where = models.whereabouts(self._core.config, self._core.vehicle)
+            local = await self._core.offload(local_earth, where)
+            before, known = known, await self._core.offload(self._solve, windows, local)
+            self._name_left_out(before, known)
+        assert local is not None
+        await self._stands.check_offsets()
+        draft = Draft(datetime.datetime.now(tz=datetime.UTC), self._core.vehicle.system_id)
+        draft.warnings += local.warnings
+        if known.wish is not None:
+            draft.warnings.append(f"after {MOST} stands {known.wish}")
+        try:
+            if write and known.wish is None:
+                await self._write(job, windows[-1], known.by_imu, draft)
+        finally:
+            job.deliver(self._record(windows, known.by_imu, local, draft))
+        if not write:
+            self._machine.on(Event.NOTHING_TO_WRITE)
+        elif known.wish is not None:
+            raise CalibrationRefusedError(f"nothing was written: after {MOST} stands {known.wish}")
+        return _in_words(known.by_imu, written=write)
+
+    async def _next(self, job: Job, known: _Known, number: int) -> Window:
+        def take(window: Window) -> tuple[Window, str | None]:
+            names = [imu.name for imu in window.imus if imu.name in known.by_imu]
+            for name in names[:1]:
+                read = self._face(next(imu for imu in window.imus if imu.name == name))
+                found = known.by_imu[name]
+                up = read.accel_m_s2 - found.figures[BIAS]
+                again = seen_before(found, up / np.linalg.norm(up))
+                if again is not None:
+                    return window, f"it stands as in stand {again + 1}: {known.wish}"
+            return window, None
+
+        return await self._stands.next(job, Asked(number, max(EXPECTED, number), known.wish or ""), take)
+
+    def _name_left_out(self, before: _Known, now: _Known) -> None:
+        for name, found in now.by_imu.items():
+            earlier = before.by_imu[name].left_out if name in before.by_imu else ()
+            for stand in set(found.left_out) - set(earlier):
+                off_mg = float(found.off_m_s2[stand]) / MG
+                self._core.say(Severity.WARNING, f"Stand {stand + 1} is {off_mg:+.1f} mg off: left out")
+
+    # --- working out
+
+    def _solve(self, windows: list[Window], local: LocalEarth) -> _Known:
+        """Blocking: for a thread."""
+        by_imu: dict[str, Faces] = {}
+        wish: str | None = None
+        for name, imu in self._imus.items():
+            means = [one for window in windows for one in window.imus if one.name == name and not one.refused("accel")]
+            if len(means) < len(windows) or imu.calibration is None:
+                continue
+            wander = np.mean([_wander(one) for one in means], axis=0)
+            found = faces([self._face(one) for one in means], local.gravity_m_s2, local.gravity_sigma_m_s2, wander)
+            by_imu[name] = found
+            still = missing(found, imu.calibration.orientation)
+            wish = wish or (None if still is None else str(still))
+        if not by_imu:
+            raise CalibrationRefusedError("no IMU whose accelerometers can be read")
+        return _Known(by_imu, wish)
+
+    def _face(self, imu: ImuWindow) -> Face:
+        """In the sensor's own axes, in which firmwares scale."""
+        calibration = self._imus[imu.name].in_force
+        turn = calibration.orientation.T
+        sigma = np.sqrt(np.diag(turn @ np.diag(np.square(imu.accel_sigma_use_m_s2)) @ turn.T))
+        return Face(turn @ np.array(imu.accel_m_s2), sigma)
+
+    # --- writing
+
+    async def _write(self, job: Job, last: Window, by_imu: dict[str, Faces], draft: Draft) -> None:
+        if not await self._pusher.offsets_still_hold():
+            raise CalibrationRefusedError("the offsets were changed in between: align again")
+        targets = [self._target(next(imu for imu in last.imus if imu.name == name), by_imu[name]) for name in by_imu]
+        plan = Plan(tuple(targets), self._core.vehicle.boots)
+        job.check_cancelled()
+        self._machine.on(Event.WRITE)
+        job.progress(MEASURED_PERCENT, f"writing {len(plan.changes)} parameters")
+
+        def go_on(words: str) -> None:
+            job.check_cancelled()
+            job.progress(WRITTEN_PERCENT, words or _WATCHING)
+
+        async with self._pusher.written(plan, draft, lambda words: job.progress(MEASURED_PERCENT, words)) as plan:
+            self._machine.on(Event.WRITTEN)
+            await self._pusher.verify(plan, last, draft, go_on)
+        for target in targets:
+            kept = draft.written.get(target.name, {})
+            seen = {kept[name].outcome for name in target.calibration.parameters.accel_offset if name in kept}
+            if seen == {"verified"}:
+                # One step of the output showed offsets and scales together.
+                plan.mark(draft, target.calibration.parameters.accel_scale, "verified")
+        self._machine.on(Event.VERIFIED)
+        self._machine.on(Event.CONCLUDED)
+
+    def _target(self, imu: ImuWindow, found: Faces) -> Target:
+        calibration = self._imus[imu.name].in_force
+        changes = whole_accelerometer(calibration, vector(found.figures[BIAS]), vector(found.figures[SCALE]))
+        _, step = output_step(calibration, changes, imu.accel_m_s2)
+        sigma = np.concatenate([imu.gyro_sigma_use_rad_s, imu.accel_sigma_use_m_s2])
+        solution = ImuSolution(
+            name=imu.name,
+            samples=imu.samples,
+            temperature_degc=imu.temperature_degc,
+            gyro_rad_s=None,
+            accel_m_s2=-np.array(step),
+            gyro_sigma_stat_rad_s=np.array(imu.gyro_sigma_stat_rad_s),
+            accel_sigma_stat_m_s2=np.array(imu.accel_sigma_stat_m_s2),
+            covariance=np.diag(sigma**2),
+            warnings=(),
+        )
+        kind = self._imus[imu.name].stream.kind
+        return Target(imu.name, calibration, tuple(changes), solution, kind, watched=True)
+
+    # --- the record
+
+    def _record(self, windows: list[Window], by_imu: dict[str, Faces], local: LocalEarth, draft: Draft) -> FacesRecord:
+        first = next(iter(by_imu))
+        ups = by_imu[first].up @ self._imus[first].in_force.orientation.T
+        degrees = {imu.name: imu.temperature_degc for imu in windows[-1].imus}
+        return FacesRecord(
+            measured_at=draft.started_at.isoformat(timespec="milliseconds"),
+            gravity_m_s2=local.gravity_m_s2,
+            stands=tuple(
+                FaceRecord(up=vector(np.round(up, 5)), seconds=window.end_s - window.start_s)
+                for up, window in zip(ups, windows, strict=True)
+            ),
+            imus=tuple(
+                faces_imu_record(name, found, degrees.get(name), draft.written.get(name, {}))
+                for name, found in by_imu.items()
+            ),
+            warnings=(*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each)),
+        )
+
+
+def _wander(imu: ImuWindow) -> Array:
+    """What the bias of the next minutes is away from that of this window, (3,)."""
+    use, stat = np.array(imu.accel_sigma_use_m_s2), np.array(imu.accel_sigma_stat_m_s2)
+    return np.asarray(np.sqrt(np.maximum(use**2 - stat**2, 0.0)))
+
+
+def _in_words(by_imu: dict[str, Faces], *, written: bool) -> str:
+    bias_mg = max(float(found.sigma[BIAS].max()) for found in by_imu.values()) / MG
+    scale = max(float(found.sigma[SCALE].max()) for found in by_imu.values())
+    end = "written" if written else "not written (--write does)"
+    return f"accel bias known to {bias_mg:.2f} mg, scale to {100.0 * scale:.3f} %: {end}"

@@ -1,0 +1,126 @@
+"""Stand after stand, each a still window, with words for whoever moves the aircraft.
+
+Nobody has to press anything between the stands: a movement is seen, and the next stand begins when it has ended. So
+one person alone can do it with the ground station's voice or the page; the command line only shows the same words.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from typing import Final, NamedTuple, TypeVar
+
+from companion.calibration.means.windows import Window
+from companion.component.statustext import Severity
+from companion.daemon.calibrating.course import POLL_S, Measuring
+from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.job import Job
+from companion.errors import CalibrationRefusedError
+
+STAND_S: Final = 12.0
+"""Seconds of stillness for each stand: averaging beyond 10 s buys an accelerometer nothing (method section 2.3)."""
+SETTLE_S: Final = 1.0
+ARMED: Final = "armed during the alignment; the earlier one stays in force"
+
+_T = TypeVar("_T")
+
+
+class Asked(NamedTuple):
+    """A stand that is asked for."""
+
+    number: int
+    """From 1."""
+    total: int
+    """How many there will be, about."""
+    wish: str
+    """How to stand it."""
+
+
+class Stands:
+    """Of one aircraft, for one job at a time."""
+
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], measuring: Measuring) -> None:
+        self._core, self._machine, self._collector, self._say = core, core.machine, core.collector, core.say
+        self._imus, self._measuring = imus, measuring
+        self._stand_s = max(STAND_S, core.config.calibration.min_still_s)
+        self._end_s: float | None = None
+        self._first: dict[str, dict[str, float]] = {}
+
+    def begin(self) -> None:
+        """The next stand is the first."""
+        self._end_s, self._first = None, {}
+
+    async def next(self, job: Job, asked: Asked, take: Callable[[Window], tuple[_T, str | None]]) -> _T:
+        """Wait until it stands as it should, and measure.
+
+        Args:
+            job: of the stands.
+            asked: what is asked for.
+            take: what a window tells, and why it is not the stand that was asked for, if it is not.
+
+        Returns:
+            What the first window told that was.
+
+        Raises:
+            CalibrationRefusedError: armed, out of time, or what was measured before is void.
+            JobCancelledError: cancelled.
+        """
+        loop = asyncio.get_running_loop()
+        number, total, wish = asked
+        self._say(Severity.NOTICE, f"Align {number}/{total}: {wish}")
+        # Whoever asks may yet put it down on a better spot: what was before that does not count.
+        since_s = loop.time() if self._end_s is None else self._end_s
+        moved, why = self._end_s is None, ""
+        while True:
+            now_s = loop.time()
+            status, waiting_for, hold_still_s = await self._measuring.read_state(job, ARMED)
+            self._check_known()
+            moving = self._collector.glance(now_s).moving
+            if moving:
+                moved, since_s = True, now_s
+            still_s = min(status.still_s, now_s - since_s - SETTLE_S)
+            share = min(max(still_s, 0.0) / self._stand_s, 1.0) if moved and waiting_for is None else 0.0
+            if not moved:
+                words = f"{why or f'{number - 1} done. Now {wish}'}; waiting for it to move"
+            elif waiting_for is not None:
+                # Once it stands again, what to do is said by itself.
+                words = waiting_for if hold_still_s is not None else f"{why or wish}; {waiting_for}"
+            else:
+                words = f"measuring, {max(still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
+            self._measuring.show(measuring=share > 0.0)
+            job.progress(100.0 * (number - 1 + share) / total, f"{number} of {total}: {words}")
+            if moved and waiting_for is None and still_s >= self._stand_s:
+                window = await self._core.window(since_s=since_s + SETTLE_S)
+                found, objection = take(window)
+                if objection is None:
+                    self._end_s = window.end_s
+                    self._first = self._first or self._offsets()
+                    return found
+                moved, why = False, objection
+                self._measuring.show(measuring=False)
+                self._say(Severity.NOTICE, f"Align: {objection}")
+            await job.pause(POLL_S)
+
+    async def check_offsets(self) -> None:
+        """Read them afresh: somebody may have changed them without a word.
+
+        Raises:
+            CalibrationRefusedError: what was measured before is void.
+            AutopilotError: they cannot be read.
+        """
+        for name, imu in self._imus.items():
+            if not await imu.refresh():
+                raise _changed(name)
+
+    def _check_known(self) -> None:
+        for name, offsets in self._offsets().items() if self._first else ():
+            if self._first.get(name, offsets) != offsets:
+                raise _changed(name)
+
+    def _offsets(self) -> dict[str, dict[str, float]]:
+        return {name: imu.calibration.corrections for name, imu in self._imus.items() if imu.calibration is not None}
+
+
+def _changed(name: str) -> CalibrationRefusedError:
+    return CalibrationRefusedError(f"the offsets of imu {name} were changed in between: align again")

@@ -1,0 +1,178 @@
+"""`companion align faces` on the whole daemon: an autopilot alone, held on every side by hand."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from companion.calibration.alignment.faces_record import FacesRecord
+from companion.component.service import JobResult, Refusal
+from companion.daemon.job import Job
+from sim.ardupilot.double import offset_names
+from sim.hands import Hands
+from sim.imu_model import MG
+from tests.e2e.test_calibration import started
+from tests.support.rig import ACCEL_BIAS_MG, Rig
+from tests.support.virtual_time import run_virtual
+
+SCALES = {"INS_ACCSCAL_X": 1.004, "INS_ACCSCAL_Y": 0.997, "INS_ACCSCAL_Z": 1.002}
+HELD = {
+    "level": (0, 0),
+    "on its back": (0, 180),
+    "nose up": (90, 0),
+    "nose down": (-90, 0),
+    "left side down": (0, -90),
+    "right side down": (0, 90),
+}
+
+
+def rig(folder: Path, **more: Any) -> tuple[Rig, Hands]:
+    """An autopilot and nothing else; its scales are wrong, its offsets have never been measured."""
+    made = Rig(folder, imu_rate_hz=10.0, parameters=SCALES, **more)
+    made.config = msgspec.structs.replace(made.config, gradienter=None, compass=None)
+    made.devices.clear()
+    return made, Hands(made.aircraft, seed=3)
+
+
+def way(words: str) -> tuple[float, float]:
+    """Pitch and roll of the stand that the words ask for."""
+    found = re.search(r"Now (?:half way between (.*?) and (.*?)|(.*?)) is missing", words)
+    assert found is not None, words
+    up = np.zeros(3)
+    for name in found.groups():
+        if name is not None:
+            pitch, roll = np.radians(HELD[name])
+            up += [np.sin(pitch), -np.sin(roll) * np.cos(pitch), -np.cos(roll) * np.cos(pitch)]
+    up /= np.linalg.norm(up)
+    return float(np.degrees(np.arcsin(up[0]))), float(np.degrees(np.arctan2(-up[1], -up[2])))
+
+
+Meddle = Callable[[int], tuple[float, float] | None]
+
+
+async def follow(rig: Rig, hands: Hands, job: Job, meddle: Meddle = lambda _: None) -> JobResult:
+    """Hold it as the words say, by hand; or as `meddle(stand)` says, once."""
+    random, done = np.random.default_rng(5), 1
+    while not job.finished.done():
+        if job.words.startswith(f"{done + 1} of") and "waiting for it to move" in job.words:
+            pitch, roll = way(job.words) + random.normal(size=2) * 4.0
+            hands.hold(rig.aircraft.time_at(rig.now_s), *(meddle(done + 1) or (float(pitch), float(roll))))
+            done += 1
+        await asyncio.sleep(0.5)
+    return job.finished.result()
+
+
+def faced(rig: Rig, *, write: bool) -> Job:
+    return started(rig.service.calibrating.conductor.start_faces("test", 2000.0, write=write))
+
+
+def read(rig: Rig, what: str) -> np.ndarray[Any, Any]:
+    return np.array([rig.double.parameter(name) for name in offset_names(1, what)])  # type: ignore[arg-type]
+
+
+def test_bias_and_scale_are_measured_written_seen_and_undone_to_the_bit(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            old = {name: made.double.parameter(name) for what in ("accel", "scale") for name in offset_names(1, what)}
+            job = faced(made, write=True)
+            result = await follow(made, hands, job)
+            assert result.outcome == "done", result
+            assert result.reason.endswith("written")
+            record = job.product
+            assert isinstance(record, FacesRecord)
+            assert 11 <= len(record.stands) <= 14
+            (imu,) = record.imus
+            assert not imu.left_out
+            # With scales undone the sensor is what it is: a bias, and nothing wrong with its scale.
+            np.testing.assert_allclose(read(made, "scale"), 1.0, atol=2e-4)
+            true_mg = made.model.true_bias(made.aircraft.time_at(made.now_s)).accel_m_s2 / MG
+            np.testing.assert_allclose(read(made, "accel") / MG, true_mg, atol=0.15)
+            assert np.abs(true_mg - ACCEL_BIAS_MG).max() < 0.2
+            wrong = np.array(list(SCALES.values())) - 1.0
+            np.testing.assert_allclose(imu.accel_scale.value, wrong, atol=2e-4)
+            assert {one.outcome for one in imu.written.values()} == {"verified"}
+            assert set(imu.written) == set(old)
+            undone = made.service.calibrating.conductor.start_undo("test")
+            assert not isinstance(undone, Refusal)
+            assert (await undone.finished).outcome == "done"
+            assert {name: made.double.parameter(name) for name in old} == old
+
+    run_virtual(main())
+
+
+def test_without_write_nothing_is_written_and_what_is_missing_is_said(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            job = faced(made, write=False)
+            result = await follow(made, hands, job)
+            assert result.outcome == "done", result
+            assert result.reason.endswith("not written (--write does)")
+            np.testing.assert_allclose(read(made, "scale"), list(SCALES.values()), rtol=1e-6)
+            said = " ".join(made.ground.texts())
+            assert "on its back is missing: z bias" in said
+            assert re.search(r"nose (up|down) is missing: x (bias|scale)", said)
+
+    run_virtual(main())
+
+
+def test_a_stand_given_twice_and_a_cancel(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            job = faced(made, write=True)
+            again = asyncio.ensure_future(follow(made, hands, job, lambda stand: (3.0, -2.0) if stand == 3 else None))
+            await made.until(lambda: "it stands as in stand 1: " in job.words, 200.0)
+            assert made.service.calibrating.conductor.cancel("test")
+            result = await again
+            assert result.outcome == "cancelled"
+            np.testing.assert_allclose(read(made, "scale"), list(SCALES.values()), rtol=1e-6)
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("what", ["offset", "scale"])
+def test_parameters_that_somebody_changes_meanwhile_void_the_stands(tmp_path: Path, what: str) -> None:
+    made, hands = rig(tmp_path)
+    name = "INS_ACCOFFS_X" if what == "offset" else "INS_ACCSCAL_X"
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            job = faced(made, write=False)
+            task = asyncio.ensure_future(follow(made, hands, job))
+            await made.until(lambda: job.words.startswith("3 of"), 200.0)
+            made.double.parameters.set(name, 1.01)
+            result = await task
+            assert result.outcome == "failed"
+            assert "were changed in between: align again" in result.reason
+
+    run_virtual(main())
+
+
+def test_who_asks_for_what_cannot_be_is_told_at_once(tmp_path: Path) -> None:
+    made, _ = rig(tmp_path)
+    made.config = msgspec.structs.replace(made.config, push=msgspec.structs.replace(made.config.push, parameters=False))
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            refused = made.service.calibrating.conductor.start_faces("test", 100.0, write=True)
+            assert isinstance(refused, Refusal)
+            assert "push.parameters is false" in refused.reason
+
+    run_virtual(main())
