@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import Final
 
 from companion.calibration.alignment.align_record import AlignmentRecord
-from companion.calibration.alignment.faces_record import FacesRecord
 from companion.calibration.request import What
 from companion.calibration.solution.doubt import Doubt
+from companion.calibration.solution.faces_record import FacesRecord
 from companion.calibration.solution.record import Record, WrittenParameter
 from companion.component.service import JobResult
 from companion.errors import CalibrationRefusedError

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.alignment.faces_record import FacesRecord
+from companion.calibration.solution.faces_record import FacesRecord
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
 from sim.ardupilot.double import offset_names

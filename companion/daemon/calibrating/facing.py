@@ -13,11 +13,11 @@ import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import output_step, whole_accelerometer
 from companion.calibration.alignment.faces import BIAS, SCALE, Face, Faces, faces
-from companion.calibration.alignment.faces_record import FaceRecord, FacesRecord, faces_imu_record
 from companion.calibration.alignment.missing import missing, seen_before
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.solution.draft import Draft
+from companion.calibration.solution.faces_record import FaceRecord, FacesRecord, faces_imu_record
 from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.calibration.solution.solve import ImuSolution
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
