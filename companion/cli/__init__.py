@@ -112,7 +112,11 @@ def _parser() -> Parser:
     undo.add_argument(
         "--force", action="store_true", help="leave what somebody else has changed since, and put the rest back"
     )
-    add("autopilot-setup", client.setup, "what the autopilot needs set to take in our heading")
+    add(
+        "autopilot-setup",
+        client.setup,
+        "what the autopilot needs set: heading, gate, offsets, port",
+    )
     history = add("history", client.history, "list past calibrations")
     history.add_argument(
         "-n", "--limit", type=within(1, 1e6, int), default=20, metavar="N", help="the latest N (default 20)"

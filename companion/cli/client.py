@@ -105,12 +105,21 @@ async def setup(options: argparse.Namespace) -> int:
 
 def setup_lines(answer: Object) -> list[str]:
     """The set-up as a person reads it."""
-    lines = [f"{answer['state']}: {answer['reason']}"]
-    for row in answer["parameters"]:
-        now, wanted = _number(row["now"]), _number(row["wanted"])
-        change = f"{now} -> {wanted}" if now != wanted else now
-        lines.append(f"  {row['parameter']:16} {change:12}  {row['why']}")
-    return [*lines, *(f"risk: {risk}" for risk in answer["risks"])]
+    lines = [f"heading: {answer['state']}: {answer['reason']}", *map(_row, answer["parameters"])]
+    lines += [f"risk: {risk}" for risk in answer["risks"]]
+    gate = answer["gate"]
+    how = gate["problem"] or "the autopilot asks before it arms"
+    lines.append(f"gate: {how}" if gate["at_arm"] == "gate" else f"gate: not wanted; for at_arm = gate: {how}")
+    lines += [f"rival: {words}" for words in answer["rivals"]] or ["rivals: none: nothing overwrites the offsets"]
+    if answer["port"]:
+        lines += ["port:", *map(_row, answer["port"])]
+    return lines
+
+
+def _row(row: Object) -> str:
+    now, wanted = _number(row["now"]), _number(row["wanted"])
+    change = f"{now} -> {wanted}" if now != wanted else now
+    return f"  {row['parameter']:16} {change:12}  {row['why']}"
 
 
 def _number(value: float | None) -> str:

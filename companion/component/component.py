@@ -10,6 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.arm_authorisation import ArmAuthoriser, ArmingScript
 from companion.component.commands import CommandServer, Permission
+from companion.component.named_values import NamedValues
+from companion.component.no_files import NoFiles
 from companion.component.own_parameters import OwnParameters, Parameter
 from companion.component.service import ArmGate, CalibrationService
 from companion.component.statustext import StatusText
@@ -47,6 +49,8 @@ class Component:
         self._commands = CommandServer(link, service, texts.say, self._woken.set, self.permission)
         self._authoriser = ArmAuthoriser(link, gate, texts.say)
         self._script = ArmingScript(link, gate)
+        self._files = NoFiles(link)
+        self._values = NamedValues(link, service, gate)
         self._unsubscribe = link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
 
     async def run(self) -> None:
@@ -65,6 +69,7 @@ class Component:
         finally:
             self._unsubscribe()
             self._authoriser.close()
+            self._files.close()
             self.parameters.close()
             self._commands.close(loop.time())
             self._texts.step(loop.time())
@@ -75,6 +80,7 @@ class Component:
         if now_s >= self._next_heartbeat_s:
             if self._link.connected:
                 self._link.send(heartbeat(self._service.mav_state))
+                self._values.beat(now_s)
                 # The rhythm is kept, but what a stall has missed is not made up for.
                 next_s = self._next_heartbeat_s + HEARTBEAT_PERIOD_S
                 self._next_heartbeat_s = next_s if next_s > now_s else now_s + HEARTBEAT_PERIOD_S

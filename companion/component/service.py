@@ -62,6 +62,10 @@ class CalibrationService(Protocol):
         """Cancel what runs, whoever asked for it; whether something was running."""
 
     @property
+    def progress_percent(self) -> int:
+        """Of the calibration or undo under way; 100 where none is."""
+
+    @property
     def mav_state(self) -> int:
         """MAV_STATE_* for the heartbeat: CALIBRATING while busy, ACTIVE or STANDBY when idle, CRITICAL on a fault."""
 

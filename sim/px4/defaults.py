@@ -122,6 +122,7 @@ def _mavlink() -> dict[str, float]:
         "MAV_HB_FORW_EN": 1,
         "MAV_RADIO_TOUT": 5,
         "MAV_FWDEXTSP": 1,
+        "SER_TEL2_BAUD": 921600,
     }
     for port, config, mode, rate, forward in ((0, 101, 0, 1200, 1), (1, 102, 2, 0, 0), (2, 0, 0, 0, 0)):
         table |= {f"MAV_{port}_CONFIG": config, f"MAV_{port}_MODE": mode, f"MAV_{port}_RATE": rate}

@@ -123,6 +123,7 @@ class ScriptedService:
 
     def __init__(self) -> None:
         self.mav_state = int(mavlink.MAV_STATE_ACTIVE)
+        self.progress_percent = 100
         self.started: list[Started] = []
         self.reboots: list[bool] = []
         """Of every calibration that was asked for, whether with a restart of the autopilot."""

@@ -21,7 +21,7 @@ def words_of(autopilot: ScriptedAutopilot) -> tuple[bool, str]:
         link = MavlinkLink()
         vehicle = Vehicle(link)
         parameters = ParameterClient(link, vehicle)
-        reach = Reach(link, vehicle, parameters)
+        reach = Reach(link, vehicle, parameters, "serial:/dev/serial0:921600")
         async with flying_on(link, autopilot):
             running = asyncio.create_task(reach.run())
             await asyncio.sleep(8.0)

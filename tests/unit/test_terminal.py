@@ -191,7 +191,7 @@ def test_the_monitor_on_a_terminal(replies: dict[str, Object], capsys: pytest.Ca
 def test_what_is_on_the_ports(
     config: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, form: list[str]
 ) -> None:
-    async def listen(port: str) -> object:
+    async def listen(port: str, first: object = ()) -> object:
         raise LinkError(f"{port}: {EVIL}")
 
     port = SerialPort(

@@ -46,7 +46,7 @@ class GateSetup:
             await self._vehicle.wait_found()
             self._stale.clear()
             try:
-                self.problem = await self._find_missing()
+                self.problem = await self.find_missing()
             except AutopilotError as error:
                 logger.info("whether the gate is set up is not known: %s", error)
                 self._stale.set()
@@ -73,11 +73,19 @@ class GateSetup:
             logger.warning("arming is not gated: %s", self.problem)
             self._say(Severity.WARNING, f"NO GATE: {self.problem}", Weight.RESULT)
 
-    async def _find_missing(self) -> str | None:
+    async def find_missing(self, script_starts_s: float = SCRIPT_STARTS_S) -> str | None:
+        """What has to be set so that the autopilot asks, for people; None: nothing.
+
+        Args:
+            script_starts_s: how long ArduPilot's script is waited for where it does not run yet.
+
+        Raises:
+            AutopilotError: it does not answer.
+        """
         if self._vehicle.firmware == "px4":
             return await self._px4()
         if self._vehicle.firmware == "ardupilot":
-            return await self._ardupilot()
+            return await self._ardupilot(script_starts_s)
         return "this autopilot has no gate that is known here"
 
     async def _px4(self) -> str | None:
@@ -93,10 +101,10 @@ class GateSetup:
         ]
         return f"set {', '.join(wrong)}" if wrong else None
 
-    async def _ardupilot(self) -> str | None:
+    async def _ardupilot(self, script_starts_s: float) -> str | None:
         enabled = await self._parameters.read_optional(_SCRIPT)
-        if enabled is None:
-            await asyncio.sleep(SCRIPT_STARTS_S)
+        if enabled is None and script_starts_s:
+            await asyncio.sleep(script_starts_s)
             enabled = await self._parameters.read_optional(_SCRIPT)
         if enabled is None:
             return "the arming script does not run (see: companion lua)"

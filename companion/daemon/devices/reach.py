@@ -15,6 +15,7 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.autopilot.firmware.port_parameters import baud_of, port_needs
 from companion.autopilot.parameters.client import ParameterClient, read_integer
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.errors import AutopilotError
@@ -31,8 +32,8 @@ RETRY_S: Final = 10.0
 class Reach:
     """Listens for ground stations and reads what the autopilot says about forwarding."""
 
-    def __init__(self, link: MavlinkLink, vehicle: Vehicle, parameters: ParameterClient) -> None:
-        self._vehicle, self._parameters = vehicle, parameters
+    def __init__(self, link: MavlinkLink, vehicle: Vehicle, parameters: ParameterClient, url: str) -> None:
+        self._vehicle, self._parameters, self._baud = vehicle, parameters, baud_of(url)
         self._heard_s = -math.inf
         self._forwards: dict[int, bool] | None = None
         self._stale = asyncio.Event()
@@ -58,10 +59,11 @@ class Reach:
         if not self._vehicle.alive:
             return True, "not known: no autopilot"
         if not self.answered:
+            needs = "" if self._baud is None else f"; {port_needs(self._vehicle.firmware, self._baud)}"
             return False, (
                 "the autopilot is heard but does not answer: it does not hear our heartbeat, so nobody can reach the"
                 " companion through it; check the wire to the autopilot's RX, the baud rate and the port's protocol"
-                f"{self._vehicle.why_silent}"
+                f"{needs}{self._vehicle.why_silent}"
             )
         if self.heard:
             return True, "a ground station is heard; it reaches the companion as component 191 of this vehicle"

@@ -8,6 +8,8 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from companion.autopilot.firmware.heading_parameters import RISKS, changes_for, wanted_for
+from companion.autopilot.firmware.imu_calibration import read_rivals
+from companion.autopilot.firmware.port_parameters import PortRow, baud_of, port_names, port_rows
 from companion.calibration.means.pose import up_in_vehicle, vehicle_heading_rad
 from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.configured import models
@@ -34,7 +36,7 @@ class Heading(Subsystem):
     """The pose that people see, and the attitude that is pushed."""
 
     def __init__(self, core: Core, devices: Devices, calibrating: Calibrating, arming: Arming) -> None:
-        self._core = core
+        self._core, self._gate = core, arming.gate_setup
         self.attitude: AttitudeService | None = None
         """None unless a heading is pushed."""
         if core.config.push.attitude != "off":
@@ -49,7 +51,7 @@ class Heading(Subsystem):
         return {"autopilot-setup": self._answer_setup}
 
     async def _answer_setup(self, _request: Object, _face: str) -> AsyncIterator[Object]:
-        """What is set, what should be, and what to do.
+        """What is set, what should be, and what to do: for our heading, the gate, the offsets, and the port.
 
         Raises:
             AutopilotError: it does not answer, or cannot take in a heading.
@@ -81,7 +83,15 @@ class Heading(Subsystem):
                 for now in (found.get(one.parameter),)
             ],
             "risks": list(RISKS.get(firmware or "other", ())),
+            "gate": {"at_arm": self._core.wanted.at_arm, "problem": await self._gate.find_missing(0.0)},
+            "rivals": [rival.words for rival in await read_rivals(self._core.parameters)],
+            "port": [row._asdict() for row in await self._port()],
         }
+
+    async def _port(self) -> list[PortRow]:
+        firmware = self._core.vehicle.firmware
+        found = await self._core.parameters.read_many(port_names(firmware), optional=True)
+        return port_rows(firmware, found, baud_of(self._core.config.mavlink.url))
 
     def status(self) -> Object:  # noqa: D102
         attitude = self.attitude

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from companion.autopilot.firmware.port_parameters import baud_of, port_needs
 from companion.config.sections import Config
 from companion.configured.models import cannot_work, doubtful, serial_devices
 from companion.daemon.devices.sensor_health import ABSENT
@@ -212,7 +213,7 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
     findings += [Finding("configuration", good=False, words=words) for words in cannot_work(config)]
     findings += [Finding("warning", good=True, words=words) for words in doubtful(config)]
     vehicle = status["vehicle"]
-    findings.append(Finding("autopilot", good=vehicle["system_id"] is not None, words=vehicle["summary"]))
+    findings.append(_autopilot(config, vehicle))
     if (signing := vehicle["signing"]) is not None:
         findings.append(Finding("signing", good=signing["good"], words=signing["summary"]))
     elsewhere = where_it_may_be(config)
@@ -235,6 +236,16 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
             without = {"gradienter": "gyros only", "compass": "gyro sigma widened by the Earth's rate"}[kind]
             findings.append(Finding(kind, good=True, words=f"not configured: {without}"))
     return findings
+
+
+def _autopilot(config: Config, vehicle: Object) -> Finding:
+    """Whether it is heard; where not on a serial line, what its end of that needs."""
+    if vehicle["system_id"] is not None:
+        return Finding("autopilot", good=True, words=vehicle["summary"])
+    baud = baud_of(config.mavlink.url)
+    remedy = "" if baud is None else f"{port_needs(None, baud)}; TX to RX; companion setup looks for it elsewhere"
+    words = f"{vehicle['summary']}: {remedy}" if remedy else vehicle["summary"]
+    return Finding("autopilot", good=False, words=words, remedy=remedy)
 
 
 def _device(device: Object, elsewhere: Finding | None) -> Finding:
