@@ -133,16 +133,20 @@ def add_command(add: AddCommand) -> None:
     what.add_argument(
         "what",
         nargs="?",
-        choices=("zero", "tilts", "faces"),
-        metavar="zero|tilts|faces",
-        help="zero: on one spot; tilts: that, and 4 tilts; faces: accelerometers, about 12 stands on any side",
+        choices=("zero", "tilts", "turn", "faces"),
+        metavar="zero|tilts|turn|faces",
+        help="zero: on one spot; tilts: that, and 4 tilts; without a gradienter, turn: level on one spot;"
+        " faces: accelerometers, about 12 stands on any side",
     )
     what.add_argument("--show", action="store_true", help="the alignment that is kept")
     what.add_argument("--forget", action="store_true", help="go back to the configuration's zero and sigma")
     parser.add_argument(
-        "--headings", type=int, choices=(2, 4), default=2, help="zero: 2: there, turned, back; 4: every 90 deg"
+        "--headings",
+        type=int,
+        choices=(2, 4),
+        help="2: there, turned, back (of zero without it); 4: every 90 deg (of turn without it)",
     )
-    parser.add_argument("--write", action="store_true", help="faces: write bias and scale to the autopilot")
+    parser.add_argument("--write", action="store_true", help="turn, faces: write what was found to the autopilot")
     parser.add_argument("--timeout", type=seconds, metavar="S", help="give up after so long (default 900)")
 
 
@@ -162,7 +166,7 @@ async def align(options: argparse.Namespace) -> int:
         lines = [f"{state}: {answer['reason']}" if answer["reason"] else state]
         found = answer["alignment"]
         if found:
-            lines += faces_lines(found) if found.get("kind") == "faces" else alignment_lines(found)
+            lines += {"faces": faces_lines, "turn": turn_lines}.get(found["kind"], alignment_lines)(found)
     good = answer.get("state") in ("done", "in force") or (action == "show" and answer.get("state") != "refused")
     return finish(options, reply, answer, lines, good=good)
 
@@ -179,9 +183,27 @@ def faces_lines(record: Object) -> list[str]:
         ):
             found = imu[key]
             lines.append(f"  {words:16} {unit:6} {show.axes(found['value'], found['sigma'], form, scale)}")
-        for name, written in imu["written"].items():
-            lines.append(f"  {name:18} {written['before']:+.6f} -> {written['after']:+.6f}  {written['outcome']}")
+        lines += _written_lines(imu["written"])
     return lines + [f"warning: {words}" for words in record["warnings"]]
+
+
+def turn_lines(record: Object) -> list[str]:
+    """A turn without a gradienter as a person reads it."""
+    when, stands = record["measured_at"][:19], len(record["stands"])
+    lines = [f"measured {when} UTC in {stands} stands; the spot slopes by {record['slope_deg']:.2f} deg"]
+    for imu in record["imus"]:
+        lines.append(f"{imu['name']}:")
+        lines.append(
+            f"  {'bias when level':16} {'mg':6} {show.axes(imu['level_bias_mg'], imu['level_sigma_mg'], '+.3f')}"
+        )
+        lines += _written_lines(imu["written"])
+    return lines + [f"warning: {words}" for words in record["warnings"]]
+
+
+def _written_lines(written: Object) -> list[str]:
+    return [
+        f"  {name:18} {one['before']:+.6f} -> {one['after']:+.6f}  {one['outcome']}" for name, one in written.items()
+    ]
 
 
 def alignment_lines(record: Object) -> list[str]:

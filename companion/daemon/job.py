@@ -11,6 +11,7 @@ from companion.calibration.request import What
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.faces_record import FacesRecord
 from companion.calibration.solution.record import Record, WrittenParameter
+from companion.calibration.solution.turn_record import TurnRecord
 from companion.component.service import JobResult
 from companion.errors import CalibrationRefusedError
 from companion.samples import Triad
@@ -19,10 +20,12 @@ ALIGNMENT: Final = "gradienter alignment"
 """The kind of job that calibrates nothing."""
 FACES: Final = "measurement on all sides"
 """The kind of job that measures accelerometers in any orientation."""
-BY_STANDS: Final = (ALIGNMENT, FACES)
+TURN: Final = "turn on the spot"
+"""The kind of job that finds the level by that alone."""
+BY_STANDS: Final = (ALIGNMENT, FACES, TURN)
 """Those that are not calibrations."""
 
-Product = Record | AlignmentRecord | FacesRecord | dict[str, WrittenParameter]
+Product = Record | AlignmentRecord | FacesRecord | TurnRecord | dict[str, WrittenParameter]
 
 
 class JobCancelledError(Exception):

@@ -20,6 +20,7 @@ import numpy as np
 from companion.calibration.alignment.align import LEVEL, Alignment, ImuAlignment, align
 from companion.calibration.alignment.align_model import Ground, Priors, Stand
 from companion.calibration.alignment.faces import BIAS, FIGURES, PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR, SCALE, Faces
+from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, roll_pitch_from_up
 
 ALONE: Final = Priors(
@@ -39,7 +40,10 @@ def turned(stands: Sequence[Stand], ground: Ground, priors: Priors = ALONE) -> A
     Raises:
         CalibrationRefusedError: the readings cannot belong together.
     """
-    return align("slope", np.eye(3), stands, ground, priors)
+    try:
+        return align("slope", np.eye(3), stands, ground, priors)
+    except CalibrationRefusedError:
+        raise CalibrationRefusedError("the readings do not belong together: is the orientation right?") from None
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
 
 from companion.calibration.alignment.align_record import Kind
+from companion.calibration.means.windows import Window
 from companion.physics.frames import Array
 from companion.physics.units import DEG
 
@@ -33,11 +34,13 @@ class Plan:
     kind: Kind
     headings: int = 2
     """2: there, turned by 180 degrees, and back; 4: every quarter turn."""
+    back: bool = False
+    """Of quarter turns: on to the first heading again, as a check."""
 
     @property
     def on_spot(self) -> int:
         """How many stands share the spot."""
-        return HEADINGS if self.kind == "tilts" or self.headings == HEADINGS else 3
+        return HEADINGS + self.back if self.kind == "tilts" or self.headings == HEADINGS else 3
 
     @property
     def total(self) -> int:
@@ -62,7 +65,7 @@ def request(plan: Plan, taken: Sequence[Seen]) -> str:
         done = [_side(taken[0].up, seen.up) for seen in taken[plan.on_spot :]]
         already = f", not {' or '.join(done)} again" if done else ": nose up, nose down, left or right side down"
         return f"tilt it 20 to 28 deg and prop it up{already}"
-    if plan.on_spot == HEADINGS:
+    if plan.on_spot >= HEADINGS:
         return "turn it by 90 deg on its spot"
     if number == 1:
         return "turn it by 180 deg, onto its marks"
@@ -77,7 +80,7 @@ def objection(plan: Plan, taken: Sequence[Seen], now: Seen) -> str | None:
     first = taken[0]
     if number < plan.on_spot:
         turned = _wrapped(now.heading_deg - first.heading_deg)
-        if plan.on_spot == HEADINGS:
+        if plan.on_spot >= HEADINGS and number < HEADINGS:
             return _quarter(taken, turned)
         wanted = 180.0 if number == 1 else 0.0
         off = _wrapped(turned - wanted)
@@ -121,6 +124,12 @@ def _side(level: Array, up: Array) -> str:
 
 def _wrapped(angle_deg: float) -> float:
     return (angle_deg + 180.0) % 360.0 - 180.0
+
+
+def turned_between_deg(rates_rad_s: Mapping[int, Array], before: Window, now: Window) -> float:
+    """By how much it was turned between two stands: the first IMU's means of seconds about down, less its bias."""
+    bias = (before.imus[0].gyro_rad_s[2] + now.imus[0].gyro_rad_s[2]) / 2.0
+    return turned_deg([float(rate[2]) for second, rate in rates_rad_s.items() if second < now.start_s], bias)
 
 
 def turned_deg(rates_down_rad_s: Sequence[float], bias_rad_s: float) -> float:

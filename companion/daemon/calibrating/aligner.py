@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from companion.calibration.alignment.align import Alignment, align, in_words
-from companion.calibration.alignment.align_model import Ground, ImuStand, Stand
+from companion.calibration.alignment.align_model import Ground, Stand
 from companion.calibration.alignment.align_record import AlignmentRecord, imu_record, stand_record
 from companion.calibration.machine import Event
 from companion.calibration.means.pose import GradienterModel, up_in_vehicle, vehicle_heading_rad
@@ -26,7 +26,7 @@ from companion.daemon.calibrating import align_steps
 from companion.daemon.calibrating.align_steps import Plan, Seen
 from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.calibrating.course import Measuring
-from companion.daemon.calibrating.stands import Asked, Stands
+from companion.daemon.calibrating.stands import Asked, Stands, imu_stand
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
@@ -139,11 +139,8 @@ class Aligner:
 
     def _turned_deg(self, before: Window, now: Window) -> float:
         """By the gyros: the first IMU's means, second by second, about down."""
-        name = now.imus[0].name
-        bias = (before.imus[0].gyro_rad_s[2] + now.imus[0].gyro_rad_s[2]) / 2.0
-        rates = self._collector.snapshot(before.end_s, None).rates_rad_s(name)
-        between = [float(rate[2]) for second, rate in rates.items() if second < now.start_s]
-        return align_steps.turned_deg(between, bias)
+        rates = self._collector.snapshot(before.end_s, None).rates_rad_s(now.imus[0].name)
+        return align_steps.turned_between_deg(rates, before, now)
 
     # --- the result
 
@@ -169,16 +166,7 @@ class Aligner:
         assert tilt is not None
         imus = {imu.name: imu for imu in window.imus}
         return Stand(
-            imus=tuple(
-                ImuStand(
-                    name,
-                    np.array(imus[name].accel_m_s2),
-                    np.array(imus[name].accel_sigma_use_m_s2),
-                    np.array(imus[name].gyro_rad_s),
-                    np.array(imus[name].gyro_sigma_use_rad_s),
-                )
-                for name in names
-            ),
+            imus=tuple(imu_stand(imus[name]) for name in names),
             tilt_deg=(tilt.x_deg - configured[0], tilt.y_deg - configured[1]),
             tilt_sigma_deg=(
                 math.hypot(READING_SIGMA_DEG, tilt.x_sigma_deg),

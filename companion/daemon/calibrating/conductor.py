@@ -26,9 +26,10 @@ from companion.daemon.calibrating.aligner import Aligner
 from companion.daemon.calibrating.bias_memory import Results, has_written
 from companion.daemon.calibrating.course import Course
 from companion.daemon.calibrating.facing import Facing
+from companion.daemon.calibrating.turning import Turning
 from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
 from companion.daemon.core import Core
-from companion.daemon.job import ALIGNMENT, FACES, Job, JobCancelledError
+from companion.daemon.job import ALIGNMENT, FACES, TURN, Job, JobCancelledError
 from companion.daemon.offsets.ledger import Recovery
 from companion.errors import CompanionError
 from companion.links.system.listeners import Listeners
@@ -45,12 +46,13 @@ class Conductor:
         course: Course,
         aligner: Aligner,
         facing: Facing,
+        turning: Turning,
         recovery: Recovery,
         results: Results,
     ) -> None:
         self._machine, self._wanted, self._only_listening = core.machine, core.wanted, core.only_listening
         self._vehicle, self._collector, self._say = core.vehicle, core.collector, core.say
-        self._course, self._aligner, self._facing = course, aligner, facing
+        self._course, self._aligner, self._facing, self._turning = course, aligner, facing, turning
         self._recovery, self._results = recovery, results
         self._has_gradienter = core.config.gradienter is not None
         self._on_deck = core.config.vehicle.platform == "deck"
@@ -137,15 +139,23 @@ class Conductor:
 
     def start_faces(self, requester: str, timeout_s: float, *, write: bool) -> Job | Refusal:
         """Start measuring the accelerometers in stands of any orientation, or say why not."""
-        if self._on_deck:
-            return Refusal("other", "accelerometers are not measured on a deck that moves: align ashore")
-        refusal = self._refusal(requester)
-        if refusal is None and (missing := self._facing.why_not(write=write)) is not None:
-            refusal = Refusal("other", missing)
-        if refusal is not None:
+        if (refusal := self._refuses_stands(requester, self._facing.why_not(write=write))) is not None:
             return refusal
         job = Job(FACES, What.ACCELEROMETERS, requester, asyncio.get_running_loop().time() + timeout_s)
         return self._start(job, Event.REQUEST, self._face(job, write=write))
+
+    def start_turn(self, headings: int, requester: str, timeout_s: float, *, write: bool) -> Job | Refusal:
+        """Start finding the level by turning on a spot, without a gradienter, or say why not."""
+        if (refusal := self._refuses_stands(requester, self._turning.why_not(write=write))) is not None:
+            return refusal
+        job = Job(TURN, What.ACCELEROMETERS, requester, asyncio.get_running_loop().time() + timeout_s)
+        return self._start(job, Event.REQUEST, self._turn(job, Plan("zero", headings, back=True), write=write))
+
+    def _refuses_stands(self, requester: str, missing: str | None) -> Refusal | None:
+        if self._on_deck:
+            return Refusal("other", "accelerometers are not measured on a deck that moves: align ashore")
+        refusal = self._refusal(requester)
+        return Refusal("other", missing) if refusal is None and missing is not None else refusal
 
     def start_undo(self, requester: str, *, force: bool = False) -> Job | Refusal:
         """Start putting back the values from before the last calibration, or say why not (see `Recovery.undo`)."""
@@ -256,6 +266,9 @@ class Conductor:
 
     async def _face(self, job: Job, *, write: bool) -> None:
         self._end(job, await _result(job, self._facing.run(job, write=write)))
+
+    async def _turn(self, job: Job, plan: Plan, *, write: bool) -> None:
+        self._end(job, await _result(job, self._turning.run(job, plan, write=write)))
 
     # --- an undo
 

@@ -11,7 +11,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from companion.autopilot.firmware.imu_calibration import output_step, whole_accelerometer
+from companion.autopilot.firmware.imu_calibration import whole_accelerometer
+from companion.autopilot.parameters.change import Change
 from companion.calibration.alignment.faces import BIAS, SCALE, Face, Faces, faces
 from companion.calibration.alignment.missing import missing, seen_before
 from companion.calibration.machine import Event
@@ -19,16 +20,13 @@ from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.faces_record import FaceRecord, FacesRecord, faces_imu_record
 from companion.calibration.solution.site import LocalEarth, local_earth
-from companion.calibration.solution.solve import ImuSolution
-from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity
 from companion.configured import models
+from companion.daemon.calibrating.accel_writes import AccelWrites
 from companion.daemon.calibrating.stands import Asked, Stands
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
-from companion.daemon.offsets.plan import Plan, Target
-from companion.daemon.offsets.push import Pusher
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, vector
 from companion.physics.units import MG
@@ -37,7 +35,6 @@ EXPECTED: Final = 12
 """How many stands it takes, about."""
 MOST: Final = 24
 _FIRST: Final = "any side down, propped up, hands off"
-_WATCHING: Final = "watching the telemetry take the new offsets"
 
 
 class _Known(NamedTuple):
@@ -51,19 +48,15 @@ class _Known(NamedTuple):
 class Facing:
     """Measures accelerometers so; who may start it is the conductor's."""
 
-    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], stands: Stands, pusher: Pusher) -> None:
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], stands: Stands, writes: AccelWrites) -> None:
         self._core, self._machine, self._imus = core, core.machine, imus
-        self._stands, self._pusher = stands, pusher
+        self._stands, self._writes = stands, writes
 
     def why_not(self, *, write: bool) -> str | None:
         """Why there is nothing to measure, or nothing could be written; None where all is well."""
-        if not self._imus:
-            return "there is no IMU of the autopilot to measure: none is configured"
-        if write and not self._core.wanted.push:
-            return "nothing is written while push.parameters is false"
         if write and self._core.vehicle.firmware == "px4":
             return "scales are not written to PX4: align faces without --write shows them"
-        return None
+        return self._writes.why_not(write=write)
 
     async def run(self, job: Job, *, write: bool) -> str:
         """Measure stand after stand, work out, write; returns the result in one line.
@@ -93,7 +86,7 @@ class Facing:
             draft.warnings.append(f"after {MOST} stands {known.wish}")
         try:
             if write and known.wish is None:
-                await self._write(job, windows[-1], known.by_imu, draft)
+                await self._writes.write(job, windows[-1], self._changes(known.by_imu), draft)
         finally:
             job.deliver(self._record(windows, known.by_imu, local, draft))
         if not write:
@@ -149,51 +142,13 @@ class Facing:
         sigma = np.sqrt(np.diag(turn @ np.diag(np.square(imu.accel_sigma_use_m_s2)) @ turn.T))
         return Face(turn @ np.array(imu.accel_m_s2), sigma)
 
-    # --- writing
-
-    async def _write(self, job: Job, last: Window, by_imu: dict[str, Faces], draft: Draft) -> None:
-        if not await self._pusher.offsets_still_hold():
-            raise CalibrationRefusedError("the offsets were changed in between: align again")
-        targets = [self._target(next(imu for imu in last.imus if imu.name == name), by_imu[name]) for name in by_imu]
-        plan = Plan(tuple(targets), self._core.vehicle.boots)
-        job.check_cancelled()
-        self._machine.on(Event.WRITE)
-        job.progress(MEASURED_PERCENT, f"writing {len(plan.changes)} parameters")
-
-        def go_on(words: str) -> None:
-            job.check_cancelled()
-            job.progress(WRITTEN_PERCENT, words or _WATCHING)
-
-        async with self._pusher.written(plan, draft, lambda words: job.progress(MEASURED_PERCENT, words)) as plan:
-            self._machine.on(Event.WRITTEN)
-            await self._pusher.verify(plan, last, draft, go_on)
-        for target in targets:
-            kept = draft.written.get(target.name, {})
-            seen = {kept[name].outcome for name in target.calibration.parameters.accel_offset if name in kept}
-            if seen == {"verified"}:
-                # One step of the output showed offsets and scales together.
-                plan.mark(draft, target.calibration.parameters.accel_scale, "verified")
-        self._machine.on(Event.VERIFIED)
-        self._machine.on(Event.CONCLUDED)
-
-    def _target(self, imu: ImuWindow, found: Faces) -> Target:
-        calibration = self._imus[imu.name].in_force
-        changes = whole_accelerometer(calibration, vector(found.figures[BIAS]), vector(found.figures[SCALE]))
-        _, step = output_step(calibration, changes, imu.accel_m_s2)
-        sigma = np.concatenate([imu.gyro_sigma_use_rad_s, imu.accel_sigma_use_m_s2])
-        solution = ImuSolution(
-            name=imu.name,
-            samples=imu.samples,
-            temperature_degc=imu.temperature_degc,
-            gyro_rad_s=None,
-            accel_m_s2=-np.array(step),
-            gyro_sigma_stat_rad_s=np.array(imu.gyro_sigma_stat_rad_s),
-            accel_sigma_stat_m_s2=np.array(imu.accel_sigma_stat_m_s2),
-            covariance=np.diag(sigma**2),
-            warnings=(),
-        )
-        kind = self._imus[imu.name].stream.kind
-        return Target(imu.name, calibration, tuple(changes), solution, kind, watched=True)
+    def _changes(self, by_imu: dict[str, Faces]) -> dict[str, list[Change]]:
+        return {
+            name: whole_accelerometer(
+                self._imus[name].in_force, vector(found.figures[BIAS]), vector(found.figures[SCALE])
+            )
+            for name, found in by_imu.items()
+        }
 
     # --- the record
 

@@ -10,7 +10,10 @@ import asyncio
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple, TypeVar
 
-from companion.calibration.means.windows import Window
+import numpy as np
+
+from companion.calibration.alignment.align_model import ImuStand
+from companion.calibration.means.windows import ImuWindow, Window
 from companion.component.statustext import Severity
 from companion.daemon.calibrating.course import POLL_S, Measuring
 from companion.daemon.core import Core
@@ -120,6 +123,17 @@ class Stands:
 
     def _offsets(self) -> dict[str, dict[str, float]]:
         return {name: imu.calibration.corrections for name, imu in self._imus.items() if imu.calibration is not None}
+
+
+def imu_stand(window: ImuWindow) -> ImuStand:
+    """One IMU of a stand, as measured in its window."""
+    return ImuStand(
+        window.name,
+        np.array(window.accel_m_s2),
+        np.array(window.accel_sigma_use_m_s2),
+        np.array(window.gyro_rad_s),
+        np.array(window.gyro_sigma_use_rad_s),
+    )
 
 
 def _changed(name: str) -> CalibrationRefusedError:

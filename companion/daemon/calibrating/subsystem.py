@@ -11,6 +11,7 @@ import msgspec
 from companion.calibration.request import What, is_time_limit
 from companion.calibration.solution.record import Record
 from companion.component.service import Refusal
+from companion.daemon.calibrating.accel_writes import AccelWrites
 from companion.daemon.calibrating.align_steps import HEADINGS, Plan
 from companion.daemon.calibrating.aligner import Aligner
 from companion.daemon.calibrating.alignment import AlignmentInForce
@@ -19,6 +20,7 @@ from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.course import Course, Measuring, Solving
 from companion.daemon.calibrating.facing import Facing
 from companion.daemon.calibrating.stands import Stands
+from companion.daemon.calibrating.turning import Turning
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
@@ -58,9 +60,10 @@ class Calibrating(Subsystem):
         self.conclusion = Conclusion(core, offsets.effect, offsets.firmware)
         course = Course(core, measuring, self.solving, ditherer, offsets.planner, offsets.pusher, self.conclusion)
         aligner = Aligner(core, imus, measuring, self.alignment)
-        facing = Facing(core, imus, Stands(core, imus, measuring), offsets.pusher)
+        stands, writes = Stands(core, imus, measuring), AccelWrites(core, imus, offsets.pusher, self.conclusion)
+        facing, turning = Facing(core, imus, stands, writes), Turning(core, imus, stands, writes)
         self._results = Results(core, self.store, self.memory)
-        self.conductor = Conductor(core, course, aligner, facing, offsets.recovery, self._results)
+        self.conductor = Conductor(core, course, aligner, facing, turning, offsets.recovery, self._results)
 
     def load(self) -> None:  # noqa: D102 - as in the base class
         self.alignment.load()
@@ -150,12 +153,16 @@ class Calibrating(Subsystem):
         return {"state": state, "reason": reason, "alignment": msgspec.to_builtins(alignment.record)}
 
     def _start_alignment(self, request: Object, face: str) -> Job:
-        action, headings = request.get("action"), request.get("headings", 2)
+        action, headings = request.get("action"), request.get("headings")
         timeout_s = request.get("timeout_s")
         timeout_s = ALIGN_TIMEOUT_S if timeout_s is None else timeout_s
+        write = request.get("write") is True
         if action == "faces" and is_time_limit(timeout_s):
-            write = request.get("write") is True
             return _accepted(self.conductor.start_faces(f"{face} align", float(timeout_s), write=write))
+        if action == "turn" and headings in (None, 2, HEADINGS) and is_time_limit(timeout_s):
+            started = self.conductor.start_turn(headings or HEADINGS, f"{face} align", float(timeout_s), write=write)
+            return _accepted(started)
+        headings = 2 if headings is None else headings
         if action not in ("zero", "tilts") or headings not in (2, HEADINGS) or not is_time_limit(timeout_s):
             raise CalibrationRefusedError(f"align: {request} is not understood")
         return _accepted(self.conductor.start_alignment(Plan(action, headings), f"{face} align", float(timeout_s)))

@@ -1,0 +1,60 @@
+"""The record of an aircraft turned on its spot, without a gradienter; its keys are a surface that others rely on."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+from companion.calibration.alignment.align import ImuAlignment
+from companion.calibration.alignment.align_record import Determined, StandRecord, imu_record
+from companion.calibration.solution.record import WrittenParameter
+from companion.samples import Vector
+
+FORMAT_VERSION = 1
+
+
+class TurnImuRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """One IMU, vehicle FRD, of its output as it was."""
+
+    name: str
+    temperature_degc: float | None
+    level_bias_mg: Vector
+    """What the accelerometers of the aircraft read too much when its base is level."""
+    level_sigma_mg: Vector
+    gyro_bias_deg_h: Determined
+    written: dict[str, WrittenParameter]
+    """Empty where nothing was to be written."""
+
+
+class TurnRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """Finished."""
+
+    format_version: int = FORMAT_VERSION
+    kind: Literal["turn"] = "turn"
+    measured_at: str
+    """UTC, ISO 8601; the host's clock."""
+    slope_deg: float
+    """Of the spot."""
+    checked: bool
+    """Whether a spot that moved between the stands would have been noticed."""
+    chi_square: float
+    freedom: int
+    stands: tuple[StandRecord, ...]
+    imus: tuple[TurnImuRecord, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def turn_imu_record(
+    imu: ImuAlignment, temperature_degc: float | None, written: dict[str, WrittenParameter]
+) -> TurnImuRecord:
+    """One IMU in the units that people know."""
+    whole = imu_record(imu, temperature_degc)
+    return TurnImuRecord(
+        name=whole.name,
+        temperature_degc=temperature_degc,
+        level_bias_mg=whole.level_bias_mg,
+        level_sigma_mg=whole.level_sigma_mg,
+        gyro_bias_deg_h=whole.gyro_bias_deg_h,
+        written=written,
+    )

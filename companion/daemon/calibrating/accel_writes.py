@@ -1,0 +1,94 @@
+"""Accelerometer offsets and scales into the autopilot, after stands; seen in the telemetry of the last of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from companion.autopilot.firmware.imu_calibration import output_step
+from companion.autopilot.firmware.px4 import warnings_about
+from companion.autopilot.parameters.change import Change
+from companion.calibration.machine import Event
+from companion.calibration.means.windows import ImuWindow, Window
+from companion.calibration.solution.draft import Draft
+from companion.calibration.solution.solve import ImuSolution
+from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
+from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.job import Job
+from companion.daemon.offsets.plan import Plan, Target
+from companion.daemon.offsets.push import Conclusion, Pusher
+from companion.errors import CalibrationRefusedError
+
+_WATCHING: Final = "watching the telemetry take the new offsets"
+
+
+class AccelWrites:
+    """Writes what stands have told; all or nothing."""
+
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], pusher: Pusher, conclusion: Conclusion) -> None:
+        self._core, self._machine, self._imus = core, core.machine, imus
+        self._pusher, self._conclusion = pusher, conclusion
+
+    def why_not(self, *, write: bool) -> str | None:
+        """Why there is nothing to measure, or nothing could be written; None where all is well."""
+        if not self._imus:
+            return "there is no IMU of the autopilot to measure: none is configured"
+        if write and not self._core.wanted.push:
+            return "nothing is written while push.parameters is false"
+        return None
+
+    async def write(self, job: Job, last: Window, changes: Mapping[str, Sequence[Change]], draft: Draft) -> None:
+        """By IMU; the aircraft stands still as in the last stand.
+
+        Raises:
+            CompanionError: it failed, and why; the old values are back, or it is said which are not.
+            JobCancelledError: cancelled; likewise.
+        """
+        if not await self._pusher.offsets_still_hold():
+            raise CalibrationRefusedError("the offsets were changed in between: align again")
+        means = {imu.name: imu for imu in last.imus}
+        targets = tuple(self._target(means[name], each) for name, each in changes.items())
+        for target in targets:
+            for words in warnings_about(target.calibration, target.changes):
+                draft.warn(target.name, words)
+        plan = Plan(targets, self._core.vehicle.boots)
+        job.check_cancelled()
+        self._machine.on(Event.WRITE)
+        job.progress(MEASURED_PERCENT, f"writing {len(plan.changes)} parameters")
+
+        def go_on(words: str) -> None:
+            job.check_cancelled()
+            job.progress(WRITTEN_PERCENT, words or _WATCHING)
+
+        async with self._pusher.written(plan, draft, lambda words: job.progress(MEASURED_PERCENT, words)) as plan:
+            self._machine.on(Event.WRITTEN)
+            await self._pusher.verify(plan, last, draft, go_on)
+        for target in targets:
+            kept = draft.written.get(target.name, {})
+            seen = {kept[name].outcome for name in target.calibration.parameters.accel_offset if name in kept}
+            if seen == {"verified"}:
+                # One step of the output showed offsets and scales together.
+                plan.mark(draft, target.calibration.parameters.accel_scale, "verified")
+        await self._conclusion.conclude(job, plan, last, draft)
+        self._machine.on(Event.CONCLUDED)
+
+    def _target(self, imu: ImuWindow, changes: Sequence[Change]) -> Target:
+        calibration = self._imus[imu.name].in_force
+        _, step = output_step(calibration, changes, imu.accel_m_s2)
+        sigma = np.concatenate([imu.gyro_sigma_use_rad_s, imu.accel_sigma_use_m_s2])
+        solution = ImuSolution(
+            name=imu.name,
+            samples=imu.samples,
+            temperature_degc=imu.temperature_degc,
+            gyro_rad_s=None,
+            accel_m_s2=-np.array(step),
+            gyro_sigma_stat_rad_s=np.array(imu.gyro_sigma_stat_rad_s),
+            accel_sigma_stat_m_s2=np.array(imu.accel_sigma_stat_m_s2),
+            covariance=np.diag(sigma**2),
+            warnings=(),
+        )
+        kind = self._imus[imu.name].stream.kind
+        return Target(imu.name, calibration, tuple(changes), solution, kind, watched=True)

@@ -1,0 +1,157 @@
+"""Level without a gradienter, from turning the aircraft on its spot: horizontal accelerometers, and the slope."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+
+from companion.autopilot.firmware.imu_calibration import changes_for
+from companion.calibration.alignment.align import Alignment, in_words
+from companion.calibration.alignment.align_model import Ground, Stand
+from companion.calibration.alignment.align_record import stand_record
+from companion.calibration.alignment.spot import turned
+from companion.calibration.machine import Event
+from companion.calibration.means.windows import Window
+from companion.calibration.solution.draft import Draft
+from companion.calibration.solution.site import LocalEarth, local_earth
+from companion.calibration.solution.turn_record import TurnRecord, turn_imu_record
+from companion.configured import models
+from companion.daemon.calibrating import align_steps
+from companion.daemon.calibrating.accel_writes import AccelWrites
+from companion.daemon.calibrating.align_steps import Plan, Seen
+from companion.daemon.calibrating.stands import Asked, Stands, imu_stand
+from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.daemon.job import Job
+from companion.errors import CalibrationRefusedError
+from companion.physics.frames import vector
+from companion.physics.units import DEG, MG
+
+COUNTED_SIGMA_DEG: Final = 1.5
+"""Of a turn by the gyros' means of seconds, besides their scale: hands do not turn about the vertical alone."""
+SLOPE_WARNING_DEG: Final = 1.0
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _Taken:
+    """One stand, measured; its heading is counted by the gyros from the first stand on, not wrapped."""
+
+    window: Window
+    seen: Seen
+
+
+class Turning:
+    """Measures so; who may start it is the conductor's."""
+
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], stands: Stands, writes: AccelWrites) -> None:
+        self._core, self._machine, self._imus = core, core.machine, imus
+        self._stands, self._writes = stands, writes
+
+    def why_not(self, *, write: bool) -> str | None:
+        """Why there is nothing to measure, or nothing could be written; None where all is well."""
+        return self._writes.why_not(write=write)
+
+    async def run(self, job: Job, plan: Plan, *, write: bool) -> str:
+        """Measure all headings, work out, write; returns the result in one line.
+
+        Raises:
+            CompanionError: it failed, and why; what was written is back, or it is said what is not.
+            JobCancelledError: cancelled; likewise.
+        """
+        taken: list[_Taken] = []
+        self._stands.begin()
+        while len(taken) < plan.on_spot:
+            if taken:
+                self._machine.on(Event.MOVED)
+            taken.append(await self._next(job, plan, taken))
+            self._machine.on(Event.ENOUGH)
+        await self._stands.check_offsets()
+        where = models.whereabouts(self._core.config, self._core.vehicle)
+        local = await self._core.offload(local_earth, where)
+        stands = self._as_stands(taken)
+        found: Alignment = await self._core.offload(turned, stands, _ground(local))
+        if found.complaint is not None:
+            raise CalibrationRefusedError(in_words(found.complaint))
+        draft = Draft(datetime.datetime.now(tz=datetime.UTC), self._core.vehicle.system_id)
+        draft.warnings += local.warnings
+        if found.slope_deg > SLOPE_WARNING_DEG and plan.headings == 2:
+            draft.warnings.append(
+                f"the spot slopes by {found.slope_deg:.1f} deg: four headings (--headings 4) know it better there"
+            )
+        try:
+            if write:
+                changes = {
+                    imu.name: changes_for(self._imus[imu.name].in_force, None, vector(imu.level_bias_m_s2))
+                    for imu in found.imus
+                }
+                await self._writes.write(job, taken[-1].window, changes, draft)
+        finally:
+            job.deliver(_record(taken, stands, found, draft))
+        if not write:
+            self._machine.on(Event.NOTHING_TO_WRITE)
+        sigma_mg = max(float(np.sqrt(np.diag(imu.level_covariance_m2_s4))[:2].max()) for imu in found.imus) / MG
+        end = "written" if write else "not written (--write does)"
+        return f"level known to {sigma_mg:.2f} mg, the spot slopes by {found.slope_deg:.2f} deg: {end}"
+
+    async def _next(self, job: Job, plan: Plan, taken: list[_Taken]) -> _Taken:
+        seen = [one.seen for one in taken]
+
+        def take(window: Window) -> tuple[_Taken, str | None]:
+            up = np.array(window.imus[0].accel_m_s2)
+            heading = self._turned_deg(taken[-1], window) if taken else 0.0
+            found = _Taken(window, Seen(up / np.linalg.norm(up), heading))
+            return found, align_steps.objection(plan, seen, found.seen)
+
+        asked = Asked(len(taken) + 1, plan.on_spot, align_steps.request(plan, seen))
+        return await self._stands.next(job, asked, take)
+
+    def _turned_deg(self, before: _Taken, now: Window) -> float:
+        """How it heads now, by the gyros of the first IMU since the stand before."""
+        rates = self._core.collector.snapshot(before.window.end_s, None).rates_rad_s(now.imus[0].name)
+        return before.seen.heading_deg + align_steps.turned_between_deg(rates, before.window, now)
+
+    def _as_stands(self, taken: list[_Taken]) -> list[Stand]:
+        names = [
+            name
+            for name in self._imus
+            if all(any(one.name == name and not one.refused("accel") for one in each.window.imus) for each in taken)
+        ]
+        if not names:
+            raise CalibrationRefusedError("no IMU whose accelerometers can be read")
+        return [self._as_stand(one, names, first=not k) for k, one in enumerate(taken)]
+
+    def _as_stand(self, taken: _Taken, names: list[str], *, first: bool) -> Stand:
+        by_name = {imu.name: imu for imu in taken.window.imus}
+        return Stand(
+            imus=tuple(imu_stand(by_name[name]) for name in names),
+            tilt_deg=None,
+            tilt_sigma_deg=(1.0, 1.0),
+            heading_rad=taken.seen.heading_deg * DEG,
+            heading_sigma_rad=(0.01 if first else COUNTED_SIGMA_DEG) * DEG,
+            on_spot=True,
+        )
+
+
+def _ground(local: LocalEarth) -> Ground:
+    """Headings count from the first stand, which may point anywhere."""
+    rate = local.rate_in_body(np.eye(3), heading_known=False)
+    return Ground(local.gravity_m_s2, local.gravity_sigma_m_s2, rate.mean, rate.covariance)
+
+
+def _record(taken: list[_Taken], stands: list[Stand], found: Alignment, draft: Draft) -> TurnRecord:
+    degrees = {imu.name: imu.temperature_degc for imu in taken[-1].window.imus}
+    spans_s = [one.window.end_s - one.window.start_s for one in taken]
+    return TurnRecord(
+        measured_at=draft.started_at.isoformat(timespec="milliseconds"),
+        slope_deg=round(found.slope_deg, 3),
+        checked=found.checked,
+        chi_square=round(found.chi_square, 3),
+        freedom=found.freedom,
+        stands=tuple(stand_record(stand, found, k, spans_s[k], (0.0, 0.0)) for k, stand in enumerate(stands)),
+        imus=tuple(turn_imu_record(imu, degrees.get(imu.name), draft.written.get(imu.name, {})) for imu in found.imus),
+        warnings=(*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each)),
+    )
