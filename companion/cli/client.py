@@ -146,6 +146,9 @@ def add_command(add: AddCommand) -> None:
         choices=(2, 4),
         help="2: there, turned, back (of zero without it); 4: every 90 deg (of turn without it)",
     )
+    parser.add_argument(
+        "--level", action="store_true", help="turn, after faces: write how the board sits (AHRS_TRIM), not offsets"
+    )
     parser.add_argument("--write", action="store_true", help="turn, faces: write what was found to the autopilot")
     parser.add_argument("--timeout", type=seconds, metavar="S", help="give up after so long (default 900)")
 
@@ -154,8 +157,7 @@ async def align(options: argparse.Namespace) -> int:
     """`companion align`; Ctrl-C cancels it in the daemon too."""
     action = "show" if options.show else "forget" if options.forget else options.what
     wanted = {"command": "align", "action": action, "headings": options.headings}
-    if options.write:
-        wanted["write"] = True
+    wanted |= {key: True for key in ("write", "level") if getattr(options, key)}
     if options.timeout is not None:
         wanted["timeout_s"] = options.timeout
     reply = await request(options, wanted, {"command": "cancel"})
@@ -197,6 +199,15 @@ def turn_lines(record: Object) -> list[str]:
             f"  {'bias when level':16} {'mg':6} {show.axes(imu['level_bias_mg'], imu['level_sigma_mg'], '+.3f')}"
         )
         lines += _written_lines(imu["written"])
+    if (board := record["board"]) is not None:
+        roll, pitch = board["sigma_deg"]
+        lines.append(
+            f"the board of {board['imu']} sits at roll {board['roll_deg']:+.3f} +- {roll:.3f},"
+            f" pitch {board['pitch_deg']:+.3f} +- {pitch:.3f} deg; the same in parameters:"
+        )
+        x, y = math.radians(board["roll_deg"]), math.radians(board["pitch_deg"])
+        lines.append(f"  AHRS_TRIM_X = {x:.5f}, AHRS_TRIM_Y = {y:.5f} (ArduPilot; --level writes them)")
+        lines += _written_lines(board["written"])
     return lines + [f"warning: {words}" for words in record["warnings"]]
 
 

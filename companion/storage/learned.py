@@ -9,7 +9,7 @@ from typing import Final
 import msgspec
 
 from companion.calibration.alignment import align_record
-from companion.calibration.solution import history
+from companion.calibration.solution import faces_record, history
 from companion.storage.state import StateFile
 
 
@@ -19,6 +19,15 @@ class AlignmentStore(StateFile[align_record.AlignmentRecord]):
     def __init__(self, directory: Path) -> None:
         super().__init__(
             directory / "alignment.json", align_record.AlignmentRecord, align_record.check, align_record.FORMAT_VERSION
+        )
+
+
+class FacesStore(StateFile[faces_record.FacesRecord]):
+    """`faces.json` in the storage directory."""
+
+    def __init__(self, directory: Path) -> None:
+        super().__init__(
+            directory / "faces.json", faces_record.FacesRecord, faces_record.check, faces_record.FORMAT_VERSION
         )
 
 

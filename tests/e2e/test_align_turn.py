@@ -12,11 +12,14 @@ import pytest
 
 from companion.calibration.solution.turn_record import TurnRecord
 from companion.component.service import JobResult, Refusal
+from companion.daemon.calibrating.turning import TurnAsked
 from companion.daemon.job import Job
 from sim.aircraft import Pose
 from sim.ardupilot.double import offset_names
+from sim.earth import mounting_matrix
 from sim.hands import Hands
 from sim.imu_model import MG
+from tests.e2e.test_align_faces import follow as by_sides
 from tests.e2e.test_calibration import started
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
@@ -26,9 +29,11 @@ FLAT = Pose(pitch_deg=0.4, roll_deg=-0.3, heading_deg=40.0)
 TARGET_MG = 0.25
 
 
-def rig(folder: Path, pose: Pose, firmware: Literal["ardupilot", "px4"] = "ardupilot") -> tuple[Rig, Hands]:
+def rig(
+    folder: Path, pose: Pose, firmware: Literal["ardupilot", "px4"] = "ardupilot", **more: Any
+) -> tuple[Rig, Hands]:
     """An autopilot and nothing else."""
-    made = Rig(folder, pose=pose, firmware=firmware, imu_rate_hz=25.0)
+    made = Rig(folder, pose=pose, firmware=firmware, imu_rate_hz=25.0, **more)
     made.config = msgspec.structs.replace(made.config, gradienter=None, compass=None)
     made.devices.clear()
     return made, Hands(made.aircraft, placement_deg=0.02, seed=4)
@@ -48,7 +53,7 @@ async def follow(rig: Rig, hands: Hands, job: Job, bump_before: int = 0) -> JobR
 
 
 def turn(rig: Rig, headings: int, *, write: bool) -> Job:
-    return started(rig.service.calibrating.conductor.start_turn(headings, "test", 900.0, write=write))
+    return started(rig.service.calibrating.conductor.start_turn(TurnAsked(headings, write=write), "test", 900.0))
 
 
 def true_mg(rig: Rig) -> Any:
@@ -148,3 +153,49 @@ def test_px4s_offsets_are_written_too(tmp_path: Path) -> None:
             assert {one.outcome for one in imu.written.values()} == {"verified"}
 
     run_virtual(main())
+
+
+def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restart_does_not_forget(
+    tmp_path: Path,
+) -> None:
+    """A board that sits 1.2 deg to the right and 0.8 deg nose down; the spot slopes by 5 deg."""
+    board_deg = (1.2, -0.8, 0.0)
+    first, hand = rig(tmp_path, FLAT, mounting_deg=board_deg)
+
+    async def sides() -> None:
+        async with first.running():
+            await first.ready()
+            refused = first.service.calibrating.conductor.start_turn(TurnAsked(4, level=True), "test", 900.0)
+            assert isinstance(refused, Refusal)
+            assert "align faces --write first" in refused.reason
+            job = started(first.service.calibrating.conductor.start_faces("test", 2000.0, write=True))
+            result = await by_sides(first, hand, job)
+            assert result.outcome == "done", result
+
+    async def level() -> None:
+        names = (*offset_names(1, "accel"), *offset_names(1, "scale"))
+        offsets = {name: float(first.double.parameter(name) or 0.0) for name in names}
+        made, hands = rig(tmp_path, STEEP, mounting_deg=board_deg, parameters=offsets)
+        async with made.running():
+            await made.ready()
+            job = started(made.service.calibrating.conductor.start_turn(TurnAsked(4, level=True), "test", 900.0))
+            result = await follow(made, hands, job)
+            assert result.outcome == "done", result
+            record = job.product
+            assert isinstance(record, TurnRecord)
+            assert record.board is not None
+            assert max(record.board.sigma_deg) < 0.03
+            up = mounting_matrix(*board_deg).T @ np.array([0.0, 0.0, -1.0])
+            true_deg = np.degrees([np.arctan2(-up[1], -up[2]), np.arcsin(up[0])])
+            trim = np.degrees([made.double.parameter("AHRS_TRIM_X"), made.double.parameter("AHRS_TRIM_Y")])
+            np.testing.assert_allclose(trim, true_deg, atol=0.05)
+            assert (np.abs(trim - true_deg) < 3.0 * np.array(record.board.sigma_deg)).all()
+            assert set(record.board.written) == {"AHRS_TRIM_X", "AHRS_TRIM_Y"}
+            assert offsets == {name: made.double.parameter(name) for name in offsets}, "offsets stay as they are"
+            undone = made.service.calibrating.conductor.start_undo("test")
+            assert not isinstance(undone, Refusal)
+            assert (await undone.finished).outcome == "done"
+            assert made.double.parameter("AHRS_TRIM_X") == made.double.parameter("AHRS_TRIM_Y") == 0.0
+
+    run_virtual(sides())
+    run_virtual(level())

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from companion.calibration.solution.record import Arming
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
-from companion.storage.learned import SIGNING_FILE, AlignmentStore, BiasStore, signing_time_in
+from companion.storage.learned import SIGNING_FILE, AlignmentStore, BiasStore, FacesStore, signing_time_in
 from companion.storage.records import RecordStore
 from companion.storage.state import BoundedList, sealed
 
@@ -59,12 +59,14 @@ def test_any_bytes_in_any_file(data: bytes) -> None:
         folder = Path(name)
         (folder / "records").mkdir()
         files = ("journal.json", "undo-1.json", "alignment.json", "biases.json", "armings.json", SIGNING_FILE)
+        files = (*files, "faces.json")
         for file in (*files, "records/000001.json"):
             (folder / file).write_bytes(data)
         log = ChangeLog(folder)
         log.journal.load()
         log.undo_of(1).load()
         AlignmentStore(folder).load()
+        FacesStore(folder).load()
         BiasStore(folder).read()
         BoundedList(folder / "armings.json", Arming, 5).read()
         signing_time_in(folder).load()

@@ -18,7 +18,7 @@ import pytest
 from companion.calibration.solution.record import Arming
 from companion.errors import StorageError
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
-from companion.storage.learned import SIGNING_FILE, AlignmentStore, BiasStore, signing_time_in
+from companion.storage.learned import SIGNING_FILE, AlignmentStore, BiasStore, FacesStore, signing_time_in
 from companion.storage.profiles import ProfileStore, read_profile
 from companion.storage.records import RecordStore
 from companion.storage.state import MOST_ASIDE, BoundedList, sealed, unsealed
@@ -65,6 +65,7 @@ FILES: dict[str, Callable[[Path], Any]] = {
     "journal.json": lambda folder: ChangeLog(folder).journal.load(),
     "undo-1.json": lambda folder: ChangeLog(folder).undos()[0].load(),
     "alignment.json": lambda folder: AlignmentStore(folder).load(),
+    "faces.json": lambda folder: FacesStore(folder).load(),
     "biases.json": lambda folder: BiasStore(folder).read() or None,
     "armings.json": lambda folder: BoundedList(folder / "armings.json", Arming, 200).read() or None,
     SIGNING_FILE: lambda folder: signing_time_in(folder).load(),

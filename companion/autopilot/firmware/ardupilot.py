@@ -19,6 +19,8 @@ from companion.rotations import ROTATION_NAMES
 INSTANCES: Final = (1, 2, 3, 4, 5)
 """4 and 5 exist from 4.4 on boards with auxiliary instances; no message carries them, so none can be measured."""
 
+TRIM: Final = ("AHRS_TRIM_X", "AHRS_TRIM_Y")
+"""Roll and pitch of the board against the aircraft, rad; taken off the attitude, never off IMU data."""
 _TCAL_LEARNING: Final = 2
 
 

@@ -7,6 +7,7 @@ autopilot may have had before, which an undo puts back; far too narrow for nonse
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Final
 
@@ -95,6 +96,8 @@ ACCEL_SCALE: Final = Range(0.5, 2.0)
 _CALTEMP: Final = Range(-300.0, 200.0, unit="deg C")
 """-300: not known."""
 _DEVICE_ID: Final = Range(0.0, 2.0**24, whole=True)
+_TRIM: Final = Range(-math.radians(10.0), math.radians(10.0), unit="rad")
+"""ArduPilot cuts it off there."""
 _SWITCH: Final = Range(0.0, 255.0, whole=True)
 
 
@@ -111,7 +114,7 @@ def _ardupilot() -> dict[str, Range]:
     for names in map(ardupilot.parameters_of, ardupilot.INSTANCES):
         # Its own gyro calibration, which we start, sets the last two: what it has overwritten is put back.
         found |= {**_offsets(names), names.gyro_caltemp: _CALTEMP, names.gyro_id: _DEVICE_ID}
-    return found
+    return found | dict.fromkeys(ardupilot.TRIM, _TRIM)
 
 
 def _px4() -> dict[str, Range]:

@@ -56,6 +56,14 @@ class Face:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Accelerometer:
+    """Figures (9,), as in `Faces`, and their covariance (9, 9)."""
+
+    figures: Array
+    covariance: Matrix
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Faces:
     """What all stands together tell: figures (9,), bias x y z, scale x y z, shear xy xz yz, with their covariance."""
 
@@ -72,6 +80,11 @@ class Faces:
     """(stands,) how much longer than gravity each reads, corrected; of one that was left out, by the others."""
     in_doubt: tuple[int, ...]
     """Stands of which one does not fit, and nobody can tell which; the next stand does."""
+
+    @property
+    def accelerometer(self) -> Accelerometer:
+        """The figures alone."""
+        return Accelerometer(self.figures, self.covariance)
 
     @property
     def sigma(self) -> Array:

@@ -19,7 +19,15 @@ import numpy as np
 
 from companion.calibration.alignment.align import LEVEL, Alignment, ImuAlignment, align
 from companion.calibration.alignment.align_model import Ground, Priors, Stand
-from companion.calibration.alignment.faces import BIAS, FIGURES, PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR, SCALE, Faces
+from companion.calibration.alignment.faces import (
+    BIAS,
+    FIGURES,
+    PRIOR_BIAS_M_S2,
+    PRIOR_SCALE,
+    PRIOR_SHEAR,
+    SCALE,
+    Accelerometer,
+)
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, roll_pitch_from_up
 
@@ -63,7 +71,7 @@ class Mounting:
         return np.sqrt(np.diag(self.covariance_rad2))
 
 
-def mounting(level: ImuAlignment, known: Faces, vehicle_from_sensor: Matrix) -> Mounting:
+def mounting(level: ImuAlignment, known: Accelerometer, gravity_m_s2: float, vehicle_from_sensor: Matrix) -> Mounting:
     """How the board sits against the base, from its level bias and the bias and scale of its accelerometers.
 
     Shear is not taken off, for no firmware does; so the attitude that is corrected by this is right when level.
@@ -71,9 +79,10 @@ def mounting(level: ImuAlignment, known: Faces, vehicle_from_sensor: Matrix) -> 
     Args:
         level: of `turned` (or of `align`), of the output as it comes.
         known: of the same output, in the sensor's axes; measured earlier, its covariance holds what came since.
+        gravity_m_s2: at the place.
         vehicle_from_sensor: 3x3, the orientation that is configured.
     """
-    read = vehicle_from_sensor.T @ (level.level_bias_m_s2 + known.gravity_m_s2 * LEVEL)
+    read = vehicle_from_sensor.T @ (level.level_bias_m_s2 + gravity_m_s2 * LEVEL)
     stretch = 1.0 + known.figures[SCALE]
     corrected = (read - known.figures[BIAS]) / stretch
     by = np.zeros((3, FIGURES))

@@ -40,6 +40,10 @@ class FacesImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     """One IMU, in its own axes, of its output as it was: what the autopilot takes off already is not in it."""
 
     name: str
+    accel_id: int | None
+    """The accelerometer's device id in the autopilot."""
+    corrections: dict[str, float]
+    """Offsets and scales in force meanwhile, by parameter."""
     temperature_degc: float | None
     accel_bias_mg: Determined
     accel_scale: Determined
@@ -66,14 +70,35 @@ class FacesRecord(msgspec.Struct, frozen=True, kw_only=True):
     warnings: tuple[str, ...] = ()
 
 
-def faces_imu_record(
-    name: str, found: Faces, temperature_degc: float | None, written: dict[str, WrittenParameter]
-) -> FacesImuRecord:
+class Measured(msgspec.Struct, frozen=True, kw_only=True):
+    """What belongs to the figures of one IMU."""
+
+    name: str
+    accel_id: int | None
+    corrections: dict[str, float]
+    temperature_degc: float | None
+
+
+def check(record: FacesRecord) -> None:
+    """Whether a record can be used.
+
+    Raises:
+        msgspec.ValidationError: figures that no accelerometer has.
+    """
+    for imu in record.imus:
+        for found, most in ((imu.accel_bias_mg, 1e4), (imu.accel_scale, 0.5)):
+            if not np.abs([*found.value, *found.sigma]).max() < most or min(found.sigma) <= 0.0:
+                raise msgspec.ValidationError(f"bias or scale of {imu.name} cannot be")
+
+
+def faces_imu_record(of: Measured, found: Faces, written: dict[str, WrittenParameter]) -> FacesImuRecord:
     """One IMU in the units that people know."""
     kept = [k for k in range(len(found.off_m_s2)) if k not in found.left_out]
     return FacesImuRecord(
-        name=name,
-        temperature_degc=temperature_degc,
+        name=of.name,
+        accel_id=of.accel_id,
+        corrections=of.corrections,
+        temperature_degc=of.temperature_degc,
         accel_bias_mg=_determined(found, BIAS, MG, PRIOR_BIAS_M_S2),
         accel_scale=_determined(found, SCALE, 1.0, PRIOR_SCALE),
         accel_shear=_determined(found, SHEAR, 1.0, PRIOR_SHEAR),

@@ -27,6 +27,21 @@ class TurnImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Empty where nothing was to be written."""
 
 
+class BoardRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """How the board sits against the base: what its attitude shows too much when the base is level."""
+
+    imu: str
+    """Whose accelerometers told; their bias and scale are known from all sides."""
+    faces_measured_at: str
+    roll_deg: float
+    """Right side down +."""
+    pitch_deg: float
+    """Nose up +."""
+    sigma_deg: tuple[float, float]
+    """Of roll and pitch."""
+    written: dict[str, WrittenParameter] = {}
+
+
 class TurnRecord(msgspec.Struct, frozen=True, kw_only=True):
     """Finished."""
 
@@ -42,6 +57,8 @@ class TurnRecord(msgspec.Struct, frozen=True, kw_only=True):
     freedom: int
     stands: tuple[StandRecord, ...]
     imus: tuple[TurnImuRecord, ...]
+    board: BoardRecord | None = None
+    """None where nothing is known from all sides."""
     warnings: tuple[str, ...] = ()
 
 

@@ -26,7 +26,7 @@ from companion.daemon.calibrating.aligner import Aligner
 from companion.daemon.calibrating.bias_memory import Results, has_written
 from companion.daemon.calibrating.course import Course
 from companion.daemon.calibrating.facing import Facing
-from companion.daemon.calibrating.turning import Turning
+from companion.daemon.calibrating.turning import TurnAsked, Turning
 from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
 from companion.daemon.core import Core
 from companion.daemon.job import ALIGNMENT, FACES, TURN, Job, JobCancelledError
@@ -144,12 +144,12 @@ class Conductor:
         job = Job(FACES, What.ACCELEROMETERS, requester, asyncio.get_running_loop().time() + timeout_s)
         return self._start(job, Event.REQUEST, self._face(job, write=write))
 
-    def start_turn(self, headings: int, requester: str, timeout_s: float, *, write: bool) -> Job | Refusal:
+    def start_turn(self, asked: TurnAsked, requester: str, timeout_s: float) -> Job | Refusal:
         """Start finding the level by turning on a spot, without a gradienter, or say why not."""
-        if (refusal := self._refuses_stands(requester, self._turning.why_not(write=write))) is not None:
+        if (refusal := self._refuses_stands(requester, self._turning.why_not(asked))) is not None:
             return refusal
         job = Job(TURN, What.ACCELEROMETERS, requester, asyncio.get_running_loop().time() + timeout_s)
-        return self._start(job, Event.REQUEST, self._turn(job, Plan("zero", headings, back=True), write=write))
+        return self._start(job, Event.REQUEST, self._turn(job, asked))
 
     def _refuses_stands(self, requester: str, missing: str | None) -> Refusal | None:
         if self._on_deck:
@@ -267,8 +267,8 @@ class Conductor:
     async def _face(self, job: Job, *, write: bool) -> None:
         self._end(job, await _result(job, self._facing.run(job, write=write)))
 
-    async def _turn(self, job: Job, plan: Plan, *, write: bool) -> None:
-        self._end(job, await _result(job, self._turning.run(job, plan, write=write)))
+    async def _turn(self, job: Job, asked: TurnAsked) -> None:
+        self._end(job, await _result(job, self._turning.run(job, asked)))
 
     # --- an undo
 

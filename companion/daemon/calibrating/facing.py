@@ -18,11 +18,12 @@ from companion.calibration.alignment.missing import missing, seen_before
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.faces_record import FaceRecord, FacesRecord, faces_imu_record
+from companion.calibration.solution.faces_record import FaceRecord, FacesRecord, Measured, faces_imu_record
 from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.component.statustext import Severity
 from companion.configured import models
 from companion.daemon.calibrating.accel_writes import AccelWrites
+from companion.daemon.calibrating.faces_in_force import FacesInForce
 from companion.daemon.calibrating.stands import Asked, Stands
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -48,9 +49,11 @@ class _Known(NamedTuple):
 class Facing:
     """Measures accelerometers so; who may start it is the conductor's."""
 
-    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], stands: Stands, writes: AccelWrites) -> None:
+    def __init__(
+        self, core: Core, imus: Mapping[str, AutopilotImu], stands: Stands, writes: AccelWrites, kept: FacesInForce
+    ) -> None:
         self._core, self._machine, self._imus = core, core.machine, imus
-        self._stands, self._writes = stands, writes
+        self._stands, self._writes, self._kept = stands, writes, kept
 
     def why_not(self, *, write: bool) -> str | None:
         """Why there is nothing to measure, or nothing could be written; None where all is well."""
@@ -84,11 +87,14 @@ class Facing:
         draft.warnings += local.warnings
         if known.wish is not None:
             draft.warnings.append(f"after {MOST} stands {known.wish}")
+        measured = self._measured(windows[-1], known.by_imu)
         try:
             if write and known.wish is None:
                 await self._writes.write(job, windows[-1], self._changes(known.by_imu), draft)
         finally:
-            job.deliver(self._record(windows, known.by_imu, local, draft))
+            job.deliver(record := self._record(windows, known.by_imu, local, draft, measured))
+        if known.wish is None:
+            await self._kept.keep(record)
         if not write:
             self._machine.on(Event.NOTHING_TO_WRITE)
         elif known.wish is not None:
@@ -152,10 +158,25 @@ class Facing:
 
     # --- the record
 
-    def _record(self, windows: list[Window], by_imu: dict[str, Faces], local: LocalEarth, draft: Draft) -> FacesRecord:
+    def _measured(self, last: Window, by_imu: dict[str, Faces]) -> list[Measured]:
+        """What belongs to each IMU's figures, before anything is written."""
+        degrees = {imu.name: imu.temperature_degc for imu in last.imus}
+        calibrations = {name: self._imus[name].in_force for name in by_imu}
+        return [
+            Measured(name=name, accel_id=one.accel_id, corrections=one.corrections, temperature_degc=degrees.get(name))
+            for name, one in calibrations.items()
+        ]
+
+    def _record(
+        self,
+        windows: list[Window],
+        by_imu: dict[str, Faces],
+        local: LocalEarth,
+        draft: Draft,
+        measured: list[Measured],
+    ) -> FacesRecord:
         first = next(iter(by_imu))
         ups = by_imu[first].up @ self._imus[first].in_force.orientation.T
-        degrees = {imu.name: imu.temperature_degc for imu in windows[-1].imus}
         return FacesRecord(
             measured_at=draft.started_at.isoformat(timespec="milliseconds"),
             gravity_m_s2=local.gravity_m_s2,
@@ -163,10 +184,7 @@ class Facing:
                 FaceRecord(up=vector(np.round(up, 5)), seconds=window.end_s - window.start_s)
                 for up, window in zip(ups, windows, strict=True)
             ),
-            imus=tuple(
-                faces_imu_record(name, found, degrees.get(name), draft.written.get(name, {}))
-                for name, found in by_imu.items()
-            ),
+            imus=tuple(faces_imu_record(one, by_imu[one.name], draft.written.get(one.name, {})) for one in measured),
             warnings=(*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each)),
         )
 

@@ -18,9 +18,10 @@ from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.calibrating.bias_memory import BiasMemory, Results
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.course import Course, Measuring, Solving
+from companion.daemon.calibrating.faces_in_force import FacesInForce
 from companion.daemon.calibrating.facing import Facing
 from companion.daemon.calibrating.stands import Stands
-from companion.daemon.calibrating.turning import Turning
+from companion.daemon.calibrating.turning import TurnAsked, Turning
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
@@ -60,13 +61,18 @@ class Calibrating(Subsystem):
         self.conclusion = Conclusion(core, offsets.effect, offsets.firmware)
         course = Course(core, measuring, self.solving, ditherer, offsets.planner, offsets.pusher, self.conclusion)
         aligner = Aligner(core, imus, measuring, self.alignment)
-        stands, writes = Stands(core, imus, measuring), AccelWrites(core, imus, offsets.pusher, self.conclusion)
-        facing, turning = Facing(core, imus, stands, writes), Turning(core, imus, stands, writes)
+        self.faces = FacesInForce(config, core.offload)
+        stands, writes = Stands(core, imus, measuring), AccelWrites(core, imus, offsets, self.conclusion)
+        facing, turning = (
+            Facing(core, imus, stands, writes, self.faces),
+            Turning(core, imus, stands, writes, self.faces),
+        )
         self._results = Results(core, self.store, self.memory)
         self.conductor = Conductor(core, course, aligner, facing, turning, offsets.recovery, self._results)
 
     def load(self) -> None:  # noqa: D102 - as in the base class
         self.alignment.load()
+        self.faces.load()
         self.memory.load()
         self._results.load()
 
@@ -156,12 +162,12 @@ class Calibrating(Subsystem):
         action, headings = request.get("action"), request.get("headings")
         timeout_s = request.get("timeout_s")
         timeout_s = ALIGN_TIMEOUT_S if timeout_s is None else timeout_s
-        write = request.get("write") is True
+        write, level = request.get("write") is True, request.get("level") is True
         if action == "faces" and is_time_limit(timeout_s):
             return _accepted(self.conductor.start_faces(f"{face} align", float(timeout_s), write=write))
         if action == "turn" and headings in (None, 2, HEADINGS) and is_time_limit(timeout_s):
-            started = self.conductor.start_turn(headings or HEADINGS, f"{face} align", float(timeout_s), write=write)
-            return _accepted(started)
+            asked = TurnAsked(headings or HEADINGS, write=write, level=level)
+            return _accepted(self.conductor.start_turn(asked, f"{face} align", float(timeout_s)))
         headings = 2 if headings is None else headings
         if action not in ("zero", "tilts") or headings not in (2, HEADINGS) or not is_time_limit(timeout_s):
             raise CalibrationRefusedError(f"align: {request} is not understood")

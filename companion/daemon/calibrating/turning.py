@@ -5,24 +5,27 @@ from __future__ import annotations
 import dataclasses
 import datetime
 from collections.abc import Mapping
-from typing import Final
+from typing import Final, NamedTuple
 
+import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import changes_for
 from companion.calibration.alignment.align import Alignment, in_words
 from companion.calibration.alignment.align_model import Ground, Stand
 from companion.calibration.alignment.align_record import stand_record
-from companion.calibration.alignment.spot import turned
+from companion.calibration.alignment.spot import Mounting, mounting, turned
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
 from companion.calibration.solution.draft import Draft
+from companion.calibration.solution.record import WrittenParameter
 from companion.calibration.solution.site import LocalEarth, local_earth
-from companion.calibration.solution.turn_record import TurnRecord, turn_imu_record
+from companion.calibration.solution.turn_record import BoardRecord, TurnRecord, turn_imu_record
 from companion.configured import models
 from companion.daemon.calibrating import align_steps
 from companion.daemon.calibrating.accel_writes import AccelWrites
 from companion.daemon.calibrating.align_steps import Plan, Seen
+from companion.daemon.calibrating.faces_in_force import FacesInForce
 from companion.daemon.calibrating.stands import Asked, Stands, imu_stand
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -44,24 +47,44 @@ class _Taken:
     seen: Seen
 
 
+class TurnAsked(NamedTuple):
+    """What was asked for."""
+
+    headings: int
+    """2 or 4."""
+    write: bool = False
+    """The level bias, as offsets."""
+    level: bool = False
+    """How the board sits, as trim: of accelerometers that are known from all sides."""
+
+
 class Turning:
     """Measures so; who may start it is the conductor's."""
 
-    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], stands: Stands, writes: AccelWrites) -> None:
+    def __init__(
+        self, core: Core, imus: Mapping[str, AutopilotImu], stands: Stands, writes: AccelWrites, known: FacesInForce
+    ) -> None:
         self._core, self._machine, self._imus = core, core.machine, imus
-        self._stands, self._writes = stands, writes
+        self._stands, self._writes, self._known = stands, writes, known
 
-    def why_not(self, *, write: bool) -> str | None:
+    def why_not(self, asked: TurnAsked) -> str | None:
         """Why there is nothing to measure, or nothing could be written; None where all is well."""
-        return self._writes.why_not(write=write)
+        if asked.level and asked.write:
+            return "either --write (offsets) or --level (the board's tilt): what is in one is not in the other"
+        if asked.level and self._known.record is None:
+            return "the board's tilt needs accelerometers known from all sides: companion align faces --write first"
+        if asked.level and self._core.vehicle.firmware == "px4":
+            return "the level is not written to PX4: align turn without --level shows it"
+        return self._writes.why_not(write=asked.write or asked.level)
 
-    async def run(self, job: Job, plan: Plan, *, write: bool) -> str:
+    async def run(self, job: Job, asked: TurnAsked) -> str:
         """Measure all headings, work out, write; returns the result in one line.
 
         Raises:
             CompanionError: it failed, and why; what was written is back, or it is said what is not.
             JobCancelledError: cancelled; likewise.
         """
+        plan = Plan("zero", asked.headings, back=True)
         taken: list[_Taken] = []
         self._stands.begin()
         while len(taken) < plan.on_spot:
@@ -82,20 +105,48 @@ class Turning:
             draft.warnings.append(
                 f"the spot slopes by {found.slope_deg:.1f} deg: four headings (--headings 4) know it better there"
             )
+        board = self._board(found, local, taken[-1].window)
+        if board is None and asked.level:
+            raise CalibrationRefusedError("nothing is known from all sides of these accelerometers: align faces again")
+        sits: dict[str, WrittenParameter] = {}
         try:
-            if write:
+            if asked.write:
                 changes = {
                     imu.name: changes_for(self._imus[imu.name].in_force, None, vector(imu.level_bias_m_s2))
                     for imu in found.imus
                 }
                 await self._writes.write(job, taken[-1].window, changes, draft)
+            elif asked.level and board is not None:
+                sits = await self._writes.write_level(job, board)
         finally:
-            job.deliver(_record(taken, stands, found, draft))
-        if not write:
+            record = _record(taken, stands, found, draft)
+            job.deliver(msgspec.structs.replace(record, board=self._as_record(found, board, sits)))
+        if not (asked.write or asked.level):
             self._machine.on(Event.NOTHING_TO_WRITE)
-        sigma_mg = max(float(np.sqrt(np.diag(imu.level_covariance_m2_s4))[:2].max()) for imu in found.imus) / MG
-        end = "written" if write else "not written (--write does)"
-        return f"level known to {sigma_mg:.2f} mg, the spot slopes by {found.slope_deg:.2f} deg: {end}"
+        return _in_words(found, board, asked)
+
+    def _board(self, found: Alignment, local: LocalEarth, last: Window) -> Mounting | None:
+        """How the board of the first IMU sits, where its accelerometers are known from all sides."""
+        imu = found.imus[0]
+        calibration = self._imus[imu.name].in_force
+        degrees = {one.name: one.temperature_degc for one in last.imus}
+        known = self._known.known(imu.name, calibration, degrees.get(imu.name))
+        return None if known is None else mounting(imu, known, local.gravity_m_s2, calibration.orientation)
+
+    def _as_record(
+        self, found: Alignment, board: Mounting | None, written: dict[str, WrittenParameter]
+    ) -> BoardRecord | None:
+        if board is None or self._known.record is None:
+            return None
+        roll, pitch = (board.sigma_rad / DEG).tolist()
+        return BoardRecord(
+            imu=found.imus[0].name,
+            faces_measured_at=self._known.record.measured_at,
+            roll_deg=round(board.roll_rad / DEG, 4),
+            pitch_deg=round(board.pitch_rad / DEG, 4),
+            sigma_deg=(round(roll, 4), round(pitch, 4)),
+            written=written,
+        )
 
     async def _next(self, job: Job, plan: Plan, taken: list[_Taken]) -> _Taken:
         seen = [one.seen for one in taken]
@@ -134,6 +185,15 @@ class Turning:
             heading_sigma_rad=(0.01 if first else COUNTED_SIGMA_DEG) * DEG,
             on_spot=True,
         )
+
+
+def _in_words(found: Alignment, board: Mounting | None, asked: TurnAsked) -> str:
+    sigma_mg = max(float(np.sqrt(np.diag(imu.level_covariance_m2_s4))[:2].max()) for imu in found.imus) / MG
+    words = f"level known to {sigma_mg:.2f} mg, the spot slopes by {found.slope_deg:.2f} deg"
+    if board is not None:
+        words += f"; the board sits at roll {board.roll_rad / DEG:+.2f}, pitch {board.pitch_rad / DEG:+.2f} deg"
+    end = "level written" if asked.level else "written" if asked.write else "not written"
+    return f"{words}: {end}"
 
 
 def _ground(local: LocalEarth) -> Ground:

@@ -198,7 +198,10 @@ def by_hand(part: str, seed: int, number: int) -> HandRun:
         for headings, slope in TURNS
     }
     steepest = turns[4, max(SLOPES_DEG)]
-    board, true_board = mounting(steepest.imus[0], known, np.eye(3)), _tilt((read - bias) / (1.0 + here.scale))
+    board, true_board = (
+        mounting(steepest.imus[0], known.accelerometer, local.gravity_m_s2, np.eye(3)),
+        _tilt((read - bias) / (1.0 + here.scale)),
+    )
     first = spots[max(SLOPES_DEG)][0].rows[: rivals.ARDUPILOT_READINGS].mean(axis=0)
     return HandRun(
         faces=known.figures - truth,
