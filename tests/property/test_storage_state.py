@@ -59,8 +59,7 @@ def test_any_bytes_in_any_file(data: bytes) -> None:
         folder = Path(name)
         (folder / "records").mkdir()
         files = ("journal.json", "undo-1.json", "alignment.json", "biases.json", "armings.json", SIGNING_FILE)
-        files = (*files, "faces.json")
-        for file in (*files, "records/000001.json"):
+        for file in (*files, "faces.json", "records/000001.json"):
             (folder / file).write_bytes(data)
         log = ChangeLog(folder)
         log.journal.load()

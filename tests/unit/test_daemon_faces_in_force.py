@@ -95,8 +95,8 @@ def test_once_written_nothing_is_left_of_it(tmp_path: Path) -> None:
     names = before.parameters
     written = dataclasses.replace(
         before,
-        accel_offset_m_s2=tuple(after[name] for name in names.accel_offset),
-        accel_scale=tuple(after[name] for name in names.accel_scale),
+        accel_offset_m_s2=vector(np.array([after[name] for name in names.accel_offset])),
+        accel_scale=vector(np.array([after[name] for name in names.accel_scale])),
     )
     found = kept(tmp_path).known("fc", written, 25.0)
     assert found is not None

@@ -63,10 +63,8 @@ class Calibrating(Subsystem):
         aligner = Aligner(core, imus, measuring, self.alignment)
         self.faces = FacesInForce(config, core.offload)
         stands, writes = Stands(core, imus, measuring), AccelWrites(core, imus, offsets, self.conclusion)
-        facing, turning = (
-            Facing(core, imus, stands, writes, self.faces),
-            Turning(core, imus, stands, writes, self.faces),
-        )
+        facing = Facing(core, imus, stands, writes, self.faces)
+        turning = Turning(core, imus, stands, writes, self.faces)
         self._results = Results(core, self.store, self.memory)
         self.conductor = Conductor(core, course, aligner, facing, turning, offsets.recovery, self._results)
 
