@@ -19,12 +19,12 @@ from companion.errors import CompanionError, ConfigError, DaemonDeniedError, Dae
 from companion.installation import install as installing
 from companion.links.mavlink.listening import USUAL_PORTS
 from companion.links.serial.listening import ports_to_try
-from companion.links.serial.ports import ROOT, list_ports, resolve
+from companion.links.serial.ports import list_ports
 from companion.protocols.registry import Kind
 from companion.setup import keeping
 from companion.setup.document import active_lines
 from companion.setup.draft import Draft
-from companion.setup.survey import Survey, survey
+from companion.setup.survey import Survey, same_port, same_url, survey
 
 KINDS: Final[tuple[Kind, ...]] = ("gradienter", "compass", "imu")
 WITHOUT: Final = {
@@ -104,7 +104,7 @@ class _Session:
         if draft.is_new and os.geteuid() != 0 and self._path != config.DEFAULT_PATH:
             draft.keep_beside(self._path)
         given = self._given()
-        found = await self._listen()
+        found = await self._listen(draft)
         await self._take_autopilot(draft, found)
         for kind in KINDS:
             await self._take_device(draft, found, kind)
@@ -112,8 +112,7 @@ class _Session:
         draft.parsed()
         text = draft.result()
         self.answer |= {"guessed": sorted(draft.guessed), "configuration": draft.wanted}
-        changed = not self._path.exists() or text != draft.text
-        if changed:
+        if not keeping.holds(self._path, text):
             say("", f"{self._path} will say (and, as comments, all defaults):", "")
             say(*(f"    {line}" if line else "" for line in active_lines(text)))
             if not await self.asking.agrees("Write it?"):
@@ -150,7 +149,7 @@ class _Session:
             given[f"{device}.mounting"] = how
         return {key: words for key, words in given.items() if words is not None}
 
-    async def _listen(self) -> Survey:
+    async def _listen(self, draft: Draft) -> Survey:
         """Everything that can be listened to; not a byte is sent."""
         options = self._options
         ports = [*map(_absolute, options.ports)] or ports_to_try(list_ports())
@@ -166,24 +165,23 @@ class _Session:
             self.answer["heard"][place] = words
             self.asking.say(f"  {place}: {words}")
 
-        found = await survey(ports, udp, tell)
+        found = await survey(ports, udp, tell, draft.lines)
         self.asking.say("", "Enter takes what stands in [brackets]; Ctrl-C ends, and nothing is written.")
         return found
 
     async def _take_autopilot(self, draft: Draft, found: Survey) -> None:
         """Its url: as it was where it is heard there or held by somebody, else where one is heard, else as typed."""
-        say, heard = self.asking.say, found.autopilots
+        say, was = self.asking.say, draft.url
+        heard = [one.url for one in found.autopilots]
         if self._options.mavlink is not None:
             draft.take_url(self._options.mavlink)
-        elif draft.url is not None and (not heard or any(one.url == draft.url for one in heard)):
-            say(f"Autopilot: {draft.url}, as it was")
-        elif draft.url is not None:
-            say(f"The autopilot is not heard at {draft.url}.")
-            one = await self._choose("Autopilot", [*(each.url for each in heard), draft.url])
-            draft.take_url(one)
+        elif was is not None and (not heard or any(same_url(url, was) for url in heard) or not found.silent_url(was)):
+            say(f"Autopilot: {was}, as it was")
+        elif was is not None:
+            say(f"The autopilot is not heard at {was}.")
+            draft.take_url(await self._choose("Autopilot", [*heard, was]))
         elif heard:
-            url = await self._choose("Autopilot", [each.url for each in heard])
-            draft.take_url(url)
+            draft.take_url(await self._choose("Autopilot", heard))
         elif self.asking.yes:
             raise CompanionError(
                 "no autopilot was heard (its port's protocol MAVLink 2? TX to RX? --mavlink URL names its place)"
@@ -199,15 +197,14 @@ class _Session:
         """One that is heard, in the place of one that is not; one that is held by somebody stays."""
         section, heard = draft.section(kind), found.devices(kind)
         if section is not None:
-            again = [one for one in heard if _same(one.port, section.get("port", ""))]
-            away = [one for one in heard if not again]
-            if not away:
-                if again:
-                    draft.take(dataclasses.replace(again[0], port=section["port"]))
-                self.asking.say(f"{kind.capitalize()}: {section['protocol']} at {section['port']}, as it was")
+            port = section["port"]
+            again = [one for one in heard if same_port(one.port, port)]
+            if again or not heard or not found.silent(port):
+                for one in again:
+                    draft.take(dataclasses.replace(one, port=port))
+                self.asking.say(f"{kind.capitalize()}: {section['protocol']} at {port}, as it was")
                 return
-            heard = away
-            self.asking.say(f"The {kind} is not heard at {section['port']}.")
+            self.asking.say(f"The {kind} is not heard at {port}.")
         if not heard:
             if kind in WITHOUT:
                 self.asking.say(WITHOUT[kind].capitalize())
@@ -338,8 +335,3 @@ def _next_steps(parsed: Config, command: str, *, runs: bool, started: bool, good
 
 def _absolute(port: str) -> str:
     return os.path.abspath(port)
-
-
-def _same(port: str, other: str) -> bool:
-    """Whether two names are one device."""
-    return resolve(ROOT, port) == resolve(ROOT, other)

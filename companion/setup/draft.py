@@ -16,6 +16,8 @@ from companion import config
 from companion.config.sections import Config, Law, Platform
 from companion.config.words import shown
 from companion.errors import CompanionError, ConfigError
+from companion.links.mavlink.transport import parse_url
+from companion.protocols.guess import Line
 from companion.protocols.registry import PROTOCOLS, Kind
 from companion.rotations import ROTATIONS_DEG
 from companion.setup.document import Table, render
@@ -82,6 +84,22 @@ class Draft:
         """The autopilot's, where somebody has said it."""
         return None if self.is_new else str(self.wanted["mavlink"]["url"])
 
+    @property
+    def lines(self) -> dict[str, Line]:
+        """How the ports are set, by what is said of them."""
+        if self.is_new:
+            return {}
+        found = {}
+        kind, where, number = parse_url(self.wanted["mavlink"]["url"])
+        if kind == "serial":
+            found[where] = Line(number, "none")
+        kinds: Sequence[Kind] = ("gradienter", "compass", "imu")
+        for each in kinds:
+            if (section := self.section(each)) is not None:
+                info = PROTOCOLS[each][section["protocol"]]
+                found[section["port"]] = Line(section.get("baud", info.baud), section.get("parity", info.parity))
+        return found
+
     def take_url(self, url: str) -> None:
         """The autopilot is there.
 
@@ -113,12 +131,17 @@ class Draft:
                 self.wanted["imu"].append(section)
             else:
                 self.wanted[found.kind] = section
-        elif section.get("protocol") != found.protocol:
+        elif section["protocol"] != found.protocol:
             for key in section.keys() - _LASTING:
                 del section[key]
-        section |= {"port": found.port, "protocol": found.protocol, "baud": found.line.baud}
-        if found.kind != "imu":
-            section["parity"] = found.line.parity
+        is_there = "protocol" in section
+        section |= {"port": found.port, "protocol": found.protocol}
+        info = PROTOCOLS[found.kind][found.protocol]
+        for key in ("baud", "parity")[: 1 if found.kind == "imu" else 2]:
+            value = getattr(found.line, key)
+            # What the protocol's device comes with need not be said of one that works without.
+            if key in section or not is_there or value != getattr(info, key):
+                section[key] = value
         if found.kind == "gradienter" and "law" not in section:
             known = PROTOCOLS["gradienter"][found.protocol].law
             section["law"] = known or UNDOCUMENTED_LAW

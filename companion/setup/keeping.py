@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import stat
 from pathlib import Path
@@ -51,8 +52,16 @@ def check_writable(path: Path) -> None:
         )
 
 
+def holds(path: Path, text: str) -> bool:
+    """Whether the file is there and says just this."""
+    try:
+        return read_regular(path, config.MOST_BYTES) == text.encode()
+    except OSError:
+        return False
+
+
 def put(path: Path, text: str) -> Path | None:
-    """Write the file at once and whole; where the old content went, None if there was none.
+    """Write the file at once and whole; where the old content went, None if there was none but the sample.
 
     Raises:
         StorageError: it cannot be written; then the old one is still there.
@@ -60,10 +69,9 @@ def put(path: Path, text: str) -> Path | None:
     # What is behind a link is replaced, not the link.
     path = path.resolve()
     kept, mode = None, installing.MODE
-    if path.exists():
-        kept = next(
-            name for number in range(1, 1000) if not (name := path.with_name(f"{path.name}.old{number}")).exists()
-        )
+    if path.exists() and not holds(path, sample()):
+        names = (path.with_name(f"{path.name}.old{number}") for number in itertools.count(1))
+        kept = next(name for name in names if not name.exists())
         mode = stat.S_IMODE(path.stat().st_mode)
         write_atomically(kept, path.read_bytes(), mode=mode)
     write_atomically(path, text.encode(), mode=mode)

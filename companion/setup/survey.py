@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from companion.errors import LinkError
 from companion.links.mavlink.listening import HeardUdp, listen_udp
+from companion.links.mavlink.transport import parse_url
 from companion.links.serial.listening import Heard, listen_to_all
+from companion.links.serial.ports import ROOT, resolve
 from companion.protocols.guess import Line
 from companion.protocols.heartbeat import Heartbeat
 from companion.protocols.registry import Kind, main_kind
 
 AUTOPILOT_LINES: Final = tuple(Line(baud, "none") for baud in (57600, 921600, 115200))
 """ArduPilot's usual speed, PX4's TELEM 2's, and what both are set to by hand; believed first on every port."""
+Believed = Mapping[str, Line]
+"""How ports are set by what is configured: a port that takes any speed, as on USB, is then heard at that one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,12 +87,39 @@ class Survey:
                 found.append(FoundDevice(port, protocol, heard.line, main, also))
         return found
 
+    def silent(self, port: str) -> bool:
+        """Whether nobody of use is at a serial port, as far as was listened to; one that somebody holds is not."""
+        if port.startswith("/") and not os.path.exists(port):
+            return True
+        heard = [found for name, found in self.serial.items() if same_port(name, port)]
+        return any(not isinstance(found, str) for found in heard)
+
+    def silent_url(self, url: str) -> bool:
+        """Likewise of a MAVLink url at which no autopilot was heard."""
+        kind, where, number = parse_url(url)
+        if kind == "serial":
+            return self.silent(where)
+        return kind == "udpin" and isinstance(self.udp.get(number), HeardUdp)
+
+
+def same_port(one: str, other: str) -> bool:
+    """Whether two names are one serial port."""
+    return resolve(ROOT, one) == resolve(ROOT, other)
+
+
+def same_url(one: str, other: str) -> bool:
+    """Whether two MAVLink urls lead to the same place; whom a UDP port listens to does not matter."""
+    (kind, where, number), theirs = parse_url(one), parse_url(other)
+    if kind == "udpin":
+        return theirs[::2] == (kind, number)
+    return theirs[::2] == (kind, number) and (same_port(where, theirs[1]) if kind == "serial" else where == theirs[1])
+
 
 Tell = Callable[[str, str], None]
 """Is told what was heard at a place, in words."""
 
 
-async def survey(ports: Sequence[str], udp: Sequence[int], tell: Tell) -> Survey:
+async def survey(ports: Sequence[str], udp: Sequence[int], tell: Tell, believed: Believed) -> Survey:
     """Listen to all at the same time; half a minute at the most."""
 
     async def one(port: int) -> HeardUdp | str:
@@ -99,8 +131,11 @@ async def survey(ports: Sequence[str], udp: Sequence[int], tell: Tell) -> Survey
         tell(f"UDP {port}", _in_words(found))
         return found
 
+    def first(port: str) -> list[Line]:
+        return [*(line for name, line in believed.items() if same_port(name, port)), *AUTOPILOT_LINES]
+
     serial, datagrams = await asyncio.gather(
-        listen_to_all(ports, AUTOPILOT_LINES, lambda port, found: tell(port, _in_words(found))),
+        listen_to_all(ports, first, lambda port, found: tell(port, _in_words(found))),
         asyncio.gather(*(one(port) for port in udp)),
     )
     return Survey(serial, dict(zip(udp, datagrams, strict=True)))

@@ -341,8 +341,7 @@ def control(stage: Path, work: Path, version: str, python: str) -> dict[str, str
         " the rest is their bias. It is written to the parameters of the autopilot\n"
         " (ArduPilot or PX4, over MAVLink) and read back.\n"
         " .\n"
-        " After the installation: edit /etc/companion/companion.toml, then\n"
-        " systemctl enable --now companion"
+        " After the installation: sudo companion setup"
     )
     return {
         "Package": "companion",

@@ -51,7 +51,7 @@ expect 100 'is there already, from an installation by hand' apt-get install -q -
 rm -r "$root/opt/companion"
 
 say 'install'
-expect 0 'edit /etc/companion/companion.toml, then' apt-get install -q -y --no-install-recommends /companion.deb
+expect 0 'sudo companion setup' apt-get install -q -y --no-install-recommends /companion.deb
 inside dpkg --verify companion >"$log" && [ ! -s "$log" ] || fail 'dpkg --verify finds changed files'
 version=$(dpkg-deb -f "$package" Version)
 expect 0 "^companion ${version%%-*}$" companion --version

@@ -62,20 +62,22 @@ def ports_to_try(found: Sequence[SerialPort]) -> list[str]:
 
 
 async def listen_to_all(
-    names: Sequence[str], first: Sequence[Line] = (), tell: Callable[[str, Heard | str], None] | None = None
+    names: Sequence[str],
+    first: Callable[[str], Sequence[Line]] = lambda _: (),
+    tell: Callable[[str, Heard | str], None] | None = None,
 ) -> dict[str, Heard | str]:
     """Who speaks on each port, or why that is not known; all at the same time.
 
     Args:
         names: the ports.
-        first: as for `listen`.
+        first: as for `listen`, by port.
         tell: is told of each as soon as it is known.
     """
 
     async def one(port: str) -> Heard | str:
         found: Heard | str
         try:
-            found = await listen(port, first)
+            found = await listen(port, first(port))
         except LinkError as error:
             found = str(error)
         if tell is not None:
