@@ -35,7 +35,8 @@ HELD = {
 
 def rig(folder: Path, **more: Any) -> tuple[Rig, Hands]:
     """An autopilot and nothing else; its scales are wrong, its offsets have never been measured."""
-    made = Rig(folder, imu_rate_hz=10.0, parameters=SCALES, **more)
+    options: dict[str, Any] = {"imu_rate_hz": 10.0, "parameters": SCALES} | more
+    made = Rig(folder, **options)
     made.config = msgspec.structs.replace(made.config, gradienter=None, compass=None)
     made.devices.clear()
     return made, Hands(made.aircraft, seed=3)
@@ -174,5 +175,29 @@ def test_who_asks_for_what_cannot_be_is_told_at_once(tmp_path: Path) -> None:
             refused = made.service.calibrating.conductor.start_faces("test", 100.0, write=True)
             assert isinstance(refused, Refusal)
             assert "push.parameters is false" in refused.reason
+
+    run_virtual(main())
+
+
+def test_px4_is_measured_and_not_written(tmp_path: Path) -> None:
+    """It starts without scales that are near 1, whatever its parameters say: so they are only shown."""
+    made, hands = rig(tmp_path, firmware="px4", parameters={})
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            refused = made.service.calibrating.conductor.start_faces("test", 100.0, write=True)
+            assert isinstance(refused, Refusal)
+            assert "PX4 starts without scales" in refused.reason
+            job = faced(made, write=False)
+            result = await follow(made, hands, job)
+            assert result.outcome == "done", result
+            record = job.product
+            assert isinstance(record, FacesRecord)
+            (imu,) = record.imus
+            true_mg = made.model.true_bias(made.aircraft.time_at(made.now_s)).accel_m_s2 / MG
+            sigma = np.array(imu.accel_bias_mg.sigma)
+            assert (np.abs(np.subtract(imu.accel_bias_mg.value, true_mg)) < 3.0 * sigma).all()
+            assert sigma.max() < 0.5
 
     run_virtual(main())

@@ -58,7 +58,8 @@ class Facing:
     def why_not(self, *, write: bool) -> str | None:
         """Why there is nothing to measure, or nothing could be written; None where all is well."""
         if write and self._core.vehicle.firmware == "px4":
-            return "scales are not written to PX4: align faces without --write shows them"
+            # It compares with what is in use, which is 1 after a start.
+            return "PX4 starts without scales that are within 1 % of 1: align faces without --write shows them"
         return self._writes.why_not(write=write)
 
     async def run(self, job: Job, *, write: bool) -> str:
