@@ -201,3 +201,30 @@ def test_px4_is_measured_and_not_written(tmp_path: Path) -> None:
             assert sigma.max() < 0.5
 
     run_virtual(main())
+
+
+@pytest.mark.parametrize("what", ["armed", "restarted"])
+def test_the_stands_so_far_outlive_an_arming_and_a_restart_of_the_autopilot(tmp_path: Path, what: str) -> None:
+    made, hands = rig(tmp_path)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            job = faced(made, write=True)
+            task = asyncio.ensure_future(follow(made, hands, job))
+            await made.until(lambda: job.words.startswith("4 of"), 200.0)
+            if what == "armed":
+                made.double.arm()
+                await made.until(lambda: "armed: it goes on once it is disarmed" in job.words, 30.0)
+                await asyncio.sleep(20.0)
+                made.double.armed = False
+            else:
+                made.double.reboot()
+            result = await task
+            assert result.outcome == "done", result
+            record = job.product
+            assert isinstance(record, FacesRecord)
+            assert len(record.stands) <= 13
+            np.testing.assert_allclose(read(made, "scale"), 1.0, atol=2e-4)
+
+    run_virtual(main())

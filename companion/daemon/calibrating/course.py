@@ -83,17 +83,24 @@ class Measuring:
         """A calibration begins, which may measure more than once."""
         self._upsets = {name: imu.upsets for name, imu in self._imus.items()}
 
-    async def read_state(self, job: Job, if_armed: str) -> Stand:
+    async def read_state(self, job: Job, if_armed: str | None) -> Stand:
         """How it stands now.
 
+        Args:
+            job: what it is looked at for.
+            if_armed: why the job fails where it was armed since it began; None: it goes on once it is disarmed.
+
         Raises:
-            CalibrationRefusedError: armed since the job began (in those words), or out of time.
+            CalibrationRefusedError: armed (in those words), or out of time.
         """
-        if job.was_armed or self._core.vehicle.arm_state is ArmState.ARMED:
+        armed = self._core.vehicle.arm_state is ArmState.ARMED
+        if if_armed is not None and (armed or job.was_armed):
             raise CalibrationRefusedError(if_armed)
         job.check_time()
         await self._core.catch_up()
         status = self._core.collector.status(asyncio.get_running_loop().time())
+        if armed:
+            return Stand(status, "armed: it goes on once it is disarmed", None)
         other = not_ready(self._core.vehicle, self._imus) or models.place_doubt(self._core.config, self._core.vehicle)
         if other is not None or status.obstacle is None:
             return Stand(status, other, None)

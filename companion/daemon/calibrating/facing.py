@@ -114,7 +114,9 @@ class Facing:
                     return window, f"it stands as in stand {again + 1}: {known.wish}"
             return window, None
 
-        return await self._stands.next(job, Asked(number, max(EXPECTED, number), known.wish or ""), take)
+        asked = Asked(number, max(EXPECTED, number), known.wish or "")
+        # No stand hangs on another, so that a flight in between costs nothing.
+        return await self._stands.next(job, asked, take, if_armed=None)
 
     def _name_left_out(self, before: _Known, now: _Known) -> None:
         for name, found in now.by_imu.items():

@@ -54,13 +54,16 @@ class Stands:
         """The next stand is the first."""
         self._end_s, self._first = None, {}
 
-    async def next(self, job: Job, asked: Asked, take: Callable[[Window], tuple[_T, str | None]]) -> _T:
+    async def next(
+        self, job: Job, asked: Asked, take: Callable[[Window], tuple[_T, str | None]], if_armed: str | None = ARMED
+    ) -> _T:
         """Wait until it stands as it should, and measure.
 
         Args:
             job: of the stands.
             asked: what is asked for.
             take: what a window tells, and why it is not the stand that was asked for, if it is not.
+            if_armed: as `Measuring.read_state`.
 
         Returns:
             What the first window told that was.
@@ -77,7 +80,7 @@ class Stands:
         moved, why = self._end_s is None, ""
         while True:
             now_s = loop.time()
-            status, waiting_for, hold_still_s = await self._measuring.read_state(job, ARMED)
+            status, waiting_for, hold_still_s = await self._measuring.read_state(job, if_armed)
             self._check_known()
             moving = self._collector.glance(now_s).moving
             if moving:
