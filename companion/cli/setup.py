@@ -273,7 +273,8 @@ class _Session:
         if not runs and not self._options.no_check:
             good = await self._check(parsed)
         started = await self._service(runs=runs)
-        steps = list(_next_steps(parsed, self._command, runs=runs, started=started, good=good))
+        is_old = runs and not started and self.answer["state"] != "unchanged"
+        steps = list(_next_steps(parsed, self._command, is_old=is_old, runs=runs or started, good=good))
         self.answer["next"] = steps
         self.asking.say("", "Next:", *(f"  {number}. {step}" for number, step in enumerate(steps, 1)))
 
@@ -288,6 +289,9 @@ class _Session:
 
         self.asking.say("", "Checking (it speaks with all of them now, and changes nothing):")
         findings = await run_check(parsed, CHECK_S)
+        if not all(finding.good for finding in findings):
+            self.asking.say("Something is missing: once more, and longer.")
+            findings = await run_check(parsed, 2.0 * CHECK_S)
         self.asking.say(*finding_lines(findings))
         bad = [f"{finding.name}: {finding.words}" for finding in findings if not finding.good]
         self.answer["findings"] = [dataclasses.asdict(finding) for finding in findings]
@@ -317,16 +321,25 @@ class _Session:
         return not failed
 
 
-def _next_steps(parsed: Config, command: str, *, runs: bool, started: bool, good: bool) -> Iterator[str]:
+def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good: bool) -> Iterator[str]:
+    """What to do, in this order.
+
+    Args:
+        parsed: the configuration.
+        command: how the companion is called with it.
+        is_old: what runs has another configuration.
+        runs: something does.
+        good: nothing is missing.
+    """
     if not good:
         yield f"mend what is BAD above, then: {command} check"
     service = command == "companion"
-    if runs and not started:
+    if is_old:
         how = "sudo systemctl restart companion" if service else "end it, and start it again"
         yield f"{how}   (it still runs with the old configuration)"
-    elif not started and service:
+    elif not runs and service:
         yield "sudo companion install-service   (starts it now, and at every boot)"
-    elif not started:
+    elif not runs:
         yield f"{command} run   (leave it running, and go on in another terminal)"
     if parsed.gradienter is not None:
         yield f"{command} align zero   (once: the gradienter's zero)"

@@ -128,22 +128,22 @@ async def survey(ports: Sequence[str], udp: Sequence[int], tell: Tell, believed:
             found = await listen_udp(port)
         except LinkError as error:
             found = str(error)
-        tell(f"UDP {port}", _in_words(found))
+        tell(f"UDP {port}", _in_words(f"UDP {port}", found))
         return found
 
     def first(port: str) -> list[Line]:
         return [*(line for name, line in believed.items() if same_port(name, port)), *AUTOPILOT_LINES]
 
     serial, datagrams = await asyncio.gather(
-        listen_to_all(ports, first, lambda port, found: tell(port, _in_words(found))),
+        listen_to_all(ports, first, lambda port, found: tell(port, _in_words(port, found))),
         asyncio.gather(*(one(port) for port in udp)),
     )
     return Survey(serial, dict(zip(udp, datagrams, strict=True)))
 
 
-def _in_words(found: Heard | HeardUdp | str) -> str:
+def _in_words(place: str, found: Heard | HeardUdp | str) -> str:
     if isinstance(found, str):
-        return f"left alone: {found}"
+        return f"left alone: {found.removeprefix(f'{place}: ')}"
     if isinstance(found, HeardUdp):
         if found.senders:
             return "; ".join(map(str, found.senders))

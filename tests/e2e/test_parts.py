@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from companion.autopilot.firmware.parts import part_of
+from companion.calibration.means.windows import Hidden, ImuWindow
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
 from companion.calibration.solution.record import ImuRecord
+from companion.calibration.solution.widened import without_heading
 from companion.config import parse
 from companion.config.sections import Noise
 from companion.daemon.process.check import run_check
@@ -162,3 +164,26 @@ def test_check_says_it(tmp_path: Path) -> None:
         assert said.words == "none: sigmas are those of the worst common parts"
 
     run_virtual(main())
+
+
+def test_integers_that_hide_the_mean_are_not_blamed_on_the_part() -> None:
+    window = ImuWindow(
+        name="fc",
+        samples=1000,
+        duration_s=10.0,
+        gyro_rad_s=(0.0, 0.0, 0.0),
+        accel_m_s2=(0.0, 0.0, -9.8),
+        gyro_sigma_stat_rad_s=(1e-4, 1e-4, 1e-4),
+        accel_sigma_stat_m_s2=(1e-3, 1e-3, 1e-3),
+        gyro_sigma_use_rad_s=(6e-4, 6e-4, 6e-4),
+        accel_sigma_use_m_s2=(1e-3, 1e-3, 1e-3),
+        temperature_degc=None,
+        warnings=(),
+        named=False,
+    )
+    earth = np.diag([1.0, 1.0, 0.0]) * (8.0 * DEG_H) ** 2
+    (said,) = without_heading([window], earth, "no compass")
+    assert said.startswith("imu fc: gyro sigma is that of the worst common parts")
+    hidden = msgspec.structs.replace(window, hidden={"gyro": Hidden("coarse steps", useless=False)})
+    (said,) = without_heading([hidden], earth, "no compass")
+    assert said.startswith("no compass: ")

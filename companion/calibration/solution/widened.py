@@ -19,7 +19,12 @@ def without_heading(imus: Sequence[ImuWindow], earth_covariance: Matrix, no_head
         no_heading: why there is none, in a few words.
     """
     earth = float(np.diag(earth_covariance).max())
-    by_part = [imu.name for imu in imus if not imu.named and float(np.square(imu.gyro_sigma_use_rad_s).max()) > earth]
+    by_part = [
+        imu.name
+        for imu in imus
+        # Where integers hide the mean, that made it, and is said.
+        if not imu.named and "gyro" not in imu.hidden and float(np.square(imu.gyro_sigma_use_rad_s).max()) > earth
+    ]
     found = [
         f"imu {name}: gyro sigma is that of the worst common parts: say its part (profile), or learn it (companion"
         " profile)"
