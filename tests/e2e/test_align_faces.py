@@ -18,7 +18,7 @@ from companion.daemon.job import Job
 from sim.ardupilot.double import offset_names
 from sim.hands import Hands
 from sim.imu_model import MG
-from tests.e2e.test_calibration import started
+from tests.e2e.test_calibration import calibrated, started
 from tests.support.rig import ACCEL_BIAS_MG, Rig
 from tests.support.virtual_time import run_virtual
 
@@ -226,5 +226,25 @@ def test_the_stands_so_far_outlive_an_arming_and_a_restart_of_the_autopilot(tmp_
             assert isinstance(record, FacesRecord)
             assert len(record.stands) <= 13
             np.testing.assert_allclose(read(made, "scale"), 1.0, atol=2e-4)
+
+    run_virtual(main())
+
+
+def test_a_gradienter_that_falls_silent_when_turned_over_is_not_waited_for_and_is_back_afterwards(
+    tmp_path: Path,
+) -> None:
+    made = Rig(tmp_path, imu_rate_hz=10.0, parameters=SCALES)
+    hands = Hands(made.aircraft, seed=3)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            result = await follow(made, hands, faced(made, write=False))
+            assert result.outcome == "done", result
+            hands.back(made.aircraft.time_at(made.now_s))
+            result, record = await calibrated(made)
+            assert result.outcome == "done", result
+            assert record.pose is not None
+            assert (record.pose.sigma_deg.theta or 90.0) < 0.1
 
     run_virtual(main())

@@ -69,6 +69,10 @@ class Facing:
             CompanionError: it failed, and why; what was written is back, or it is said what is not.
             JobCancelledError: cancelled; likewise.
         """
+        with self._stands.imus_alone():
+            return await self._run(job, write=write)
+
+    async def _run(self, job: Job, *, write: bool) -> str:
         windows: list[Window] = []
         known = _Known({}, _FIRST)
         local: LocalEarth | None = None

@@ -7,7 +7,8 @@ one person alone can do it with the ground station's voice or the page; the comm
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -107,6 +108,16 @@ class Stands:
                 self._measuring.show(measuring=False)
                 self._say(Severity.NOTICE, f"Align: {objection}")
             await job.pause(POLL_S)
+
+    @contextlib.contextmanager
+    def imus_alone(self) -> Iterator[None]:
+        """Meanwhile nobody waits for a gradienter or a compass: turned over, either may fall silent."""
+        config = self._core.config
+        self._collector.expect(gradienter=False, compass=False)
+        try:
+            yield
+        finally:
+            self._collector.expect(gradienter=config.gradienter is not None, compass=config.compass is not None)
 
     async def check_offsets(self) -> None:
         """Read them afresh: somebody may have changed them without a word.

@@ -84,6 +84,10 @@ class Turning:
             CompanionError: it failed, and why; what was written is back, or it is said what is not.
             JobCancelledError: cancelled; likewise.
         """
+        with self._stands.imus_alone():
+            return await self._run(job, asked)
+
+    async def _run(self, job: Job, asked: TurnAsked) -> str:
         plan = Plan("zero", asked.headings, back=True)
         taken: list[_Taken] = []
         self._stands.begin()
