@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.alignment.align import Alignment, in_words
-from companion.calibration.alignment.align_model import Ground, ImuStand, Stand
+from companion.calibration.alignment.align import Alignment, Complaint, in_words
+from companion.calibration.alignment.align_model import Ground, ImuStand, Row, Stand
 from companion.calibration.alignment.faces import Accelerometer, Face, faces
 from companion.calibration.alignment.spot import ALONE, mounting, turned
 from companion.physics.frames import rotation_matrix
@@ -114,7 +114,7 @@ def test_a_gyro_that_counts_a_turn_wrong_costs_quarters_little_and_is_in_the_sig
 def test_a_spot_that_moved_is_named_in_words_that_know_no_gradienter(headings: tuple[float, ...]) -> None:
     found = solved(on_spot((0.5, 0.5), headings, bumped=2))
     assert found.complaint is not None
-    words = in_words(found.complaint)
+    words = in_words(found.complaint, gradienter=False)
     assert "the spot moved" in words
     assert "gradienter" not in words
 
@@ -186,3 +186,11 @@ def test_hands_hold_it_in_any_orientation_and_put_it_onto_another_spot() -> None
     end_s = hands.turn(end_s + 2.0, 180.0)
     assert aircraft.pose_at(end_s + 1.0).pitch_deg == pytest.approx(-3.0)
     assert "on its back" in hands.obey("hold 1", 0.0)
+
+
+def test_without_a_gradienter_none_is_blamed() -> None:
+    loose = Complaint(Row("accelerometer", 2, "fc"), 7.0, 3.0 * MG)
+    assert "gradienter" in in_words(loose)
+    assert in_words(loose, gradienter=False).startswith(
+        "stand 2: imu fc is off by 3.0 mg (7 sigma): is something loose"
+    )

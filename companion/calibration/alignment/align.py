@@ -148,8 +148,8 @@ def align(
     )
 
 
-def in_words(complaint: Complaint) -> str:
-    """Why the stands do not fit together, and what to do, in one line."""
+def in_words(complaint: Complaint, *, gradienter: bool = True) -> str:
+    """Why the stands do not fit together, and what to do, in one line; `gradienter`: whether there was one."""
     row, size = complaint.row, complaint.size
     by = f"{complaint.sigmas:.0f} sigma"
     if row.group == "spot":
@@ -166,6 +166,8 @@ def in_words(complaint: Complaint) -> str:
         )
     if row.group == "gradienter":
         return f"stand {row.stand}: the gradienter is off by {size / DEG:.2f} deg ({by}): check its law and mounting"
+    if row.group == "accelerometer" and not gradienter:
+        return f"stand {row.stand}: imu {row.name} is off by {size / MG:.1f} mg ({by}): is something loose? Begin again"
     if row.group == "accelerometer":
         return (
             f"stand {row.stand}: imu {row.name} and the gradienter differ by {size / MG:.1f} mg ({by}): check the"

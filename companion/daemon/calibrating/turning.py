@@ -102,7 +102,7 @@ class Turning:
         stands = self._as_stands(taken)
         found: Alignment = await self._core.offload(turned, stands, _ground(local))
         if found.complaint is not None:
-            raise CalibrationRefusedError(in_words(found.complaint))
+            raise CalibrationRefusedError(in_words(found.complaint, gradienter=False))
         draft = Draft(datetime.datetime.now(tz=datetime.UTC), self._core.vehicle.system_id)
         draft.warnings += local.warnings
         if found.slope_deg > SLOPE_WARNING_DEG and plan.headings == 2:
