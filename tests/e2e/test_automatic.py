@@ -295,7 +295,8 @@ def test_the_writes_of_a_day_are_bounded_also_over_restarts(tmp_path: Path, monk
 
 def test_a_bias_that_moves_is_seen_in_the_window_and_written_anew(tmp_path: Path) -> None:
     async def main() -> None:
-        rig = Rig(tmp_path, at_arm="gate", **SLOW)
+        # With other dice it may be doubted and held back, until somebody asks: tests/e2e/test_held_back.py.
+        rig = Rig(tmp_path, at_arm="gate", seed=1, **SLOW)
         async with rig.running():
             await calibrated_by_itself(rig)
             await asyncio.sleep(automatic.SPACING_S)

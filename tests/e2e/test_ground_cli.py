@@ -187,7 +187,7 @@ def test_nobody_there() -> None:
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["fly"], "allowed: status"),
+        (["fly"], "allowed: calibrate, status"),
         (["calibrat"], "did you mean calibrate?"),
         (["status", "--url", "udp://x"], "udpin:HOST:PORT"),
         (["params", "CMP_PUSH"], "NAME=VALUE"),
