@@ -7,7 +7,6 @@ not to notice that anybody looks at it.
 from __future__ import annotations
 
 import asyncio
-import base64
 import contextlib
 import hashlib
 import logging
@@ -32,6 +31,7 @@ from companion.web.access import (
     page_url,
     split_address,
 )
+from companion.web.document import assembled, security_headers
 from companion.web.exchange import BadRequestError, Exchange, Request, Response
 
 logger = logging.getLogger(__name__)
@@ -41,7 +41,6 @@ Answer = Callable[[Object, str], AsyncIterator[Object]]
 """A request as on the control socket, and which face it came by: its replies."""
 Offload = Callable[..., Awaitable[Any]]
 
-PAGE: Final = Path(__file__).with_name("page.html")
 EVERY_S: Final = 0.5
 LEAST_S: Final = 0.1
 """Between two events, whatever wakes them."""
@@ -84,9 +83,9 @@ class Page:
         self.access = Access(new_token(), handed_out=self.local)
         self.problem: str | None = "not open yet"
         """Why nobody can look, in one line; None while the page is there."""
-        html = PAGE.read_bytes()
+        html = assembled()
         self._html, self._tag = html, hashlib.sha256(html).hexdigest()[:16]
-        self._always = _security_headers(html)
+        self._always = security_headers(html)
         self._clients: set[asyncio.Task[None]] = set()
         self._brief: dict[asyncio.Task[None], None] = {}
         """Those of them that do not look on, the oldest first."""
@@ -342,26 +341,3 @@ def _json(status: int, value: Object) -> Response:
 
 def _refusal(status: int, reason: str, *headers: tuple[str, str]) -> Response:
     return Response(status, msgspec.json.encode({"reason": reason}), headers=headers)
-
-
-def _security_headers(html: bytes) -> tuple[tuple[str, str], ...]:
-    """Nothing but the page's own style and script runs in it, and it speaks to nobody but us."""
-
-    def hashes(tag: bytes) -> str:
-        found = re.findall(b"<" + tag + b">(.*?)</" + tag + b">", html, re.DOTALL)
-        digests = (base64.b64encode(hashlib.sha256(text).digest()).decode() for text in found)
-        return " ".join(f"'sha256-{digest}'" for digest in digests)
-
-    policy = (
-        f"default-src 'none'; script-src {hashes(b'script')}; style-src {hashes(b'style')}; connect-src 'self'; "
-        "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    )
-    return (
-        ("Content-Security-Policy", policy),
-        ("X-Content-Type-Options", "nosniff"),
-        ("X-Frame-Options", "DENY"),
-        ("Referrer-Policy", "no-referrer"),
-        ("Cross-Origin-Resource-Policy", "same-origin"),
-        ("Cross-Origin-Opener-Policy", "same-origin"),
-        ("Cache-Control", "no-store"),
-    )
