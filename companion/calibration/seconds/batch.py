@@ -16,7 +16,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.noise.robust import median
 from companion.physics.frames import Floats
 
 MAX_LEVELS: Final = 1024
@@ -24,6 +23,10 @@ MAX_LEVELS: Final = 1024
 
 _EVEN: Final = 1.4999
 """Steps of a counter that are all within so much of each other are one step each, whatever the usual one is."""
+_OFF_BEAT: Final = 0.25
+"""A step farther from a whole number of usual ones is no loss: lost samples leave whole steps out."""
+_MOST_OFF_BEAT: Final = 0.2
+"""Stamps of which a larger share does so count nothing: a sender that picks now this, now that sample."""
 _LEAST_OF_A_PART: Final = 4
 _FINEST: Final = 5
 """Halvings of a second: 1/32 s; what is faster is vibration."""
@@ -59,7 +62,7 @@ class Batch(msgspec.Struct, frozen=True):
     largest_gap_s: float
     """Between samples, and to both ends of the slot."""
     missing: int | None
-    """By the device's sequence counter or clock; None where it has neither."""
+    """By the device's sequence counter or clock; None where it has neither, or one that does not count samples."""
     temperature_degc: float | None
     counts: Counts | None = None
     """Of a stream of integers; None for floats, and for a second that spans more than `MAX_LEVELS`."""
@@ -157,17 +160,21 @@ def first_of_each(stamps: Floats, rows: Floats) -> NDArray[np.bool_] | None:
     return None if fresh.all() else fresh
 
 
-def missing_of(stamps: Floats) -> int:
+def missing_of(stamps: Floats) -> int | None:
     """Samples that a counter says were lost; a clock in seconds counts in its own steps just as well.
 
     The step is learned (some devices count at an internal rate), and going down, as after a restart, is nobody's loss.
+    None where the stamps count no samples: PX4's telemetry takes those of 4 ms that are there when a message is due.
     """
     steps = stamps[1:] - stamps[:-1]
     steps = steps[steps > 0]
     if len(steps) == 0 or steps.max() < _EVEN * steps.min():
         return 0
-    usual = float(median(steps))
-    return int(np.maximum(np.rint(steps / usual) - 1.0, 0.0).sum())
+    beats = steps / np.partition(steps, len(steps) // 2)[len(steps) // 2]
+    whole = np.maximum(np.rint(beats), 1.0)
+    if np.mean(np.abs(beats - whole) > _OFF_BEAT) > _MOST_OFF_BEAT:
+        return None
+    return int((whole - 1.0).sum())
 
 
 def is_clipped(ordered: Floats, distinct: NDArray[np.int64]) -> bool:
@@ -355,7 +362,7 @@ class BatchSource:
         if len(rows) == 0:
             return None
         if stamps is not None:
-            self.lost += missing_of(np.concatenate(((self._last_stamp,), stamps)))
+            self.lost += missing_of(np.concatenate(((self._last_stamp,), stamps))) or 0
             self._last_stamp = stamps[-1]
         batch = summary(
             slot,
