@@ -74,7 +74,8 @@ async def _run(folder: Path, seed: int) -> int:
         if record["state"] != "done":
             print(f"\nThe calibration {record['state']}: {record['reason']}", file=sys.stderr)
             return 1
-        print(f"\nCalibrated in {record['duration_s']:.0f} s. Now {OBSERVE_S:.0f} s of the autopilot's own telemetry,")
+        print(f"\nbuzzer: {'; '.join(scenario.autopilot.buzzer.heard)}")
+        print(f"Calibrated in {record['duration_s']:.0f} s. Now {OBSERVE_S:.0f} s of the autopilot's own telemetry,")
         print("seen by a ground station that knows nothing of the companion...", flush=True)
         await asyncio.sleep(1.0)
         loop = asyncio.get_running_loop()

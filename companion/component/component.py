@@ -15,6 +15,7 @@ from companion.component.no_files import NoFiles
 from companion.component.own_parameters import OwnParameters, Parameter
 from companion.component.service import ArmGate, CalibrationService
 from companion.component.statustext import StatusText
+from companion.component.tunes import Tunes
 from companion.config.sections import Senders
 from companion.links.mavlink.link import MavlinkLink
 
@@ -34,10 +35,11 @@ class Component:
         service: CalibrationService,
         gate: ArmGate,
         texts: StatusText,
+        tunes: Tunes,
         parameters: Sequence[Parameter],
         senders: Senders,
     ) -> None:
-        self._link, self._service, self._texts = link, service, texts
+        self._link, self._service, self._texts, self._tunes = link, service, texts, tunes
         self._woken = texts.woken
         self._known_as = link.system_id
         """The system id under which we were heard last."""
@@ -94,6 +96,7 @@ class Component:
             self._commands.step(now_s),
             self.parameters.step(now_s),
             self._texts.step(now_s),
+            self._tunes.step(now_s),
         )
 
     def _follow_vehicle(self) -> None:

@@ -223,6 +223,13 @@ class Push(Section, frozen=True):
     """Whether to switch off what in the autopilot overwrites our biases; an undo switches it on again."""
 
 
+class Component(Section, frozen=True):
+    """How we make ourselves heard."""
+
+    tunes: bool = True
+    """Whether the autopilot's buzzer is used, while it is disarmed."""
+
+
 class Mqtt(Section, frozen=True):
     """A broker to speak to; the section absent means no MQTT."""
 
@@ -310,6 +317,7 @@ class Config(Section, frozen=True):
     compass: Compass | None = None
     calibration: Calibration = Calibration()
     push: Push = Push()
+    component: Component = Component()
     mqtt: Mqtt | None = None
     control: Control = Control()
     storage: Storage = Storage()

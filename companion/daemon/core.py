@@ -15,6 +15,7 @@ from companion.calibration.collector.outlook import Settings
 from companion.calibration.machine import Machine
 from companion.calibration.means.windows import Window
 from companion.component.statustext import Severity, StatusText, Weight
+from companion.component.tunes import Tune, Tunes
 from companion.config.sections import AtArm, Config
 from companion.configured import models
 from companion.configured.profiles import Profiles
@@ -43,15 +44,18 @@ class Wanted:
         """What happens at arming."""
         self.push = config.push.parameters
         """Whether results are written to the autopilot."""
+        self.tunes = config.component.tunes
+        """Whether the autopilot's buzzer is used."""
         self.settings = models.settings(config)
         """How good is good enough."""
         self.on_retarget: Listeners[Settings] = Listeners()
         """Told when something else is good enough."""
 
-    def switch(self, *, at_arm: AtArm | None = None, push: bool | None = None) -> None:
-        """Change what happens at arming, or whether results are written."""
+    def switch(self, *, at_arm: AtArm | None = None, push: bool | None = None, tunes: bool | None = None) -> None:
+        """Change what happens at arming, whether results are written, whether the buzzer is used."""
         self.at_arm = self.at_arm if at_arm is None else at_arm
         self.push = self.push if push is None else push
+        self.tunes = self.tunes if tunes is None else tunes
 
     def retarget(self, **targets: float) -> None:
         """Change how good is good enough: `target_...` as in `Settings`."""
@@ -72,6 +76,7 @@ class Core:
     profiles: Profiles
     collector: RecordedCollector
     texts: StatusText
+    tunes: Tunes
     machine: Machine
     """Where the calibration stands."""
     wanted: Wanted
@@ -91,6 +96,7 @@ class Core:
 
         vehicle = Vehicle(link, system_id=config.vehicle.system_id, is_carried=is_carried)
         parameters = ParameterClient(link, vehicle)
+        wanted, texts = Wanted(config), StatusText(link)
         return cls(
             config,
             offload,
@@ -99,9 +105,10 @@ class Core:
             parameters,
             Profiles(config),
             collector,
-            StatusText(link),
+            texts,
+            Tunes(link, vehicle, lambda: wanted.tunes, texts.woken),
             Machine(),
-            Wanted(config),
+            wanted,
             only_listening,
         )
 
@@ -135,6 +142,11 @@ class Core:
     def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
         """As `StatusText.say`: to the people at the ground stations."""
         return self.texts.say(severity, text, weight)
+
+    def prompt(self, tune: Tune, text: str) -> None:
+        """Tell whoever is at the aircraft what to do now: by the buzzer, and in words that are spoken."""
+        self.tunes.play(tune)
+        self.texts.say(Severity.NOTICE, text)
 
 
 class Subsystem:

@@ -70,7 +70,16 @@ class Board(AutopilotDouble):
         if not 1 <= len(imus) <= 3:
             raise ValueError(f"imus: found {len(imus)}; allowed: 1 to 3")
         channels = (ArduPilotChannel(system_id, self._handle), ArduPilotChannel(system_id, self._handle))
-        super().__init__(aircraft, imus, channels, up_s=up_s, has_position=has_position, clock_ppm=clock_ppm, seed=seed)
+        super().__init__(
+            aircraft,
+            imus,
+            channels,
+            up_s=up_s,
+            has_position=has_position,
+            clock_ppm=clock_ppm,
+            seed=seed,
+            tunes_go_on=False,
+        )
         self.system_id, self.version, self.vehicle = system_id, version, vehicle
         self._auxiliary = auxiliary
         self.parameters = self._new_store(parameters or {})

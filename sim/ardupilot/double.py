@@ -190,5 +190,7 @@ class ArduPilotDouble(Board):
             self._commands.data_stream(channel, message, loop_s)
         elif isinstance(message, mavlink.MAVLink_vision_position_estimate_message | mavlink.MAVLink_odometry_message):
             self.external_nav.take(message, loop_s)
+        elif isinstance(message, mavlink.MAVLink_play_tune_message):
+            self.buzzer.take(message, loop_s, armed=self.armed)
         elif isinstance(message, mavlink.MAVLink_timesync_message) and message.tc1 == 0:
             self.answer(channel, mavlink.MAVLink_timesync_message(self.boot_us(loop_s) * 1000, message.ts1))

@@ -11,6 +11,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.aircraft import VirtualAircraft
+from sim.firmware.buzzer import Buzzer
 from sim.firmware.channel import Channel, Message
 from sim.firmware.faults import Faults
 from sim.firmware.writes import Write
@@ -34,6 +35,7 @@ class AutopilotDouble(abc.ABC):
         up_s: how long it has been running when the simulation begins.
         has_position: whether it has a GNSS fix, and so a position and a date.
         clock_ppm: how much faster its clock runs.
+        tunes_go_on: as `Buzzer`.
     """
 
     def __init__(
@@ -46,10 +48,12 @@ class AutopilotDouble(abc.ABC):
         has_position: bool,
         clock_ppm: float,
         seed: int,
+        tunes_go_on: bool,
     ) -> None:
         self.aircraft, self.imus = aircraft, tuple(imus)
         self.has_position, self.clock_ppm = has_position, clock_ppm
         self.faults = Faults()
+        self.buzzer = Buzzer(goes_on=tunes_go_on)
         self.armed = False
         self.calibrating = False
         self.boots = 0

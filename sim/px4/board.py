@@ -89,7 +89,14 @@ class Board(AutopilotDouble):
             ),
         )  # fmt: skip
         super().__init__(
-            aircraft, imus, self.ports, up_s=up_s, has_position=has_position, clock_ppm=clock_ppm, seed=seed
+            aircraft,
+            imus,
+            self.ports,
+            up_s=up_s,
+            has_position=has_position,
+            clock_ppm=clock_ppm,
+            seed=seed,
+            tunes_go_on=True,
         )
         self.system_id, self.version, self.vehicle = system_id, version, vehicle
         self.flash_storage = flash_storage

@@ -241,6 +241,9 @@ class PX4Double(Board):
         elif isinstance(message, mavlink.MAVLink_command_ack_message):
             if is_for_us(self.system_id, message, broadcast=True):
                 self.authorization.acknowledged(message)
+        elif isinstance(message, mavlink.MAVLink_play_tune_message):
+            if is_for_us(self.system_id, message, broadcast=True):
+                self.buzzer.take(message, loop_s, armed=self.armed)
         elif isinstance(message, mavlink.MAVLink_timesync_message):
             if message.tc1 == 0:
                 now_ns = self.boot_us(loop_s) * 1000

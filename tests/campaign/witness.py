@@ -104,6 +104,9 @@ class Witness:
                     f" heartbeat {t_s - self._autopilot_s:.3f} s ago"
                 )
             self._judge_set(message)
+        elif isinstance(message, mavlink.MAVLink_play_tune_message):
+            if self._armed or t_s - self._autopilot_s >= SILENT_S:
+                self.faults.append(f"a tune at {t_s:.3f}: armed {self._armed}")
         elif isinstance(message, mavlink.MAVLink_command_ack_message) and message.command in COMMANDS:
             self._answered(message, t_s)
 

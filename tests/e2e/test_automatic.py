@@ -58,6 +58,7 @@ def test_it_calibrates_at_the_first_opportunity_after_start_and_says_one_line(tm
             assert len(said) == 1
             assert said[0].startswith("Auto calibration done: sigma")
             assert len(said[0]) <= 50
+            assert rig.double.buzzer.heard == [], "nobody asked for it"
 
     run_virtual(main())
 

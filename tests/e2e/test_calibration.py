@@ -57,6 +57,8 @@ def test_both_imus_are_calibrated_at_once_and_the_autopilot_is_right_afterwards(
                 assert off.max() < 3.5
                 off = np.abs(np.subtract(imu.accel_bias_m_s2, true.accel_m_s2)) / imu.accel_sigma_use_m_s2
                 assert off.max() < 3.5
+            await asyncio.sleep(0.1)
+            assert rig.double.buzzer.heard == ["1 long note", "4 short notes, rising"]
             fc, own = record.imus
             assert list(fc.written) == FC_PARAMETERS
             assert {written.outcome for written in fc.written.values()} == {"verified"}

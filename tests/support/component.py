@@ -9,11 +9,13 @@ from typing import Literal, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.request import What
 from companion.component.component import Component
 from companion.component.own_parameters import Parameter
 from companion.component.service import ArmAnswer, Job, JobResult, Refusal
 from companion.component.statustext import StatusText
+from companion.component.tunes import Tunes
 from companion.config.sections import EVERYBODY, Senders
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.wire import Wire
@@ -204,7 +206,8 @@ async def bench(
     if system_id is not None:
         link.join((system_id, 1))
     texts = StatusText(link)
-    component = Component(link, service, gate, texts, parameters, Senders(tuple(allow)))
+    tunes = Tunes(link, Vehicle(MavlinkLink()), lambda: False, texts.woken)
+    component = Component(link, service, gate, texts, tunes, parameters, Senders(tuple(allow)))
     wire = Wire(link, ground, seed=seed, loss=loss, duplicate=duplicate)
     task = asyncio.create_task(component.run())
     try:

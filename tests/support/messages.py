@@ -17,7 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 FILLED = "\0"
 
-SPEAKERS = {"say", "_say", "up", "_fault", "_words", "reset", "_void"}
+SPEAKERS = {"say", "_say", "prompt", "up", "_fault", "_words", "reset", "_void"}
 """What is handed to these is said as it is, even if it is one word."""
 
 NOT_FOR_PEOPLE = {

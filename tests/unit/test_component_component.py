@@ -9,9 +9,11 @@ from itertools import pairwise
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.component.commands import encode_version
 from companion.component.component import Component
 from companion.component.statustext import Severity, StatusText
+from companion.component.tunes import Tunes
 from companion.config.sections import EVERYBODY, Senders
 from companion.links.mavlink.link import MavlinkLink
 from tests.support.component import CALIBRATE, Ground, ScriptedGate, ScriptedService, bench
@@ -152,7 +154,8 @@ def test_the_first_heartbeat_on_a_late_link_comes_at_once() -> None:
         link, ground = MavlinkLink(), Ground()
         texts = StatusText(link)
         senders = Senders(EVERYBODY)
-        component = Component(link, ScriptedService(), ScriptedGate(), texts, (), senders)
+        tunes = Tunes(link, Vehicle(link), lambda: False, texts.woken)
+        component = Component(link, ScriptedService(), ScriptedGate(), texts, tunes, (), senders)
         texts.say(Severity.INFO, "waited for the link")
         async with asyncio.TaskGroup() as group:
             task = group.create_task(component.run())

@@ -21,6 +21,7 @@ from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
+from companion.component.tunes import Tune
 from companion.daemon.calibrating.align_steps import Plan
 from companion.daemon.calibrating.aligner import Aligner
 from companion.daemon.calibrating.bias_memory import Results, has_written
@@ -51,7 +52,7 @@ class Conductor:
         results: Results,
     ) -> None:
         self._machine, self._wanted, self._only_listening = core.machine, core.wanted, core.only_listening
-        self._vehicle, self._collector, self._say = core.vehicle, core.collector, core.say
+        self._vehicle, self._collector, self._say, self._tunes = core.vehicle, core.collector, core.say, core.tunes
         self._course, self._aligner, self._facing, self._turning = course, aligner, facing, turning
         self._recovery, self._results = recovery, results
         self._has_gradienter = core.config.gradienter is not None
@@ -226,6 +227,8 @@ class Conductor:
         if not (job.automatic and result.outcome == "failed" and self._vehicle.arm_state is ArmState.ARMED):
             # The pilot who has just armed has no use for the end of what nobody asked for.
             self._say(max(severity, Severity.WARNING) if job.automatic else severity, words, Weight.RESULT)
+        if not job.automatic and result.outcome != "cancelled":
+            self._tunes.play(Tune.DONE if result.outcome == "done" else Tune.FAILED)
         self.on_ended.tell(job, result)
         job.finish(result)
 

@@ -28,6 +28,7 @@ from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.calibration.solution.solve import Solution, solve
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity
+from companion.component.tunes import Tune
 from companion.config.sections import Platform
 from companion.configured import models
 from companion.daemon.calibrating import held_back
@@ -272,7 +273,10 @@ class Course:
             JobCancelledError: cancelled; likewise.
         """
         if not job.automatic:
-            self._core.say(Severity.NOTICE, _STARTED[self._core.config.vehicle.platform])
+            platform = self._core.config.vehicle.platform
+            self._core.say(Severity.NOTICE, _STARTED[platform])
+            if platform == "ground":
+                self._core.tunes.play(Tune.HOLD_STILL)
         self._measuring.begin()
         for left in reversed(range(WRONG_IMU_ATTEMPTS)):
             try:

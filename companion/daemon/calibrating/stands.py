@@ -16,6 +16,7 @@ import numpy as np
 from companion.calibration.alignment.align_model import ImuStand
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.component.statustext import Severity
+from companion.component.tunes import Tune
 from companion.daemon.calibrating.course import POLL_S, Measuring
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -75,10 +76,12 @@ class Stands:
         """
         loop = asyncio.get_running_loop()
         number, total, wish = asked
+        if number > 1:
+            self._core.tunes.play(Tune.NEXT)
         self._say(Severity.NOTICE, f"Align {number}/{total}: {wish}")
         # Whoever asks may yet put it down on a better spot: what was before that does not count.
         since_s = loop.time() if self._end_s is None else self._end_s
-        moved, why = self._end_s is None, ""
+        moved, why, held = self._end_s is None, "", False
         while True:
             now_s = loop.time()
             status, waiting_for, hold_still_s = await self._measuring.read_state(job, if_armed)
@@ -95,6 +98,9 @@ class Stands:
                 words = waiting_for if hold_still_s is not None else f"{why or wish}; {waiting_for}"
             else:
                 words = f"measuring, {max(still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
+                if not held:
+                    held = True
+                    self._core.tunes.play(Tune.HOLD_STILL)
             self._measuring.show(measuring=share > 0.0)
             job.progress(100.0 * (number - 1 + share) / total, f"{number} of {total}: {words}")
             if moved and waiting_for is None and still_s >= self._stand_s:
@@ -106,7 +112,7 @@ class Stands:
                     return found
                 moved, why = False, objection
                 self._measuring.show(measuring=False)
-                self._say(Severity.NOTICE, f"Align: {objection}")
+                self._core.prompt(Tune.WRONG, f"Align: {objection}")
             await job.pause(POLL_S)
 
     @contextlib.contextmanager

@@ -59,6 +59,7 @@ class Faces(Subsystem):
             calibrating.conductor,
             arming.readiness,
             core.texts,
+            core.tunes,
             own_parameters(core.wanted),
             Senders(core.config.mavlink.allow),
         )
@@ -159,7 +160,7 @@ class Faces(Subsystem):
 
 
 def own_parameters(wanted: Wanted) -> list[Parameter]:
-    """CMP_*: targets, at_arm and push may be set; the last result is shown.
+    """CMP_*: targets, at_arm, push and tunes may be set; the last result is shown.
 
     What a ground station sets holds until the daemon restarts: the configuration file is the aircraft owner's.
     """
@@ -175,6 +176,9 @@ def own_parameters(wanted: Wanted) -> list[Parameter]:
     def set_push(value: float) -> None:
         wanted.switch(push=bool(_whole("CMP_PUSH", value)))
 
+    def set_tunes(value: float) -> None:
+        wanted.switch(tunes=bool(_whole("CMP_TUNES", value)))
+
     def set_at_arm(value: float) -> None:
         wanted.switch(at_arm=AT_ARM[_whole("CMP_AT_ARM", value)])
 
@@ -183,6 +187,7 @@ def own_parameters(wanted: Wanted) -> list[Parameter]:
         Parameter("CMP_ACC_TGT", accel, 0.0001, LARGEST, set_accel_target),
         Parameter("CMP_PUSH", wanted.push, 0.0, 1.0, set_push),
         Parameter("CMP_AT_ARM", AT_ARM.index(wanted.at_arm), 0.0, 2.0, set_at_arm),
+        Parameter("CMP_TUNES", wanted.tunes, 0.0, 1.0, set_tunes),
         Parameter("CMP_STATE", 0.0, 0.0, 3.0),
         Parameter("CMP_GYR_SIG", 0.0, 0.0, LARGEST),
         Parameter("CMP_ACC_SIG", 0.0, 0.0, LARGEST),

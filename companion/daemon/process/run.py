@@ -51,6 +51,7 @@ RELOADABLE: Final[Mapping[str, Apply]] = {
     "calibration.target_accel_sigma_mg": _parameter("CMP_ACC_TGT"),
     "calibration.at_arm": _parameter("CMP_AT_ARM", AT_ARM.index),
     "push.parameters": _parameter("CMP_PUSH"),
+    "component.tunes": _parameter("CMP_TUNES"),
     "push.stop_rivals": lambda service, value: service.offsets.rivalry.switch(stop_rivals=value),
     "mavlink.allow": lambda service, value: service.faces.component.permission.allow(Senders(value)),
     "log.level": lambda _, value: logging.getLogger().setLevel(value.upper()),

@@ -1,0 +1,55 @@
+"""What is heard at the aircraft: the buzzer of the autopilot through an alignment, a calibration, an arming."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+from tests.e2e.test_align_turn import FLAT, follow, rig, turn
+from tests.support.virtual_time import run_virtual
+
+HOLD, NEXT, WRONG = "1 long note", "2 short notes, rising", "6 short notes, up and down"
+DONE, FAILED = "4 short notes, rising", "4 long notes, falling"
+
+
+def test_a_turn_is_heard_step_by_step(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path, FLAT, "px4")
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            job = turn(made, 2, write=False)
+            await made.until(lambda: job.words.startswith("2 of") and "waiting for it to move" in job.words, 60.0)
+            hands.turn(made.aircraft.time_at(made.now_s), 90.0)
+            await made.until(lambda: "deg more" in job.words, 60.0)
+            hands.turn(made.aircraft.time_at(made.now_s), 90.0)
+            await made.until(lambda: job.words.startswith("3 of"), 60.0)
+            hands.turn(made.aircraft.time_at(made.now_s), 180.0)
+            assert (await job.finished).outcome == "done"
+            await asyncio.sleep(2.0)
+            buzzer = made.autopilot.buzzer
+            assert buzzer.heard == [HOLD, NEXT, HOLD, WRONG, NEXT, HOLD, DONE]
+            assert (buzzer.while_armed, buzzer.broken_off) == (0, 0)
+
+    run_virtual(main())
+
+
+def test_who_turns_them_off_hears_none_and_an_armed_autopilot_never_any(tmp_path: Path) -> None:
+    made, hands = rig(tmp_path, FLAT)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            parameters = made.service.faces.component.parameters
+            parameters.change("CMP_TUNES", 0.0)
+            assert (await follow(made, hands, turn(made, 2, write=False))).outcome == "done"
+            parameters.change("CMP_TUNES", 1.0)
+            assert made.autopilot.buzzer.heard == []
+            job = turn(made, 2, write=False)
+            await made.until(lambda: made.autopilot.buzzer.heard == [HOLD], 60.0)
+            made.double.arm()
+            assert (await job.finished).outcome == "failed"
+            await asyncio.sleep(5.0)
+            assert made.autopilot.buzzer.heard == [HOLD]
+
+    run_virtual(main())
