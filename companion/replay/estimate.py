@@ -37,6 +37,7 @@ _REMEDIES: Final = Remedies(
     "say --latitude-deg",
     "say --height-m",
     no_heading="no --heading-deg",
+    part="say its part (--profile), or learn it (companion profile)",
     mounting="--mounting {}",
     any_bias="--any-bias takes it",
 )

@@ -14,6 +14,7 @@ from companion.calibration.means.windows import Hidden, ImuWindow
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
 from companion.calibration.solution.record import ImuRecord
+from companion.calibration.solution.site import IN_CONFIGURATION
 from companion.calibration.solution.widened import without_heading
 from companion.config import parse
 from companion.config.sections import Noise
@@ -182,8 +183,8 @@ def test_integers_that_hide_the_mean_are_not_blamed_on_the_part() -> None:
         named=False,
     )
     earth = np.diag([1.0, 1.0, 0.0]) * (8.0 * DEG_H) ** 2
-    (said,) = without_heading([window], earth, "no compass")
+    (said,) = without_heading([window], earth, IN_CONFIGURATION)
     assert said.startswith("imu fc: gyro sigma is that of the worst common parts")
     hidden = msgspec.structs.replace(window, hidden={"gyro": Hidden("coarse steps", useless=False)})
-    (said,) = without_heading([hidden], earth, "no compass")
+    (said,) = without_heading([hidden], earth, IN_CONFIGURATION)
     assert said.startswith("no compass: ")

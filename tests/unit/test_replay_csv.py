@@ -105,11 +105,13 @@ def test_what_is_not_said_widens_sigma_and_is_named(tmp_path: Path, capsys: pyte
     (imu,) = record["imus"]
     assert code == 0
     assert imu["accel_bias_m_s2"] is None
+    # What a part may do that nobody has named costs more than the heading that nobody has said: that is said then.
     words = " | ".join(record["warnings"])
-    for option in ("--pitch-deg", "--heading-deg", "say --latitude-deg"):
+    for option in ("--pitch-deg", "--profile", "say --latitude-deg"):
         assert option in words
     assert "GPS" not in words
-    _, record = replay(capsys, path, "--latitude-deg", "40")
+    _, record = replay(capsys, path, "--latitude-deg", "40", "--profile", "icm42688p", "--powered", "3600")
+    assert any("no --heading-deg" in warning for warning in record["warnings"])
     assert any("say --height-m" in warning for warning in record["warnings"])
     off = np.subtract(imu["gyro_bias_rad_s"], model.mean_bias(3.0, 33.0).gyro_rad_s)
     assert (np.abs(off) / imu["gyro_sigma_use_rad_s"]).max() < 3.5

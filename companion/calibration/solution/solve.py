@@ -211,7 +211,7 @@ def solve(
         warnings.append("no gradienter: gyros only, accelerometers not calibrated")
     if compass is None:
         unknown_heading = local.rate_in_body(np.eye(3), heading_known=False).covariance
-        warnings += without_heading(window.imus, unknown_heading, local.remedies.no_heading)
+        warnings += without_heading(window.imus, unknown_heading, local.remedies)
     truth = truth_of(window, gradienter, compass, local, warnings)
     believed = window.imus if any_bias else believable(window.imus, truth.up, local)
     sailing = np.zeros(3) if window.turn_rad_s is None else np.array(window.turn_rad_s)
