@@ -6,10 +6,12 @@ import argparse
 import dataclasses
 import datetime
 import faulthandler
+import io
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import quote
 
 from companion.cli import logs, show
 from companion.cli.terminal import DONE, FAILED, USAGE, AddCommand, config_path, load_config, print_json, print_lines
@@ -135,9 +137,22 @@ async def web_token(options: argparse.Namespace) -> int:
     elif token is None:
         print_lines(f"{url} needs no token: only this board can reach it")
     else:
+        whole = f"{url}#token={quote(token)}"
         print_lines(f"token: {token}")
-        print_lines(f"open once on the phone: {url}#token={token}")
+        print_lines(f"open once on the phone: {whole}")
+        if sys.stdout.isatty() and (sys.stdout.encoding or "").lower().startswith("utf"):
+            print_lines("or let its camera read this:")
+            sys.stdout.write(_code(whole))
     return DONE
+
+
+def _code(text: str) -> str:
+    """A QR code of a text for a terminal, dark on light whatever its colours are."""
+    import segno
+
+    drawn = io.StringIO()
+    segno.make(text, error="l", micro=False).terminal(drawn, border=2, compact=True)
+    return "".join(f"\x1b[97;40m{line}\x1b[0m\n" for line in drawn.getvalue().splitlines())
 
 
 async def check(options: argparse.Namespace) -> int:

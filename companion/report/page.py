@@ -25,6 +25,8 @@ AXES: Final = ("x", "y", "z")
 CLASSES: Final = ("sx", "sy", "sz")
 _MOST: Final = 1e4
 """The largest value in a plot (SI units): what is beyond comes from a damaged file and must not squash the rest."""
+_DOT_SHARE: Final = 0.015
+"""How wide a dot is, of a plot's width."""
 _LATEST_S: Final = 230 * 365.25 * 86400
 """The year 2200."""
 MAX_WARNINGS: Final = 40
@@ -128,6 +130,12 @@ def clock_is_sound(points: Sequence[Point]) -> bool:
     return None not in known and all(a <= b for a, b in itertools.pairwise(known) if a is not None and b is not None)
 
 
+def _too_close(places: Sequence[float]) -> bool:
+    """Whether by time two would be one dot: ascending places, of which some are nearer than a dot is wide."""
+    apart = [b - a for a, b in itertools.pairwise(places)]
+    return len(apart) > 1 and min(apart) < _DOT_SHARE * (places[-1] - places[0])
+
+
 def drift(
     points: Sequence[Point], triad: Triad, *, name: str, this: int | None = None, height: float = 84.0
 ) -> Markup | None:
@@ -140,6 +148,10 @@ def drift(
         return None
     places = [x for x, _ in shown]
     across, label = svg.times(places), "time (UTC)"
+    crowded = not numbered and _too_close(places)
+    if crowded:
+        across, label = svg.in_order(places), "time (UTC), in their order"
+        shown = [(float(k), point) for k, (_, point) in enumerate(shown)]
     if numbered:
         across, label = svg.linear(places, least=2.0), "number of the calibration (clock not sound)"
     plots: list[Markup] = []
@@ -162,8 +174,10 @@ def drift(
                 centre = plot.at(x, point.bias[axis] / unit)
                 plot.draw(tag("circle", cx=f"{centre[0]:.1f}", cy=f"{centre[1]:.1f}", r=8, class_="ring"))
         plots.append(plot.svg())
+    close = "Some follow each other so closely that these stand in their order, at even distances. "
     back = "The companion's clock went back in between, so these stand in their order, not by time. "
-    return tag("figure", *plots, tag("figcaption", back if numbered else None, "Bars: one sigma for the next minutes."))
+    why = back if numbered else close if crowded else None
+    return tag("figure", *plots, tag("figcaption", why, "Bars: one sigma for the next minutes."))
 
 
 def arming_items(armings: Sequence[Arming]) -> Markup:

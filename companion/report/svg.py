@@ -65,6 +65,17 @@ def times(values: Sequence[float]) -> Axis:
     return Axis(plain.low, plain.high, tuple(ticks))
 
 
+def in_order(values: Sequence[float]) -> Axis:
+    """An axis on which each of these UTC times has the place of its number, counted from 0."""
+    every = math.ceil(len(values) / 4)
+    form = "%-d %b %H:%M"
+    ticks = [
+        (float(k), datetime.datetime.fromtimestamp(values[k], tz=datetime.UTC).strftime(form))
+        for k in range(0, len(values), every)
+    ]
+    return Axis(-0.5, len(values) - 0.5, tuple(ticks))
+
+
 def _nice(step: float) -> float:
     power = 10.0 ** math.floor(math.log10(step))
     return power * next(mark for mark in (1.0, 2.0, 5.0, 10.0) if step <= mark * power * 1.25)

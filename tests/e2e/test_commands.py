@@ -336,6 +336,7 @@ def test_the_daemon_stays_light() -> None:
         "aiomqtt",
         "mcap",
         "h11",
+        "segno",
         "hypothesis",
         "sim",
     ):

@@ -203,9 +203,13 @@ def test_the_attitude_and_the_biases_that_are_shown_are_the_true_ones(tmp_path: 
             assert true_north["north"] == "true"
             assert true_north["heading_deg"] == pytest.approx(POSE.heading_deg, abs=2.0)
             await calibrated(rig)
-            shown = rig.service.status()["calibration"]
+            shown, arming = rig.service.status()["calibration"], rig.service.status()["arming"]
             assert shown["in_force"]
             assert shown["calibrated_ago_s"] < 5.0
+            for triad, key, wanted in (("gyro", "gyro_sigma_deg_h", 5.0), ("accel", "accel_sigma_mg", 0.2)):
+                worst = max(shown["imus"][0][key])  # of the autopilot's own, which is judged
+                quality = arming["quality"][triad]
+                assert quality == {"sigma": pytest.approx(worst, abs=0.01), "wanted": wanted, "met": worst <= wanted}
             for imu, model in zip(shown["imus"], (rig.model, rig.own_model), strict=True):
                 true = model.true_bias(rig.aircraft.time_at(rig.now_s))
                 for axis in range(3):

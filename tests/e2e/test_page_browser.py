@@ -71,6 +71,23 @@ async def pixels_needed(tab: Tab) -> int:
     return int(await tab.value("document.documentElement.scrollWidth - document.documentElement.clientWidth"))
 
 
+async def fits_every_phone(here: Scene) -> None:
+    """Nothing is cut off on the smallest phone nor on its side, by day or night; then as before."""
+    cut_off = "[...document.querySelectorAll('button,#word,#reason')].filter(it => it.scrollWidth > it.clientWidth + 1)"
+    for size in ((320, 568), (740, 360)):
+        for scheme, paper in (("light", "rgb(255, 255, 255)"), ("dark", "rgb(11, 11, 11)")):
+            await here.tab.size(size)
+            await here.tab.scheme(scheme)
+            assert await pixels_needed(here.tab) == 0
+            assert await here.tab.value(f"{cut_off}.map(it => it.id)") == []
+            assert await here.tab.value("getComputedStyle(document.body).backgroundColor") == paper
+            below = "[...document.querySelectorAll('#keys button')].map(it => it.getBoundingClientRect().bottom - innerHeight)"
+            assert await here.tab.value(f"Math.max(...{below})") <= 0
+            await here.picture(f"phone_{size[0]}_{scheme}")
+    await here.tab.scheme("light")
+    await here.tab.size(PHONE)
+
+
 async def read_the_record(here: Scene, record: Record) -> None:
     """Bars of the last calibration, and its download."""
     tab = here.tab
@@ -131,6 +148,7 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
                 box = f"document.querySelector('#{button}').getBoundingClientRect()"
                 assert await tab.value(f"{box}.height >= 80 && {box}.width >= 90 && {box}.bottom <= innerHeight")
             await here.picture("phone_not_calibrated")
+            await fits_every_phone(here)
             await read_the_record(here, record)
 
             # A short tap is no order, and says why.

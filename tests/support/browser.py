@@ -48,12 +48,20 @@ class Tab:
         return await self._browser.call(method, self._session, **parameters)
 
     async def open(self, url: str, size: tuple[int, int] = PHONE) -> None:
+        await self.size(size)
+        await self.call("Page.navigate", url=url)
+
+    async def size(self, size: tuple[int, int]) -> None:
+        """Let the screen be of that size; below 800 px it is a phone's."""
         phone = size[0] < 800
         await self.call(
             "Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1, mobile=phone
         )
         await self.call("Emulation.setTouchEmulationEnabled", enabled=phone)
-        await self.call("Page.navigate", url=url)
+
+    async def scheme(self, name: str) -> None:
+        """`light` or `dark`, as the device prefers."""
+        await self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": name}])
 
     async def value(self, expression: str) -> Any:
         reply = await self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import html
+import itertools
 import json
 import re
 import shutil
@@ -257,6 +258,19 @@ def test_a_clock_that_went_back_is_said_and_order_is_used(tmp_path: Path) -> Non
     found = Page(_calibration(tmp_path))
     assert "The companion's clock went back in between" in found.text
     assert "number of the calibration" in found.text
+
+
+def test_three_calibrations_of_one_hour_after_a_month_are_three_dots(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path)
+    for k, when in enumerate(("04-20T09:00", "05-23T09:02", "05-23T09:31", "05-23T10:12")):
+        store.save(record(k, started_at=f"2026-{when}:00.000+00:00"))
+    found = Page(_calibration(tmp_path))
+    (course, *_) = (held["d"] or "" for tag, held in found.tags if tag == "path" and held.get("class") == "dot sx")
+    places = [float(x) for x in re.findall(r"M([\d.]+)", course)]
+    assert len(places) == 4
+    assert min(b - a for a, b in itertools.pairwise(places)) > 20.0
+    assert "stand in their order" in found.text
+    assert "23 May 09:31" in found.text
 
 
 # -------------------------------------------------------------------------------------------------------- the command

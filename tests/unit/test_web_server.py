@@ -11,6 +11,7 @@ import logging
 import re
 import socket
 import stat
+import sys
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -595,7 +596,9 @@ def test_the_kept_token_stays_and_a_useless_one_is_refused(tmp_path: Path) -> No
             access.kept_token(tmp_path)
 
 
-def test_a_token_that_somebody_chose_has_twelve_characters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_token_that_somebody_chose_has_twelve_characters(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, toml = tmp_path / "web-token", tmp_path / "c.toml"
     toml.write_text(
         '[mavlink]\nurl = "udpout:127.0.0.1:9"\n[[imu]]\nname = "fc"\nsource = "autopilot"\n'
@@ -609,7 +612,17 @@ def test_a_token_that_somebody_chose_has_twelve_characters(tmp_path: Path, capsy
     )
     path.write_text("twelve - chars!\n")
     assert companion(["web-token", "-c", str(toml)]) == 0
-    assert capsys.readouterr().out.startswith("token: twelve - chars!\n")
+    out = capsys.readouterr().out
+    assert out.startswith("token: twelve - chars!\n")
+    assert out.endswith("#token=twelve%20-%20chars%21\n")  # no picture into a pipe
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    assert companion(["web-token", "-c", str(toml)]) == 0
+    rows = [re.sub(r"\x1b\[[\d;]*m", "", line) for line in capsys.readouterr().out.splitlines()[3:]]
+    assert set("".join(rows)) == set(" ▀▄█")
+    # Three corners have the sign by which a camera finds it, dark on light (ISO/IEC 18004, 6.3.3).
+    finder = ["█ ▄▄▄▄▄ █", "█ █   █ █", "█ █▄▄▄█ █", "█▄▄▄▄▄▄▄█"]
+    assert [row[1:10] for row in rows[1:5]] == [row[-10:-1] for row in rows[1:5]] == finder
+    assert len({len(row) for row in rows}) == 1 <= len(rows) <= 24
 
 
 def test_who_has_the_token_is_let_in_whoever_guesses_meanwhile(

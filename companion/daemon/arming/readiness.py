@@ -24,6 +24,7 @@ from companion.daemon.core import Core
 from companion.daemon.offsets.effect import LOOK_S
 from companion.daemon.offsets.push import Conclusion
 from companion.physics.units import DEG_H, MG
+from companion.samples import Triad
 
 logger = logging.getLogger(__name__)
 
@@ -273,6 +274,16 @@ class Readiness:
             *([f"{accel / MG:.2f} mg"] if accel is not None else []),
         ]
 
+    def _quality(self, triad: Triad, unit: float) -> dict[str, object]:
+        """The largest sigma in force and what is aimed at, in deg/h or mg."""
+        sigma, settings = self.in_force.sigma(triad), self._wanted.settings
+        wanted = settings.target_gyro_sigma_rad_s if triad == "gyro" else settings.target_accel_sigma_m_s2
+        return {
+            "sigma": None if sigma is None else round(sigma / unit, 3),
+            "wanted": round(wanted / unit, 4),
+            "met": None if sigma is None else sigma <= wanted,
+        }
+
     def status(self) -> dict[str, object]:
         """For `companion status`."""
         now_s = asyncio.get_running_loop().time()
@@ -285,6 +296,7 @@ class Readiness:
             "state": state,
             "in_force": words,
             "held_back": self.in_force.held_back,
+            "quality": {"gyro": self._quality("gyro", DEG_H), "accel": self._quality("accel", MG)},
             "against": [finding.words for finding in self.in_force.findings(now_s)],
         }
 

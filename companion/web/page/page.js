@@ -1,4 +1,5 @@
 "use strict";
+const DEG_H = Math.PI / 180 / 3600, MG = 9.80665e-3;
 const HOLD_MS = 1500, GONE_MS = 3000, AGAIN_MS = 1000, SLIP_PX = 80;
 const $ = id => document.getElementById(id);
 let token = null, handedOut = false, source = null, heardAt = 0, page = null, shownRecords = null, counted = {}, busy = false;
@@ -38,11 +39,16 @@ function show(status) {
   busy = status.progress !== null;
   $("progress").hidden = !busy;
   if (busy) document.querySelector("#progress div").style.width = status.progress + "%";
+  quality(status);
   const pose = status.pose || {};
   $("pitch").textContent = fixed(pose.pitch_deg, 2, "°");
   $("roll").textContent = fixed(pose.roll_deg, 2, "°");
   $("heading").textContent = fixed(pose.heading_deg, 1, "°");
   $("north").textContent = pose.heading_deg != null ? "heading, " + pose.north : "heading";
+  $("known").setAttribute("visibility", status.pose ? "visible" : "hidden");
+  $("unknown").setAttribute("visibility", status.pose ? "hidden" : "visible");
+  $("lost").hidden = status.pose !== null;
+  document.querySelector("#pose svg").setAttribute("aria-label", status.pose ? "horizon" : "attitude not known");
   $("horizon").setAttribute("transform", `rotate(${-(pose.roll_deg || 0)}) translate(0 ${(pose.pitch_deg || 0) * 1.5})`);
   calibration(status.calibration, status.arming);
   const last = status.last, missed = last && last.state !== "done";
@@ -56,7 +62,18 @@ function show(status) {
   const key = JSON.stringify([status.last, status.headline.word === "READY", busy]);
   if (key !== shownRecords) { shownRecords = key; records(); }
 }
-function axes(names, digits, biases, sigmas, unit, title, held) {
+// How good what is in force is, beside what was asked for.
+function quality(status) {
+  const rows = [["gyro", "°/h", 1], ["accel", "mg", 2]].flatMap(([triad, unit, digits]) => {
+    const {wanted, met} = status.arming.quality[triad];
+    return met === null ? [] : [[met, `${+wanted.toFixed(digits)} ${unit} ${met ? "✓" : "✕"}`]];
+  });
+  const shown = rows.length > 0 && status.headline.tone === "good";
+  $("quality").hidden = !shown;
+  $("quality").textContent = "wanted: " + rows.map(([, words]) => words).join(", ");
+  $("head").classList.toggle("coarse", shown && rows.some(([met]) => !met));
+}
+function axes(names, digits, biases, sigmas, unit, title, held, before) {
   if (!biases) return [];
   const full = Math.max(...biases.map((bias, k) => Math.abs(bias) + sigmas[k])) * 1.08 || 1;
   const rows = names.map((name, k) => {
@@ -72,9 +89,26 @@ function axes(names, digits, biases, sigmas, unit, title, held) {
     return row;
   });
   const words = held ? [make("p", "held back: measured, not written; what was in force before still is", "note")] : [];
+  if (before) {
+    const most = Math.max(...biases.map((bias, k) => Math.abs(bias - before.bias[k])));
+    words.push(make("p", `changed by ${most.toFixed(digits)} ${unit.split(" ")[0]} at most since ${utc(before.at)}`, "note"));
+  }
   return [make("h3", `${title}, ${unit}${held ? ", held back" : ""}`), ...words, ...rows];
 }
-let shownBiases = null;
+// The same figures of the calibration before this one, as far as it has been read.
+function earlier(found, name, triad) {
+  const at = recordsRead.findIndex(({record}) => record.started_at === found.started_at);
+  if (at < 0) return null;
+  const [key, unit] = triad === "gyro" ? ["gyro_bias_rad_s", DEG_H] : ["accel_bias_m_s2", MG];
+  for (const {record} of recordsRead.slice(at + 1)) {
+    const imu = record.imus.find(imu => imu.name === name);
+    if (record.state === "done" && !record.undone_at && imu && imu[key] && !imu.held_back.includes(triad)) {
+      return {at: record.started_at, bias: imu[key].map(value => value / unit)};
+    }
+  }
+  return null;
+}
+let shownBiases = null, recordsRead = [];
 function calibration(found, arming) {
   if (!found) {
     $("age").textContent = arming.state === "uncalibrated" ? "none yet" : arming.in_force;
@@ -88,7 +122,7 @@ function calibration(found, arming) {
   if (found.confirmed_ago_s !== null) words.push("seen right " + ago(found.confirmed_ago_s));
   for (const against of arming.against) words.push(against);
   $("age").textContent = words.join("; ");
-  const key = JSON.stringify(found.imus);
+  const key = JSON.stringify([found.imus, recordsRead.map(({file}) => file)]);
   if (key === shownBiases) return;
   shownBiases = key;
   $("imus").replaceChildren(...found.imus.flatMap(imu => {
@@ -96,8 +130,10 @@ function calibration(found, arming) {
     if (imu.temperature_degc !== null) warm.push(`at ${imu.temperature_degc.toFixed(1)} °C`);
     if (imu.temperature_now_degc !== null) warm.push(`now ${imu.temperature_now_degc.toFixed(1)} °C`);
     return [make("h3", `${imu.name}${warm.length ? ": " + warm.join(", ") : ""}`),
-      ...axes(["x", "y", "z"], 1, imu.gyro_bias_deg_h, imu.gyro_sigma_deg_h, "°/h ± sigma", "gyro bias", imu.held_back.includes("gyro")),
-      ...axes(["x", "y", "z"], 2, imu.accel_bias_mg, imu.accel_sigma_mg, "mg ± sigma", "accelerometer bias", imu.held_back.includes("accel"))];
+      ...axes(["x", "y", "z"], 1, imu.gyro_bias_deg_h, imu.gyro_sigma_deg_h, "°/h ± sigma", "gyro bias", imu.held_back.includes("gyro"),
+        earlier(found, imu.name, "gyro")),
+      ...axes(["x", "y", "z"], 2, imu.accel_bias_mg, imu.accel_sigma_mg, "mg ± sigma", "accelerometer bias", imu.held_back.includes("accel"),
+        earlier(found, imu.name, "accel"))];
   }));
 }
 function link(good, name, words) {
@@ -129,6 +165,7 @@ function links(status) {
 async function records() {
   let found;
   try { found = (await (await fetch("/records.json")).json()).records; } catch { shownRecords = null; return; }
+  recordsRead = found;
   const open = new Set([...document.querySelectorAll("details[open]")].map(it => it.dataset.file));
   $("records").replaceChildren(...(found.length ? found.map(({file, record}) => {
     const it = make("details"), head = make("summary"), body = make("div"), get = make("a", "DOWNLOAD", "button");
@@ -151,8 +188,8 @@ function figures(imu) {
   const part = (bias, sigma, unit, digits, name, triad) => bias === null ? "" :
     ` ${name[0]}${held(triad)} ${bias.map((value, k) => `${signed(value / unit, digits)} ± ${(sigma[k] / unit).toFixed(digits)}`).join(", ")} ${name[1]};`;
   const written = Object.keys(imu.written).length;
-  return `${imu.name}:` + part(imu.gyro_bias_rad_s, imu.gyro_sigma_use_rad_s, Math.PI / 180 / 3600, 1, ["gyro", "°/h"], "gyro")
-    + part(imu.accel_bias_m_s2, imu.accel_sigma_use_m_s2, 9.80665e-3, 2, ["accelerometer", "mg"], "accel") + (written ? ` ${written} parameters written` : "");
+  return `${imu.name}:` + part(imu.gyro_bias_rad_s, imu.gyro_sigma_use_rad_s, DEG_H, 1, ["gyro", "°/h"], "gyro")
+    + part(imu.accel_bias_m_s2, imu.accel_sigma_use_m_s2, MG, 2, ["accelerometer", "mg"], "accel") + (written ? ` ${written} parameters written` : "");
 }
 
 // --- listening
