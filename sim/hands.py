@@ -1,13 +1,15 @@
 """Somebody who takes hold of the aircraft: turns it on its spot, tilts it, puts it back.
 
 A spot is a plane. However the aircraft is turned on it, its down axis stays the plane's normal, but for what the hands
-leave (`placement`). Typed lines make it so while a simulation runs: `python -m sim all --hands`.
+leave (`placement`). Typed lines make it so while a simulation runs (`python -m sim all --hands`), and so does what
+companion and autopilots ask for (`follow`).
 """
 
 from __future__ import annotations
 
 import asyncio
 import math
+import re
 import sys
 from collections.abc import Callable
 from typing import Final
@@ -19,11 +21,34 @@ from sim.earth import angles_of, axis_rotation, body_from_ned
 from sim.motions import Handling, Turn
 
 TAKES_S: Final = 6.0
-HELP: Final = "turn DEG | tilt PITCH ROLL | hold PITCH ROLL | spot PITCH ROLL | back | bump PITCH ROLL"
+AHEAD_S: Final = 0.1
+"""A real firmware's readings are made that far ahead."""
+HELP: Final = (
+    "turn DEG | tilt PITCH ROLL | hold PITCH ROLL | spot PITCH ROLL | back | bump PITCH ROLL | grip SECONDS"
+    " | wait SECONDS"
+)
+PLACEMENT_DEG, PROPPED_DEG = 0.02, 4.0
+"""What careful hands leave on marks, and what somebody who props it up does."""
 _EXAMPLES: Final = (
     "turn 180: clockwise on its spot; tilt 20 0: nose up; hold 0 180: on its back, whatever the spot; spot 3 0:"
-    " onto another one, which slopes; back: onto its spot; bump 0.3 0: the spot tips"
+    " onto another one, which slopes; back: onto its spot; bump 0.3 0: the spot tips; grip 20: a hand stays on it;"
+    " wait 20: the next line later"
 )
+SIDES: Final = {
+    "level": (0.0, 0.0),
+    "on its back": (0.0, 180.0),
+    "nose up": (90.0, 0.0),
+    "nose down": (-90.0, 0.0),
+    "left side down": (0.0, -90.0),
+    "right side down": (0.0, 90.0),
+}
+"""Pitch and roll of each side, by the companion's words."""
+_SIDE = "|".join(SIDES)
+_MISSING = re.compile(rf"(?:half way between ({_SIDE}) and ({_SIDE})|({_SIDE})) is missing")
+_TURN = re.compile(r"turn it (?:by|on by) (\d+) deg")
+_PLACE = {"level": "level", "on its LEFT side": "left side down", "on its RIGHT side": "right side down",
+          "nose DOWN": "nose down", "nose UP": "nose up", "on its BACK": "on its back"}  # fmt: skip
+"""In ArduPilot's words: how it asks for each side."""
 
 
 class Hands:
@@ -32,11 +57,14 @@ class Hands:
     Args:
         aircraft: as it stands now, so does it stand on its spot.
         placement_deg: one sigma of how the down axis misses the spot's normal each time, each axis.
-        seed: of that.
+        propped_deg: one sigma of how pitch and roll miss what was wanted, propped up by hand.
+        seed: of both.
     """
 
-    def __init__(self, aircraft: VirtualAircraft, *, placement_deg: float = 0.0, seed: int = 0) -> None:
-        self._aircraft, self._placement_deg = aircraft, placement_deg
+    def __init__(
+        self, aircraft: VirtualAircraft, *, placement_deg: float = 0.0, propped_deg: float = 0.0, seed: int = 0
+    ) -> None:
+        self._aircraft, self._placement_deg, self._propped_deg = aircraft, placement_deg, propped_deg
         self._random = np.random.default_rng([seed, 31])
         pose = aircraft.pose
         self._spot = body_from_ned(*(math.radians(a) for a in (pose.roll_deg, pose.pitch_deg, pose.heading_deg)))
@@ -64,7 +92,34 @@ class Hands:
 
     def hold(self, t_s: float, pitch_deg: float, roll_deg: float) -> float:
         """Prop it up anywhere, in any orientation: nose up, right side down, from the horizon."""
-        return self._go(t_s, self._held(pitch_deg, roll_deg))
+        pitch_off, roll_off = self._propped_deg * self._random.standard_normal(2)
+        return self._go(t_s, self._held(pitch_deg + pitch_off, roll_deg + roll_off))
+
+    def grip(self, t_s: float, seconds: float) -> float:
+        """Keep a hand on it: it trembles by some tenths of a degree, and ends as it began."""
+        self._number += 1
+        tremor = Handling(start_s=t_s, duration_s=seconds, angle_deg=0.4, acceleration=0.1, seed=self._number)
+        self._aircraft.add(tremor)
+        return tremor.end_s
+
+    def follow(self, words: str, t_s: float) -> bool:
+        """Do what companion or ArduPilot asks for; whether these words ask for anything.
+
+        Understood are what `companion align` shows and tells ground stations, and ArduPilot's six positions.
+        """
+        if (missing := _MISSING.search(words)) is not None:
+            up = np.mean([_up(*SIDES[name]) for name in missing.groups() if name is not None], axis=0)
+            up /= np.linalg.norm(up)
+            self.hold(t_s, math.degrees(math.asin(up[0])), math.degrees(math.atan2(-up[1], -up[2])))
+        elif (asked := _TURN.search(words)) is not None:
+            self.turn(t_s, float(asked[1]))
+        elif "turn it back onto its first marks" in words:
+            self.turn(t_s, -self._turned_deg)
+        elif words.startswith("Place vehicle"):
+            self.hold(t_s, *next(SIDES[side] for how, side in _PLACE.items() if how in words))
+        else:
+            return False
+        return True
 
     def spot(self, t_s: float, pitch_deg: float, roll_deg: float) -> float:
         """Put it onto another spot, on which it stands like this at first."""
@@ -116,6 +171,9 @@ class Hands:
             elif word == "bump" and len(figures) == 2:
                 self.bump(figures[0], figures[1])
                 return "the spot has tipped; it shows when the aircraft is put onto it again"
+            elif word == "grip" and len(figures) == 1:
+                self.grip(t_s, figures[0])
+                return f"a hand stays on it for {figures[0]:g} s"
             else:
                 raise ValueError
         except ValueError:
@@ -127,10 +185,19 @@ class Hands:
         )
 
 
+def _up(pitch_deg: float, roll_deg: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """Up in the aircraft's axes, forward, right, down."""
+    return -body_from_ned(math.radians(roll_deg), math.radians(pitch_deg), 0.0)[:, 2]
+
+
 async def take_lines(hands: Hands, aircraft: VirtualAircraft, say: Callable[[str], None]) -> None:
-    """Obey standard input line by line until it ends."""
+    """Obey standard input, a terminal or a script of stands, line by line until it ends."""
     loop = asyncio.get_running_loop()
     reader = asyncio.StreamReader()
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
     while line := await reader.readline():
-        say(hands.obey(line.decode(errors="replace"), aircraft.time_at(loop.time())))
+        words = line.decode(errors="replace")
+        if (waiting := re.fullmatch(r"\s*wait\s+([0-9.]+)\s*", words)) is not None:
+            await asyncio.sleep(float(waiting[1]))
+        elif words.strip():
+            say(hands.obey(words, aircraft.time_at(loop.time()) + AHEAD_S))

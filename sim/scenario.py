@@ -74,6 +74,8 @@ def demo(
     part: str = "icm42688p",
     gyro_deg_h: Sequence[float] = FIRST_GYRO_DEG_H,
     accel_mg: Sequence[float] = FIRST_ACCEL_MG,
+    accel_scale: Sequence[float] = (0.0, 0.0, 0.0),
+    board_deg: tuple[float, float] = (0.0, 0.0),
     gradienter_offset_deg: tuple[float, float] = GRADIENTER_OFFSET_DEG,
     devices: tuple[str, str, str] = DEMO_DEVICES,
 ) -> Scenario:
@@ -95,6 +97,8 @@ def demo(
         part: what the flight controller's IMUs are.
         gyro_deg_h: gyro biases of its first IMU.
         accel_mg: likewise of the accelerometers.
+        accel_scale: relative scale errors of the accelerometers of its first two IMUs.
+        board_deg: roll and pitch by which the flight controller does not sit straight in the aircraft.
         gradienter_offset_deg: what the gradienter shows too much, x and y.
         devices: families of IMU, gradienter and compass, by their names in `sim.families`; law and errors are those of
             the usual ones, any other has none.
@@ -107,6 +111,7 @@ def demo(
         forces_mg: Sequence[float],
         name: str,
         mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        scale: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> ImuModel:
         return ImuModel(
             aircraft,
@@ -114,12 +119,14 @@ def demo(
             seed=seed * 10 + number,
             gyro_bias_rad_s=[value * DEG_H for value in rates_deg_h],
             accel_bias_m_s2=[value * MG for value in forces_mg],
+            accel_scale=scale,
             mounting_deg=mounting_deg,
         )
 
+    board = (*board_deg, 0.0)
     flight_controller = (
-        imu(1, gyro_deg_h, accel_mg, part),
-        imu(2, (-89.532, -98.564, -72.196), (-0.55739, -1.0068, 0.34809), part),
+        imu(1, gyro_deg_h, accel_mg, part, board, accel_scale),
+        imu(2, (-89.532, -98.564, -72.196), (-0.55739, -1.0068, 0.34809), part, board, accel_scale),
     )
     autopilot: AutopilotDouble
     if firmware == "px4":

@@ -18,7 +18,7 @@ from sim.accuracy import cli as accuracy
 from sim.aircraft import Pose
 from sim.devices import SerialDevice
 from sim.families import COMPASSES, GRADIENTERS, IMUS, Devices, fit
-from sim.hands import HELP, Hands, take_lines
+from sim.hands import HELP, PLACEMENT_DEG, PROPPED_DEG, Hands, take_lines
 from sim.imu_model import DEG_H, MG, ImuModel
 from sim.pty_device import PtyDevice
 from sim.scenario import DEMO_DEVICES, DEMO_POSE, GRADIENTER_OFFSET_DEG, Scenario, demo
@@ -32,6 +32,7 @@ FIRMWARE_COMMANDS = {
     "ardupilot": "a real ArduPilot SITL binary on this aircraft, and the devices",
     "px4": "a real PX4 SITL binary on this aircraft, and the devices",
     "residuals": "what each calibration leaves in a real autopilot, as a table",
+    "first-hour": "from a bare real autopilot to calibrated accelerometers, as a tape of all that is said",
 }
 """Of `sim.sitl.cli`."""
 
@@ -262,7 +263,11 @@ def main(argv: Sequence[str]) -> int:
     if arguments.motion != "still":
         text += '# What it stands on moves: it waits, and says so, unless [vehicle] says platform = "deck"\n'
     text += configuration(scenario, directory=directory, udp=udp)
-    hands = Hands(scenario.aircraft, placement_deg=0.02, seed=arguments.seed) if arguments.hands else None
+    hands = (
+        Hands(scenario.aircraft, placement_deg=PLACEMENT_DEG, propped_deg=PROPPED_DEG, seed=arguments.seed)
+        if arguments.hands
+        else None
+    )
     try:
         ground = arguments.ground if autopilot else None
         return asyncio.run(

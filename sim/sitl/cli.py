@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sim.aircraft import Pose
+from sim.hands import HELP, PLACEMENT_DEG, PROPPED_DEG, Hands
 from sim.imu_model import PARTS
 from sim.scenario import FIRST_ACCEL_MG, FIRST_GYRO_DEG_H, GRADIENTER_OFFSET_DEG, Scenario, demo
 from sim.sea import motions_of
@@ -23,6 +24,7 @@ from sim.sitl.process import BinaryError
 from sim.sitl.px4 import Px4Sitl
 from sim.sitl.vehicle import SitlVehicle
 
+SERVING = ("ardupilot", "px4")
 COMPANION_UDP, GROUND_UDP = "127.0.0.1:14540", "127.0.0.1:14550"
 
 
@@ -34,7 +36,8 @@ def parser() -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=text)
         command.add_argument("--binary", type=Path, required=True, help="the firmware: arducopter, arduplane or px4")
         _add_aircraft(command)
-        if name != "residuals":
+        if name in SERVING:
+            command.add_argument("--hands", action="store_true", help=f"move the aircraft by lines typed here: {HELP}")
             command.add_argument(
                 "--dir", type=Path, help="folder for the ports and the firmware's files (default: a new one)"
             )
@@ -54,10 +57,16 @@ def parser() -> argparse.ArgumentParser:
                 )  # fmt: skip
         if name != "ardupilot":
             command.add_argument("--etc", type=Path, help="PX4's etc folder (default: ../etc of the binary)")
-    residuals = commands.choices["residuals"]
-    residuals.add_argument(
-        "--firmware", choices=("ardupilot", "px4"), help="which one the binary is (default: by its name)"
+    for name in ("residuals", "first-hour"):
+        commands.choices[name].add_argument(
+            "--firmware", choices=("ardupilot", "px4"), help="which one the binary is (default: by its name)"
+        )
+    hour = commands.choices["first-hour"]
+    hour.add_argument("--own", action="store_true", help="the firmware's own six positions and level instead")
+    hour.set_defaults(
+        pose=(4.0, -3.0, 40.0), accel_bias=(20.0, -20.0, 20.0), accel_scale=(0.5, -0.5, 0.5), board=(0.8, -0.6)
     )
+    residuals = commands.choices["residuals"]
     residuals.add_argument(
         "--observe", type=float, default=60.0, metavar="SECONDS", help="length of each look (default 60)"
     )
@@ -87,6 +96,14 @@ def _add_aircraft(command: argparse.ArgumentParser) -> None:
         help="likewise, in mg (default %(default)s)",
     )  # fmt: skip
     command.add_argument(
+        "--accel-scale", type=float, nargs=3, metavar=("X", "Y", "Z"), default=(0.0, 0.0, 0.0),
+        help="scale errors of its accelerometers, in %% (default none)",
+    )  # fmt: skip
+    command.add_argument(
+        "--board", type=float, nargs=2, metavar=("ROLL", "PITCH"), default=(0.0, 0.0),
+        help="how its board sits in the aircraft, in degrees (default straight)",
+    )  # fmt: skip
+    command.add_argument(
         "--part", choices=sorted(PARTS), default="icm42688p", help="what that IMU is (default icm42688p)"
     )
     command.add_argument(
@@ -110,6 +127,8 @@ def scenario_of(arguments: argparse.Namespace) -> Scenario:
         part=arguments.part,
         gyro_deg_h=arguments.gyro_bias,
         accel_mg=arguments.accel_bias,
+        accel_scale=[value / 100.0 for value in arguments.accel_scale],
+        board_deg=tuple(arguments.board),
         gradienter_offset_deg=tuple(arguments.gradienter_offset),
     )
 
@@ -121,7 +140,7 @@ def vehicle_of(arguments: argparse.Namespace, scenario: Scenario, folder: Path) 
         BinaryError: it is missing or cannot be executed.
     """
     firmware = arguments.command
-    if firmware == "residuals":
+    if firmware not in SERVING:
         firmware = arguments.firmware or ("px4" if arguments.binary.name.startswith("px4") else "ardupilot")
     if firmware == "px4":
         return Px4Sitl(arguments.binary, scenario, folder, etc=arguments.etc)
@@ -156,9 +175,17 @@ def main(argv: Sequence[str]) -> int:
                     own=not arguments.companion_only, companion=not arguments.own_only,
                 )
             )  # fmt: skip
+        if arguments.command == "first-hour":
+            from sim.sitl.first_hour import first_hour
+
+            return asyncio.run(first_hour(vehicle, folder, own=arguments.own, seed=arguments.seed))
+        hands = None
+        if arguments.hands:
+            hands = Hands(scenario.aircraft, placement_deg=PLACEMENT_DEG, propped_deg=PROPPED_DEG, seed=arguments.seed)
         return asyncio.run(
             run_until_stopped(
-                lambda started: _serve(vehicle, scenario, folder, started), lambda: _words(vehicle, scenario, folder)
+                lambda started: _serve(vehicle, scenario, folder, started, hands),
+                lambda: _words(vehicle, scenario, folder),
             )
         )
     except KeyboardInterrupt:
@@ -173,7 +200,9 @@ def main(argv: Sequence[str]) -> int:
                 os.rmdir(folder)
 
 
-async def _serve(vehicle: SitlVehicle, scenario: Scenario, folder: Path, started: asyncio.Event) -> None:
+async def _serve(
+    vehicle: SitlVehicle, scenario: Scenario, folder: Path, started: asyncio.Event, hands: Hands | None
+) -> None:
     """Firmware and devices until cancelled.
 
     Raises:
@@ -182,7 +211,7 @@ async def _serve(vehicle: SitlVehicle, scenario: Scenario, folder: Path, started
     async with vehicle:
         up = asyncio.Event()
         tasks = [
-            asyncio.create_task(serve(scenario, directory=folder, started=up), name="devices"),
+            asyncio.create_task(serve(scenario, directory=folder, started=up, hands=hands), name="devices"),
             asyncio.create_task(vehicle.process.wait(), name="firmware"),
         ]
         try:

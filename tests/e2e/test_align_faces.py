@@ -23,14 +23,6 @@ from tests.support.rig import ACCEL_BIAS_MG, Rig
 from tests.support.virtual_time import run_virtual
 
 SCALES = {"INS_ACCSCAL_X": 1.004, "INS_ACCSCAL_Y": 0.997, "INS_ACCSCAL_Z": 1.002}
-HELD = {
-    "level": (0, 0),
-    "on its back": (0, 180),
-    "nose up": (90, 0),
-    "nose down": (-90, 0),
-    "left side down": (0, -90),
-    "right side down": (0, 90),
-}
 
 
 def rig(folder: Path, **more: Any) -> tuple[Rig, Hands]:
@@ -39,20 +31,7 @@ def rig(folder: Path, **more: Any) -> tuple[Rig, Hands]:
     made = Rig(folder, **options)
     made.config = msgspec.structs.replace(made.config, gradienter=None, compass=None)
     made.devices.clear()
-    return made, Hands(made.aircraft, seed=3)
-
-
-def way(words: str) -> tuple[float, float]:
-    """Pitch and roll of the stand that the words ask for."""
-    found = re.search(r"Now (?:half way between (.*?) and (.*?)|(.*?)) is missing", words)
-    assert found is not None, words
-    up = np.zeros(3)
-    for name in found.groups():
-        if name is not None:
-            pitch, roll = np.radians(HELD[name])
-            up += [np.sin(pitch), -np.sin(roll) * np.cos(pitch), -np.cos(roll) * np.cos(pitch)]
-    up /= np.linalg.norm(up)
-    return float(np.degrees(np.arcsin(up[0]))), float(np.degrees(np.arctan2(-up[1], -up[2])))
+    return made, Hands(made.aircraft, propped_deg=4.0, seed=3)
 
 
 Meddle = Callable[[int], tuple[float, float] | None]
@@ -60,12 +39,14 @@ Meddle = Callable[[int], tuple[float, float] | None]
 
 async def follow(rig: Rig, hands: Hands, job: Job, meddle: Meddle = lambda _: None) -> JobResult:
     """Hold it as the words say, by hand; or as `meddle(stand)` says, once."""
-    random, done = np.random.default_rng(5), 1
+    done = 1
     while not job.finished.done():
         if job.words.startswith(f"{done + 1} of") and "waiting for it to move" in job.words:
-            pitch, roll = way(job.words) + random.normal(size=2) * 4.0
-            hands.hold(rig.aircraft.time_at(rig.now_s), *(meddle(done + 1) or (float(pitch), float(roll))))
-            done += 1
+            done, now_s = done + 1, rig.aircraft.time_at(rig.now_s)
+            if (otherwise := meddle(done)) is not None:
+                hands.hold(now_s, *otherwise)
+            else:
+                assert hands.follow(job.words, now_s), job.words
         await asyncio.sleep(0.5)
     return job.finished.result()
 
@@ -234,7 +215,7 @@ def test_a_gradienter_that_falls_silent_when_turned_over_is_not_waited_for_and_i
     tmp_path: Path,
 ) -> None:
     made = Rig(tmp_path, imu_rate_hz=10.0, parameters=SCALES)
-    hands = Hands(made.aircraft, seed=3)
+    hands = Hands(made.aircraft, propped_deg=4.0, seed=3)
 
     async def main() -> None:
         async with made.running():

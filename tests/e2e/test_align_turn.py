@@ -47,7 +47,7 @@ async def follow(rig: Rig, hands: Hands, job: Job, bump_before: int = 0) -> JobR
             done += 1
             if done == bump_before:
                 hands.bump(0.4, 0.0)
-            hands.turn(rig.aircraft.time_at(rig.now_s), 90.0 if "by 90" in job.words else 180.0)
+            assert hands.follow(job.words, rig.aircraft.time_at(rig.now_s)), job.words
         await asyncio.sleep(0.5)
     return job.finished.result()
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -95,8 +97,8 @@ def test_a_stand_given_twice_adds_nothing_and_is_known_again() -> None:
     before = solved(stands)
     again = sensor.read(sensor.up(*poses[2]))
     up = np.linalg.solve(sensor.response, again.accel_m_s2 - sensor.truth[BIAS])
-    assert seen_before(before, up / np.linalg.norm(up)) == 2
-    assert seen_before(before, np.array([0.0, 1.0, 0.0])) is None
+    assert seen_before(before, up / np.linalg.norm(up), np.eye(3)) == 2
+    assert seen_before(before, np.array([0.0, 1.0, 0.0]), np.eye(3)) is None
     # Two stands that are 5 deg apart tell a little, and no more than that.
     assert solved([*stands, again]).sigma[BIAS].max() > 0.5 * before.sigma[BIAS].max()
 
@@ -186,6 +188,31 @@ def _middle(side: str) -> tuple[float, float]:
         up += [np.sin(pitch), -np.sin(roll) * np.cos(pitch), -np.cos(roll) * np.cos(pitch)]
     up /= np.linalg.norm(up)
     return float(np.degrees(np.arcsin(up[0]))), float(np.degrees(np.arctan2(-up[1], -up[2])))
+
+
+def test_where_every_side_has_been_seen_a_side_may_be_held_again() -> None:
+    """Else it would ask for a side, and refuse it, for ever."""
+    sensor, turned = Sensor(11), np.eye(3)
+    opposite = [("level", "on its back"), ("nose up", "nose down"), ("left side down", "right side down")]
+    edges = [f"half way between {a} and {b}" for a, b in itertools.combinations(HELD, 2) if (a, b) not in opposite]
+    stands = sensor.held([*HELD.values(), *map(_middle, edges)])
+    # So noisy that something stays open.
+    stands = [Face(one.accel_m_s2, 100.0 * one.sigma_m_s2) for one in stands]
+    found = solved(stands)
+    wish = missing(found, turned)
+    assert wish is not None
+    up = sensor.up(*_middle(wish.side))
+    assert seen_before(found, up / np.linalg.norm(up), turned) is None
+
+
+def test_a_sensor_that_wanders_is_done_after_a_dozen_too() -> None:
+    """Nobody knows the part (0.4 mg): its stands can tell no better, and what they tell is written."""
+    sensor = Sensor(12, 0.4 * MG)
+    stands = sensor.held(TWELVE)
+    found = faces(stands, SITE.gravity_m_s2, 3e-4, np.full(3, 0.4 * MG))
+    assert missing(found, np.eye(3)) is None
+    assert (found.sigma[BIAS] > 0.4 * MG).all()
+    assert missing(faces(stands[:6], SITE.gravity_m_s2, 3e-4, np.full(3, 0.4 * MG)), np.eye(3)) is not None
 
 
 def test_what_gravity_leaves_open_is_not_asked_of_stands() -> None:

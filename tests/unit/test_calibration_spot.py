@@ -188,6 +188,36 @@ def test_hands_hold_it_in_any_orientation_and_put_it_onto_another_spot() -> None
     assert "on its back" in hands.obey("hold 1", 0.0)
 
 
+@pytest.mark.parametrize(
+    ("words", "force_g"),
+    [
+        ("[  8 %] 2 of 12: 1 done. Now on its back is missing: z bias 30 mg; waiting for it to move", (0, 0, 1)),
+        ("Align 3/12: half way between level and nose up is missing: x bias 2 mg", (0.5**0.5, 0, -(0.5**0.5))),
+        ("Place vehicle nose DOWN and press any key.", (-1, 0, 0)),
+        ("Place vehicle on its LEFT side and press any key.", (0, 1, 0)),
+    ],
+)
+def test_hands_follow_what_is_asked_for(words: str, force_g: tuple[float, ...]) -> None:
+    aircraft = VirtualAircraft(Pose(1.0, 2.0, 40.0), SITE)
+    hands = Hands(aircraft)
+    assert hands.follow(words, 0.0)
+    np.testing.assert_allclose(aircraft.truth_at(10.0).force_m_s2, np.multiply(force_g, G), atol=1e-9)
+    assert not hands.follow("2 of 12: measuring, 3 of 12 s, hands off", 10.0)
+    assert hands.follow("1 of 5: it stands 100 deg from where it stood first: turn it by 80 deg more", 10.0)
+    assert hands.follow("3 of 3: 2 done. Now turn it back onto its first marks", 20.0)
+    assert aircraft.pose_at(30.0).heading_deg == pytest.approx(40.0)
+    assert aircraft.pose_at(30.0).pitch_deg == pytest.approx(1.0)
+
+
+def test_a_hand_that_stays_on_it_trembles_and_leaves_it_as_it_was() -> None:
+    aircraft = VirtualAircraft(Pose(1.0, 2.0, 40.0), SITE)
+    hands = Hands(aircraft)
+    assert hands.obey("grip 20", 1.0).startswith("a hand stays")
+    tilts = [aircraft.pose_at(float(t)).pitch_deg for t in np.linspace(5.0, 15.0, 50)]
+    assert 0.02 < np.std(tilts) < 0.5
+    assert aircraft.pose_at(30.0).pitch_deg == pytest.approx(1.0)
+
+
 def test_without_a_gradienter_none_is_blamed() -> None:
     loose = Complaint(Row("accelerometer", 2, "fc"), 7.0, 3.0 * MG)
     assert "gradienter" in in_words(loose)

@@ -68,8 +68,10 @@ class Faces:
     """What all stands together tell: figures (9,), bias x y z, scale x y z, shear xy xz yz, with their covariance."""
 
     figures: Array
-    covariance: Matrix
-    """(9, 9)."""
+    by_stands: Matrix
+    """Their covariance, (9, 9), as the stands tell them."""
+    wander_m_s2: Array
+    """One sigma, (3,), of what the biases do from here to where they are used."""
     gravity_m_s2: float
     gravity_sigma_m_s2: float
     up: Matrix
@@ -80,6 +82,13 @@ class Faces:
     """(stands,) how much longer than gravity each reads, corrected; of one that was left out, by the others."""
     in_doubt: tuple[int, ...]
     """Stands of which one does not fit, and nobody can tell which; the next stand does."""
+
+    @property
+    def covariance(self) -> Matrix:
+        """(9, 9), with what the biases wander."""
+        both = self.by_stands.copy()
+        both[BIAS, BIAS] += np.diag(self.wander_m_s2**2)
+        return both
 
     @property
     def accelerometer(self) -> Accelerometer:
@@ -101,7 +110,7 @@ def faces(
         stands: one at least; what they do not determine keeps the sigma of what was known before.
         gravity_m_s2: at the place.
         gravity_sigma_m_s2: its sigma.
-        wander_m_s2: one sigma, (3,), of what the biases do from here to where they are used; it widens theirs.
+        wander_m_s2: as in `Faces`; None: nothing.
 
     Raises:
         CalibrationRefusedError: readings that no accelerometer can give.
@@ -126,12 +135,10 @@ def faces(
     response, bias = np.eye(3) + _symmetric(fit.figures), fit.figures[BIAS]
     inside = np.linalg.solve(response, np.array([stand.accel_m_s2 - bias for stand in stands]).T).T
     lengths = np.linalg.norm(inside, axis=1)
-    covariance = fit.covariance.copy()
-    if wander_m_s2 is not None:
-        covariance[BIAS, BIAS] += np.diag(wander_m_s2**2)
     return Faces(
         figures=fit.figures,
-        covariance=covariance,
+        by_stands=fit.covariance,
+        wander_m_s2=np.zeros(3) if wander_m_s2 is None else wander_m_s2,
         gravity_m_s2=gravity_m_s2,
         gravity_sigma_m_s2=gravity_sigma_m_s2,
         up=inside / lengths[:, None],

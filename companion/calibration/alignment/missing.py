@@ -14,6 +14,8 @@ from companion.physics.units import MG
 
 ENOUGH_BIAS_M_S2: Final = 0.15 * MG
 ENOUGH_SCALE: Final = 2e-4
+ENOUGH_WANDER: Final = 0.8
+"""By how much of what a bias wanders it may be unknown: beyond that a dozen stands make a bad sensor no better."""
 SAME_DEG: Final = 20.0
 """Two stands within this angle tell hardly more than one."""
 FACE_DEG: Final = 30.0
@@ -51,15 +53,18 @@ def missing(found: Faces, vehicle_from_sensor: Matrix) -> Missing | None:
         found: from the stands so far.
         vehicle_from_sensor: 3x3, the mounting of the accelerometers that `found` speaks of.
     """
+    wander, gravity = ENOUGH_WANDER * found.wander_m_s2, found.gravity_m_s2
     # No stand tells by how much gravity is not what the place says: that much of the scale stays open.
-    scale = np.hypot(ENOUGH_SCALE, found.gravity_sigma_m_s2 / found.gravity_m_s2)
-    wanted = np.concatenate([np.full(3, ENOUGH_BIAS_M_S2), np.full(3, scale), np.full(3, np.inf)])
-    share = found.sigma / wanted
+    scale = np.hypot(np.maximum(ENOUGH_SCALE, wander / gravity), found.gravity_sigma_m_s2 / gravity)
+    wanted = np.concatenate([np.maximum(ENOUGH_BIAS_M_S2, wander), scale, np.full(3, np.inf)])
+    share = _sigma(found) / wanted
     open_figures = share > 1.0
     unchecked = len(found.up) - len(found.left_out) < FIGURES + LEAST_SPARE
     if not open_figures.any() and not unchecked and not found.in_doubt:
         return None
-    told = {side: _told(found, up) for side, up in _not_seen(found, vehicle_from_sensor)}
+    # Where all have been seen, the one that tells most is held once more.
+    sides = _not_seen(found, vehicle_from_sensor) or _all_sides(vehicle_from_sensor)
+    told = {side: _told(found, up) for side, up in sides}
     if not open_figures.any():
         words = "a stand does not fit, one more tells which" if found.in_doubt else "nothing checks the others yet"
         return Missing(max(told, key=lambda side: float(told[side].sum())), words)
@@ -67,13 +72,16 @@ def missing(found: Faces, vehicle_from_sensor: Matrix) -> Missing | None:
     return Missing(side, _figure(found, int(np.argmax(np.where(open_figures, told[side] * share, 0.0)))))
 
 
-def seen_before(found: Faces, up: Array) -> int | None:
-    """The stand, counted from 0, that was held like this one; None where it is a new one.
+def seen_before(found: Faces, up: Array, vehicle_from_sensor: Matrix) -> int | None:
+    """The stand, counted from 0, that was held like this one; None where it is a new one, or no side is new any more.
 
     Args:
         found: from the stands before.
         up: likewise in the sensor's axes, (3,), of length 1.
+        vehicle_from_sensor: as for `missing`.
     """
+    if not _not_seen(found, vehicle_from_sensor):
+        return None
     near = found.up @ up
     near[list(found.left_out)] = -1.0
     nearest = int(np.argmax(near))
@@ -81,32 +89,37 @@ def seen_before(found: Faces, up: Array) -> int | None:
 
 
 def _not_seen(found: Faces, vehicle_from_sensor: Matrix) -> list[tuple[str, Array]]:
-    """Faces that no stand so far was near, else edges between them, else all; up in the sensor's axes."""
+    """Faces that no stand so far was near, else edges between them; up in the sensor's axes."""
+    kept = np.delete(found.up, found.left_out, axis=0)
+    sides = _all_sides(vehicle_from_sensor)
+    new = [(name, up) for name, up in sides if (kept @ up).max() < np.cos(np.radians(FACE_DEG))]
+    return [(name, up) for name, up in new if name in _SIDES] or new
+
+
+def _all_sides(vehicle_from_sensor: Matrix) -> list[tuple[str, Array]]:
     faces = {name: np.array(up, dtype=np.float64) for name, up in _SIDES.items()}
     edges = {
         f"half way between {a} and {b}": (faces[a] + faces[b]) / np.sqrt(2.0)
         for a, b in itertools.combinations(faces, 2)
         if not faces[a] @ faces[b]
     }
-    kept = np.delete(found.up, found.left_out, axis=0)
-    for sides in (faces, edges):
-        turned = [(name, vehicle_from_sensor.T @ up) for name, up in sides.items()]
-        new = [(name, up) for name, up in turned if (kept @ up).max() < np.cos(np.radians(FACE_DEG))]
-        if new:
-            return new
     return [(name, vehicle_from_sensor.T @ up) for name, up in {**faces, **edges}.items()]
 
 
 def _told(found: Faces, up: Array) -> Array:
     """The share of each figure's variance, (9,), that a stand with `up` upwards would take away."""
     by = along(up, found.gravity_m_s2)
-    gain = found.covariance @ by
-    return np.asarray(gain**2 / (by @ gain + _STAND_SIGMA_M_S2**2) / np.diag(found.covariance))
+    gain = found.by_stands @ by
+    return np.asarray(gain**2 / (by @ gain + _STAND_SIGMA_M_S2**2) / np.diag(found.by_stands))
+
+
+def _sigma(found: Faces) -> Array:
+    return np.sqrt(np.diag(found.by_stands))
 
 
 def _figure(found: Faces, which: int) -> str:
     assert which < FIGURES
-    axis, sigma = _AXES[which % 3], found.sigma[which]
+    axis, sigma = _AXES[which % 3], _sigma(found)[which]
     if which in range(*BIAS.indices(FIGURES)):
         return f"{axis} bias {sigma / MG:.2g} mg"
     assert which in range(*SCALE.indices(FIGURES))

@@ -113,7 +113,7 @@ class Facing:
                 read = self._face(next(imu for imu in window.imus if imu.name == name))
                 found = known.by_imu[name]
                 up = read.accel_m_s2 - found.figures[BIAS]
-                again = seen_before(found, up / np.linalg.norm(up))
+                again = seen_before(found, up / np.linalg.norm(up), self._imus[name].in_force.orientation)
                 if again is not None:
                     return window, f"it stands as in stand {again + 1}: {known.wish}"
             return window, None

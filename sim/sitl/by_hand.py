@@ -1,0 +1,149 @@
+"""A real firmware's accelerometers on all sides: held by hand, judged by its telemetry beside the truth."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from typing import NamedTuple
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from sim.earth import Array
+from sim.hands import AHEAD_S, SIDES, TAKES_S, Hands
+from sim.imu_model import MG
+from sim.sitl.ground import GroundStation
+from sim.sitl.observe import mean_reading
+from sim.sitl.vehicle import SitlVehicle
+
+LOOK_S = 4.0
+SETTLE_S = 40.0
+"""After a start: the estimator has its position, and gravity."""
+STANDS_S = 1.5
+"""From the end of a movement until every filter has forgotten it."""
+SIX_WITHIN_S = 240.0
+_POSITIONS = {
+    mavlink.ACCELCAL_VEHICLE_POS_LEVEL: "level",
+    mavlink.ACCELCAL_VEHICLE_POS_LEFT: "left side down",
+    mavlink.ACCELCAL_VEHICLE_POS_RIGHT: "right side down",
+    mavlink.ACCELCAL_VEHICLE_POS_NOSEDOWN: "nose down",
+    mavlink.ACCELCAL_VEHICLE_POS_NOSEUP: "nose up",
+    mavlink.ACCELCAL_VEHICLE_POS_BACK: "on its back",
+}
+_PX4_SIDES = {
+    "down": "level", "up": "on its back", "front": "nose down", "back": "nose up", "left": "left side down",
+    "right": "right side down",
+}  # fmt: skip
+"""PX4 names the side that looks down."""
+
+
+class Accelerometer(NamedTuple):
+    """What is wrong with the output of one, in its own axes."""
+
+    bias_mg: Array
+    scale_percent: Array
+
+    def __str__(self) -> str:
+        bias, scale = (" ".join(f"{value:+8.3f}" for value in part) for part in self)
+        return f"bias {bias} mg, scale {scale} %"
+
+
+async def judged(vehicle: SitlVehicle, ground: GroundStation, hands: Hands, instance: int = 1) -> Accelerometer:
+    """What telemetry on six sides and the truth of the aircraft tell: output = A force + bias.
+
+    A holds scale, shear and how the board sits; the length of its rows is the scale. The aircraft ends on its spot.
+
+    Raises:
+        RuntimeError: the telemetry does not come.
+    """
+    outputs, forces = [], []
+    for pitch, roll in SIDES.values():
+        await stand(vehicle, hands.hold(vehicle.now_s + AHEAD_S, pitch, roll))
+        begun_s = vehicle.now_s
+        outputs.append((await mean_reading(vehicle, ground, instance, LOOK_S))[3:])
+        forces.append(vehicle.aircraft.truth_at(begun_s).force_m_s2)
+    await stand(vehicle, hands.back(vehicle.now_s + AHEAD_S))
+    both = np.column_stack([np.array(forces), np.ones(len(forces))])
+    found, *_ = np.linalg.lstsq(both, np.array(outputs), rcond=None)
+    return Accelerometer(found[3] / MG, 100.0 * (np.linalg.norm(found[:3], axis=0) - 1.0))
+
+
+async def attitude_error_deg(vehicle: SitlVehicle, ground: GroundStation) -> Array:
+    """What ATTITUDE says too much after a restart, where the aircraft stands: roll, pitch.
+
+    Raises:
+        RuntimeError: ATTITUDE does not come.
+    """
+    await vehicle.power_cycle()
+    await vehicle.sleep(SETTLE_S)
+    await ground.stream(mavlink.MAVLINK_MSG_ID_ATTITUDE, 20.0)
+    seen = await ground.collect(mavlink.MAVLink_attitude_message, LOOK_S)
+    if not seen:
+        raise RuntimeError("no ATTITUDE came")
+    told = np.mean([(message.roll, message.pitch) for message in seen], axis=0)
+    error: Array = np.degrees(told - np.array(vehicle.aircraft.angles_rad(vehicle.now_s)[:2]))
+    return error
+
+
+async def own_six_positions(vehicle: SitlVehicle, ground: GroundStation, hands: Hands) -> list[str]:
+    """The firmware's own calibration on six sides (param5 = 1), each held as it asks; what it said.
+
+    Raises:
+        TimeoutError: it does not end.
+    """
+    loop = asyncio.get_running_loop()
+    since_s, said, at = loop.time(), list[str](), len(ground.heard)
+    ground.send(
+        mavlink.MAVLink_command_long_message(
+            ground.vehicle, 1, mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0
+        )
+    )
+    placed = 0
+    async with asyncio.timeout(SIX_WITHIN_S):
+        while not any(re.search(r"Calibration (successful|FAILED)|calibration (done|failed)", one) for one in said):
+            await asyncio.sleep(0.05)
+            new, at = [message for _, message in ground.heard[at:]], len(ground.heard)
+            for message in new:
+                if isinstance(message, mavlink.MAVLink_statustext_message) and message.get_srcComponent() == 1:
+                    said.append(message.text.strip())
+                    if (side := _px4_side(said)) is not None:
+                        await stand(vehicle, hands.hold(vehicle.now_s + AHEAD_S, *SIDES[side]))
+                asked = _asked(message)
+                if asked is not None and asked > placed:  # it repeats itself while we hold it
+                    placed = asked
+                    await stand(vehicle, hands.hold(vehicle.now_s + AHEAD_S, *SIDES[_POSITIONS[asked]]))
+                    ground.send(
+                        mavlink.MAVLink_command_long_message(
+                            ground.vehicle, 1, mavlink.MAV_CMD_ACCELCAL_VEHICLE_POS, 0, float(asked), *[0.0] * 6
+                        )
+                    )
+    assert since_s < loop.time()
+    await stand(vehicle, hands.back(vehicle.now_s + AHEAD_S))
+    return said
+
+
+def _asked(message: mavlink.MAVLink_message) -> int | None:
+    """The position that ArduPilot asks for."""
+    if (
+        isinstance(message, mavlink.MAVLink_command_long_message)
+        and message.command == mavlink.MAV_CMD_ACCELCAL_VEHICLE_POS
+        and int(message.param1) in _POSITIONS
+    ):
+        return int(message.param1)
+    return None
+
+
+def _px4_side(said: list[str]) -> str | None:
+    """The side to hold next, where PX4 has just listed those that are missing."""
+    if not said[-1].startswith("[cal] pending:"):
+        return None
+    pending = said[-1].removeprefix("[cal] pending:").split()
+    return _PX4_SIDES[pending[0]] if pending else None
+
+
+async def stand(vehicle: SitlVehicle, until_s: float) -> None:
+    """Wait until it stands, in aircraft time, and a little longer."""
+    await vehicle.sleep(max(until_s - vehicle.now_s, 0.0) + STANDS_S)
+
+
+__all__ = ["TAKES_S", "Accelerometer", "attitude_error_deg", "judged", "own_six_positions", "stand"]
