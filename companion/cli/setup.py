@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import dataclasses
+import logging
 import os
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
@@ -13,7 +14,7 @@ from companion import config
 from companion.cli.asking import Asking
 from companion.cli.show import finding_lines
 from companion.cli.terminal import DONE, FAILED, AddCommand, config_path, load_config, print_json
-from companion.config.sections import Config
+from companion.config.sections import Config, Imu
 from companion.config.words import shown
 from companion.errors import CompanionError, ConfigError, DaemonDeniedError, DaemonUnreachableError
 from companion.installation import install as installing
@@ -31,6 +32,7 @@ WITHOUT: Final = {
     "gradienter": "no gradienter: gyros only (it may be connected later: companion setup again)",
     "compass": "no compass: the gyros' sigmas are a little wider",
 }
+IMUS_S: Final = 4.0
 CHECK_S: Final = 5.0
 
 
@@ -101,7 +103,8 @@ class _Session:
         say = self.asking.say
         keeping.check_writable(self._path)
         draft = await self._begin()
-        if draft.is_new and os.geteuid() != 0 and self._path != config.DEFAULT_PATH:
+        is_new = draft.is_new
+        if is_new and self._path != config.DEFAULT_PATH:
             draft.keep_beside(self._path)
         given = self._given()
         found = await self._listen(draft)
@@ -122,7 +125,7 @@ class _Session:
             say("", f"{self._path} says all this already.")
             self.answer["state"] = "unchanged"
             self.so_far = f"{self._path} is as it was"
-        await self._finish()
+        await self._finish(draft, is_new=is_new)
 
     async def _begin(self) -> Draft:
         try:
@@ -250,13 +253,14 @@ class _Session:
                 guess = " (a guess)" if question.key in draft.guessed else ""
                 self.asking.say(f"{question.words} {question.now}{guess}")
 
-    def _write(self, text: str) -> None:
-        kept = keeping.put(self._path, text)
+    def _write(self, text: str, *, keep: bool = True) -> None:
+        kept = keeping.put(self._path, text, keep=keep)
         self.so_far = f"{self._path} is written"
         self.asking.say(f"Written: {self._path}" + (f" (the old one: {kept.name})" if kept is not None else ""))
-        self.answer["kept"] = None if kept is None else str(kept)
+        if kept is not None:
+            self.answer["kept"] = str(kept)
 
-    async def _finish(self) -> None:
+    async def _finish(self, draft: Draft, *, is_new: bool) -> None:
         """Check it, offer the service, tell the next step."""
         from companion.daemon.faces.control import ask
 
@@ -269,12 +273,16 @@ class _Session:
             runs = True
         except DaemonUnreachableError:
             runs = False
-        good = True
-        if not runs and not self._options.no_check:
+        good, checks = True, not runs and not self._options.no_check
+        if checks:
+            await self._take_other_imus(draft, parsed, by_default=is_new)
+            parsed = load_config(self._options, profiles=True)
             good = await self._check(parsed)
+        elif runs:
+            self.asking.say("", "Not checked: a companion runs, and has the ports.")
         started = await self._service(runs=runs)
         is_old = runs and not started and self.answer["state"] != "unchanged"
-        steps = list(_next_steps(parsed, self._command, is_old=is_old, runs=runs or started, good=good))
+        steps = list(_next_steps(parsed, self._command, is_old=is_old, runs=runs or started, good=good, checks=checks))
         self.answer["next"] = steps
         self.asking.say("", "Next:", *(f"  {number}. {step}" for number, step in enumerate(steps, 1)))
 
@@ -282,6 +290,28 @@ class _Session:
     def _command(self) -> str:
         """How to call the companion with this file."""
         return "companion" if self._path == config.DEFAULT_PATH else f"companion -c {self._path}"
+
+    async def _take_other_imus(self, draft: Draft, parsed: Config, *, by_default: bool) -> None:
+        """Those that the autopilot has besides; it is asked, and nothing is written to it."""
+        from companion.daemon.process.check import answering_imus
+
+        others = draft.other_imus()
+        if not others:
+            return
+        self.asking.say("", "Asking the autopilot which IMUs it has:")
+        logging.disable(logging.WARNING)  # what is wrong with an IMU that there is not
+        try:
+            there = await answering_imus(parsed, [Imu(**one) for one in others], IMUS_S)
+        finally:
+            logging.disable(logging.NOTSET)
+        found = [one for one in others if one["name"] in there]
+        numbers = " and ".join(str(one["instance"]) for one in found)
+        if not found:
+            self.asking.say("no others")
+        elif await self.asking.agrees(f"It has IMU {numbers} too: calibrate that as well?", by_default=by_default):
+            draft.wanted["imu"] += found
+            self._write(draft.result(), keep=self.answer["state"] == "unchanged")
+            self.answer |= {"state": "done", "configuration": draft.wanted}
 
     async def _check(self, parsed: Config) -> bool:
         """As `companion check` does: it speaks with autopilot and sensors as the daemon will, and writes nothing."""
@@ -321,7 +351,7 @@ class _Session:
         return not failed
 
 
-def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good: bool) -> Iterator[str]:
+def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good: bool, checks: bool) -> Iterator[str]:
     """What to do, in this order.
 
     Args:
@@ -330,17 +360,20 @@ def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good:
         is_old: what runs has another configuration.
         runs: something does.
         good: nothing is missing.
+        checks: that has been looked at.
     """
+    is_service = command == "companion"
     if not good:
         yield f"mend what is BAD above, then: {command} check"
-    service = command == "companion"
     if is_old:
-        how = "sudo systemctl restart companion" if service else "end it, and start it again"
+        how = "sudo systemctl restart companion" if is_service else "end it, and start it again"
         yield f"{how}   (it still runs with the old configuration)"
-    elif not runs and service:
-        yield "sudo companion install-service   (starts it now, and at every boot)"
+    elif not runs and is_service and installing.systemd_runs():
+        yield f"{installing.how_to_start()}   (starts it now, and at every boot)"
     elif not runs:
         yield f"{command} run   (leave it running, and go on in another terminal)"
+    if not checks:
+        yield f"{command} check"
     if parsed.gradienter is not None:
         yield f"{command} align zero   (once: the gradienter's zero)"
     yield f"{command} calibrate --wait   (disarmed, standing still, hands off)"

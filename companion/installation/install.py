@@ -99,6 +99,7 @@ HIDDEN: Final = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S10
 
 PACKAGED: Final = "packaged-by"
 """A file at the top of the environment that a Debian package brings: the service is then the package's."""
+_START_PACKAGED: Final = "sudo systemctl enable --now companion"
 UDEV_RUNS: Final = Path("/run/udev/control")
 
 Outcome = Literal["written", "updated", "unchanged", "kept", "removed", "absent", "done", "failed", "skipped"]
@@ -169,7 +170,7 @@ def install(target: Target, run: Run | None = None) -> Iterator[Step]:
         CompanionError: it cannot be installed from here, or not by this user, or a package has brought the service.
     """
     if target.is_this_machine:
-        _check_not_packaged("sudo systemctl enable --now companion")
+        _check_not_packaged(_START_PACKAGED)
         _check_user(target, "install-service")
         _check_reach(target.executable)
     sample = content(CONFIGURATION)
@@ -198,11 +199,16 @@ def start_service(run: Run | None = None) -> Iterator[Step]:
     Raises:
         CompanionError: as `install`.
     """
-    if (Path(sys.prefix) / PACKAGED).exists():
+    if _is_packaged():
         for command in ("enable", "restart"):
             yield _command(_HERE, run or _run, "systemctl", command, "companion.service")
         return
     yield from install(dataclasses.replace(_HERE, executable=own_executable()), run)
+
+
+def how_to_start() -> str:
+    """What to type for that."""
+    return _START_PACKAGED if _is_packaged() else "sudo companion install-service"
 
 
 def uninstall(target: Target, run: Run | None = None) -> Iterator[Step]:
@@ -267,8 +273,12 @@ def _read(path: Path) -> bytes | None:
 # --- this machine
 
 
+def _is_packaged() -> bool:
+    return (Path(sys.prefix) / PACKAGED).exists()
+
+
 def _check_not_packaged(instead: str) -> None:
-    if (Path(sys.prefix) / PACKAGED).exists():
+    if _is_packaged():
         raise CompanionError(f"this companion is a Debian package, and its service came with it: {instead}")
 
 

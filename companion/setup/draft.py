@@ -148,6 +148,19 @@ class Draft:
             if known is None:
                 self.guessed.add("gradienter.law")
 
+    def other_imus(self) -> list[Table]:
+        """Those that the autopilot may have besides, as sections of the file."""
+        imus = self.wanted["imu"]
+        taken = {
+            imu.get("instance", 1) if imu["source"] == "autopilot" else imu.get("autopilot_instance") for imu in imus
+        }
+        names = {imu["name"] for imu in imus}
+        return [
+            {"name": name, "source": "autopilot", "instance": instance}
+            for instance in (1, 2, 3)
+            if instance not in taken and (name := f"fc{instance}") not in names
+        ]
+
     def questions(self) -> Iterator[Question]:
         """What has to be asked, with the answer that holds at present."""
         yield Question(

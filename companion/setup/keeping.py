@@ -60,8 +60,13 @@ def holds(path: Path, text: str) -> bool:
         return False
 
 
-def put(path: Path, text: str) -> Path | None:
+def put(path: Path, text: str, *, keep: bool = True) -> Path | None:
     """Write the file at once and whole; where the old content went, None if there was none but the sample.
+
+    Args:
+        path: of the file.
+        text: its new content.
+        keep: whether the old content is somebody's.
 
     Raises:
         StorageError: it cannot be written; then the old one is still there.
@@ -70,9 +75,10 @@ def put(path: Path, text: str) -> Path | None:
     path = path.resolve()
     kept, mode = None, installing.MODE
     if path.exists() and not holds(path, sample()):
-        names = (path.with_name(f"{path.name}.old{number}") for number in itertools.count(1))
-        kept = next(name for name in names if not name.exists())
         mode = stat.S_IMODE(path.stat().st_mode)
-        write_atomically(kept, path.read_bytes(), mode=mode)
+        if keep:
+            names = (path.with_name(f"{path.name}.old{number}") for number in itertools.count(1))
+            kept = next(name for name in names if not name.exists())
+            write_atomically(kept, path.read_bytes(), mode=mode)
     write_atomically(path, text.encode(), mode=mode)
     return kept

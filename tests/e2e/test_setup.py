@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import os
+import re
 import socket
 import sys
 import termios
@@ -17,6 +18,8 @@ from typing import Any, Literal
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion import cli, config
+from companion.installation import install as installing
 from sim.firmware.double import AutopilotDouble
 from sim.pty_device import PtyDevice, reader_setting
 from sim.scenario import demo
@@ -141,6 +144,7 @@ def test_a_person_answers_and_has_a_configuration_that_works(tmp_path: Path) -> 
             shown = await terminal.says(r"Write it\?")
             assert "# What its two readings mean" in shown
             await terminal.answer("", "")
+            await terminal.answer("It has IMU 2 too", "")
             checked = await terminal.says("Next:")
             assert await terminal.ended() == 0, terminal.screen
             assert "BAD" not in checked
@@ -152,7 +156,11 @@ def test_a_person_answers_and_has_a_configuration_that_works(tmp_path: Path) -> 
             }  # fmt: skip
             assert made.configuration()["compass"]["protocol"] == "hmr3300"
             assert made.configuration()["compass"]["baud"] == 19200
-            assert made.configuration()["imu"][1]["mounting"] == "ROTATION_YAW_90"
+            first, own, second = made.configuration()["imu"]
+            assert own["mounting"] == "ROTATION_YAW_90"
+            assert (first["source"], second) == ("autopilot", {"name": "fc2", "source": "autopilot", "instance": 2})
+            assert re.search(r"ok +fc2 +autopilot IMU 2", checked), "what is there, and nothing of the third"
+            assert "IMU 3" not in terminal.screen
             assert made.left() == {"companion.toml"}
 
     asyncio.run(main())
@@ -172,6 +180,8 @@ def test_a_script_has_gyros_of_an_autopilot_on_a_wire_alone(tmp_path: Path, firm
             assert (answer["state"], answer["reason"], answer["guessed"]) == ("done", "", [])
             assert [finding["name"] for finding in answer["findings"] if not finding["good"]] == []
             assert "no gradienter: gyros only" in told.lower()
+            assert [imu["name"] for imu in made.configuration()["imu"]] == ["fc", "fc2"]
+            assert made.configuration()["storage"]["directory"] == str(tmp_path / "companion-state")
             assert answer["next"][-1].split("   ")[0] == f"companion -c {made.file} calibrate --wait"
 
     asyncio.run(main())
@@ -321,6 +331,53 @@ def test_a_script_that_cannot_go_on_writes_nothing(tmp_path: Path, words: list[s
         assert made.left() == set()
 
     asyncio.run(main())
+
+
+@pytest.mark.parametrize("works", [True, False])
+def test_the_service_is_started_with_it(
+    works: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With a stand-in for systemctl, as after `apt install`; a real systemd is in test_under_systemd.py."""
+    systemctl, told = tmp_path / "systemctl", tmp_path / "told"
+    systemctl.write_text(f'#!/bin/sh\necho "$@" >>{told}\n' + ("" if works else "echo no such unit >&2; exit 5\n"))
+    systemctl.chmod(0o755)
+    (tmp_path / installing.PACKAGED).touch()
+    monkeypatch.setattr(installing, "systemd_runs", lambda: True)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(config, "DEFAULT_PATH", tmp_path / "companion.toml")
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    words = ["setup", str(tmp_path / "nobody"), "--mavlink", "udpin:127.0.0.1:14550", "--udp", str(free_udp())]
+    code = cli.main([*words, "--yes", "--json", "--no-check"])
+    out, err = capsys.readouterr()
+    answer = json.loads(out)
+    assert told.read_text().splitlines() == ["enable companion.service", "restart companion.service"]
+    assert "Start the companion now, and at every boot?" in err
+    if works:
+        assert (code, answer["state"]) == (0, "done")
+        assert [step["outcome"] for step in answer["steps"]] == ["done", "done"]
+        assert not any("systemctl" in step for step in answer["next"])
+    else:
+        assert (code, answer["state"]) == (1, "failed")
+        assert answer["reason"] == "; ".join(
+            f"systemctl {verb} companion.service: no such unit" for verb in ("enable", "restart")
+        )
+        assert answer["next"][0].startswith("sudo systemctl enable --now companion ")
+
+
+def test_where_no_systemd_runs_it_is_started_by_hand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(installing, "systemd_runs", lambda: False)
+    monkeypatch.setattr(config, "DEFAULT_PATH", tmp_path / "companion.toml")
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    words = ["setup", str(tmp_path / "nobody"), "--mavlink", "udpin:127.0.0.1:14550", "--udp", str(free_udp())]
+    assert cli.main([*words, "--yes", "--json", "--no-check"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["steps"] is None
+    assert [step.split("   ")[0] for step in answer["next"]] == [
+        "companion run", "companion check", "companion calibrate --wait",
+    ]  # fmt: skip
 
 
 def test_a_damaged_file_is_not_replaced_unasked(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import contextlib
 import grp
 import json
 import os
+import tomllib
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
@@ -69,6 +70,7 @@ async def main_process(machine: Machine) -> str:
 def test_the_life_of_the_service(tmp_path: Path) -> None:
     async def main() -> None:
         async with booted(tmp_path) as machine, aircraft(tmp_path) as configuration:
+            await set_up(machine, configuration)
             await installed(machine, configuration)
             await restricted(machine)
             await serial_ports_alone(machine)
@@ -82,12 +84,30 @@ def test_the_life_of_the_service(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-async def installed(machine: Machine, configuration: str) -> None:
+async def set_up(machine: Machine, configuration: str) -> None:
     # Without a configuration of its owner's nothing is started.
     _, out, _ = await machine.run(*INSTALL)
     assert f"written    {CONFIGURATION}: the sample: companion setup fills it in" in out
     assert "not started: sudo companion setup" in out
     assert (await machine.show("companion", "ActiveState"))["ActiveState"] == "inactive"
+    wanted = tomllib.loads(configuration)
+    ports = [wanted[name]["port"] for name in ("gradienter", "compass")]
+    _, out, told = await machine.run(
+        COMPANION, "setup", *ports, "--mavlink", wanted["mavlink"]["url"], "--yes", "--json", "--no-check"
+    )
+    answer = json.loads(out)
+    assert "Start the companion now, and at every boot?" in told
+    assert [step["outcome"] for step in answer["steps"] if step["what"].startswith("systemctl")] == ["done"] * 4
+    assert answer["configuration"]["gradienter"]["port"] == ports[0]
+    shown = await machine.show("companion", "ActiveState", "UnitFileState")
+    assert shown == {"ActiveState": "active", "UnitFileState": "enabled"}
+    code, out, _ = await machine.run(COMPANION, "setup", *ports, "--yes", "--no-service", check=False)
+    assert code == 0
+    assert "says all this already" in out
+    assert "Not checked: a companion runs" in out
+
+
+async def installed(machine: Machine, configuration: str) -> None:
     await machine.write(CONFIGURATION, configuration)
     _, out, _ = await machine.run(*INSTALL)
     assert f"kept       {CONFIGURATION}" in out

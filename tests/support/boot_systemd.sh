@@ -18,7 +18,7 @@ mount -t cgroup2 cgroup2 "$root/sys/fs/cgroup"
 mount -t tmpfs tmpfs "$root/run"
 mount -t tmpfs tmpfs "$root/tmp"
 mount -t tmpfs tmpfs "$root/var/tmp"
-rm -rf "$root/etc/systemd/system" "$root/var/log/journal"
+rm -rf "$root/etc/systemd/system" "$root/var/log/journal" "$root/var/lib/companion" "$root/var/lib/private/companion"
 mkdir -p "$root/etc/systemd/system" "$root/run/log/journal"
 # Python where the service may look, and the companion as an installation would have it.
 mkdir -p "$root/opt/companion/bin" "$root/opt/companion/python" "$root/opt/companion/site" "$root/opt/companion/src"
@@ -26,10 +26,11 @@ mount --bind "$3" "$root/opt/companion/python"
 mount --bind "$4" "$root/opt/companion/site"
 cp -r "$2/companion" "$2/systemd" "$root/opt/companion/src"
 chmod -R a+rX "$root/opt/companion/src"
+ln -s ../python/bin/python3 "$root/opt/companion/bin/python3"
 cat >"$root/opt/companion/bin/companion" <<'END'
 #!/bin/sh
 PYTHONPATH=/opt/companion/src:/opt/companion/site PYTHONDONTWRITEBYTECODE=1 \
-    exec /opt/companion/python/bin/python3 -m companion "$@"
+    exec /opt/companion/bin/python3 -m companion "$@"
 END
 chmod a+rx "$root/opt/companion/bin/companion"
 cat >"$root/etc/systemd/system/booted.target" <<'END'

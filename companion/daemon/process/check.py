@@ -12,8 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import msgspec
+
 from companion.autopilot.firmware.port_parameters import baud_of, port_needs
-from companion.config.sections import Config
+from companion.config.sections import Config, Imu
 from companion.configured.models import cannot_work, doubtful, serial_devices
 from companion.daemon.devices.sensor_health import ABSENT
 from companion.daemon.faces.control import ask, process_behind
@@ -27,6 +29,7 @@ from companion.protocols.guess import Line
 from companion.protocols.registry import PROTOCOLS, Kind, main_kind
 
 STOP_FIRST: Final = "to try other speeds: sudo systemctl stop companion, then companion check again"
+ONLY_CHECKING: Final = "only a check is running: start companion run"
 _TO_BE_TRIED: Final = ("undecodable", "damaged")
 
 
@@ -208,7 +211,7 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
         findings.append(Finding("daemon", good=True, words="not running: ports opened by this check"))
         findings.append(_storage(config.storage.path))
         # The status that a daemon would have after some seconds; nothing is written anywhere.
-        service = Service(config, only_listening="only a check is running: start companion run")
+        service = Service(config, only_listening=ONLY_CHECKING)
         status = await service.listen(seconds)
     findings += [Finding("configuration", good=False, words=words) for words in cannot_work(config)]
     findings += [Finding("warning", good=True, words=words) for words in doubtful(config)]
@@ -236,6 +239,17 @@ async def run_check(config: Config, seconds: float) -> list[Finding]:
             without = {"gradienter": "gyros only", "compass": "gyro sigma widened by the Earth's rate"}[kind]
             findings.append(Finding(kind, good=True, words=f"not configured: {without}"))
     return findings
+
+
+async def answering_imus(config: Config, imus: Sequence[Imu], seconds: float) -> list[str]:
+    """Which of these IMUs of the autopilot there are: their offsets can be read, and they are sent. Writes nothing.
+
+    Raises:
+        CompanionError: something that makes asking itself impossible.
+    """
+    alone = msgspec.structs.replace(config, imu=list(imus), gradienter=None, compass=None, mqtt=None, web=None)
+    status = await Service(alone, only_listening=ONLY_CHECKING).listen(seconds)
+    return [device["name"] for device in status["devices"] if device["good"]]
 
 
 def _autopilot(config: Config, vehicle: Object) -> Finding:
