@@ -161,7 +161,8 @@ def _resolution(batches: Sequence[Batch]) -> Floats:
     """Step of a reading that shows fewer than 3 values: their distance, or that of the last decimal it prints."""
     low = np.min([batch.low for batch in batches], axis=0)
     high = np.max([batch.high for batch in batches], axis=0)
-    return np.where(few_distinct(batches), np.where(high > low, high - low, decimal(low, high)), 0.0)
+    few = few_distinct(np.array([batch.distinct for batch in batches]))
+    return np.where(few, np.where(high > low, high - low, decimal(low, high)), 0.0)
 
 
 OLDEST_TILT_S: Final = 1.0

@@ -151,24 +151,29 @@ def allan_variance(slots: NDArray[np.int64], values: Floats, span: int) -> tuple
         (c,) variance (zero where no pair exists) and its equivalent degrees of freedom (white noise; NIST SP 1065
         eq. for white FM; 0 where no pair exists).
     """
-    place = slots - slots[0]
-    length = int(place[-1]) + 1
+    length = int(slots[-1] - slots[0]) + 1
     if length < 2 * span:
         return np.zeros(values.shape[1]), 0.0
     sums = np.zeros((length + 1, values.shape[1]))
-    counts = np.zeros(length + 1)
-    centred = values - values.mean(axis=0)
-    sums[place + 1] = centred
-    counts[place + 1] = 1.0
-    sums, counts = np.cumsum(sums, axis=0), np.cumsum(counts)
-    count = counts[span:] - counts[:-span]
-    mean = (sums[span:] - sums[:-span]) / np.maximum(count, 1.0)[:, None]
-    usable = count >= 0.5 * span
-    pair = usable[span:] & usable[:-span]
-    pairs = int(pair.sum())
+    centred = values - np.add.reduce(values) / len(values)
+    if length == len(slots):
+        np.cumsum(centred, axis=0, out=sums[1:])
+        mean = (sums[span:] - sums[:-span]) / span
+        apart = mean[span:] - mean[:-span]
+    else:
+        place = slots - slots[0]
+        counts = np.zeros(length + 1)
+        sums[place + 1] = centred
+        counts[place + 1] = 1.0
+        sums, counts = np.cumsum(sums, axis=0), np.cumsum(counts)
+        count = counts[span:] - counts[:-span]
+        mean = (sums[span:] - sums[:-span]) / np.maximum(count, 1.0)[:, None]
+        usable = count >= 0.5 * span
+        apart = (mean[span:] - mean[:-span])[usable[span:] & usable[:-span]]
+    pairs = len(apart)
     if pairs == 0:
         return np.zeros(values.shape[1]), 0.0
-    variance = 0.5 * np.square(mean[span:] - mean[:-span])[pair].mean(axis=0)
+    variance = 0.5 * (np.add.reduce(apart * apart) / pairs)
     points = pairs + 2 * span
     freedom = (1.5 * (points - 1) / span - 2.0 * (points - 2) / points) * 4.0 * span**2 / (4.0 * span**2 + 5.0)
     return variance, max(freedom, 1.0)

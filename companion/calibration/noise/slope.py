@@ -60,11 +60,11 @@ def fit_slope(
         hidden: by how much coarse steps may hide what is between them, either way.
     """
     length_s = float(slots[-1] - slots[0] + 1)
-    time = slots - slots.mean()
-    spread = float(np.square(time).sum())
-    centred = values - values.mean(axis=0)
+    time = slots - np.add.reduce(slots) / len(slots)
+    spread = float(np.add.reduce(time * time))
+    centred = values - np.add.reduce(values) / len(values)
     slope = time @ centred / spread
-    left = centred - np.outer(time, slope)
+    left = centred - time[:, None] * slope
     noise = np.maximum(white_noise(slots, left), white)
     flickers, walks = wandering(slots, left, noise)
     variance = (
@@ -78,7 +78,7 @@ def fit_slope(
 
 def plain_slope(times: NDArray[np.int64], values: Floats) -> float:
     """Least squares of (m,) values, m >= 2."""
-    time = times - times.mean()
+    time = times - np.add.reduce(times) / len(times)
     return float(time @ values / (time @ time))
 
 

@@ -7,6 +7,7 @@ then numpy looks at them once.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import Counter
 from collections.abc import Callable
@@ -109,18 +110,23 @@ def summary(
 
 def _allan_within(off: Floats) -> Floats:
     """Allan variances of (n, c) rows of one second, in halves, quarters and so on, of which each holds four or more."""
-    n = len(off)
-    depth = min(max(int(math.log2(n / _LEAST_OF_A_PART)), 0), _FINEST)
+    firsts, sizes = _parts_of(len(off))
+    depth = len(sizes).bit_length() - 1
     found = np.empty((depth, off.shape[1]))
-    if depth == 0:
-        return found
-    edges = np.arange((1 << depth) + 1) * n >> depth
-    means = np.add.reduceat(off, edges[:-1], axis=0) / (edges[1:] - edges[:-1])[:, None]
+    means = np.add.reduceat(off, firsts, axis=0) / sizes
     for rung in range(depth - 1, -1, -1):
         step = means[1:] - means[:-1]
         found[rung] = np.add.reduce(step * step, axis=0) / (2 * len(step))
         means = (means[::2] + means[1::2]) / 2.0
     return found
+
+
+@functools.lru_cache(maxsize=64)
+def _parts_of(n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Where the finest parts of n samples begin, (k,), and how many each has, (k, 1); k is a power of two."""
+    depth = min(max(int(math.log2(n / _LEAST_OF_A_PART)), 0), _FINEST)
+    edges = np.arange((1 << depth) + 1) * n >> depth
+    return edges[:-1], np.diff(edges)[:, None]
 
 
 def counts_of(rows: Floats, steps: Floats) -> Counts | None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.seconds.batch import Batch
 from companion.physics.frames import Floats
 
 _MAX_DECIMALS: Final = 4
@@ -20,19 +18,22 @@ def decimal(low: Floats, high: Floats) -> Floats:
     found = np.full(low.shape[1], 10.0**-_MAX_DECIMALS)
     for digits in range(_MAX_DECIMALS - 1, -1, -1):
         off = np.maximum(np.abs(low - np.round(low, digits)), np.abs(high - np.round(high, digits)))
-        found = np.where(off.max(axis=0) < 1e-9, 10.0**-digits, found)
+        fits = off.max(axis=0) < 1e-9
+        if not fits.any():
+            break
+        found = np.where(fits, 10.0**-digits, found)
     return found
 
 
-def few_distinct(batches: Sequence[Batch]) -> NDArray[np.bool_]:
-    """(c,) whether no second shows more than two values: then the noise does not spread the readings."""
-    return np.asarray(np.max([batch.distinct for batch in batches], axis=0) < 3)
+def few_distinct(distinct: Floats | NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(c,) whether no second shows more than two values, (m, c): then the noise does not spread the readings."""
+    return np.asarray(distinct.max(axis=0) < 3)
 
 
-def step(batches: Sequence[Batch]) -> Floats:
-    """(c,) distance of two neighbouring readings: that of a second which shows two, else the last decimal printed."""
-    low = np.array([batch.low for batch in batches])
-    high = np.array([batch.high for batch in batches])
-    pairs = np.array([batch.distinct for batch in batches]) == 2
-    apart = np.where(pairs, high - low, 0.0).max(axis=0)
+def step(low: Floats, high: Floats, distinct: Floats) -> Floats:
+    """(c,) distance of two neighbouring readings: that of a second which shows two, else the last decimal printed.
+
+    Lowest and highest readings of m seconds, (m, c), and how many different ones each shows.
+    """
+    apart = np.where(distinct == 2, high - low, 0.0).max(axis=0)
     return np.asarray(np.maximum(apart, decimal(low, high)))

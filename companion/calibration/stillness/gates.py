@@ -27,6 +27,7 @@ import numpy as np
 
 from companion.calibration.noise.allan import NoiseProfile
 from companion.calibration.seconds.batch import Batch
+from companion.calibration.seconds.recent import Recent
 from companion.calibration.stillness.coarse import Steps
 from companion.calibration.stillness.own_noise import OwnNoise
 from companion.calibration.stillness.plausible import MOST_GYRO_RAD_S, unit_of_force
@@ -135,10 +136,10 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values)
 
 
-def _beyond(values: list[float], reference: Sequence[Floats], chance: list[float]) -> float:
+def _beyond(values: list[float], reference: Sequence[list[float]], chance: list[float]) -> float:
     """The largest difference of a channel from a mean, beyond what chance alone may make of it."""
     scatter = math.sqrt(1.0 + 1.0 / len(reference))  # of the difference, over that of one mean
-    others: list[float] = np.mean(reference, axis=0).tolist()
+    others = map(_mean, zip(*reference, strict=True))
     return max(abs(value - other) - scatter * alone for value, other, alone in zip(values, others, chance, strict=True))
 
 
@@ -168,14 +169,14 @@ class ImuGate:
         self._own = own or OwnNoise((profile.gyro.white, profile.accel.white))
         self._white = np.repeat([profile.gyro.white, profile.accel.white], 3)
         self._steps = Steps([steps[0]] * 3 + [steps[1]] * 3)
-        self._learned: deque[Floats] = deque(maxlen=_LEARN_FROM)
+        self._learned = Recent(_LEARN_FROM, len(self._white))
         self._noise: Floats | None = None
         self.new_stretch()
 
     def new_stretch(self) -> None:
         """The still stretch has ended: references start again. The noise stays known."""
-        self._recent: deque[Floats] = deque(maxlen=_RECENT)
-        self._start: list[Floats] = []
+        self._recent: deque[list[float]] = deque(maxlen=_RECENT)
+        self._start: list[list[float]] = []
 
     def forget_level(self) -> None:
         """The readings are not comparable with earlier ones: an offset was written, the owner restarted."""
@@ -184,9 +185,9 @@ class ImuGate:
 
     def accept(self, batch: Batch) -> None:
         """The second counts as still for all sources."""
-        self._recent.append(batch.mean[:3])
+        self._recent.append(batch.mean[:3].tolist())
         if len(self._start) < _REFERENCE:
-            self._start.append(batch.mean[3:])
+            self._start.append(batch.mean[3:].tolist())
 
     def judge(self, batch: Batch) -> Verdict:
         """Whether this second was still for this IMU; learns its noise on the way."""
@@ -244,13 +245,13 @@ class ImuGate:
         """Variance of one sample at rest, learned; None until there is enough to learn from."""
         learned: list[float | None] = [None] * len(floor)
         if len(self._learned) >= _LEARNED_ENOUGH:
-            ordered = np.sort(np.array(self._learned), axis=0)
+            ordered = np.sort(self._learned.rows, axis=0)
             below, share = divmod(0.25 * (len(ordered) - 1), 1.0)
             low, high = ordered[int(below)], ordered[int(below) + 1]
             learned[:] = ((low + (high - low) * share) / _lower_quartile(n - 1)).tolist()
         for (_, triad, *_), own in zip(_TRIADS, self._own.known, strict=True):
             if own is not None:
-                learned[triad] = own.variance.tolist()
+                learned[triad] = own.variance
         # A reading that toggles between two steps has up to a quarter of a step squared.
         least = [known + step * step / 4.0 for known, step in zip(floor, self._steps.sizes, strict=True)]
         found = [max(each, bound) for each, bound in zip(learned, least, strict=True) if each is not None]
@@ -289,7 +290,7 @@ class ImuGate:
         scatter = [each / batch.n for each in noise]
         for (_, triad, *_), own in zip(_TRIADS, self._own.known, strict=True):
             if own is not None:
-                scatter[triad] = map(max, scatter[triad], own.density.tolist())
+                scatter[triad] = map(max, scatter[triad], own.density)
         chance = [_CHANCE * math.sqrt(each) for each in scatter]
         if self._recent:
             found = _beyond(rate, self._recent, chance[:3])

@@ -16,6 +16,7 @@ it says how many independent values a second holds, which behind a filter are fe
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import deque
 from collections.abc import Iterable
@@ -67,34 +68,35 @@ _SHARPEST: Final = 1.5
 
 
 class Known(msgspec.Struct, frozen=True):
-    """The noise of the three axes of one triad at rest; arrays are (3,), squares of its unit."""
+    """The noise of the three axes of one triad at rest, in squares of its unit."""
 
-    variance: Floats
+    variance: list[float]
     """Of one sample."""
-    white: Floats
+    white: list[float]
     """The part of it that successive differences show (`Batch.white`)."""
-    density: Floats
+    density: list[float]
     """N^2 at low frequencies: the variance of a second's mean."""
 
     @property
     def rms(self) -> float:
         """Of one sample, over the three axes."""
-        return math.sqrt(float(self.variance.mean()))
+        return math.sqrt(sum(self.variance) / 3.0)
 
     @property
     def slow(self) -> float:
         """Mean of what looks like motion."""
-        return float((self.variance - self.white).mean())
+        return sum(total - white for total, white in zip(self.variance, self.white, strict=True)) / 3.0
 
     @property
     def chance(self) -> float:
         """Standard deviation of a second's variance, the mean of the three axes."""
-        return math.sqrt(_SHARPEST * float((self.variance * self.density).sum())) / 3.0
+        both = sum(variance * density for variance, density in zip(self.variance, self.density, strict=True))
+        return math.sqrt(_SHARPEST * both) / 3.0
 
     @property
     def freedom(self) -> float:
         """Independent values a second, of one axis."""
-        return max(float(self.variance.sum() / self.density.sum()) / _SHARPEST, 1.0)
+        return max(sum(self.variance) / sum(self.density) / _SHARPEST, 1.0)
 
 
 class OwnNoise:
@@ -156,7 +158,7 @@ class OwnNoise:
         seen = [_Seen(seconds), _Seen(seconds[-LEARN_S:])] if len(seconds) > LEARN_S else [_Seen(seconds)]
         for triad, part in enumerate((slice(0, 3), slice(3, 6))):
             found = next(filter(None, (some.noise(part) for some in seen)), None)
-            self._too_much[triad] = found is not None and float(found.density.mean()) > float(self._most2[part][0])
+            self._too_much[triad] = found is not None and sum(found.density) / 3.0 > float(self._most2[part][0])
             if found is not None and not self._too_much[triad]:
                 self.known[triad] = found
 
@@ -166,13 +168,11 @@ class OwnNoise:
         if before is not None:
             if not 0 < batch.slot - before.slot <= _GAP:
                 return True
-            step = np.square(batch.mean - before.mean) / (2.0 * most2)
-            if float(step.max()) > _OUTLIER_SIGMAS**2:
+            step = batch.mean - before.mean
+            if (step * step > 2.0 * _OUTLIER_SIGMAS**2 * most2).any():
                 return True
         rungs = _rungs(batch)
-        parts = _parts(len(rungs))
-        allowed = _upper(_freedom(parts), _OUTLIER_SIGMAS)
-        return bool((rungs / parts[:, None] > allowed[:, None] * most2).any())
+        return bool((rungs > _allowed(len(rungs)) * most2).any())
 
 
 def learned_of(batches: Iterable[Batch], *, at_rest: bool = False) -> OwnNoise:
@@ -214,7 +214,8 @@ class _Seen:
             return None
         share = np.maximum(variance / variance.mean(), white / white.mean())
         is_white = float(white.mean()) > WHITE * float(variance.mean())
-        found = Known(variance, white, variance / self._samples if is_white else density * share)
+        densities = variance / self._samples if is_white else density * share
+        found = Known(variance.tolist(), white.tolist(), densities.tolist())
         known = self._is_flat(part, density, freedom) and self._is_low(part, density * share, freedom)
         return found if known and self._is_steady(part, found) and self._is_round(part) else None
 
@@ -234,10 +235,10 @@ class _Seen:
     def _is_steady(self, part: slice, found: Known) -> bool:
         """Whether no second is an outlier, by its variance or by its step from the one before."""
         most = float(self._variances[:, part].mean(axis=1).max())
-        if most > float(found.variance.mean()) * float(_upper(3.0 * found.freedom, _OUTLIER_SIGMAS)):
+        if most > sum(found.variance) / 3.0 * float(_upper(3.0 * found.freedom, _OUTLIER_SIGMAS)):
             return False
         steps = np.square(self._steps(part)).mean(axis=1) / 2.0
-        return float(steps.max()) <= float(found.density.mean()) * float(_upper(3.0, _OUTLIER_SIGMAS))
+        return float(steps.max()) <= sum(found.density) / 3.0 * float(_upper(3.0, _OUTLIER_SIGMAS))
 
     def _is_round(self, part: slice) -> bool:
         """Whether the axes go their own ways, each about as far: a rocking aircraft turns about one axis or two."""
@@ -262,6 +263,13 @@ def _parts(depth: int) -> Floats:
 def _freedom(parts: Floats) -> Floats:
     """Degrees of freedom of the Allan variance of so many parts of a second."""
     return np.maximum(0.75 * parts - 1.0, 1.0)
+
+
+@functools.lru_cache(maxsize=8)
+def _allowed(depth: int) -> Floats:
+    """(depth, 1) Allan variance that chance alone may make of noise whose density is one."""
+    parts = _parts(depth)
+    return np.asarray((parts * _upper(_freedom(parts), _OUTLIER_SIGMAS))[:, None])
 
 
 def _rungs(batch: Batch) -> Floats:

@@ -8,16 +8,15 @@ walk in between, and what warming up does, by the thermometer or by the slope of
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import Final, NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import AllanModel, floor_variance
 from companion.calibration.noise.slope import FEWEST, Slope, fit_slope, hidden_by_steps
 from companion.calibration.seconds.batch import Batch
+from companion.calibration.seconds.recent import Recent
 from companion.physics.frames import Array, Floats, Matrix
 from companion.physics.units import DEG, DEG_H
 
@@ -40,6 +39,8 @@ _WARMED_RAD_S: Final = 10.0 * PER_K_RAD_S
 _RAMP_SIGMAS: Final = 1.5
 _REMEMBERED: Final = 2
 """Windows before the latest in which a turn may have begun."""
+HINT_SIGMAS: Final = 2.0
+"""A step of no more than that is chance."""
 ACROSS_SIGMAS: Final = 4.0
 ACROSS_SHARE: Final = 0.25
 """A turn about the vertical shows across it by the error of the vertical only, some degrees."""
@@ -115,11 +116,13 @@ class Look(msgspec.Struct, frozen=True, kw_only=True):
     """N about the vertical."""
 
 
-class _Second(msgspec.Struct, frozen=True):
-    slot: int
-    rows: Floats
-    """(6,) vehicle FRD."""
-    temperature_degc: float | None
+_SLOT: Final = 0
+_RATES: Final = slice(1, 4)
+_READINGS: Final = slice(1, 7)
+"""Rates and forces, vehicle FRD."""
+_DEGC: Final = 7
+_COLUMNS: Final = 8
+"""Of a second at rest; NaN where no thermometer told."""
 
 
 class _Level(msgspec.Struct):
@@ -128,7 +131,8 @@ class _Level(msgspec.Struct):
     rows: Floats
     slot: float
     weight: float
-    temperature_degc: float | None
+    degc: float
+    """NaN: not all of it is known."""
     turn_variance: float | None
     """What was not known of the platform's own turn at the time; None: nobody but the level itself told."""
 
@@ -145,23 +149,28 @@ class ImuLevel:
         self._white = 0.0
         self._spread = np.zeros(6)
         """Variance of one reading."""
+        self._seconds = Recent(span + self._memory, _COLUMNS)
         self.held = 0
         """Seconds for which it has been off its level by itself."""
         self.forget()
 
     def forget(self) -> None:
         """Its readings are not comparable with earlier ones."""
-        self._seconds: deque[_Second] = deque()
-        self._older: deque[_Second] = deque(maxlen=self._memory)
-        """Of the same stretch, but before its latest window."""
+        self._clear()
         self._level: _Level | None = None
         self.held = 0
 
+    def _clear(self) -> None:
+        self._seconds.clear()
+        self._measured = 0
+        """Of those seconds, the latest, the others being older, but of the same stretch."""
+
     def add(self, slot: int, batch: Batch) -> None:
         """A still second."""
-        mean = batch.mean
-        rows = np.concatenate([self._turned @ mean[:3], self._turned @ mean[3:]])
-        self._seconds.append(_Second(slot, rows, batch.temperature_degc))
+        mean, degc = batch.mean, batch.temperature_degc
+        rates, forces = (self._turned @ mean[:3]).tolist(), (self._turned @ mean[3:]).tolist()
+        self._seconds.append([slot, *rates, *forces, math.nan if degc is None else degc])
+        self._measured += 1
         self._spread = np.array(batch.variance)
 
     def keep(self, least: int, *, trusted: bool, turn_variance: float | None) -> None:
@@ -169,59 +178,55 @@ class ImuLevel:
 
         `turn_variance` is what was not known of the platform's own turn; None: nobody but the level itself tells.
         """
-        while len(self._seconds) > least:
-            second = self._seconds.popleft()
-            self._older.append(second)
-            if trusted:
+        if trusted and self._measured > least:
+            rows = self._seconds.rows[-self._measured :]
+            for second in rows[: self._measured - least]:
                 self._level = self._with(second, turn_variance)
+        self._measured = min(self._measured, least)
 
     def new_stretch(self, *, trusted: bool, turn_variance: float | None) -> None:
         """What was measured is over, and makes part of the level if it can be trusted."""
-        enough = self._level is not None or len(self._seconds) >= LEVEL_S
+        enough = self._level is not None or self._measured >= LEVEL_S
         self.keep(0, trusted=trusted and enough, turn_variance=turn_variance)
-        self._older.clear()
+        self._clear()
 
     def split(self, slot: int, *, turn_variance: float | None) -> None:
         """From that second on it is something new: the seconds before it are the level."""
         known = None if self._level is None else self._level.turn_variance
-        before = [second for second in (*self._older, *self._seconds) if second.slot < slot]
         self._level = None
-        for second in before:
-            self._level = self._with(second, known if turn_variance is None else turn_variance)
-        self._seconds.clear()
-        self._older.clear()
+        for second in self._seconds.rows:
+            if second[_SLOT] < slot:
+                self._level = self._with(second, known if turn_variance is None else turn_variance)
+        self._clear()
 
     def adopt(self) -> None:
         """What it reads now is its level."""
         self._level = None
         self.held = 0
 
-    def _with(self, second: _Second, turn_variance: float | None) -> _Level:
-        level = self._level
+    def _with(self, second: Floats, turn_variance: float | None) -> _Level:
+        level, readings, slot, degc = self._level, second[_READINGS], float(second[_SLOT]), float(second[_DEGC])
         if level is None or (level.turn_variance is None and turn_variance is not None):
-            return _Level(second.rows, float(second.slot), 1.0, second.temperature_degc, turn_variance)
+            return _Level(readings.copy(), slot, 1.0, degc, turn_variance)
         level.weight = min(level.weight, self._memory / _REMEMBERED - 1.0) + 1.0
         share = 1.0 / level.weight
-        level.rows = level.rows + share * (second.rows - level.rows)
-        level.slot += share * (second.slot - level.slot)
+        level.rows = level.rows + share * (readings - level.rows)
+        level.slot += share * (slot - level.slot)
         if turn_variance is not None and level.turn_variance is not None:
             level.turn_variance += share * (turn_variance - level.turn_variance)
-        if level.temperature_degc is None or second.temperature_degc is None:
-            level.temperature_degc = None
-        else:
-            level.temperature_degc += share * (second.temperature_degc - level.temperature_degc)
+        level.degc += share * (degc - level.degc)
         return level
 
     def look(self) -> Look | None:
         """Against its level, if there is one, and against gravity, over the seconds of this stretch."""
-        if len(self._seconds) < FEWEST:
+        if self._measured < FEWEST:
             return None
-        kind = self._kind
-        slots = np.array([second.slot for second in self._seconds], dtype=np.int64)
-        rows = np.array([second.rows for second in self._seconds])
+        kind, seconds = self._kind, self._seconds.rows
+        latest = seconds[-self._measured :]
+        slots, rows = latest[:, _SLOT].astype(np.int64), latest[:, _READINGS]
         # The vertical by its accelerometers, (3,) vehicle FRD; good to some degrees, and enough here.
         force = rows[:, 3:].mean(axis=0)
-        down = np.asarray(-force / math.sqrt(force @ force))
+        down = np.asarray(-force / _length(force))
         steps = (kind.gyro_step_rad_s, kind.accel_step_m_s2)
         hidden = [hidden_by_steps(steps[k // 3], float(self._spread[k])) for k in range(6)]
         own = len(slots) >= TELLS_NOISE_S
@@ -233,29 +238,22 @@ class ImuLevel:
             walk=self._least[2],
             hidden=np.array(hidden),
         )
-        change = self._change(slots, rows[:, :3], slope, down)
+        change = self._change(latest, slope, down)
         if own:
             self._white = float(slope.white[:3].max())
         white = float(np.sqrt(np.square(down) @ np.square(slope.white[:3])))
         step = None
-        if kind.gyro_step_rad_s == 0.0 and len(self._older) + len(slots) >= RESTED_S + LEVEL_S:
-            older = np.array([second.rows for second in self._older]).reshape(-1, 6)
-            step = _step(
-                np.array([*(second.slot for second in self._older), *slots.tolist()], dtype=np.float64),
-                np.concatenate([older, rows])[:, :3] @ down,
-                white,
-                kind.gyro,
-                len(slots),
-            )
+        if kind.gyro_step_rad_s == 0.0 and len(seconds) >= RESTED_S + LEVEL_S:
+            step = _step(seconds[:, _SLOT], seconds[:, _RATES] @ down, white, kind.gyro, len(slots))
         return Look(change=change, tilting=_tilting(force, slope), step=step, white=white)
 
-    def _change(self, slots: NDArray[np.int64], rates: Floats, slope: Slope, down: Array) -> Change | None:
+    def _change(self, latest: Floats, slope: Slope, down: Array) -> Change | None:
         level, white = self._level, slope.white[:3]
         if level is None or level.weight < LEVEL_S:
             return None
-        kind, count = self._kind, len(slots)
-        off = rates.mean(axis=0) - level.rows[:3]
-        middle = float(slots.mean()) - level.slot
+        kind, count = self._kind, len(latest)
+        off = latest[:, _RATES].mean(axis=0) - level.rows[:3]
+        middle = float(latest[:, _SLOT].mean()) - level.slot
         gap_s = max(middle - (count + level.weight) / 2.0, 0.0)
         variance = np.square(white) * (1.0 / count + 1.0 / level.weight)
         variance = variance + floor_variance(kind.gyro.flicker, kind.gyro.walk, level.weight, count + 2.0 * gap_s)
@@ -265,15 +263,16 @@ class ImuLevel:
         ramp = np.abs(slope.per_s[:3])
         ramp = np.where(ramp > _RAMP_SIGMAS * np.sqrt(slope.variance[:3]), ramp, 0.0)
         variance = variance + np.square(2.0 * ramp * min(middle, _WARMING_S))
-        temperatures = [second.temperature_degc for second in self._seconds if second.temperature_degc is not None]
-        if temperatures and level.temperature_degc is not None:
-            warmed = PER_K_RAD_S * (float(np.mean(temperatures)) - level.temperature_degc)
+        told = latest[:, _DEGC]
+        told = told[np.isfinite(told)]
+        if len(told) and math.isfinite(level.degc):
+            warmed = PER_K_RAD_S * (float(told.mean()) - level.degc)
         else:
             warmed = min(_WARMING_RAD_S2 * max(middle - _WARMING_S, 0.0), _WARMED_RAD_S)
         # Integers of the stream hide up to half a step each time.
         hidden = 0.5 * kind.gyro_step_rad_s
-        was = level.rows[3:] / np.linalg.norm(level.rows[3:])
-        leaned = float(np.linalg.norm(down + was))
+        was = level.rows[3:] / _length(level.rows[3:])
+        leaned = _length(down + was)
         felt = (PER_G_RAD_S + EARTH_RAD_S) * leaned
         variance = variance + warmed**2 + hidden**2 + felt**2
         along = float(off @ down)
@@ -291,17 +290,26 @@ class ImuLevel:
         )
 
 
+def _length(vector: Floats) -> float:
+    return math.sqrt(vector @ vector)
+
+
 def _tilting(force: Floats, slope: Slope) -> Tilting:
-    size = float(np.linalg.norm(force))
+    size = _length(force)
     up = force / size
     moves = slope.per_s[3:] / size
     moves = moves - up * (up @ moves)
     # d up / dt = -rate x up, so that the level part of the rate is (d up / dt) x up.
-    return Tilting(rate_rad_s=np.cross(moves, up), variance=float(slope.variance[3:].max()) / size**2)
+    (a, b, c), (x, y, z) = moves.tolist(), up.tolist()
+    rate = np.array([b * z - c * y, c * x - a * z, a * y - b * x])
+    return Tilting(rate_rad_s=rate, variance=float(slope.variance[3:].max()) / size**2)
 
 
-def _step(slots: Floats, values: Floats, white: float, model: AllanModel, window: int) -> Step:
-    """The likeliest step in (m,) means of a second, m >= `RESTED_S` + `LEVEL_S`; the last `window` are measured."""
+def _step(slots: Floats, values: Floats, white: float, model: AllanModel, window: int) -> Step | None:
+    """The likeliest step in (m,) means of a second, m >= `RESTED_S` + `LEVEL_S`; the last `window` are measured.
+
+    None where it is no more than chance.
+    """
     count = len(values)
     values = values - values.mean()
     before = np.arange(RESTED_S, count - LEVEL_S + 1)
@@ -311,13 +319,15 @@ def _step(slots: Floats, values: Floats, white: float, model: AllanModel, window
     chance = white**2 * (1.0 / before + 1.0 / after)
     best = int(np.argmax(np.square(jump) / chance))
     first, last = float(before[best]), float(after[best])
-    variance = chance[best] + floor_variance(model.flicker, model.walk, first, last)
+    sigma = math.sqrt(chance[best] + floor_variance(model.flicker, model.walk, first, last))
+    if abs(jump[best]) <= HINT_SIGMAS * sigma:
+        return None
     time = (slots - slots[0]) / (slots[-1] - slots[0])
     basis, _ = np.linalg.qr(np.vander(time, 4))
     drift = float(np.square(values @ basis).sum())
     return Step(
         first=int(slots[before[best]]),
-        sigmas=float(abs(jump[best]) / math.sqrt(variance)),
+        sigmas=float(abs(jump[best]) / sigma),
         beats_drift_by=float(jump[best] ** 2 / chance[best]) - drift / white**2,
         jump_rad_s=float(jump[best]),
         off_rad_s=float(jump[best]) * min(last / window, 1.0),

@@ -13,7 +13,6 @@ from a new bias; several can.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import Final, Literal
 
@@ -22,9 +21,10 @@ import numpy as np
 
 from companion.calibration.noise.slope import FEWEST, fit_slope, hidden_by_steps, plain_slope
 from companion.calibration.seconds.batch import Batch
+from companion.calibration.seconds.recent import Recent
 from companion.calibration.seconds.resolution import few_distinct, step
 from companion.calibration.turning.level import Change, Common, ImuKind, ImuLevel, Look, Step, common_change
-from companion.physics.frames import Array, Matrix, vector
+from companion.physics.frames import Array, Floats, Matrix, vector
 from companion.physics.units import DEG
 from companion.samples import Vector
 
@@ -49,8 +49,6 @@ SUSPECT_CHI_SQUARE: Final = 4.0
 """A step that may be one makes every later sigma of the stretch larger: it will be forgotten by the level."""
 CLEARED_S: Final = 10
 """So many seconds say whether the level is the one before."""
-HINT_SIGMAS: Final = 2.0
-"""And one that may be chance that of its own window."""
 GROWN: Final = 30
 """A stretch of a minute and more is looked at again once it has grown by this part: a log may have an hour."""
 CHANGED_RAD_S: Final = 0.5 * DEG
@@ -148,6 +146,12 @@ def _by_gyros(common: Common, *, gyros_stay: bool = False) -> Turn:
     )
 
 
+_SLOT, _GOOD, _DEG, _WHITE, _N = range(5)
+_LOW, _HIGH, _DISTINCT = (slice(at, at + 1) for at in range(5, 8))
+_COLUMNS: Final = 8
+"""Of a second of the compass."""
+
+
 class _Seen(msgspec.Struct, frozen=True):
     """The slope of the heading."""
 
@@ -167,7 +171,7 @@ class TurnWatch:
     def __init__(self, span: int) -> None:
         self._span = span
         self._levels: dict[str, ImuLevel] = {}
-        self._headings: deque[tuple[Batch, bool]] = deque(maxlen=span)
+        self._headings = Recent(span, _COLUMNS)
         """Seconds of the compass, and whether each was one of a still stretch."""
         self._start: int | None = None
         """First second of the stretch under way."""
@@ -217,7 +221,10 @@ class TurnWatch:
             good: it is one of the still stretch.
         """
         if heading is not None:
-            self._headings.append((heading, good))
+            (mean,), (white,), (low,), (high,) = (
+                each.tolist() for each in (heading.mean, heading.white, heading.low, heading.high)
+            )
+            self._headings.append([heading.slot, good, mean, white, heading.n, low, high, int(heading.distinct[0])])
         if good:
             if self._start is None:
                 self._start = slot
@@ -256,7 +263,8 @@ class TurnWatch:
         changes = {name: look.change for name, look in looks.items() if look.change is not None}
         common = common_change(list(changes.values()))
         start, moved = self._start, self._moved
-        measured = [one for one, good in self._headings if good and start is not None and one.slot >= start]
+        headings = self._headings.rows
+        measured = headings[(headings[:, _GOOD] > 0.0) & (headings[:, _SLOT] >= (math.inf if start is None else start))]
         seen = self._slope(measured)
         self.turn, changed = self._weigh(common, seen, changes)
         if looks:
@@ -272,7 +280,7 @@ class TurnWatch:
             self._is_suspect = False
         waits = self._believe(changes, changed)
         # A compass that turns breaks the stretch again and again, but not its memory.
-        since = [one for one, _ in self._headings if moved is None or one.slot > moved]
+        since = headings if moved is None else headings[headings[:, _SLOT] > moved]
         longer = seen if len(since) <= len(measured) else self._slope(since)
         if longer is None or not longer.is_even or self.turn.gyros_stay or self._contradicts(common, longer):
             lasting = Turn()
@@ -291,7 +299,7 @@ class TurnWatch:
 
     def _hint(self, step: Step | None) -> float:
         """What a turn that perhaps began within this stretch makes the mean wrong by."""
-        if step is None or step.sigmas <= HINT_SIGMAS:
+        if step is None:
             return self._suspected_rad_s
         if step.sigmas > SUSPECT_SIGMAS and step.beats_drift_by > SUSPECT_CHI_SQUARE:
             self._suspected_rad_s = max(abs(step.jump_rad_s), self._suspected_rad_s)
@@ -312,17 +320,18 @@ class TurnWatch:
         return words
 
     @staticmethod
-    def _slope(batches: list[Batch]) -> _Seen | None:
+    def _slope(headings: Floats) -> _Seen | None:
         """Of the heading in rad/s."""
-        if len(batches) < FEWEST:
+        if len(headings) < FEWEST:
             return None
-        slots = np.array([batch.slot for batch in batches], dtype=np.int64)
-        values = np.array([batch.mean for batch in batches])
-        turned = np.cumsum(np.mod(np.diff(values, axis=0, prepend=values[:1]) + 180.0, 360.0) - 180.0, axis=0)
-        white = np.array([batch.white[0] for batch in batches])
-        hidden = hidden_by_steps(float(step(batches)[0]), float(white.mean()), dithered=not few_distinct(batches)[0])
+        slots, values, white = headings[:, _SLOT].astype(np.int64), headings[:, _DEG], headings[:, _WHITE]
+        turned = np.zeros((len(slots), 1))
+        np.cumsum(np.mod(values[1:] - values[:-1] + 180.0, 360.0) - 180.0, out=turned[1:, 0])
+        low, high, distinct = headings[:, _LOW], headings[:, _HIGH], headings[:, _DISTINCT]
+        coarse, few = float(step(low, high, distinct)[0]), bool(few_distinct(distinct)[0])
+        hidden = hidden_by_steps(coarse, float(white.mean()), dithered=not few)
         # Few seconds say little about their own noise; what is inside them says more.
-        least = math.sqrt(float(np.mean(white / [batch.n for batch in batches])))
+        least = math.sqrt(float(np.mean(white / headings[:, _N])))
         found = fit_slope(slots, turned, white=least, hidden=hidden)
         rate = float(found.per_s[0])
         half = len(slots) // 2
