@@ -31,6 +31,8 @@ QUEUE_TEXTS = 16
 LINES_PER_S = 2.0
 BURST_LINES = 8.0
 REPEAT_S = 3.0
+SPOKEN = 4
+"""How many of what was to be heard are kept for those who look on."""
 STALE_S = 20.0
 """What could not be said for so long (no link) is no news any more; results are kept."""
 _REMEMBERED_TEXTS = 32
@@ -43,13 +45,23 @@ _ASCII = str.maketrans(
 
 
 class Severity(enum.IntEnum):
-    """MAV_SEVERITY. QGroundControl speaks NOTICE and worse aloud, and opens a window for ERROR and worse."""
+    """MAV_SEVERITY, and what we use it for.
+
+    QGroundControl speaks NOTICE and worse aloud (`Vehicle.cc`: `severity <= MAV_SEVERITY_NOTICE`), as our page does,
+    and opens a window for ERROR and worse. Mission Planner speaks and shows on its HUD WARNING and worse, unless its
+    user has chosen NOTICE (`MAVLinkInterface.cs`: setting "severity", 4 by default).
+    """
 
     CRITICAL = 2
+    """Somebody must act this second."""
     ERROR = 3
+    """What was asked for has failed."""
     WARNING = 4
+    """Something is wrong, and who flies has to know it."""
     NOTICE = 5
+    """For who is at the aircraft and looks at no screen: what to do now, and that it is done. Short, to be heard."""
     INFO = 6
+    """To be read."""
 
 
 class Weight(enum.IntEnum):
@@ -91,6 +103,14 @@ class _Text(NamedTuple):
     said_s: float
 
 
+class Spoken(NamedTuple):
+    """A text that is to be heard."""
+
+    number: int
+    """Counts from 1."""
+    text: str
+
+
 class StatusText:
     """The component's voice.
 
@@ -108,6 +128,7 @@ class StatusText:
         self._sending: deque[mavlink.MAVLink_statustext_message] = deque()
         self._lines = Budget(LINES_PER_S, BURST_LINES)
         self._next_id = 1
+        self._spoken: deque[Spoken] = deque(maxlen=SPOKEN)
 
     def say(self, severity: Severity, text: str, weight: Weight = Weight.NEWS) -> bool:
         """Queue a text; False when it repeats one said within the last seconds, or when the queue is full.
@@ -125,8 +146,15 @@ class StatusText:
             return False
         self._remember(severity, text, now_s)
         self._waiting[weight].append(_Text(severity, text, now_s))
+        if severity <= Severity.NOTICE:
+            self._spoken.append(Spoken(self._spoken[-1].number + 1 if self._spoken else 1, text))
         self.woken.set()
         return True
+
+    @property
+    def spoken(self) -> tuple[Spoken, ...]:
+        """The latest texts that are to be heard, the oldest first."""
+        return tuple(self._spoken)
 
     def step(self, now_s: float) -> float:
         """Send what the bucket allows; return when there is more to do (infinity: nothing waits)."""

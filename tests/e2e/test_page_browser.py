@@ -28,6 +28,16 @@ pytestmark = pytest.mark.skipif(find() is None, reason="chromium is not installe
 
 WORD = "document.querySelector('#word span').textContent"
 SAID = "(document.querySelector('#said').hidden ? '' : document.querySelector('#said').textContent)"
+HEARING = """
+speechSynthesis.speak = words => (window.heard ??= []).push(words.text);
+navigator.wakeLock.request = async kind => {
+  const lock = new EventTarget();
+  lock.release = () => { window.awake.push("released"); lock.dispatchEvent(new Event("release")); };
+  (window.awake ??= []).push(kind);
+  return lock;
+};
+"""
+"""Keeps what the browser would have said aloud, and whether it keeps the screen on."""
 PICTURES = os.environ.get("PAGE_PICTURES")
 """A folder for pictures of what the tests see, for people."""
 
@@ -162,6 +172,11 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             await tab.lift()
             assert (await here.status())["state"] == "idle"
 
+            await tab.value(HEARING)
+            await tab.value("document.querySelector('#aloud').click()")
+            assert await tab.until("window.heard && heard[0]") == "The companion speaks."
+            await here.picture("phone_aloud")
+
             # Held for 1.5 s, with a glove that rolls a little.
             await tab.touch("#calibrate")
             await tab.roll("#calibrate", 25.0)
@@ -179,6 +194,12 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             await tab.until("document.querySelector('#last').textContent.includes('cancelled by the page')")
             assert (await here.status())["last"]["state"] == "cancelled"
             await here.picture("phone_cancelled")
+            spoken = await tab.value("heard.slice(1)")
+            assert [words.split()[:2] for words in spoken] == [
+                ["Calibration", "started:"],
+                ["Calibration", "cancelled"],
+            ]
+            assert await tab.value("awake.join()") == "screen,released"
 
             # The daemon goes away, is noticed, and comes back; the page's old token is none any more.
             assert here.line.daemon is not None

@@ -129,6 +129,7 @@ class Faces(Subsystem):
             "vehicle": self._vehicle(),
             "mqtt": None if self.mqtt is None else self.mqtt.status(),
             "page": None if self.page is None else self.page.status(),
+            "spoken": [spoken._asdict() for spoken in self._core.texts.spoken],
         }
 
     def _vehicle(self) -> Mapping[str, object]:

@@ -55,6 +55,7 @@ function show(status) {
   $("last").hidden = !missed;
   if (missed) $("last").textContent = "the last one: " + (last.reason.startsWith(last.state) ? last.reason : `${last.state}: ${last.reason}`);
   links(status);
+  aloud(status);
   // Whether it may is the daemon's to say, with the reason; here only what makes no sense at all is off.
   $("calibrate").disabled = busy;
   $("cancel").disabled = !busy;
