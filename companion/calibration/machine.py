@@ -39,8 +39,13 @@ class State(enum.Enum):
 
     @property
     def shown(self) -> str:
-        """What users see: the coarser words that other programs rely on."""
+        """The coarser words that other programs rely on."""
         return _SHOWN.get(self, self).value
+
+    @property
+    def word(self) -> str:
+        """What people read, wherever they look."""
+        return _WORDS.get(self, self.value)
 
 
 class Event(enum.Enum):
@@ -68,6 +73,13 @@ _SHOWN: Final = {
     State.RESTARTING: State.VERIFYING,
     State.SETTLING: State.VERIFYING,
     State.UNDOING: State.WRITING,
+}
+_WORDS: Final = {
+    State.COLLECTING: "measuring",
+    State.SOLVING: "measuring",
+    State.VERIFYING: "checking",
+    State.RESTARTING: "restarting autopilot",
+    State.UNDOING: "putting back",
 }
 _WRITING: Final = {State.WRITING, State.VERIFYING, *_SHOWN}
 

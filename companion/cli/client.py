@@ -28,7 +28,7 @@ async def request(options: argparse.Namespace, wanted: Object, at_interrupt: Obj
         async for reply in ask(load_config(options).control.path, wanted):
             if reply["kind"] == "progress" and reply["text"] != shown:
                 shown = reply["text"]
-                print_lines(f"[{reply['percent']:3d} %] {reply['state']}: {shown}", error=True)
+                print_lines(f"[{reply['percent']:3d} %] {reply.get('word', reply['state'])}: {shown}", error=True)
     except asyncio.CancelledError:
         if at_interrupt is None or not reply:
             raise

@@ -82,7 +82,9 @@ def _number(value: float | None, form: str) -> str:
 def status_lines(status: Object) -> list[str]:
     """The daemon's state as a person reads it."""
     lines = [headline_line(status)]
-    lines += [f"state: {status['state']}" + (f" - {status['reason']}" if status["reason"] else "")]
+    said = () if status["last"] is None else status["last"]["reason"]
+    if status["progress"] is None and status["reason"] and status["reason"] != said:
+        lines.append(f"last: {status['reason']}")
     if status["fault"] is not None:
         lines.append(f"FAULT: {status['fault']}")
     if status["putting_back"]:

@@ -75,10 +75,10 @@ def test_after_a_large_accelerometer_step_px4_has_to_be_rebooted_before_the_gate
     async def main() -> None:
         async with px4(tmp_path, CAL_ACC0_XOFF=0.3).running() as rig:
             readiness = rig.service.arming.readiness
-            await rig.until(lambda: readiness.answer().words.startswith("reboot first"), 100.0)
+            await rig.until(lambda: readiness.answer().words.startswith("reboot PX4"), 100.0)
             assert float(np.degrees(np.hypot(*rig.px4.vehicle_imus[0].estimator.tilt_error_rad))) > 0.3
             assert await try_to_arm(rig) == 1
-            assert re.search(r"Not armed: reboot first: tilt up to 1\.\d deg off", texts(rig))
+            assert re.search(r"Not armed: reboot PX4: tilt 1\.\d deg off", texts(rig))
             assert all(len(words) <= 50 for words in rig.ground.texts())
             rig.px4.reboot()
             await rig.until(lambda: rig.service.core.vehicle.boots == 1, 20.0)

@@ -110,7 +110,7 @@ def test_a_day_at_the_flight_line(tmp_path: Path) -> None:
 
             status = await companion("status", "-c", config)
             assert status.code == DONE
-            for word in ("state: idle", "ArduPilot", "disarmed", "vectornav on", "hmr3300 on"):
+            for word in ("in force: ", "ArduPilot", "disarmed", "vectornav on", "hmr3300 on"):
                 assert word in status.out
 
             undo = await companion("-c", config, "--json", "undo")

@@ -13,7 +13,7 @@ import pytest
 
 from companion.autopilot.firmware.firmwares import read_calibration
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes_for
-from companion.autopilot.firmware.px4 import NO_IMU, Slot, SlotMemory, needs_reboot, warnings_about
+from companion.autopilot.firmware.px4 import NO_IMU, Slot, SlotMemory, stale_tilt_deg, warnings_about
 from companion.autopilot.parameters.change import Change, WriteFailedError
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.writer import ParameterWriter
@@ -245,11 +245,10 @@ def test_accelerometer_offsets_below_a_milli_g_in_all_are_warned_about() -> None
     assert warnings_about(found, changes_for(found, (0.001, 0.0, 0.0), None)) == ()
 
 
-def test_new_accelerometer_offsets_need_a_reboot_and_new_gyro_offsets_do_not() -> None:
+def test_new_accelerometer_offsets_leave_a_stale_tilt_and_new_gyro_offsets_do_not() -> None:
     found = read(ScriptedPx4())
-    assert needs_reboot(changes_for(found, None, (0.05, 0.0, 0.0)))
-    assert not needs_reboot(changes_for(found, (0.05, 0.0, 0.0), None))
-    assert not needs_reboot(changes_for(found, None, (0.0005, 0.0, 0.0)))
+    assert stale_tilt_deg(changes_for(found, None, (0.05, 0.0, 0.0))) == pytest.approx(0.292, abs=0.001)
+    assert stale_tilt_deg(changes_for(found, (0.05, 0.0, 0.0), None)) == 0.0
 
 
 # --- changes that PX4 would ignore

@@ -65,13 +65,13 @@ def test_it_says_what_it_waits_for_and_how_it_ends() -> None:
             for percent in (75, 85):
                 b.service.jobs[0].progress_percent = percent
                 await asyncio.sleep(1.0)
-            b.texts.say(Severity.WARNING, "Reboot the autopilot before flight", Weight.RESULT)
+            b.texts.say(Severity.WARNING, "Before flight: reboot PX4: tilt 1.2 deg off", Weight.RESULT)
             b.texts.say(Severity.NOTICE, "Calibration done: sigma 2.5 deg/h", Weight.RESULT)
             b.service.jobs[0].finish("done")
             outcome = await asking
             assert (outcome.state, outcome.reason, outcome.good) == ("done", "sigma 2.5 deg/h", True)
             assert outcome.lines[0].startswith("DONE after")
-            assert "warning: Reboot the autopilot before flight" in outcome.lines
+            assert "warning: Before flight: reboot PX4: tilt 1.2 deg off" in outcome.lines
             assert outcome.answer["gyro_sigma_deg_h"] == 2.5
             assert outcome.answer["accel_sigma_mg"] is None, "0 is how the companion says that it has none"
             assert "Calibration: waiting for still: gyro 0.31 deg/s > 0.10" in notes.texts

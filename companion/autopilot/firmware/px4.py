@@ -139,9 +139,6 @@ MARGIN: Final = 1.05
 FAR_GYRO_RAD_S: Final = 0.02
 FAR_ACCEL_M_S2: Final = 0.05
 
-TILTS_M_S2: Final = 0.1 * MG
-"""An accelerometer step of this size turns EKF2's attitude by 0.006 deg at most."""
-
 FAR_SIGNS: Final[dict[int, Vector]] = {1: (1.0, 1.0, 1.0), 2: (-1.0, -1.0, -1.0), 3: (1.0, -1.0, 1.0)}
 """By instance: of several IMUs written at once each makes another far step, so that they cannot be mistaken."""
 
@@ -231,16 +228,8 @@ def too_small_to_apply_at_boot(accel_offset_m_s2: Vector) -> bool:
     return 0.0 < math.hypot(*accel_offset_m_s2) <= MARGIN * IGNORED_STEP
 
 
-def needs_reboot(changes: Sequence[Change]) -> bool:
-    """Whether EKF2 will keep a wrong tilt until a restart: it learns the step of an accelerometer very slowly."""
-    return any(
-        change.parameter.startswith(PREFIX["accel"]) and abs(change.after - change.before) > TILTS_M_S2
-        for change in changes
-    )
-
-
 def stale_tilt_deg(changes: Sequence[Change]) -> float:
-    """How far EKF2's tilt may be off until a restart, because the accelerometers step under it; 0 without a step."""
+    """How far EKF2's tilt may be off until a restart: it learns the step of an accelerometer very slowly; 0 without."""
     step: dict[str, float] = {}
     for change in changes:
         if change.parameter.startswith(PREFIX["accel"]):

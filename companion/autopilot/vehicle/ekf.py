@@ -93,7 +93,7 @@ class EkfWatch:
                 return (
                     f"the EKF has not settled within {within_s:.0f} s ({_words(bias)}): wait, or restart the autopilot"
                 )
-            go_on(f"EKF settling: {_words(bias)}, {give_up_s - loop.time():.0f} s at most")
+            go_on(f"EKF settling: {_words(bias)}; seconds as a rule, {give_up_s - loop.time():.0f} at most")
             silent_s = loop.time() - (self._seen[-1][0] if self._seen else asked_s)
             if min(silent_s, loop.time() - asked_s) > _FIRST_WITHIN_S:
                 asked_s = loop.time()

@@ -63,7 +63,7 @@ class InForce:
     def __init__(
         self, core: Core, imus: Mapping[str, AutopilotImu], conductor: Conductor, alignment: AlignmentInForce
     ) -> None:
-        self._core, self._config = core, core.config
+        self._core, self._config, self._conductor = core, core.config, conductor
         config = core.config
         self._vehicle, self._collector, self._offload = core.vehicle, core.collector, core.offload
         self._imus, self._alignment = imus, alignment
@@ -113,7 +113,9 @@ class InForce:
         for (name, triad), held in self._held.items():
             if isinstance(held, Why):
                 if not any(finding.why is held for finding in found):
-                    found += self._held_back.left_of((name, triad), [Finding(held, held.value)])
+                    since = held is Why.NEVER and self.earlier is not None
+                    words = "not confirmed since start" if since else held.value
+                    found += self._held_back.left_of((name, triad), [Finding(held, words)])
                 continue
             profile = noise_profile(self._core.profiles.of(name))
             against = judge(
@@ -133,6 +135,12 @@ class InForce:
     def held_back(self) -> str | None:
         """What was measured and not written, and why, in one short line; None when nothing was."""
         return self._held_back.text
+
+    @property
+    def earlier(self) -> Record | None:
+        """The last calibration, be it of before this start, if it was good and has not been undone."""
+        last = self._conductor.last
+        return last if last is not None and last.state == "done" and not (last.undone_at or self.undone) else None
 
     @property
     def worth_writing_s(self) -> float:
@@ -362,9 +370,11 @@ class InForce:
                     seen=True,
                     averaged_s=averaged_s,
                 )
-        elif worst_axis(held, present) is None and end_s > held.confirmed_s:
+        elif worst_axis(held, present) is None and (end_s > held.confirmed_s or not held.seen):
+            # What is collected while offsets are in doubt was sent under the new ones: a write voids what was before.
+            confirmed_s = max(end_s, held.confirmed_s)
             self._held[key] = msgspec.structs.replace(
-                held, confirmed_s=end_s, temperature_degc=temperature_degc, seen=True
+                held, confirmed_s=confirmed_s, temperature_degc=temperature_degc, seen=True
             )
 
 

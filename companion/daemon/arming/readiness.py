@@ -29,23 +29,29 @@ from companion.samples import Triad
 logger = logging.getLogger(__name__)
 
 POLL_S: Final = 0.25
+BY_ITSELF: Final = "calibrates by itself"
 STEADY_S: Final = 2.0
 """How long it must have been still when somebody arms: whoever arms has just let go of it."""
 OLDEST_ANSWER_S: Final = 1.5
 """An answer that was not renewed for so long (the loop stood still) is none."""
 _IN_THE_MIDDLE: Final[dict[State, str]] = {
-    State.DITHERING: "offsets are being dithered",
-    State.WRITING: "in the middle of writing new offsets",
-    State.VERIFYING: "new offsets written, not checked yet",
-    State.RESTARTING: "autopilot is being restarted",
-    State.SETTLING: "new offsets, EKF still settling",
-    State.UNDOING: "old offsets are being put back",
+    State.DITHERING: "dithering offsets",
+    State.WRITING: "writing offsets",
+    State.VERIFYING: "checking new offsets",
+    State.RESTARTING: "restarting autopilot",
+    State.SETTLING: "EKF settling",
+    State.UNDOING: "putting back old offsets",
 }
+_LOOKED_AT: Final[dict[Why, str]] = {
+    Why.REBOOTED: "checking after restart",
+    Why.UNSEEN: _IN_THE_MIDDLE[State.VERIFYING],
+}
+"""What the next look at the output tells, and nobody has to do anything about before."""
 _CLOSED: Final = (Rung.FAULT, Rung.CONFLICT, Rung.UNKNOWN, Rung.PENDING)
 """What keeps the gate closed whatever is in force; the other rungs have answers of their own."""
 _WAITS: Final = {
     Rung.UNKNOWN: "no heartbeat from the autopilot",
-    Rung.PENDING: "old offsets are being put back: wait",
+    Rung.PENDING: f"{_IN_THE_MIDDLE[State.UNDOING]}: wait",
 }
 WRITE_S: Final = 5.0
 """A dozen parameters: with ArduPilot's own gyro calibration in between, or with PX4's far step, 4 s on either."""
@@ -55,11 +61,6 @@ EKF_S: Final = {"ardupilot": 3.0}
 """What its EKF takes to show that it has settled, where the firmware's calibration has reset it."""
 MOVED_S: Final = 4.0
 """An estimate that has slipped by so much is of a look that has begun again."""
-_VERB: Final = {
-    State.DITHERING: "dithering offsets",
-    State.WRITING: "writing offsets",
-    State.VERIFYING: "checking new offsets",
-}
 
 
 class Forecast:
@@ -88,16 +89,13 @@ class Forecast:
     def answer(self, now_s: float) -> ArmAnswer:
         """What is going on and for how long yet, for somebody who may not arm because of it."""
         state = self._conductor.state
-        if state is State.UNDOING:
-            return ArmAnswer("wait", "old offsets are being put back: wait")
-        if state is State.RESTARTING:
-            return ArmAnswer("wait", "autopilot is being restarted: wait")
+        words = _IN_THE_MIDDLE[state]
         if state is State.SETTLING:
             left_s = self._left_s(state, self._job_s, now_s)
-            return ArmAnswer("wait", f"EKF settling: wait, {left_s:.0f} s at most")
-        if state not in _VERB:
-            return ArmAnswer("wait", "writing new offsets: wait")
-        return ArmAnswer.hold_still(self._left_s(state, self._estimate_s(state, now_s), now_s), _VERB[state])
+            return ArmAnswer("wait", f"{words}: wait, {left_s:.0f} s at most")
+        if state in (State.UNDOING, State.RESTARTING):
+            return ArmAnswer("wait", f"{words}: wait")
+        return ArmAnswer.hold_still(self._left_s(state, self._estimate_s(state, now_s), now_s), words)
 
     def _estimate_s(self, state: State, now_s: float) -> float:
         after_s = EKF_S.get(self._vehicle.firmware or "", 0.0)
@@ -151,7 +149,7 @@ class Readiness:
         if asyncio.get_running_loop().time() - self._answered_s > OLDEST_ANSWER_S:
             return ArmAnswer("wait", "companion is busy: try again")
         if self._conductor.state.is_writing and self._answer.verdict == "accept":
-            return ArmAnswer("wait", "writing new offsets: wait")
+            return ArmAnswer("wait", f"{_IN_THE_MIDDLE[self._conductor.state]}: wait")
         return self._answer
 
     async def run(self) -> None:
@@ -211,20 +209,31 @@ class Readiness:
             return ArmAnswer("refuse", glance.obstacle.words)
         if (reading := self.in_force.reading()) is not None:
             return ArmAnswer("wait", f"reading {reading}")
-        findings = self.in_force.findings(now_s)
-        if all(finding.why is Why.REBOOTED for finding in findings) and findings and not self.in_force.measured:
-            left_s = self._wanted.settings.min_still_s + 1.0 - glance.still_s
-            return ArmAnswer.hold_still(left_s, "checking after restart")
-        if findings:
+        if (looked_at := self.looked_at(now_s)) is not None:
+            return looked_at
+        if findings := self.in_force.findings(now_s):
             why_not = self._automatic.why_not()
             if why_not is None:
-                return ArmAnswer.hold_still(self.until_calibrated_s(now_s))
+                return ArmAnswer.hold_still(self.until_calibrated_s(now_s), BY_ITSELF)
             return ArmAnswer("refuse", f"{findings[0].words}: {why_not}")
-        if (owed := self._conclusion.owed) is not None:
-            return ArmAnswer("refuse", owed)
+        if self.owed is not None:
+            return ArmAnswer("refuse", self.owed)
         if glance.moving or glance.steady_s < STEADY_S:
             return ArmAnswer.hold_still(STEADY_S - glance.steady_s)
         return ArmAnswer("accept", self.state(now_s)[1])
+
+    @property
+    def owed(self) -> str | None:
+        """What the pilot has to do to the autopilot before it flies; None when nothing."""
+        return self._conclusion.owed
+
+    def looked_at(self, now_s: float) -> ArmAnswer | None:
+        """For how long to hold still, where the next look at the output will tell; None where it is not waited for."""
+        findings = self.in_force.findings(now_s)
+        if not findings or self.in_force.measured or any(finding.why not in _LOOKED_AT for finding in findings):
+            return None
+        left_s = self._wanted.settings.min_still_s + 1.0 - self._collector.glance(now_s).still_s
+        return ArmAnswer.hold_still(left_s, _LOOKED_AT[findings[0].why])
 
     def _swaying(self, answer: ArmAnswer, now_s: float) -> ArmAnswer:
         """The same on a deck, which nobody can hold still."""
@@ -259,6 +268,8 @@ class Readiness:
         findings = self.in_force.findings(now_s)
         if findings:
             return "uncalibrated", findings[0].words
+        if self.owed is not None:
+            return "uncalibrated", self.owed
         sigmas = ", ".join(self._sigmas())
         calibrated_s, confirmed_s = self.in_force.calibrated_s, self.in_force.confirmed_s
         if calibrated_s is not None:

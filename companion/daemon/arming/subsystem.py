@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Mapping, Sequence
 
 import msgspec
 
-from companion.calibration.solution.record import ImuRecord, Record
+from companion.calibration.solution.record import ImuRecord
 from companion.daemon.arming.armings import Armings, with_armings
 from companion.daemon.arming.automatic import Automatic
 from companion.daemon.arming.gate_setup import GateSetup
@@ -46,7 +46,7 @@ class Arming(Subsystem):
                 "last": msgspec.to_builtins(self.armings.last),
             },
             "automatic": self.automatic.status(),
-            "calibration": shown_calibration(self.in_force, self._conductor.last, now_s),
+            "calibration": shown_calibration(self.in_force, now_s),
         }
 
     def tasks(self) -> Sequence[Task]:  # noqa: D102
@@ -78,16 +78,14 @@ class Arming(Subsystem):
         }
 
 
-def shown_calibration(in_force: InForce, last: Record | None, now_s: float) -> dict[str, object] | None:
+def shown_calibration(in_force: InForce, now_s: float) -> dict[str, object] | None:
     """The calibration in force, else the last one if that was good and has not been undone; None without either.
 
     `calibrated_ago_s` and `confirmed_ago_s` are null where that is not known to be in force: a wall clock that was
     wrong in the field tells no age.
     """
-    record = in_force.calibration
-    known = record is not None
-    if record is None and last is not None and last.state == "done" and last.undone_at is None and not in_force.undone:
-        record = last
+    known = in_force.calibration is not None
+    record = in_force.calibration or in_force.earlier
     if record is None:
         return None
     calibrated_s, confirmed_s = in_force.calibrated_s, in_force.confirmed_s

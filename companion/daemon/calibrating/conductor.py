@@ -60,7 +60,7 @@ class Conductor:
         self._starts = StartLimit()
         self._task: asyncio.Task[None] | None = None
         self.job: Job | None = None
-        self.reason = "ready"
+        self.reason = ""
         """What the present state means, in words."""
         self.on_ended: Listeners[Job, JobResult] = Listeners()
         """Told of every end, before the requester is."""

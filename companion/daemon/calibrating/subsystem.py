@@ -176,6 +176,7 @@ class Calibrating(Subsystem):
             yield {
                 "kind": "progress",
                 "state": self.conductor.state.shown,
+                "word": self.conductor.state.word,
                 "percent": self.conductor.progress_percent,
                 "text": job.words,
             }

@@ -6,13 +6,13 @@ Worked out here once, so that everybody who looks sees the same word.
 from __future__ import annotations
 
 import asyncio
-import math
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Literal
 
 import msgspec
 
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.machine import State
+from companion.daemon.arming.readiness import BY_ITSELF
 from companion.daemon.arming.subsystem import Arming
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.why_not import Rung
@@ -25,13 +25,6 @@ if TYPE_CHECKING:
 
 Tone = Literal["good", "wait", "busy", "bad"]
 """good: may fly. wait: the pilot's patience. busy: the companion works. bad: somebody has to do something."""
-
-_WRITING: Final[dict[State, str]] = {
-    State.DITHERING: "DITHERING",
-    State.WRITING: "WRITING",
-    State.VERIFYING: "CHECKING",
-    State.RESTARTING: "RESTARTING AUTOPILOT",
-}
 
 
 class Headline(msgspec.Struct, frozen=True):
@@ -97,19 +90,16 @@ class Headlines:
         return Headline("NO AUTOPILOT", f"no heartbeat for {age_s:.0f} s: {why}", "bad")
 
     def _working(self, job: Job, now_s: float) -> Headline:
-        words, percent = job.words or self._conductor.state.shown, job.progress_percent
+        state = self._conductor.state
+        words = job.words or state.word
         if job.cancelled:
             return Headline("CANCELLING", words, "busy")
-        state = self._conductor.state
-        if state is State.SETTLING:
-            reason = "new offsets are in; the autopilot's EKF settles, at most so long"
-            return Headline(f"SETTLING {math.ceil(job.left_s)} s", reason, "busy")
         if state is State.UNDOING:
-            return Headline("PUTTING BACK", "the old values are being written", "busy")
-        if state in _WRITING:
-            return Headline(f"{_WRITING[state]} {percent} %", words, "busy")
-        if state in (State.COLLECTING, State.SOLVING):
-            return Headline(f"MEASURING {percent} %", words, "busy")
+            return Headline(state.word.upper(), "the old values are being written", "busy")
+        if state is State.SETTLING:
+            return Headline(state.word.upper(), words, "busy")
+        if state is not State.WAITING:
+            return Headline(f"{state.word.upper()} {job.progress_percent} %", words, "busy")
         if self._vehicle.arm_state is ArmState.UNKNOWN:
             return self._no_autopilot()
         if job.hold_still_s is not None:
@@ -132,6 +122,10 @@ class Headlines:
     def _uncalibrated(self, words: str, now_s: float) -> Headline:
         if (reading := self._readiness.in_force.reading()) is not None:
             return Headline("WAIT", f"reading {reading}", "wait")
+        if (looked_at := self._readiness.looked_at(now_s)) is not None and looked_at.hold_still_s is not None:
+            return _hold_still(looked_at.hold_still_s, looked_at.meanwhile)
+        if words == self._readiness.owed:
+            return Headline("NOT READY", words, "bad")
         if self._readiness.in_force.held_back is not None:
             return self._failed() or Headline("NOT CALIBRATED", words, "bad")
         todo = self._automatic.why_not()
@@ -148,7 +142,7 @@ class Headlines:
         if self._on_deck:
             return Headline("WAIT", f"{words}: {self._collector.status(now_s).measuring}", "wait")
         left_s = self._readiness.until_calibrated_s(now_s)
-        return Headline(f"HOLD STILL {left_s:.0f} s", f"{words}: it calibrates by itself", "wait")
+        return Headline(f"HOLD STILL {left_s:.0f} s", f"{words}: {BY_ITSELF}", "wait")
 
     def _failed(self) -> Headline | None:
         if self._conductor.state is not State.FAILED:

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.firmware.gyro_calibration import GyroParameters
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.autopilot.firmware.px4 import needs_reboot, stale_tilt_deg
+from companion.autopilot.firmware.px4 import stale_tilt_deg
 from companion.autopilot.parameters.change import Change, NothingWrittenError, WriteFailedError
 from companion.autopilot.parameters.verify import Verdict
 from companion.autopilot.parameters.wire import same_float32
@@ -53,8 +53,8 @@ BACK_WITHIN_S: Final = 60.0
 CONCLUDING_PERCENT: Final = 95.0
 POLL_S: Final = 0.2
 GATED_TILT_DEG: Final = 0.3
-"""Tilt that an autopilot may have kept from before a write, above which the arm gate waits for its restart. A smaller
-one is within what an EKF shows after any start."""
+"""Tilt that PX4 may have kept from before a write, above which it has to be restarted before it flies. A smaller one is
+what its EKF2 shows of the biases of an uncalibrated sensor (autopilots 9.3)."""
 READ_ATTEMPTS: Final = 3
 
 
@@ -270,7 +270,7 @@ class Conclusion:
         """Why it must be restarted before it may arm, in few words; None when it need not."""
         if self._stale is None or self._stale[0] != self._vehicle.boots or self._stale[1] < GATED_TILT_DEG:
             return None
-        return f"reboot first: tilt up to {self._stale[1]:.1f} deg off"
+        return f"reboot PX4: tilt {self._stale[1]:.1f} deg off"
 
     async def conclude(self, job: Job, plan: Plan, before: Window, draft: Draft) -> None:
         """See to it that what was written is used, and say what the pilot still has to do.
@@ -279,17 +279,18 @@ class Conclusion:
             AutopilotError: the autopilot has not come back, or not with what was written.
         """
         boots = self._vehicle.boots
-        not_rebooted = await self._restart(job, plan, before, draft) if job.reboot else ""
-        if not_rebooted:
+        if not_rebooted := await self._restart(job, plan, before, draft) if job.reboot else "":
             draft.warnings.append(not_rebooted)
             self._say(Severity.WARNING, not_rebooted, Weight.NEWS)
-        if needs_reboot(plan.changes) and not (job.reboot and not not_rebooted):
-            self._stale = (self._vehicle.boots, stale_tilt_deg(plan.changes))
+        if not job.reboot or not_rebooted:
+            # A small step after a large one leaves what the large one has left.
+            left_deg = self._stale[1] if self._stale is not None and self._stale[0] == boots else 0.0
+            self._stale = (boots, max(left_deg, stale_tilt_deg(plan.changes)))
+        if (owed := self.owed) is not None:
             draft.warnings.append(
-                "PX4's attitude stays wrong for minutes after new accelerometer offsets: reboot the autopilot before"
-                " flight (companion calibrate --reboot does)"
+                f"{owed} for minutes after such a step of the accelerometers (companion calibrate --reboot does it)"
             )
-            self._say(Severity.WARNING, "Reboot the autopilot before flight", Weight.RESULT)
+            self._say(Severity.WARNING, f"Before flight: {owed}", Weight.RESULT)
         self._machine.on(Event.VERIFIED)
         if self._vehicle.boots == boots:  # after a restart the EKF has started afresh
             await self._settle(job, plan, draft)
@@ -321,6 +322,7 @@ class Conclusion:
 
         job.lasts(settles_within_s(plan.firmware))
         try:
+            go_on("EKF settling")
             words = await self._firmware.settle(plan.gyros, plan.firmware, go_on)
         except JobCancelledError as cancelled:
             words = f"{cancelled} while the EKF was settling: the new offsets stay, wait 2 min before take-off"

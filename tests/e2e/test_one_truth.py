@@ -1,0 +1,145 @@
+"""What page, status, ground station and the answer at arming say at one moment never contradicts."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from companion.calibration.machine import State
+from companion.cli import show
+from companion.config.sections import AtArm
+from tests.e2e.test_calibration import calibrated
+from tests.support.rig import Rig
+from tests.support.virtual_time import run_virtual
+
+
+class Faces:
+    """What every face says, as often as the page is renewed."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.headlines: list[tuple[str, str]] = []
+        """Word without figures, and tone."""
+        self.progress: list[str] = []
+        """What the shell calls what goes on."""
+        self._rig = rig
+        self._task = asyncio.create_task(self._look())
+
+    async def _look(self) -> None:
+        conductor = self._rig.service.calibrating.conductor
+        while True:
+            headline = self._rig.service.status()["headline"]
+            seen = headline["word"].rstrip("0123456789 s%"), headline["tone"]
+            if self.headlines[-1:] != [seen]:
+                self.headlines.append(seen)
+            if conductor.running is not None:
+                self.progress.append(conductor.state.word)
+            await asyncio.sleep(0.1)
+
+    def stop(self) -> list[tuple[str, str]]:
+        self._task.cancel()
+        return self.headlines
+
+
+def told(rig: Rig) -> str:
+    return " | ".join(rig.ground.texts())
+
+
+@pytest.mark.parametrize("at_arm", ["warn", "off"])
+def test_while_px4_has_to_be_rebooted_no_face_says_ready(tmp_path: Path, at_arm: AtArm) -> None:
+    async def main() -> None:
+        rig = Rig(tmp_path, firmware="px4", at_arm=at_arm, max_s=12.0, parameters={"CAL_ACC0_XOFF": 0.3})
+        async with rig.running():
+            await rig.ready()
+            result, record = await calibrated(rig)
+            assert result.outcome == "done"
+            await asyncio.sleep(5.0)
+            tilt_deg = np.degrees(np.hypot(*rig.px4.vehicle_imus[0].estimator.tilt_error_rad))
+            assert tilt_deg > 0.3
+            status = rig.service.status()
+            assert status["headline"]["tone"] == "bad"
+            words = "reboot PX4: tilt "
+            assert words in status["headline"]["reason"]
+            assert words in status["arming"]["words"]
+            assert words in told(rig)
+            assert any(words in warning for warning in record.warnings)
+            assert not show.status_lines(status)[0].startswith("READY")
+            # Another one changes little, and does not take the tilt away.
+            await calibrated(rig)
+            await asyncio.sleep(5.0)
+            assert words in rig.service.status()["headline"]["reason"]
+            rig.px4.reboot()
+            await rig.until(lambda: rig.service.status()["headline"]["word"] == "READY", 60.0)
+
+    run_virtual(main())
+
+
+def test_where_nothing_has_to_be_rebooted_nobody_says_so(tmp_path: Path) -> None:
+    """A step of 3 mg: EKF2 is as far off as it was before, 0.2 deg (autopilots 9.3)."""
+
+    async def main() -> None:
+        async with Rig(tmp_path, firmware="px4", at_arm="warn", max_s=12.0).running() as rig:
+            await rig.ready()
+            result, record = await calibrated(rig)
+            assert result.outcome == "done"
+            await rig.until(lambda: rig.service.status()["headline"]["word"] == "READY", 5.0)
+            await asyncio.sleep(3.0)
+            assert "eboot" not in told(rig)
+            assert not any("reboot" in warning for warning in record.warnings)
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("at_arm", ["gate", "warn"])
+def test_after_a_success_nothing_turns_red_on_the_way_to_ready(tmp_path: Path, at_arm: AtArm) -> None:
+    """A step that telemetry hardly shows: what has not been seen to work yet is looked at, not complained of."""
+
+    async def main() -> None:
+        async with Rig(tmp_path, at_arm=at_arm, max_s=12.0).running() as rig:
+            await rig.ready()
+            await calibrated(rig)
+            was = rig.double.parameter("INS_GYROFFS_Y")
+            rig.double.write_as_another_station("INS_GYROFFS_Y", was + 7e-5)
+            await asyncio.sleep(20.0)
+            faces = Faces(rig)
+            result, record = await calibrated(rig)
+            assert result.outcome == "done"
+            assert "stored" in {written.outcome for imu in record.imus for written in imu.written.values()}
+            await rig.until(lambda: rig.service.status()["headline"]["word"] == "READY", 5.0)
+            await asyncio.sleep(3.0)
+            seen = faces.stop()
+            assert ("SETTLING", "busy") in seen
+            assert "bad" not in {tone for _, tone in seen[seen.index(("SETTLING", "busy")) :]}, seen
+            # The shell speaks the page's words.
+            busy = {word for word, tone in seen if tone == "busy"}
+            assert busy <= {word.upper() for word in faces.progress}
+
+    run_virtual(main())
+
+
+def test_words_for_people_are_one_for_each_state_and_those_for_programs_stay() -> None:
+    assert State.COLLECTING.word == State.SOLVING.word == "measuring"
+    assert (State.COLLECTING.shown, State.VERIFYING.shown, State.SETTLING.shown) == (
+        "collecting",
+        "verifying",
+        "verifying",
+    )
+
+
+def test_after_a_restart_of_the_daemon_a_calibration_is_not_denied(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            assert rig.service.status()["arming"]["in_force"] == "not calibrated yet"
+            # Nothing is claimed beside "not yet".
+            assert "ready" not in " ".join(show.status_lines(rig.service.status())).lower()
+            await calibrated(rig)
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            status = rig.service.status()
+            assert status["arming"]["in_force"] == "not confirmed since start"
+            assert "not calibrated yet" not in " ".join(show.status_lines(status))
+
+    run_virtual(main())
