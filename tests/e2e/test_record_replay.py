@@ -37,6 +37,8 @@ from tests.e2e.test_dither import CASE_A, UNDITHERED, second_imu_only
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
+LAYOUT = Path(__file__).parents[2] / "docs/recording/foxglove_layout.json"
+
 
 def ring(folder: Path) -> list[Path]:
     return sorted((folder / "recordings").glob("0*.mcap"))
@@ -511,8 +513,36 @@ def test_the_independent_reader_finds_every_message_as_its_schema_says(usual: tu
         *("/imu/fc", "/imu/own", "/gradienter", "/compass"),
         *("/companion/start", "/companion/journal", "/companion/record"),
     }
+    assert {path.partition(".")[0] for path in layout_paths()} <= set(count)
     assert count["/imu/own"] > 200 * 10
     assert count["/imu/fc"] > 100 * 5
+
+
+def layout_paths() -> list[str]:
+    """What the panels of our layout for Foxglove show, each a topic, mostly with a field."""
+    panels = json.loads(LAYOUT.read_text())["configById"].values()
+    return [
+        path
+        for panel in panels
+        for path in (panel.get("topicPath"), *(one["value"] for one in panel.get("paths", ())))
+        if path
+    ]
+
+
+def test_the_layout_for_foxglove_shows_what_there_is() -> None:
+    layout = json.loads(LAYOUT.read_text())
+
+    def panels(node: Any) -> list[str]:
+        return [node] if isinstance(node, str) else [*panels(node["first"]), *panels(node["second"])]
+
+    assert sorted(panels(layout["layout"])) == sorted(layout["configById"]), "every panel once"
+    assert {name.partition("!")[0] for name in layout["configById"]} == {"Plot", "RawMessages"}
+    for path in layout_paths():
+        topic, _, field = path.partition(".")
+        name, _, index = field.partition("[")
+        fields = topics.schema_of(topic)[1]["properties"]
+        assert not field or name in fields, path
+        assert not index or int(index.rstrip("]")) < fields[name]["maxItems"], path
 
 
 def foxglove_takes(schema: dict[str, Any]) -> None:
