@@ -43,6 +43,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     log.add_argument(
         "--law", choices=("axis", "slope", "euler"), default="axis", help="of columns tilt_x, tilt_y (default axis)"
     )
+    log.add_argument(
+        "--tilt-lag", type=within(0.0, 10.0), default=0.0, metavar="S", help="by which the tilt follows (default 0)"
+    )
+    log.add_argument(
+        "--platform", choices=("ground", "deck"), default="ground", help="deck: it swayed, on a boat (default ground)"
+    )
     log.add_argument("--mounting", default="ROTATION_NONE", metavar="ROTATION", help="sensor to vehicle")
     log.add_argument("--any-bias", action="store_true", help="take biases beyond what any part has (30 deg/s, 0.3 g)")
     log.add_argument(
@@ -81,13 +87,18 @@ def replay(options: argparse.Namespace) -> int:
 
     given = _given(options)
     log = _log(options)
+    if given.platform == "deck" and (
+        log.poses is None or (log.poses.tilt_deg is None and log.poses.heading_deg is None)
+    ):
+        raise StorageError(f"{options.file}: neither tilt nor heading in it: a deck's turn would look like a bias")
     if options.windows is not None:
         return _windows(options, log, given)
     found = estimate(log, given)
     if getattr(options, "json", False):
         print_json({**msgspec.to_builtins(found.record), "log": msgspec.to_builtins(found.used)})
     else:
-        print_lines(*show.record_lines(msgspec.to_builtins(found.record)), *used_lines(found.used))
+        used = used_lines(found.used, at_rest=given.platform == "ground")
+        print_lines(*show.record_lines(msgspec.to_builtins(found.record)), *used)
     return DONE if found.record.state == "done" else FAILED
 
 
@@ -113,6 +124,11 @@ def _given(options: argparse.Namespace) -> Given:
         raise ConfigError(f"--mounting: found {options.mounting}; allowed: a MAVLink rotation such as ROTATION_YAW_90")
     if (options.pitch_deg is None) != (options.roll_deg is None):
         raise ConfigError("found only one of --pitch-deg and --roll-deg; allowed: both or neither")
+    if options.platform == "deck":
+        for name in ("pitch_deg", "heading_deg", "windows"):
+            if getattr(options, name) is not None:
+                found = f"--{name.replace('_', '-')}"
+                raise ConfigError(f"{found}: found --platform deck; allowed: tilt and heading in the log, no windows")
     wanted = options.profile
     return Given(
         pitch_deg=options.pitch_deg,
@@ -124,6 +140,8 @@ def _given(options: argparse.Namespace) -> Given:
         longitude_deg=options.longitude_deg,
         height_m=options.height_m,
         law=options.law,
+        tilt_lag_s=options.tilt_lag,
+        platform=options.platform,
         powered_s=options.powered,
         mounting=options.mounting,
         profile=None if wanted is None else given_profile(wanted, lambda: storage_path(options)),
@@ -163,13 +181,12 @@ def window_lines(found: Windows) -> list[str]:
     return lines
 
 
-def used_lines(used: Used) -> list[str]:
+def used_lines(used: Used, *, at_rest: bool = True) -> list[str]:
     """Which stretch it was, and why not the rest."""
     lines = []
     if used.from_s is not None and used.to_s is not None:
-        lines.append(
-            f"used: {used.from_s:.0f} to {used.to_s:.0f} s of {used.seconds:.1f} s; {used.still_s} s of it at rest"
-        )
+        still = f"; {used.still_s} s of it at rest" if at_rest else ""
+        lines.append(f"used: {used.from_s:.0f} to {used.to_s:.0f} s of {used.seconds:.1f} s{still}")
     lines += [f"not used: {each.from_s:.0f} to {each.to_s:.0f} s: {each.why}" for each in used.unused[:MOST_LINES]]
     if len(used.unused) > MOST_LINES:
         lines.append(f"... and {len(used.unused) - MOST_LINES} more (--json has them all)")

@@ -14,6 +14,9 @@ import numpy as np
 from companion.calibration.collector.measurement import Measurement
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.deck.deck import EVERY_S, Deck
+from companion.calibration.deck.estimate import MAX_S, MIN_S
+from companion.calibration.deck.stream import Surroundings
 from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.noise.allan import noise_profile
@@ -22,7 +25,8 @@ from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.record import Record
 from companion.calibration.solution.site import Remedies, Whereabouts, local_earth
 from companion.calibration.solution.solve import solve
-from companion.config.sections import Mounting, Noise
+from companion.calibration.stillness.stretch import Lag
+from companion.config.sections import Mounting, Noise, Platform
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Floats, Matrix, rotation_matrix
 from companion.physics.gradienter import Law
@@ -41,8 +45,9 @@ _REMEDIES: Final = Remedies(
     mounting="--mounting {}",
     any_bias="--any-bias takes it",
 )
-_LONGER: Final = 1.02
+_LONGER: Final[dict[Platform, float]] = {"ground": 1.02, "deck": 1.1}
 """A window is chosen again when the stretch has grown by so much."""
+_AT_REST: Final[dict[Platform, str]] = {"ground": "at rest", "deck": "without a gap"}
 _AT_ONCE: Final = 4096
 _LOOK_S: Final = 300
 """Verdicts are taken from the collector so often; it keeps twice as many."""
@@ -65,6 +70,9 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
     """For so long the IMU had been switched on when the log began, at least."""
     law: Law = "axis"
     """Of a tilt in the log."""
+    tilt_lag_s: float = 0.0
+    """By which it follows the truth."""
+    platform: Platform = "ground"
     mounting: Mounting = "ROTATION_NONE"
     """IMU to vehicle FRD."""
     profile: str | Noise | None = None
@@ -142,6 +150,17 @@ class _Streams:
                 prefers_field=self.heading is None,
             )
         self._poses = (self.tilt, self.heading, self.field)
+        self._lag = Lag(given.tilt_lag_s, given.sigma_deg)
+        self._deck: Deck | None = None
+        if given.platform == "deck":
+            self._deck = Deck(
+                Surroundings(
+                    gradienter=self.gradienter,
+                    gradienter_lag_s=given.tilt_lag_s,
+                    compass=self.compass,
+                    compass_lag_s=0.0,
+                )
+            )
         # A tilt of the command line is the field's, too.
         self._constant = TiltSample(0.0, given.roll_deg or 0.0, given.pitch_deg or 0.0) if tilt_given else None
 
@@ -159,7 +178,9 @@ class _Streams:
             [imu],
             gradienter=self.tilt is not None,
             compass=self.heading is not None or self.field is not None,
+            gradienter_lag=self._lag,
             field_by=field_by,
+            deck=self._deck,
         )
 
     def feed(self, collector: RollingCollector, at: int, now_s: float) -> None:
@@ -191,8 +212,13 @@ class _Pass:
         rotation = rotation_matrix(given.mounting)
         self._streams = _Streams(log, given, rotation)
         settings = Settings(
-            min_still_s=MIN_STILL_S, max_s=max_still_s, target_gyro_sigma_rad_s=0.0, target_accel_sigma_m_s2=0.0
+            min_still_s=MIN_STILL_S,
+            max_s=max_still_s,
+            target_gyro_sigma_rad_s=0.0,
+            target_accel_sigma_m_s2=0.0,
+            on_a_boat="--platform deck",
         )
+        self._least_s = MIN_STILL_S if given.platform == "ground" else float(MIN_S)
         imu = ImuInput(name=log.imu, rotation=rotation, profile=noise_profile(given.profile or log.profile))
         self._collector = self._streams.collector(settings, imu)
         self._found: list[Measurement] = []
@@ -225,7 +251,8 @@ class _Pass:
         seconds = end_s - _FIRST_S
         if best is None:
             why = self._obstacle or self._unusable(seconds)
-            record = draft.record("failed", refused or f"no {MIN_STILL_S:.0f} s at rest in it: {why}", seconds)
+            least = f"no {self._least_s:.0f} s {_AT_REST[self._given.platform]} in it"
+            record = draft.record("failed", refused or f"{least}: {why}", seconds)
             return Estimated(record, self._used(None, seconds))
         record = self._solved(draft, best[1], seconds)
         return Estimated(record, self._used(best[0], seconds))
@@ -237,8 +264,13 @@ class _Pass:
         if glance.obstacle is not None:
             if glance.obstacle.hold_still_s is None:
                 self._obstacle = glance.obstacle.words
-        elif glance.still_s >= MIN_STILL_S and glance.still_s > self._still_s * (1.0 if last else _LONGER):
-            self._found.append(self._aged(collector.measurement(now_s)))
+        elif glance.still_s >= self._least_s and glance.still_s > self._still_s * (
+            1.0 if last else _LONGER[self._given.platform]
+        ):
+            try:
+                self._found.append(self._aged(collector.measurement(now_s)))
+            except CalibrationRefusedError:
+                return  # seconds of a deck end in tens
             self._still_s = glance.still_s
         if last or now_s - self._verdicts_from_s >= _LOOK_S:
             for slot, good, seen in collector.snapshot(self._verdicts_from_s, None).seconds:
@@ -267,7 +299,8 @@ class _Pass:
     def _solved(self, draft: Draft, window: Window, seconds: float) -> Record:
         given, streams = self._given, self._streams
         if streams.gradienter is None:
-            draft.warnings.append("no accelerometer biases without --pitch-deg and --roll-deg")
+            tilt = "a tilt in the log" if given.platform == "deck" else "--pitch-deg and --roll-deg"
+            draft.warnings.append(f"no accelerometer biases without {tilt}")
         source = None if given.latitude_deg is None and given.height_m is None else "command line"
         date = draft.started_at.date()
         where = Whereabouts(given.latitude_deg, given.longitude_deg, given.height_m, source, date)
@@ -275,7 +308,7 @@ class _Pass:
         try:
             earth = local_earth(where, _REMEDIES)
             posed, poses = _posed(window, given), (streams.gradienter, streams.compass)
-            draft.solution = solve(posed, earth, *poses, what, any_bias=given.any_bias)
+            draft.solution = solve(posed, earth, *poses, what, given.platform, any_bias=given.any_bias)
         except CalibrationRefusedError as error:
             return draft.record("failed", str(error), seconds)
         return draft.record("done", in_words(draft.solution), seconds)
@@ -285,9 +318,12 @@ class _Pass:
     def _used(self, measurement: Measurement | None, seconds: float) -> Used:
         slots = [] if measurement is None else measurement.slots
         first = math.ceil(_FIRST_S)
-        elsewhere = "at rest, but another stretch is longer" if slots else "at rest, but not for long enough"
-        if len(slots) >= self._max_still_s:
-            elsewhere = "at rest, but the longest window is full"
+        rest = _AT_REST[self._given.platform]
+        # A deck's window ends with a round second.
+        margin = EVERY_S[MAX_S] if self._given.platform == "deck" else 0
+        elsewhere = f"{rest}, but {'another stretch is longer' if slots else 'not for long enough'}"
+        if len(slots) >= (self._max_still_s if self._given.platform == "ground" else MAX_S):
+            elsewhere = f"{rest}, but the longest window is full"
         whys: list[tuple[int, int, str, str]] = []
         next_slot = first
         for slot, (words, kind) in sorted(self._verdicts.items()):
@@ -296,7 +332,7 @@ class _Pass:
             if slot > next_slot:
                 whys.append((next_slot - first, slot - first, "no samples", "no samples"))
             next_slot = slot + 1
-            if not words and not (slots and slots[0] <= slot <= slots[-1]):
+            if not words and not (slots and slots[0] - margin <= slot <= slots[-1] + margin):
                 words = kind = elsewhere
             whys.append((slot - first, next_slot - first, words, kind))
         return Used(

@@ -12,7 +12,7 @@ from companion.calibration.deck.estimate import DeckFound
 from companion.calibration.deck.fluid import Fluid, Level, readings_deg
 from companion.calibration.deck.passage import passage, rotations, running_products
 from companion.calibration.deck.stream import Surroundings
-from companion.calibration.deck.waves import fit_waves, whitened
+from companion.calibration.deck.waves import Wander, Waves, fit_waves, whitened
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import PROFILES
@@ -99,6 +99,31 @@ def test_whitened_waves_are_white_and_their_mean_is_known_better() -> None:
         assert information**-0.5 < 0.2 * series.std() / math.sqrt(200.0)
         off.append(white[:, 0] @ white[:, 1] / information * math.sqrt(information))
     assert np.square(off).mean() < 1.5
+
+
+def test_swell_that_hardly_changes_is_whitened_over_twenty_minutes() -> None:
+    """Narrow waves, all but foretold: the model of the height of a moored boat, as it was fitted to one."""
+    terms = [
+        4.774980136949905,
+        -11.841161559993463,
+        19.9937660649504,
+        -24.313602755882155,
+        21.255105743534443,
+        -12.241978382468044,
+        2.315901496088353,
+        3.5244808631778817,
+        -4.281165587738682,
+        2.497118840727361,
+        -0.7263566715225211,
+        0.04286322557964397,
+    ]
+    waves, wander = Waves(np.array(terms), 0.00011775293682860711), Wander(rate=2.3564148394118062e-07)
+    times = np.arange(1260.0) - 1260.0
+    line = np.column_stack([np.ones(1260), times, np.square(times) / 2.0])
+    white = whitened(line, waves, wander)
+    sigma = math.sqrt(np.linalg.inv(white.T @ white)[2, 2])
+    # The accelerometer's own noise, twice integrated, is the least: sqrt(rate / 1260 s).
+    assert math.sqrt(2.3564e-7 / 1260.0) < sigma < 10.0 * math.sqrt(2.3564e-7 / 1260.0)
 
 
 @pytest.mark.parametrize(

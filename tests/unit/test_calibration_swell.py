@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from companion.calibration.collector.swell import HINT, WATCHED_S, Swell
+from companion.calibration.collector.swell import WATCHED_S, Swell
 from companion.calibration.seconds.batch import summary
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.earth import Array
@@ -27,7 +27,7 @@ def hints(times: Array, rates: Array) -> list[bool]:
             continue
         swell.add(summary(slot, times[here], np.hstack([rates[here], np.zeros((here.sum(), 3))])))
         if slot >= WATCHED_S:
-            found.append(swell.hint == HINT)
+            found.append(swell.is_regular)
     return found
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 import msgspec
@@ -10,14 +9,15 @@ import msgspec
 from companion.calibration.collector.measurement import Measurement
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.deck.deck import Deck
-from companion.calibration.deck.estimate import MAX_S, MIN_LOOK_S, MIN_S, DeckFound, DeckWork, Triads
-from companion.calibration.means.windows import WHITE_SHARE, Window
+from companion.calibration.deck.estimate import MAX_S, MIN_LOOK_S, MIN_S, DeckFound, DeckWork
+from companion.calibration.deck.outlook import Past, aim, more
+from companion.calibration.means.windows import Window
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG_H, MG
 
 Smoothed = DeckFound | CalibrationRefusedError
-_FASTER: Final = 2.0 / 3.0
-"""Time over what sigma falls to: through waves and compass noise a slope falls with the time to the power 1.5."""
+_UNITS: Final = ((DEG_H, "deg/h"), (MG, "mg"))
+"""Of gyros and accelerometers."""
 
 
 class DeckMeasurement(Measurement, frozen=True, kw_only=True):
@@ -44,6 +44,8 @@ class Progress(msgspec.Struct, frozen=True):
     enough: bool
     share: float
     words: str
+    left: str = ""
+    """The part of the words that says for how long yet."""
 
 
 class Afloat:
@@ -52,11 +54,13 @@ class Afloat:
     def __init__(self, deck: Deck, horizon_s: float) -> None:
         self._deck, self._horizon_s = deck, horizon_s
         self._kept: dict[float | None, tuple[range, Smoothed]] = {}
+        self._past: list[Past] = []
         self._reference_deg: tuple[float, float] | None = None
 
     def clear(self) -> None:
         """What was worked out is of no use any more; the tilt it was given at stays, to compare with."""
         self._kept.clear()
+        self._past.clear()
 
     @property
     def seconds(self) -> int:
@@ -75,8 +79,13 @@ class Afloat:
             return
         self._kept = {key: one for key, one in self._kept.items() if key is None or key == work.since_s}
         self._kept[work.since_s] = (work.slots, found)
-        if work.since_s is None and isinstance(found, DeckFound) and (tilt := found.window.tilt) is not None:
+        if work.since_s is not None or not isinstance(found, DeckFound):
+            return
+        if (tilt := found.window.tilt) is not None:
             self._reference_deg = tilt.x_deg, tilt.y_deg
+        if self._past and len(work.slots) <= self._past[-1].seconds:
+            self._past.clear()
+        self._past.append(Past(len(work.slots), found.known))
 
     def measurement(self, since_s: float | None) -> DeckMeasurement:
         """What a window is made of.
@@ -106,19 +115,24 @@ class Afloat:
         """How far the newest estimate is from good enough."""
         kept = self._kept.get(None)
         found = None if kept is None else kept[1]
-        if found is None:
+        if found is None or self.seconds < MIN_S:
+            left_s = max(MIN_S - self.seconds, 1)
             share = min(self.seconds / MIN_S, 1.0) / 4.0
-            return Progress(enough=False, share=share, words=f"measured {self.seconds} s of at least {MIN_S} s")
+            left = f"at least {left_s} s more"
+            return Progress(enough=False, share=share, words=left, left=left)
         if isinstance(found, CalibrationRefusedError):
             return Progress(enough=False, share=0.0, words=str(found))
-        farthest, words = 1.0, "sigma is good enough"
-        for triads in found.triads:
-            for sigma, goal, unit, digits in _goals(triads, settings):
-                if goal / sigma < farthest:
-                    farthest = goal / sigma
-                    words = f"sigma {sigma:.{digits}f} {unit}, good at {goal:.{digits}f}"
-        full = self.seconds >= MAX_S
-        return Progress(enough=farthest >= 1.0 or full, share=farthest**_FASTER, words=words)
+        targets = settings.target_gyro_sigma_rad_s, settings.target_accel_sigma_m_s2
+        aims = [(aim(self._past, at, targets[at % 2]), *_UNITS[at % 2]) for at in range(len(found.known))]
+        last, unit, name = max(aims, key=lambda each: each[0].whole_s)
+        if all(each.sigma <= each.goal for each, _, _ in aims):
+            return Progress(enough=True, share=1.0, words="sigma is good enough")
+        if self.seconds >= MAX_S:
+            return Progress(enough=True, share=1.0, words=f"measured for {MAX_S // 60} min, no longer")
+        left_s = max(last.whole_s - self.seconds, 1)
+        left = more(left_s)
+        share = self.seconds / (self.seconds + left_s)
+        return Progress(enough=False, share=share, words=f"{left}: {last.in_words(unit, name)}", left=left)
 
     def _slots(self, since_s: float | None) -> range | None:
         slots = self._deck.slots(since_s)
@@ -127,15 +141,3 @@ class Afloat:
     def _work(self, slots: range, since_s: float | None) -> DeckWork:
         reference = None if since_s is None else self._reference_deg
         return self._deck.work(slots, self._horizon_s, reference, since_s)
-
-
-def _goals(triads: Triads, settings: Settings) -> list[tuple[float, float, str, int]]:
-    """Sigma and what is enough, of gyros and accelerometers: the target, or all that more time can give."""
-    found = []
-    for use, white, target, unit, name, digits in (
-        (triads.gyro_use, triads.gyro_white, settings.target_gyro_sigma_rad_s, DEG_H, "deg/h", 1),
-        (triads.accel_use, triads.accel_white, settings.target_accel_sigma_m_s2, MG, "mg", 2),
-    ):
-        goal = max(target, math.sqrt((use - white) * (1.0 + WHITE_SHARE)))
-        found.append((math.sqrt(use) / unit, goal / unit, name, digits))
-    return found

@@ -39,6 +39,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     sources: tuple[SourceStatus, ...]
     measuring: str
     """What is under way where nothing is waited for, in words."""
+    left: str = ""
+    """For how long yet, where that is minutes; part of `measuring`."""
 
     @property
     def waiting_for(self) -> str | None:
@@ -70,6 +72,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     target_gyro_sigma_rad_s: float
     target_accel_sigma_m_s2: float
     horizon_s: float = 180.0
+    on_a_boat: str = 'set vehicle.platform = "deck"'
+    """What to do where it sways with a regular wave, in words."""
     dither: bool = False
     """Integers that do not tell are measured in another way afterwards: more seconds of them are not waited for."""
 

@@ -192,6 +192,7 @@ class RollingCollector(Intake):
             progress=min(progress.share, 1.0 if progress.enough else 0.99),
             sources=tuple(source.status(now_s) for source in sources),
             measuring=progress.words,
+            left=progress.left,
         )
 
     def window(self, now_s: float, *, since_s: float | None = None) -> Window:
@@ -332,7 +333,10 @@ class RollingCollector(Intake):
         if not said:
             return Obstacle(f"hold still {self._min_good} s", moving, self._min_good)
         words = said[0].words
-        return Obstacle(words if said[0].fault else f"waiting for still: {words}{self._swell.hint}", moving)
+        if said[0].fault:
+            return Obstacle(words, moving)
+        boat = f"; on a boat? {self._settings.on_a_boat}" if self._swell.is_regular else ""
+        return Obstacle(f"waiting for still: {words}{boat}", moving)
 
     def _waiting_for(self, now_s: float) -> Obstacle | None:
         if (moves := self._obstacle(now_s)) is not None:

@@ -11,7 +11,6 @@ from companion.calibration.seconds.batch import Batch
 from companion.physics.units import DEG
 
 WATCHED_S: Final = 40
-HINT: Final = '; on a boat? set vehicle.platform = "deck"'
 _LEAST_RAD_S: Final = 0.1 * DEG
 _SLOWEST_HZ: Final = 0.05
 _FASTEST_HZ: Final = 1.0 / 3.0
@@ -40,14 +39,14 @@ class Swell:
             self._rates.append((batch.slot, batch.mean[:3]))
 
     @property
-    def hint(self) -> str:
-        """What to add to the words that say how it moves; empty where there is no regular wave."""
+    def is_regular(self) -> bool:
+        """Whether it is a regular wave."""
         if len(self._rates) < WATCHED_S:
-            return ""
+            return False
         last = self._rates[-1][0]
         if self._known is None or self._known[0] != last:
             self._known = last, self._is_regular()
-        return HINT if self._known[1] else ""
+        return self._known[1]
 
     def _is_regular(self) -> bool:
         rates = np.array([rate for _, rate in self._rates])

@@ -18,7 +18,7 @@ from companion.calibration.deck.smoother import Believed, Found, smooth
 from companion.calibration.deck.stream import ImuSecond, Surroundings
 from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.calibration.means.windows import ImuInput, ImuWindow, Window
-from companion.calibration.noise.allan import floor_variance, slope_variance
+from companion.calibration.noise.allan import AllanModel, floor_variance, slope_variance
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Floats, Matrix, vector
 from companion.physics.gradienter import up_in_sensor, up_jacobian
@@ -48,25 +48,39 @@ _MIDDLE: Final = 0.37
 _FLICKER_TO_COME: Final = 0.75
 """Of B^2: what flicker does in the next minutes that its past does not tell. With what it did in the window, as a
 random walk of B / sqrt(T), it is the flicker's part of V(T, H)."""
+_UPRIGHT: Final = 0.5
+"""Square of an axis' part along the vertical."""
 _GRAVITY_M_S2: Final = 9.8
 _TEMPERATURE_WARNING_K: Final = 3.0
 
 
-class Triads(msgspec.Struct, frozen=True):
-    """How far one IMU is: largest variances of the axes."""
+class ByHeading(msgspec.Struct, frozen=True, kw_only=True):
+    """What headings will go on telling of a bias about the vertical."""
 
-    gyro_use: float
-    gyro_white: float
+    turn_rad_s: float
+    iron_rad: float
+    """Compass error that changes with the heading, one sigma of its sine and cosine."""
+    heading_white: float
+    """N of the headings, rad * sqrt(s)."""
+    gyro: AllanModel
+
+
+class Known(msgspec.Struct, frozen=True):
+    """How well a triad is known: largest variances of the axes."""
+
+    use: float
+    white: float
     """What more seconds take away."""
-    accel_use: float
-    accel_white: float
+    by_heading: ByHeading | None = None
+    """Where the worst axis is one that the compass tells of."""
 
 
 class DeckFound(msgspec.Struct, frozen=True):
     """A window, and how far it is."""
 
     window: Window
-    triads: tuple[Triads, ...]
+    known: tuple[Known, ...]
+    """Gyros and accelerometers of one IMU after another."""
 
 
 class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
@@ -122,7 +136,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
             heading=None if around.compass is None or last is None else self._heading(last, around.compass),
             turn_rad_s=None if last is None else vector(_turn_rad_s(self.seconds[0], last)),
         )
-        return DeckFound(window, tuple(triads for _, triads, _ in found))
+        return DeckFound(window, tuple(known for _, triads, _ in found for known in triads))
 
     def _frozen(self, name: str, readings: Mapping[int, Floats]) -> set[int]:
         """Seconds in which a sensor said the same over and over while it was swayed.
@@ -150,7 +164,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
         levels: Sequence[Level],
         headings: Floats,
         reference: tuple[float, float] | None,
-    ) -> tuple[ImuWindow, Triads, Found]:
+    ) -> tuple[ImuWindow, tuple[Known, Known], Found]:
         around, gradienter = self.around, self.around.gradienter
         span_s = float(len(seconds))
         compared = None if gradienter is None else compare(levels)
@@ -190,9 +204,25 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
             covariance=covariance,
             by_earth=found.by_earth @ _level_axes(found.body_to_ned[-1]),
         )
-        wandered = _MIDDLE * believed.gyro_walk**2 * span_s
-        whites = max(float(np.diag(gyro_own).max()) - wandered, 0.0), float(np.diag(own).max())
-        return window, Triads(float(use[:3].max() ** 2), whites[0], float(use[3:].max() ** 2), whites[1]), found
+        worst = int(np.argmax(use[:3]))
+        gyros = Known(
+            float(use[worst] ** 2),
+            max(float(np.diag(gyro_own).max()) - wandered(gyro, span_s), 0.0),
+            self._by_heading(found, worst, believed, gyro),
+        )
+        return window, (gyros, Known(float(use[3:].max() ** 2), float(np.diag(own).max()))), found
+
+    def _by_heading(self, found: Found, worst: int, believed: Believed, gyro: AllanModel) -> ByHeading | None:
+        down = found.body_to_ned[-1][2]
+        if self.around.compass is None or down[worst] ** 2 < _UPRIGHT:
+            return None
+        headings = np.unwrap(np.arctan2(found.body_to_ned[:, 1, 0], found.body_to_ned[:, 0, 0]))
+        return ByHeading(
+            turn_rad_s=float(np.polyfit(np.arange(len(headings)), headings, 1)[0]),
+            iron_rad=believed.compass_sigma_rad,
+            heading_white=found.heading_sigma_rad * math.sqrt(len(self.slots)),
+            gyro=msgspec.structs.replace(gyro, white=believed.gyro_white),
+        )
 
     def _believed(
         self,
@@ -218,7 +248,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
             accel_sigma_m_s2=accel_sigma,
             compass_sigma_rad=0.0 if compass is None else compass.sigma_deg * COMPASS_SHARE * DEG,
             gyro_white=white,
-            gyro_walk=math.hypot(model.walk, model.flicker / math.sqrt(len(seconds))),
+            gyro_walk=followed_walk(model, float(len(seconds))),
             gyro_slope=math.sqrt(float(slope)),
             compass_lag_s=self.around.compass_lag_s,
             accel_white=imu.profile.accel.white,
@@ -231,6 +261,16 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
         return HeadingWindow(
             heading_deg=math.atan2(pointing[1], pointing[0]) / DEG % 360.0, sigma_deg=found.heading_sigma_rad / DEG
         )
+
+
+def followed_walk(gyro: AllanModel, span_s: float) -> float:
+    """K of a random walk that wanders in such a window as the bias does, rad/s / sqrt(s)."""
+    return math.hypot(gyro.walk, gyro.flicker / math.sqrt(span_s))
+
+
+def wandered(gyro: AllanModel, span_s: float) -> float:
+    """Variance that no averaging takes away."""
+    return _MIDDLE * followed_walk(gyro, span_s) ** 2 * span_s
 
 
 def _runs(readings: Mapping[int, Floats]) -> list[list[int]]:

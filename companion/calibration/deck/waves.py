@@ -100,7 +100,9 @@ def whitened(columns: Floats, waves: Waves, wander: Wander = Wander()) -> Floats
             state += gain * off
             covariance -= gain * spread
         state = move @ state
-        covariance = move @ covariance @ turned + kick
+        covariance = move @ covariance @ turned
+        # Narrow waves have covariances that numbers hardly bear: what is not symmetric grows without end.
+        covariance = (covariance + covariance.T) / 2.0 + kick
     return found
 
 

@@ -239,7 +239,8 @@ class Readiness:
         """The same on a deck, which nobody can hold still."""
         if answer.hold_still_s is None:
             return answer
-        return ArmAnswer("wait", f"wait: {answer.meanwhile or self._collector.status(now_s).measuring}")
+        status = self._collector.status(now_s)
+        return ArmAnswer("wait", f"wait: {answer.meanwhile or status.left or status.measuring}")
 
     def until_calibrated_s(self, now_s: float) -> float:
         """Seconds of holding still until a calibration by itself would be in force."""

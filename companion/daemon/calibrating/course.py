@@ -56,6 +56,8 @@ _WATCHING: Final = "watching the telemetry take the new offsets"
 POLL_S: Final = 0.2
 """A complete second is looked at when it is; this is how often for whatever else may change."""
 SAY_WAITING_EVERY_S: Final = 10.0
+SAY_LEFT_EVERY_S: Final = 60.0
+"""Through minutes in which nothing is in the way."""
 READ_ATTEMPTS: Final = 2
 """How often, within one calibration, the autopilot's offsets may fail to be read."""
 MOST_UPSETS: Final = 5
@@ -141,9 +143,10 @@ class Measuring:
                     job.progress(MEASURED_PERCENT, "working out the biases")
                     return await self._core.window()
                 now_s = loop.time()
-                if waiting_for not in (None, said) and not job.automatic and now_s - said_s >= SAY_WAITING_EVERY_S:
+                every_s = SAY_WAITING_EVERY_S if waiting_for else SAY_LEFT_EVERY_S
+                if (waiting_for or status.left) and words != said and not job.automatic and now_s - said_s >= every_s:
                     said, said_s = words, now_s
-                    self._core.say(Severity.INFO, f"Calibration: {waiting_for}")
+                    self._core.say(Severity.INFO, f"Calibration: {words}")
                 await job.pause(POLL_S)
         finally:
             stop()
