@@ -121,9 +121,7 @@ class _Table:
         self._columns, self._again = self._named(texts, names)
         self._width = len(self._columns.names)
         self._dates = False
-        self._rows = csv.reader(
-            itertools.chain((first,), lines), delimiter=self._separator, skipinitialspace=self._separator == " "
-        )
+        self._data = itertools.chain((first,), lines)
 
     # --- the beginning
 
@@ -201,33 +199,41 @@ class _Table:
 
     def _blocks(self, places: Sequence[int]) -> Iterator[tuple[list[int], Floats]]:
         """Some thousand lines at a time: their numbers, and what stands in the columns."""
-        rows, numbers = [], []
-        try:
-            for row in self._rows:
-                rows.append(row)
-                numbers.append(self._lines.number)
-                if len(rows) == _AT_ONCE:
-                    yield self._block(rows, numbers, places)
-                    rows, numbers = [], []
-        except csv.Error as error:
-            raise StorageError(f"{self._path}, line {self._lines.number}: {error}") from None
-        if rows and rows != [[]]:
-            yield self._block(rows, numbers, places)
+        texts, numbers = [], []
+        for text in self._data:
+            texts.append(text)
+            numbers.append(self._lines.number)
+            if len(texts) == _AT_ONCE:
+                yield self._block(texts, numbers, places)
+                texts, numbers = [], []
+        if texts and texts != [""]:
+            yield self._block(texts, numbers, places)
 
-    def _block(self, rows: list[list[str]], numbers: list[int], places: Sequence[int]) -> tuple[list[int], Floats]:
-        if not self._comma and all(len(row) == self._width for row in rows):
+    def _block(self, texts: list[str], numbers: list[int], places: Sequence[int]) -> tuple[list[int], Floats]:
+        separator, between = self._separator, self._width - 1
+        if separator != " " and not self._comma and all(text.count(separator) == between for text in texts):
             try:
-                return numbers, np.array([list(map(float, [row[place] for row in rows])) for place in places]).T
+                found = np.loadtxt(texts, delimiter=separator, usecols=places, comments=None, quotechar='"', ndmin=2)
             except ValueError:
-                pass  # not all of it is numbers: field by field
+                pass  # not all of it is numbers
+            else:
+                return numbers, found
+        return self._field_by_field(texts, numbers, places)
+
+    def _field_by_field(self, texts: list[str], numbers: list[int], places: Sequence[int]) -> tuple[list[int], Floats]:
         values, lines = [], []
-        for number, row in zip(numbers, rows, strict=True):
-            if row == self._again:
-                self._left_out["names again"] += 1
-                continue
-            self._check_width(number, row)
-            values.append([self._number(row[place], number, place) for place in places])
-            lines.append(number)
+        rows = csv.reader(texts, delimiter=self._separator, skipinitialspace=self._separator == " ")
+        try:
+            for row in rows:
+                number = numbers[rows.line_num - 1]
+                if row == self._again:
+                    self._left_out["names again"] += 1
+                    continue
+                self._check_width(number, row)
+                values.append([self._number(row[place], number, place) for place in places])
+                lines.append(number)
+        except csv.Error as error:
+            raise StorageError(f"{self._path}, line {numbers[rows.line_num - 1]}: {error}") from None
         return lines, np.array(values).reshape(-1, len(places))
 
     def _check_width(self, number: int, row: Sequence[str]) -> None:
