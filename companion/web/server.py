@@ -231,7 +231,7 @@ class Page:
             wanted = parse_request(request.body or b"{}")
         except ValueError as error:
             return _refusal(400, f"not a JSON object: {error}")
-        asked: Object = {"command": request.path.removeprefix("/")}
+        asked: Object = {"command": request.path.removeprefix("/")} | _ALWAYS.get(request.path, {})
         asked |= {key: wanted[key] for key in _ACTIONS[request.path] if key in wanted}
         try:
             reply = await self._result(asked)
@@ -320,8 +320,14 @@ class Page:
         viewer.send(event)
 
 
-_ACTIONS: Final[dict[str, tuple[str, ...]]] = {"/calibrate": ("what",), "/cancel": (), "/undo": ("force",)}
+_ACTIONS: Final[dict[str, tuple[str, ...]]] = {
+    "/calibrate": ("what",),
+    "/align": ("action", "headings", "write", "level"),
+    "/cancel": (),
+    "/undo": ("force",),
+}
 """By path, what of the body counts."""
+_ALWAYS: Final[dict[str, Object]] = {"/align": {"wait": False}}
 _RECORD: Final = re.compile(r"/records/([\w.-]{1,80})")
 
 

@@ -20,7 +20,7 @@ from tests.support.virtual_time import run_virtual
 WEB = '[web]\nbind = "127.0.0.1:0"\n'
 
 
-async def press(rig: Rig, action: str, **body: Any) -> tuple[int, str]:
+async def press(rig: Rig, button: str, /, **body: Any) -> tuple[int, str]:
     """What somebody is told who presses a button."""
     page = rig.service.faces.page
     assert page is not None
@@ -29,7 +29,7 @@ async def press(rig: Rig, action: str, **body: Any) -> tuple[int, str]:
         "content-type": "application/json",
         "x-companion-token": page.access.token,
     }
-    response = await page.respond(Request("POST", f"/{action}", headers, json.dumps(body).encode()))
+    response = await page.respond(Request("POST", f"/{button}", headers, json.dumps(body).encode()))
     assert response is not None
     return response.status, json.loads(response.body)["reason"]
 

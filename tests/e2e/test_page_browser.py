@@ -206,7 +206,7 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             here.line.daemon.kill()
             await here.line.daemon.communicate()
             await tab.until(f"{WORD} === 'NO LINK'")
-            assert await tab.value("document.querySelectorAll('button:disabled').length") == 3
+            assert await tab.value("document.querySelectorAll('#keys button:disabled').length") == 3
             await here.picture("phone_no_link")
             again = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", "companion", "-c", str(here.line.config), "run", stderr=asyncio.subprocess.PIPE

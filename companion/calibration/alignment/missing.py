@@ -124,3 +124,11 @@ def _figure(found: Faces, which: int) -> str:
         return f"{axis} bias {sigma / MG:.2g} mg"
     assert which in range(*SCALE.indices(FIGURES))
     return f"{axis} scale {100.0 * sigma:.2g} %"
+
+
+def up_of(side: str) -> tuple[float, float, float]:
+    """Up in the aircraft's axes, forward, right, down, of length 1, where it is held as `Missing.side` says."""
+    names = side.removeprefix("half way between ").split(" and ")
+    up = np.sum([_SIDES[name] for name in names], axis=0)
+    x, y, z = (up / np.linalg.norm(up)).tolist()
+    return x, y, z

@@ -24,6 +24,14 @@ LEAST_TILT_DEG: Final = 15.0
 APART_DEG: Final = 45.0
 """The least angle between two tilts to different sides."""
 TILTS: Final = 4
+LEVEL: Final = (0.0, 0.0, -1.0)
+_SIN, _COS = math.sin(24.0 * DEG), math.cos(24.0 * DEG)
+_TILTED: Final = {
+    "nose up": (_SIN, 0.0, -_COS),
+    "nose down": (-_SIN, 0.0, -_COS),
+    "left side down": (0.0, _SIN, -_COS),
+    "right side down": (0.0, -_SIN, -_COS),
+}
 HEADINGS: Final = 4
 
 
@@ -48,6 +56,16 @@ class Plan:
         return self.on_spot + (TILTS if self.kind == "tilts" else 0)
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class Hold:
+    """How the aircraft is to be held, for a picture."""
+
+    up: tuple[float, float, float]
+    """Up in its axes, forward, right, down; of length 1."""
+    turn_deg: float = 0.0
+    """By how much it is to be turned on its spot, clockwise from above."""
+
+
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Seen:
     """How the aircraft stood: up in its axes, shape (3,), and its heading, in degrees from the first stand's north."""
@@ -70,6 +88,17 @@ def request(plan: Plan, taken: Sequence[Seen]) -> str:
     if number == 1:
         return "turn it by 180 deg, onto its marks"
     return "turn it back onto its first marks"
+
+
+def hold(plan: Plan, taken: Sequence[Seen]) -> Hold:
+    """What `request` asks for, as a picture."""
+    number = len(taken)
+    if number == 0:
+        return Hold(LEVEL)
+    if number >= plan.on_spot:
+        done = {_side(taken[0].up, seen.up) for seen in taken[plan.on_spot :]}
+        return Hold(next((up for side, up in _TILTED.items() if side not in done), LEVEL))
+    return Hold(LEVEL, QUARTER_DEG if plan.on_spot >= HEADINGS else 180.0)
 
 
 def objection(plan: Plan, taken: Sequence[Seen], now: Seen) -> str | None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import math
-from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -25,10 +24,8 @@ from companion.configured import models
 from companion.daemon.calibrating import align_steps
 from companion.daemon.calibrating.align_steps import Plan, Seen
 from companion.daemon.calibrating.alignment import AlignmentInForce
-from companion.daemon.calibrating.course import Measuring
 from companion.daemon.calibrating.stands import Asked, Stands, imu_stand
 from companion.daemon.core import Core
-from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG
@@ -56,13 +53,12 @@ class Aligner:
     def __init__(
         self,
         core: Core,
-        imus: Mapping[str, AutopilotImu],
-        measuring: Measuring,
+        stands: Stands,
         alignment: AlignmentInForce,
     ) -> None:
         self._core, self._config, self._vehicle, self._collector = core, core.config, core.vehicle, core.collector
         self._offload, self._machine, self._alignment = core.offload, core.machine, alignment
-        self._stands = Stands(core, imus, measuring)
+        self._stands = stands
 
     async def run(self, job: Job, plan: Plan) -> str:
         """Measure all stands, work out, keep; returns the result in one line.
@@ -78,7 +74,7 @@ class Aligner:
         local: LocalEarth | None = None
         taken: list[_Taken] = []
         result: Alignment | None = None
-        self._stands.begin()
+        self._stands.begin(job)
         while len(taken) < plan.total:
             taken.append(await self._stand(job, plan, model, taken))
             self._machine.on(Event.ENOUGH)
@@ -116,7 +112,7 @@ class Aligner:
             found = self._taken(model, taken, window)
             return found, align_steps.objection(plan, seen, found.seen)
 
-        asked = Asked(len(taken) + 1, plan.total, align_steps.request(plan, seen))
+        asked = Asked(len(taken) + 1, plan.total, align_steps.request(plan, seen), align_steps.hold(plan, seen))
         return await self._stands.next(job, asked, take)
 
     def _taken(self, model: GradienterModel, taken: list[_Taken], window: Window) -> _Taken:

@@ -14,7 +14,7 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import whole_accelerometer
 from companion.autopilot.parameters.change import Change
 from companion.calibration.alignment.faces import BIAS, SCALE, Face, Faces, faces
-from companion.calibration.alignment.missing import missing, seen_before
+from companion.calibration.alignment.missing import Missing, missing, seen_before, up_of
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.solution.draft import Draft
@@ -23,6 +23,7 @@ from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.component.statustext import Severity
 from companion.configured import models
 from companion.daemon.calibrating.accel_writes import AccelWrites
+from companion.daemon.calibrating.align_steps import LEVEL, Hold
 from companion.daemon.calibrating.faces_in_force import FacesInForce
 from companion.daemon.calibrating.stands import Asked, Stands
 from companion.daemon.core import Core
@@ -44,6 +45,8 @@ class _Known(NamedTuple):
     by_imu: dict[str, Faces]
     wish: str | None
     """The stand that is missing, in words; None where nothing is."""
+    hold: Hold = Hold(LEVEL)
+    """The same as a picture."""
 
 
 class Facing:
@@ -76,7 +79,7 @@ class Facing:
         windows: list[Window] = []
         known = _Known({}, _FIRST)
         local: LocalEarth | None = None
-        self._stands.begin()
+        self._stands.begin(job)
         while known.wish is not None and len(windows) < MOST:
             if windows:
                 self._machine.on(Event.MOVED)
@@ -118,7 +121,7 @@ class Facing:
                     return window, f"it stands as in stand {again + 1}: {known.wish}"
             return window, None
 
-        asked = Asked(number, max(EXPECTED, number), known.wish or "")
+        asked = Asked(number, max(EXPECTED, number), known.wish or "", known.hold)
         # No stand hangs on another, so that a flight in between costs nothing.
         return await self._stands.next(job, asked, take, if_armed=None)
 
@@ -134,7 +137,7 @@ class Facing:
     def _solve(self, windows: list[Window], local: LocalEarth) -> _Known:
         """Blocking: for a thread."""
         by_imu: dict[str, Faces] = {}
-        wish: str | None = None
+        wish: Missing | None = None
         for name, imu in self._imus.items():
             means = [one for window in windows for one in window.imus if one.name == name and not one.refused("accel")]
             if len(means) < len(windows) or imu.calibration is None:
@@ -142,11 +145,10 @@ class Facing:
             wander = np.mean([_wander(one) for one in means], axis=0)
             found = faces([self._face(one) for one in means], local.gravity_m_s2, local.gravity_sigma_m_s2, wander)
             by_imu[name] = found
-            still = missing(found, imu.calibration.orientation)
-            wish = wish or (None if still is None else str(still))
+            wish = wish or missing(found, imu.calibration.orientation)
         if not by_imu:
             raise CalibrationRefusedError("no IMU whose accelerometers can be read")
-        return _Known(by_imu, wish)
+        return _Known(by_imu, None) if wish is None else _Known(by_imu, str(wish), Hold(up_of(wish.side)))
 
     def _face(self, imu: ImuWindow) -> Face:
         """In the sensor's own axes, in which firmwares scale."""

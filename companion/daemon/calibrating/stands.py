@@ -11,12 +11,15 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Final, NamedTuple, TypeVar
 
+import msgspec
 import numpy as np
 
 from companion.calibration.alignment.align_model import ImuStand
 from companion.calibration.means.windows import ImuWindow, Window
+from companion.component.service import JobResult
 from companion.component.statustext import Severity
 from companion.component.tunes import Tune
+from companion.daemon.calibrating.align_steps import LEVEL, Hold
 from companion.daemon.calibrating.course import POLL_S, Measuring
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -40,6 +43,28 @@ class Asked(NamedTuple):
     """How many there will be, about."""
     wish: str
     """How to stand it."""
+    hold: Hold
+    """The same as a picture."""
+
+
+class StandsShown(msgspec.Struct):
+    """Where the latest alignment stands, for a page that may be closed and opened again meanwhile, and after it."""
+
+    kind: str
+    number: int
+    total: int
+    wish: str
+    hold: Hold
+    words: str = ""
+    """What is going on."""
+    objection: str | None = None
+    """Why what stood there last was not what was asked for."""
+    share: float = 0.0
+    """Of the present stand, 0 to 1."""
+    done: list[tuple[float, float, float]] = []
+    """Up in the aircraft's axes, of each stand so far, as its accelerometers read it."""
+    outcome: str | None = None
+    """None while it runs."""
 
 
 class Stands:
@@ -51,10 +76,18 @@ class Stands:
         self._stand_s = max(STAND_S, core.config.calibration.min_still_s)
         self._end_s: float | None = None
         self._first: dict[str, dict[str, float]] = {}
+        self.shown: StandsShown | None = None
+        """None before the first alignment."""
 
-    def begin(self) -> None:
-        """The next stand is the first."""
+    def begin(self, job: Job) -> None:
+        """The next stand is the first, of this job."""
         self._end_s, self._first = None, {}
+        self.shown = shown = StandsShown(job.kind, 1, 1, "", Hold(LEVEL))
+
+        def ended(result: asyncio.Future[JobResult]) -> None:
+            shown.outcome, shown.words, shown.share = result.result().outcome, result.result().reason, 0.0
+
+        job.finished.add_done_callback(ended)
 
     async def next(
         self, job: Job, asked: Asked, take: Callable[[Window], tuple[_T, str | None]], if_armed: str | None = ARMED
@@ -75,7 +108,8 @@ class Stands:
             JobCancelledError: cancelled.
         """
         loop = asyncio.get_running_loop()
-        number, total, wish = asked
+        number, total, wish, _ = asked
+        shown = self._show(asked)
         if number > 1:
             self._core.tunes.play(Tune.NEXT)
         self._say(Severity.NOTICE, f"Align {number}/{total}: {wish}")
@@ -103,17 +137,24 @@ class Stands:
                     self._core.tunes.play(Tune.HOLD_STILL)
             self._measuring.show(measuring=share > 0.0)
             job.progress(100.0 * (number - 1 + share) / total, f"{number} of {total}: {words}")
+            shown.words, shown.share, shown.objection = words, round(share, 3), why or None
             if moved and waiting_for is None and still_s >= self._stand_s:
                 window = await self._core.window(since_s=since_s + SETTLE_S)
                 found, objection = take(window)
                 if objection is None:
                     self._end_s = window.end_s
                     self._first = self._first or self._offsets()
+                    shown.done.append(_up(window))
                     return found
                 moved, why = False, objection
                 self._measuring.show(measuring=False)
                 self._core.prompt(Tune.WRONG, f"Align: {objection}")
             await job.pause(POLL_S)
+
+    def _show(self, asked: Asked) -> StandsShown:
+        assert self.shown is not None
+        self.shown.number, self.shown.total, self.shown.wish, self.shown.hold = asked
+        return self.shown
 
     @contextlib.contextmanager
     def imus_alone(self) -> Iterator[None]:
@@ -143,6 +184,13 @@ class Stands:
 
     def _offsets(self) -> dict[str, dict[str, float]]:
         return {name: imu.calibration.corrections for name, imu in self._imus.items() if imu.calibration is not None}
+
+
+def _up(window: Window) -> tuple[float, float, float]:
+    """Up in the aircraft's axes, as well as one IMU reads it."""
+    read = np.array(window.imus[0].accel_m_s2)
+    x, y, z = (read / max(float(np.linalg.norm(read)), 1e-9)).round(3).tolist()
+    return x, y, z
 
 
 def imu_stand(window: ImuWindow) -> ImuStand:

@@ -60,9 +60,10 @@ class Calibrating(Subsystem):
         ditherer = Ditherer(core, imus, offsets.writer, offsets.ledger)
         self.conclusion = Conclusion(core, offsets.effect, offsets.firmware)
         course = Course(core, measuring, self.solving, ditherer, offsets.planner, offsets.pusher, self.conclusion)
-        aligner = Aligner(core, imus, measuring, self.alignment)
         self.faces = FacesInForce(config, core.offload)
-        stands, writes = Stands(core, imus, measuring), AccelWrites(core, imus, offsets, self.conclusion)
+        self.stands = stands = Stands(core, imus, measuring)
+        writes = AccelWrites(core, imus, offsets, self.conclusion)
+        aligner = Aligner(core, stands, self.alignment)
         facing = Facing(core, imus, stands, writes, self.faces)
         turning = Turning(core, imus, stands, writes, self.faces)
         self._results = Results(core, self.store, self.memory)
@@ -88,6 +89,7 @@ class Calibrating(Subsystem):
             "still_s": round(still.still_s, 1),
             "waiting_for": still.waiting_for,
             "alignment": self.alignment.status(),
+            "stands": msgspec.to_builtins(self.stands.shown),
             "last": _summary(conductor.last),
         }
 
@@ -136,6 +138,9 @@ class Calibrating(Subsystem):
             yield {"kind": "result", "state": "done", "reason": words}
         else:
             job = self._start_alignment(request, face)
+            if request.get("wait") is False:
+                yield {"kind": "result", "state": self.conductor.state.shown, "reason": f"{job.kind} started"}
+                return
             async for reply in self._progress(job):
                 yield {**reply, "job": job.kind}
             result = job.finished.result()

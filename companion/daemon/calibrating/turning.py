@@ -90,7 +90,7 @@ class Turning:
     async def _run(self, job: Job, asked: TurnAsked) -> str:
         plan = Plan("zero", asked.headings, back=True)
         taken: list[_Taken] = []
-        self._stands.begin()
+        self._stands.begin(job)
         while len(taken) < plan.on_spot:
             if taken:
                 self._machine.on(Event.MOVED)
@@ -161,7 +161,7 @@ class Turning:
             found = _Taken(window, Seen(up / np.linalg.norm(up), heading))
             return found, align_steps.objection(plan, seen, found.seen)
 
-        asked = Asked(len(taken) + 1, plan.on_spot, align_steps.request(plan, seen))
+        asked = Asked(len(taken) + 1, plan.on_spot, align_steps.request(plan, seen), align_steps.hold(plan, seen))
         return await self._stands.next(job, asked, take)
 
     def _turned_deg(self, before: _Taken, now: Window) -> float:

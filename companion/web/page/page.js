@@ -56,8 +56,11 @@ function show(status) {
   if (missed) $("last").textContent = "the last one: " + (last.reason.startsWith(last.state) ? last.reason : `${last.state}: ${last.reason}`);
   links(status);
   aloud(status);
+  stands(status.stands);
   // Whether it may is the daemon's to say, with the reason; here only what makes no sense at all is off.
   $("calibrate").disabled = busy;
+  for (const button of document.querySelectorAll("#align button")) button.disabled = busy;
+  for (const it of document.querySelectorAll(".wants-gradienter")) it.hidden = !status.devices.some(({name}) => name === "gradienter");
   $("cancel").disabled = !busy;
   $("undo").disabled = busy || status.why_no_undo !== null;
   const key = JSON.stringify([status.last, status.headline.word === "READY", busy]);
@@ -216,7 +219,7 @@ setInterval(() => {
   headline("gone", "NO LINK", heardAt ? `no word from the companion for ${Math.round(silent / 1000)} s: off, or out of range?`
     : "no word from the companion yet");
   $("progress").hidden = true;
-  for (const id of ["calibrate", "cancel", "undo"]) $(id).disabled = true;
+  for (const button of document.querySelectorAll("#keys button, #align button")) button.disabled = true;
   if (source && silent > 2 * GONE_MS && heardAt) { heardAt = Date.now() - GONE_MS; listen(); }
 }, 500);
 document.addEventListener("visibilitychange", () => { if (!document.hidden && Date.now() - heardAt > GONE_MS) listen(); });
@@ -231,7 +234,7 @@ function say(words, bad) {
   clearTimeout(saidTimer);
   saidTimer = setTimeout(() => { $("said").hidden = true; }, 10000);
 }
-async function act(what) {
+async function act(what, path, body) {
   if (!token) {
     $("ask").hidden = false;
     $("token").focus();
@@ -240,7 +243,7 @@ async function act(what) {
   }
   say(what + ": asked for");
   try {
-    const answer = await fetch("/" + what, {method: "POST", body: "{}",
+    const answer = await fetch("/" + path, {method: "POST", body: JSON.stringify(body),
       headers: {"Content-Type": "application/json", "X-Companion-Token": token}});
     const said = await answer.json();
     say(`${what}: ${said.reason}`, !answer.ok || said.state === "failed");
@@ -261,9 +264,10 @@ if (location.hash.startsWith("#token=")) {
 } else { try { token = localStorage.getItem("token"); } catch { /* none */ } }
 
 for (const button of document.querySelectorAll("button.hold")) {
+  const name = button.dataset.name || button.id, path = name.split(" ")[0];
   let timer = 0, from = null;
   const stop = () => {
-    if (timer) { clearTimeout(timer); timer = 0; say("hold " + button.id + " for 1.5 s", true); }
+    if (timer) { clearTimeout(timer); timer = 0; say("hold " + name + " for 1.5 s", true); }
     button.classList.remove("held");
   };
   const start = () => {
@@ -275,7 +279,9 @@ for (const button of document.querySelectorAll("button.hold")) {
       button.classList.remove("held");
       if (button.disabled) return;
       if (navigator.vibrate) navigator.vibrate(80);
-      act(button.id);
+      const body = JSON.parse(button.dataset.body || "{}");
+      if ($("write").checked && ["faces", "turn"].includes(body.action) && !body.level) body.write = true;
+      act(name + (body.write ? " --write" : ""), path, body);
     }, HOLD_MS);
   };
   button.addEventListener("pointerdown", event => {
@@ -293,5 +299,5 @@ for (const button of document.querySelectorAll("button.hold")) {
   button.addEventListener("keydown", event => { if (!event.repeat && (event.key === "Enter" || event.key === " ")) start(); });
   button.addEventListener("keyup", stop);
 }
-$("cancel").addEventListener("click", () => act("cancel"));
+$("cancel").addEventListener("click", () => act("cancel", "cancel", {}));
 listen();

@@ -1,0 +1,89 @@
+"use strict";
+// Alignments: how to hold the aircraft now, how far the stand is, what has been done. All of it is the daemon's word.
+
+const SVG = "http://www.w3.org/2000/svg";
+// An aircraft in its own axes, forward, right, down; what looks up when it stands level is "top".
+const PARTS = [
+  ...[[.14, 0], [0, .14], [-.14, 0], [0, -.14]].flatMap(([y, z], k, ring) => {
+    const [y2, z2] = ring[(k + 1) % 4], side = z + z2 < 0 ? "top" : "under";
+    return [["nose " + side, [[1, 0, 0], [.55, y, z], [.55, y2, z2]]],
+      [side, [[.55, y, z], [-.95, y / 3, z / 3], [-.95, y2 / 3, z2 / 3], [.55, y2, z2]]]];
+  }),
+  ["wing", [[.3, 0, -.03], [.12, 1.05, -.03], [-.12, 1.05, -.03], [-.12, 0, -.03]]],
+  ["wing", [[.3, 0, -.03], [-.12, 0, -.03], [-.12, -1.05, -.03], [.12, -1.05, -.03]]],
+  ["wing", [[-.68, .42, 0], [-.92, .42, 0], [-.92, -.42, 0], [-.68, -.42, 0]]],
+  ["fin", [[-.6, 0, 0], [-.88, 0, -.5], [-1, 0, -.5], [-.95, 0, 0]]],
+];
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const spherical = (azimuth, elevation) => [Math.cos(elevation) * Math.cos(azimuth), Math.cos(elevation) * Math.sin(azimuth), Math.sin(elevation)];
+const AZIMUTH = -.95, ELEVATION = .38;
+const EYE = spherical(AZIMUTH, ELEVATION), RIGHT = [-Math.sin(AZIMUTH), Math.cos(AZIMUTH), 0], TOP = spherical(AZIMUTH, ELEVATION + Math.PI / 2);
+
+// From the aircraft's axes to north, west, up: it heads north, and `up` is up by the shortest turn from level.
+function attitude(up) {
+  const from = [up[0], -up[1], -up[2]], cosine = from[2];
+  const axis = [from[1], -from[0], 0], sine = Math.hypot(axis[0], axis[1]);
+  const about = sine > 1e-6 ? axis.map(value => value / sine) : [1, 0, 0];
+  return ([x, y, z]) => {
+    const point = [x, -y, -z], along = dot(about, point), aside = cross(about, point);
+    return point.map((value, k) => value * cosine + aside[k] * sine + about[k] * along * (1 - cosine));
+  };
+}
+function draw(tag, attributes) {
+  const it = document.createElementNS(SVG, tag);
+  for (const [name, value] of Object.entries(attributes)) it.setAttribute(name, value);
+  return it;
+}
+const onScreen = point => [60 * dot(point, RIGHT), -60 * dot(point, TOP)];
+const path = points => "M" + points.map(point => onScreen(point).map(value => value.toFixed(1)).join(" ")).join("L");
+
+// A picture of the aircraft so held, above the ground; with an arrow where it is to be turned.
+function picture(up, turnDeg, label) {
+  const turned = attitude(up), svg = draw("svg", {role: "img", "aria-label": label, class: "hold"});
+  const parts = PARTS.map(([name, points]) => [name, points.map(turned)]);
+  const floor = Math.min(...parts.flatMap(([, points]) => points.map(point => point[2]))) - .12;
+  const around = (radius, from, to) => Array.from({length: 25}, (_, k) => {
+    const angle = from + (to - from) * k / 24;
+    return [radius * Math.cos(angle), -radius * Math.sin(angle), floor];
+  });
+  const ring = around(1.1, 0, 2 * Math.PI), heights = [ring, ...parts.map(([, points]) => points)].flat().map(point => onScreen(point)[1]);
+  svg.setAttribute("viewBox", `-78 ${(Math.min(...heights) + Math.max(...heights)) / 2 - 78} 156 156`);
+  svg.append(draw("path", {class: "floor", d: path(ring) + "Z"}));
+  const middle = points => points.reduce((sum, point) => sum + dot(point, EYE), 0) / points.length;
+  for (const [name, points] of parts.sort(([, a], [, b]) => middle(a) - middle(b))) {
+    const [a, b, c] = points.map(onScreen), seen = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) > 0;
+    svg.append(draw("path", {class: name === "wing" ? (seen ? "top" : "under") : name, d: path(points) + "Z"}));
+  }
+  if (turnDeg) {
+    const arc = around(1.1, 0, turnDeg * Math.PI / 180), end = onScreen(arc[24]), before = onScreen(arc[22]);
+    const angle = Math.atan2(end[1] - before[1], end[0] - before[0]) * 180 / Math.PI;
+    svg.append(draw("path", {class: "arrow", d: path(arc)}),
+      draw("path", {class: "head", d: "M9 0L-8 8V-8Z", transform: `translate(${end}) rotate(${angle})`}));
+  }
+  return svg;
+}
+
+let shownStands = null;
+function stands(found) {
+  $("stands").hidden = found === null;
+  if (found === null) return;
+  const running = found.outcome === null, [wish, unknown] = found.wish.split(/: (.*)/);
+  document.querySelector("#share div").style.width = 100 * found.share + "%";
+  $("result").textContent = running ? "" : found.words;
+  const key = JSON.stringify([found.number, found.total, found.wish, found.objection, found.done.length, found.outcome]);
+  if (key === shownStands) return;
+  shownStands = key;
+  $("standing").textContent = running ? `${found.kind}: stand ${found.number} of ${found.total}` : `${found.kind}: ${found.outcome}`;
+  $("stands").dataset.outcome = found.outcome || "";
+  $("wish").textContent = wish;
+  $("still").textContent = found.objection || unknown || "";
+  $("still").className = found.objection ? "objection" : "";
+  $("how").replaceChildren(picture(found.hold.up, found.hold.turn_deg, wish));
+  const left = Math.max(found.total - found.done.length, 0);
+  $("done").replaceChildren(...found.done.map((up, k) => {
+    const it = make("li");
+    it.append(picture(up, 0, `stand ${k + 1}: done`), sign("good"));
+    return it;
+  }), ...Array.from({length: running ? left : 0}, (_, k) => make("li", String(found.done.length + k + 1))));
+}
