@@ -148,7 +148,10 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
     async def main() -> None:
         async with scene(tmp_path, "127.0.0.1:0", PHONE) as here:
             tab = here.tab
-            assert await tab.value("document.querySelector('#reason').textContent") == "not confirmed since start: calibrate"
+            assert (
+                await tab.value("document.querySelector('#reason').textContent")
+                == "not confirmed since start: calibrate"
+            )
             assert await tab.value("document.querySelector('#pitch').textContent") == "5.00°"
             assert await tab.value("document.querySelector('#roll').textContent") == "−3.00°"
             assert await tab.value("document.querySelectorAll('.link').length") == 5
