@@ -22,6 +22,7 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.windows import ImuInput, Window
+from companion.calibration.solution.otherwise import NOTHING, Otherwise
 from companion.calibration.solution.prior import Expectation
 from companion.calibration.solution.record import Record
 from companion.calibration.solution.site import Whereabouts
@@ -65,6 +66,8 @@ class Solved(msgspec.Struct, frozen=True, kw_only=True):
     """The gradienter's: offset x and y, and sigma, in degrees."""
     expectation: Expectation
     """What was known from before: it lies on the daemon's disk, and changes with every calibration."""
+    otherwise: Otherwise = NOTHING
+    """What filled in for a gradienter or a compass."""
 
 
 _TYPES: Final[dict[JournalEvent, Any]] = {

@@ -18,6 +18,7 @@ from companion.calibration.means.windows import Window
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.joint import weigh
+from companion.calibration.solution.otherwise import NOTHING, Otherwise
 from companion.calibration.solution.record import AlignmentUsed, Record
 from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.calibration.solution.solve import ImuSolution, Solution, solve
@@ -177,19 +178,21 @@ class Calibrations:
         try:
             if isinstance(window, CalibrationRefusedError):
                 raise window
-            solution = self._solved(refined_window(window.window(), detail.refined), What[detail.what])
+            solution = self._solved(
+                refined_window(window.window(), detail.refined), What[detail.what], detail.otherwise
+            )
             whole = {found.name: self._whole(found) for found in solution.imus}
             self._solution = weigh(solution, whole, detail.expectation).solution
         except CalibrationRefusedError as error:
             self._refused = f"refused here: {error}"
 
-    def _solved(self, window: Window, what: What) -> Solution:
+    def _solved(self, window: Window, what: What, otherwise: Otherwise = NOTHING) -> Solution:
         config = self.config
         assert config is not None
         gradienter = aligned(models.gradienter_model(config.gradienter), self._alignment)
         compass = models.compass_model(config.compass)
         local, platform, any_bias = local_earth(self.where), config.vehicle.platform, config.calibration.any_bias
-        return solve(window, local, gradienter, compass, what, platform, any_bias=any_bias)
+        return solve(window, local, gradienter, compass, what, platform, any_bias=any_bias, otherwise=otherwise)
 
     def _whole(self, found: ImuSolution) -> tuple[Array | None, Array | None]:
         calibration = self._solved_with.get(found.name)

@@ -65,6 +65,8 @@ class AutopilotDouble(abc.ABC):
         self._port, self.ground = channels
         self.random = np.random.default_rng([seed, 4])
         """For everything that varies and is not a sensor's noise."""
+        self.has_compass = False
+        """Whether its own magnetometer works, and holds its yaw."""
         self._up_s = up_s
         self._booted_s: float | None = None
         self._down = False

@@ -62,6 +62,7 @@ def sys_status(double: AutopilotDouble, loop_s: float) -> Message:
         mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
         | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
         | mavlink.MAV_SYS_STATUS_PREARM_CHECK
+        | (mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG if double.has_compass else 0)
     )
     health = sensors if not double.prearm_failures(loop_s) else sensors & ~mavlink.MAV_SYS_STATUS_PREARM_CHECK
     return mavlink.MAVLink_sys_status_message(sensors, sensors, health, 180, 12600, -1, -1, 0, 0, 0, 0, 0, 0)

@@ -12,7 +12,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from companion.calibration.request import What
 from companion.calibration.solution.faces_record import FacesRecord
+from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
 from sim.ardupilot.double import offset_names
@@ -227,5 +229,45 @@ def test_a_gradienter_that_falls_silent_when_turned_over_is_not_waited_for_and_i
             assert result.outcome == "done", result
             assert record.pose is not None
             assert (record.pose.sigma_deg.theta or 90.0) < 0.1
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+def test_with_all_sides_known_later_calibrations_have_a_tilt_and_the_autopilots_heading(
+    tmp_path: Path, firmware: str
+) -> None:
+    options = {} if firmware == "ardupilot" else {"firmware": "px4", "parameters": {}}
+    made, hands = rig(tmp_path, **options)
+
+    async def calibration() -> Record:
+        result, record = await calibrated(made, What.GYROS)
+        assert result.outcome == "done", result
+        return record
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            before = await calibration()
+            assert before.pose is not None
+            assert before.pose.tilt_from is before.pose.heading_from is before.pose.theta_deg is None
+            result = await follow(made, hands, faced(made, write=firmware == "ardupilot"))
+            assert result.outcome == "done", result
+            hands.spot(made.aircraft.time_at(made.now_s), 3.0, -4.0)
+            made.autopilot.has_compass = True
+            await asyncio.sleep(30.0)
+            after = await calibration()
+            pose = after.pose
+            yaw = made.aircraft.angles_rad(made.aircraft.time_at(made.now_s))[2]
+            assert pose is not None
+            assert (pose.tilt_from, pose.heading_from) == ("accelerometers", "autopilot")
+            assert pose.theta_deg == pytest.approx(3.0, abs=0.03)
+            assert pose.gamma_deg == pytest.approx(-4.0, abs=0.03)
+            assert 0.0 < (pose.sigma_deg.theta or 0.0) < 0.02
+            assert pose.psi_deg == pytest.approx(np.degrees(yaw) % 360.0, abs=0.5)
+            assert pose.sigma_deg.psi == pytest.approx(10.0)
+            widest = [max(record.imus[0].gyro_sigma_use_rad_s or ()) for record in (before, after)]
+            assert widest[1] < widest[0]
+            assert any("known from all sides" in words for words in after.warnings)
 
     run_virtual(main())

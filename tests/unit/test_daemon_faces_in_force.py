@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,15 @@ from companion.autopilot.firmware.ardupilot import parameters_of
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_step, whole_accelerometer
 from companion.calibration.alignment.align_record import Determined
 from companion.calibration.alignment.faces import BIAS, SCALE
-from companion.calibration.solution.faces_record import FacesImuRecord, FacesRecord
+from companion.calibration.solution.faces_record import FacesImuRecord, FacesRecord, Running
 from companion.config import parse
 from companion.daemon.calibrating.faces_in_force import FacesInForce
+from companion.daemon.core import Core
 from companion.physics.frames import rotation_matrix, vector
 from companion.physics.units import MG
 from companion.samples import Vector
+from companion.storage.learned import this_boot
+from tests.support.rig import inline
 from tests.support.virtual_time import run_virtual
 
 BIAS_MG, ERROR = (3.0, -2.0, 1.0), (0.004, -0.003, 0.002)
@@ -41,14 +43,22 @@ def calibration(
     )
 
 
-def record(hours: float = 0.0) -> FacesRecord:
-    measured_at = datetime.datetime.now(tz=datetime.UTC) - datetime.timedelta(hours=hours)
+HOST, UP_S = this_boot(), 5000.0
+
+
+def running(at_s: float = UP_S) -> Running:
+    """Of the sensor that started at 0."""
+    return Running(host=HOST, started_s=0.0, up_s=at_s)
+
+
+def record(when: Running | None) -> FacesRecord:
     known = (True, True, True)
     imu = FacesImuRecord(
         name="fc",
         accel_id=7,
         corrections=calibration().corrections,
         temperature_degc=25.0,
+        running=when,
         accel_bias_mg=Determined(value=BIAS_MG, sigma=(0.03, 0.03, 0.03), known=known),
         accel_scale=Determined(value=ERROR, sigma=(4e-5, 4e-5, 4e-5), known=known),
         accel_shear=Determined(value=(0.0, 0.0, 0.0), sigma=(4e-5, 4e-5, 4e-5), known=known),
@@ -56,32 +66,40 @@ def record(hours: float = 0.0) -> FacesRecord:
         scatter_mg=0.02,
         written={},
     )
-    return FacesRecord(measured_at=measured_at.isoformat(), gravity_m_s2=9.81, stands=(), imus=(imu,))
+    return FacesRecord(measured_at="2026-01-01T00:00:00+00:00", gravity_m_s2=9.81, stands=(), imus=(imu,))
 
 
-def kept(folder: Path, hours: float = 0.0) -> FacesInForce:
-    async def inline(function: Any, *arguments: Any) -> Any:
-        return function(*arguments)
+class There(FacesInForce):
+    """Of a daemon that hears for how long the sensor has been on."""
 
+    def running(self, name: str) -> Running | None:
+        return running()
+
+
+def kept(folder: Path, when: Running | None) -> FacesInForce:
     text = f"""
 [mavlink]
 url = "udpout:127.0.0.1:9"
 [[imu]]
 name = "fc"
 source = "autopilot"
+profile = "icm42688p"
 [storage]
 directory = "{folder}"
 """
-    config = parse(text, "a.toml")
-    first = FacesInForce(config, inline)
-    run_virtual(first.keep(record(hours)))
-    again = FacesInForce(config, inline)
-    again.load()
-    return again
+
+    async def made() -> FacesInForce:
+        core = Core.of(parse(text, "a.toml"), None, inline, None)
+        await There(core, {}).keep(record(when))
+        again = There(core, {})
+        again.load()
+        return again
+
+    return run_virtual(made())
 
 
 def test_under_the_same_offsets_it_is_what_was_measured(tmp_path: Path) -> None:
-    found = kept(tmp_path).known("fc", calibration(), 25.0)
+    found = kept(tmp_path, running()).known("fc", calibration(), 25.0)
     assert found is not None
     np.testing.assert_allclose(found.figures[BIAS] / MG, BIAS_MG, atol=1e-6)
     np.testing.assert_allclose(found.figures[SCALE], ERROR, atol=1e-9)
@@ -98,7 +116,7 @@ def test_once_written_nothing_is_left_of_it(tmp_path: Path) -> None:
         accel_offset_m_s2=vector(np.array([after[name] for name in names.accel_offset])),
         accel_scale=vector(np.array([after[name] for name in names.accel_scale])),
     )
-    found = kept(tmp_path).known("fc", written, 25.0)
+    found = kept(tmp_path, running()).known("fc", written, 25.0)
     assert found is not None
     np.testing.assert_allclose(found.figures[BIAS] / MG, 0.0, atol=1e-3)
     np.testing.assert_allclose(found.figures[SCALE], 0.0, atol=1e-6)
@@ -122,18 +140,26 @@ def test_what_is_written_moves_the_output_to_the_truth_on_every_side(up: Vector)
     np.testing.assert_allclose(TURN @ output + step, corrected, atol=2e-6)
 
 
-def test_hours_and_kelvins_widen_the_biases(tmp_path: Path) -> None:
-    def sigma_mg(found: Any) -> float:
-        return float(np.sqrt(found.covariance[0, 0])) / MG
+def sigma_mg(found: Any) -> float:
+    return float(np.sqrt(found.covariance[0, 0])) / MG
 
-    fresh = kept(tmp_path)
+
+def test_hours_and_kelvins_widen_the_biases(tmp_path: Path) -> None:
+    fresh = kept(tmp_path, running())
     assert sigma_mg(fresh.known("fc", calibration(), 30.0)) == pytest.approx(1.0, rel=0.01)
-    old = kept(tmp_path, hours=5.0)
-    assert sigma_mg(old.known("fc", calibration(), 25.0)) == pytest.approx(0.3, rel=0.02)
+    old = kept(tmp_path, running(UP_S - 3600.0))
+    assert 0.032 < sigma_mg(old.known("fc", calibration(), 25.0)) < 0.1
     assert sigma_mg(old.known("fc", calibration(), None)) > 1.0
 
 
+@pytest.mark.parametrize(
+    "when", [None, Running(host="another", started_s=0.0, up_s=UP_S), Running(host=HOST, started_s=-100.0, up_s=UP_S)]
+)
+def test_in_another_power_up_the_bias_may_be_another(tmp_path: Path, when: Running | None) -> None:
+    assert sigma_mg(kept(tmp_path, when).known("fc", calibration(), 25.0)) == pytest.approx(2.0, rel=0.01)
+
+
 def test_of_another_sensor_nothing_is_known(tmp_path: Path) -> None:
-    there = kept(tmp_path)
+    there = kept(tmp_path, running())
     assert there.known("fc", calibration(accel_id=8), 25.0) is None
     assert there.known("other", calibration(), 25.0) is None

@@ -17,6 +17,7 @@ from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.autopilot.vehicle.heartbeats import Firmware
 from companion.links.mavlink.link import MavlinkLink, Message
 
 logger = logging.getLogger(__name__)
@@ -151,6 +152,7 @@ class _Wanted:
     message: type[Message]
     rate_hz: float | None
     """None: wanted once, and again after a restart."""
+    of: Firmware | None
     heard_s: float = -math.inf
     asked_s: float = -math.inf
     pause_s: float = FIRST_PAUSE_S
@@ -163,9 +165,9 @@ class StandingRequests:
         self._commands = commands
         self._wanted: list[_Wanted] = []
 
-    def add(self, message: type[Message], rate_hz: float | None) -> None:
-        """Want a message from now on; without a rate, only once after every `forget_asking`."""
-        self._wanted.append(_Wanted(message, rate_hz))
+    def add(self, message: type[Message], rate_hz: float | None, of: Firmware | None = None) -> None:
+        """Want a message from now on, `of` one firmware or all; without a rate, once after every `forget_asking`."""
+        self._wanted.append(_Wanted(message, rate_hz, of))
 
     def heard(self, message: Message, t_s: float) -> None:
         """One has come."""
@@ -180,9 +182,11 @@ class StandingRequests:
             if wanted.rate_hz is None:
                 wanted.heard_s = -math.inf
 
-    def ask_for_missing(self, now_s: float) -> None:
+    def ask_for_missing(self, now_s: float, firmware: Firmware | None = None) -> None:
         """Ask for what has stayed away, unless it was asked for a short time ago."""
         for wanted in self._wanted:
+            if wanted.of not in (None, firmware):
+                continue
             age_s = now_s - wanted.heard_s
             silent = age_s == math.inf if wanted.rate_hz is None else age_s > 2.5 / wanted.rate_hz
             if silent and now_s - wanted.asked_s > wanted.pause_s:

@@ -110,10 +110,10 @@ class Vehicle:
         self._tick_timer: asyncio.TimerHandle | None = None
         self._tick_due_s = math.inf
         self._unsubscribe = link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
-        link.subscribe(mavlink.MAVLink_system_time_message, self._of_ours(self.place.hear_time))
-        link.subscribe(mavlink.MAVLink_autopilot_version_message, self._of_ours(self._on_version))
-        link.subscribe(mavlink.MAVLink_global_position_int_message, self._of_ours(self.place.hear_estimate))
-        link.subscribe(mavlink.MAVLink_gps_raw_int_message, self._of_ours(self.place.hear_receiver))
+        self.hear(mavlink.MAVLink_system_time_message, self.place.hear_time)
+        self.hear(mavlink.MAVLink_autopilot_version_message, self._on_version)
+        self.hear(mavlink.MAVLink_global_position_int_message, self.place.hear_estimate)
+        self.hear(mavlink.MAVLink_gps_raw_int_message, self.place.hear_receiver)
 
     @property
     def arm_state(self) -> ArmState:
@@ -166,6 +166,21 @@ class Vehicle:
         """Whether a message came from the latched autopilot."""
         header = message.get_header()
         return header.srcComponent == self.component_id and header.srcSystem == self.system_id
+
+    def hear(
+        self, message: type[M], handler: Handler[M], rate_hz: float | None = None, of: Firmware | None = None
+    ) -> None:
+        """Hand over every such message of the latched autopilot, and ask for them at a rate, if one is given.
+
+        Args:
+            message: which.
+            handler: told of each, with its time.
+            rate_hz: None: they come by themselves, or do not.
+            of: the firmware that has it, where not all do.
+        """
+        self._link.subscribe(message, self._of_ours(handler))
+        if rate_hz is not None:
+            self._wanted.add(message, rate_hz, of)
 
     def watch(self, callback: Callable[[VehicleEvent], None]) -> Unsubscribe:
         """Be told of events, in the order in which they are seen; returns how to stop that."""
@@ -325,14 +340,14 @@ class Vehicle:
                 # Its heartbeat cannot be had faster than once a second, so that after a single one that is lost nobody
                 # would know whether it is armed.
                 self.commands.request_message(_HEARTBEAT_ID)
-            self._wanted.ask_for_missing(now_s)
+            self._wanted.ask_for_missing(now_s, self.firmware)
 
     def _ask_soon(self) -> None:
         # What was streamed before a loss is gone if the autopilot restarted meanwhile.
         self._wanted.forget_asking()
         if self.firmware == "ardupilot":
             self.commands.request_message_interval(_HEARTBEAT_ID, HEARTBEAT_RATE_HZ)
-        self._wanted.ask_for_missing(asyncio.get_running_loop().time())
+        self._wanted.ask_for_missing(asyncio.get_running_loop().time(), self.firmware)
 
     # --- what the other messages tell
 

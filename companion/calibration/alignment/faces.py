@@ -132,8 +132,8 @@ def faces(
             break
         worst = mended[0] if mended else min(kept, key=lambda k: without[k].chi_square)
         left_out, fit = (*left_out, worst), without[worst]
-    response, bias = np.eye(3) + _symmetric(fit.figures), fit.figures[BIAS]
-    inside = np.linalg.solve(response, np.array([stand.accel_m_s2 - bias for stand in stands]).T).T
+    stretch, bias = response(fit.figures), fit.figures[BIAS]
+    inside = np.linalg.solve(stretch, np.array([stand.accel_m_s2 - bias for stand in stands]).T).T
     lengths = np.linalg.norm(inside, axis=1)
     return Faces(
         figures=fit.figures,
@@ -162,8 +162,9 @@ class _Fit:
     fits: bool
 
 
-def _symmetric(figures: Array) -> Matrix:
-    result = np.diag(figures[SCALE])
+def response(figures: Array) -> Matrix:
+    """I + S of figures (9,) or more, (3, 3)."""
+    result = np.diag(1.0 + figures[SCALE])
     for (i, j), value in zip(_PAIRS, figures[SHEAR], strict=True):
         result[i, j] = result[j, i] = value
     return result
@@ -190,7 +191,7 @@ def _fit(stands: Sequence[Face], which: Sequence[int], gravity: tuple[float, flo
 
 def _linearised(force: Matrix, variance: Matrix, at: Array, gravity_m_s2: float, prior: Array) -> tuple[Array, Matrix]:
     """Residuals over sigma, measured minus foretold, and the derivatives of what is foretold times the prior sigmas."""
-    inverse = np.linalg.inv(np.eye(3) + _symmetric(at))
+    inverse = np.linalg.inv(response(at))
     inside = (force - at[BIAS]) @ inverse
     lengths = np.linalg.norm(inside, axis=1)
     across = inside / lengths[:, None] @ inverse

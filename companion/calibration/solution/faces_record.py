@@ -27,6 +27,8 @@ from companion.physics.units import MG
 from companion.samples import Vector
 
 FORMAT_VERSION = 1
+SAME_START_S = 30.0
+"""By how much two clocks run apart in weeks; a restart takes away at least all the time that it had been on."""
 
 
 class FaceRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -34,6 +36,21 @@ class FaceRecord(msgspec.Struct, frozen=True, kw_only=True):
 
     up: Vector
     seconds: float
+
+
+class Running(msgspec.Struct, frozen=True, kw_only=True):
+    """Which run of a sensor it was; another one has other biases."""
+
+    host: str
+    """Which start of the companion computer, whose clock counts."""
+    started_s: float
+    """When the sensor's device started, on that clock."""
+    up_s: float
+    """For how long it had been on."""
+
+    def is_same(self, other: Running) -> bool:
+        """Whether the power has surely been on in between."""
+        return self.host == other.host != "" and abs(self.started_s - other.started_s) < SAME_START_S
 
 
 class FacesImuRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,6 +62,8 @@ class FacesImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     corrections: dict[str, float]
     """Offsets and scales in force meanwhile, by parameter."""
     temperature_degc: float | None
+    running: Running | None = None
+    """None where the device does not tell since when it has been on."""
     accel_bias_mg: Determined
     accel_scale: Determined
     accel_shear: Determined
@@ -77,6 +96,7 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True):
     accel_id: int | None
     corrections: dict[str, float]
     temperature_degc: float | None
+    running: Running | None
 
 
 def check(record: FacesRecord) -> None:
@@ -99,6 +119,7 @@ def faces_imu_record(of: Measured, found: Faces, written: dict[str, WrittenParam
         accel_id=of.accel_id,
         corrections=of.corrections,
         temperature_degc=of.temperature_degc,
+        running=of.running,
         accel_bias_mg=_determined(found, BIAS, MG, PRIOR_BIAS_M_S2),
         accel_scale=_determined(found, SCALE, 1.0, PRIOR_SCALE),
         accel_shear=_determined(found, SHEAR, 1.0, PRIOR_SHEAR),

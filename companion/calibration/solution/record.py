@@ -19,6 +19,10 @@ FORMAT_VERSION = 1
 Outcome = Literal["verified", "stored", "failed", "rolled_back"]
 
 
+TiltFrom = Literal["gradienter", "accelerometers"]
+HeadingFrom = Literal["compass", "autopilot"]
+
+
 class PoseSigma(msgspec.Struct, frozen=True, kw_only=True):
     """One-sigma uncertainty of the pose."""
 
@@ -34,6 +38,9 @@ class Pose(msgspec.Struct, frozen=True, kw_only=True):
     gamma_deg: float | None
     psi_deg: float | None
     sigma_deg: PoseSigma
+    tilt_from: TiltFrom | None = None
+    """Whose: "accelerometers" are those of an IMU that was held on all sides before."""
+    heading_from: HeadingFrom | None = None
 
 
 class Site(msgspec.Struct, frozen=True, kw_only=True):

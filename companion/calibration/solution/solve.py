@@ -27,31 +27,35 @@ import math
 from collections.abc import Collection, Mapping
 from typing import Final
 
+import msgspec
 import numpy as np
 
 from companion.calibration.means.pose import (
     CompassModel,
     GradienterModel,
-    TiltWindow,
-    up_in_vehicle,
 )
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.request import What
-from companion.calibration.solution import magnetic
 from companion.calibration.solution.believable import believable, untold, widened
-from companion.calibration.solution.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site
-from companion.calibration.solution.site import LocalEarth, Uncertain
+from companion.calibration.solution.otherwise import NOTHING, Otherwise
+from companion.calibration.solution.record import (
+    Effective,
+    Magnetic,
+    Pose,
+    PoseSigma,
+    Prior,
+    Site,
+)
+from companion.calibration.solution.site import LocalEarth
+from companion.calibration.solution.truth import Truth, truth_of
 from companion.calibration.solution.widened import without_heading
 from companion.calibration.turning.watch import Turn
 from companion.config.sections import Platform
 from companion.errors import CalibrationRefusedError
-from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, skew
-from companion.physics.gradienter import up_in_sensor, up_jacobian
+from companion.physics.frames import Array, Matrix, roll_pitch_from_up, skew
+from companion.physics.gradienter import up_in_sensor
 from companion.physics.units import DEG
 from companion.samples import Triad
-
-# Without a gradienter the accelerometers level the Earth's rate; a 50 mg bias tilts it by 3 degrees (0.8 deg/h).
-LEVEL_BY_ACCELEROMETER_SIGMA_DEG: Final = 3.0
 
 _ON_DECK: Final = "on a deck gyros need a compass: without one a slow turn looks like a bias"
 
@@ -95,34 +99,6 @@ class ImuSolution:
     def use_covariance(self) -> Matrix:
         """The warm-up in it: sigma_use is the root of its diagonal."""
         return self.covariance + np.diag(self.warm_up_variance)
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Truth:
-    """What the sensors should have read, from everything but the sensors themselves."""
-
-    up: Array
-    up_covariance: Matrix
-    attitude_covariance_rad2: Matrix
-    """(3, 3) in vehicle FRD."""
-    up_by_reading: Matrix | None
-    """d up / d (gradienter's readings in radian), (3, 2); None without a gradienter."""
-    reading_sigma_rad: tuple[float, float]
-    """Of the gradienter's two means, without its zero."""
-    heading_rad: float | None = None
-    heading_sigma_rad: float | None = None
-    magnetic: Magnetic | None = None
-    """What the compass' field and steadiness say of the heading; None without a compass."""
-
-    @property
-    def body_from_ned(self) -> Matrix:
-        """The attitude; with an unknown heading, that of heading north."""
-        gamma, theta = roll_pitch_from_up(self.up)
-        return body_from_ned(gamma, theta, self.heading_rad or 0.0)
-
-    def earth_rate(self, local: LocalEarth) -> Uncertain:
-        """The Earth's rate in the vehicle's axes."""
-        return local.rate_in_body(self.body_from_ned, heading_known=self.heading_rad is not None)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -170,19 +146,6 @@ def gyro_bias(mean_rad_s: Array, earth_rate_body_rad_s: Array) -> Array:
     return mean_rad_s - earth_rate_body_rad_s
 
 
-def attitude_error_jacobian(up: Array) -> Matrix:
-    """How a change of `up` turns the attitude, at a fixed heading angle: eps = jacobian @ d up, shape (3, 3).
-
-    C_hat = (I - [eps x]) C. Roll turns about the body's x axis, pitch about the horizontal axis
-    (0, cos gamma, -sin gamma); with gamma = atan2(-u_y, -u_z) and sin theta = u_x.
-    """
-    gamma, theta = roll_pitch_from_up(up)
-    horizontal = np.hypot(up[1], up[2])
-    by_gamma = np.array([0.0, up[2], -up[1]]) / horizontal**2
-    by_theta = np.array([1.0 / np.cos(theta), 0.0, 0.0])
-    return np.outer([1.0, 0.0, 0.0], by_gamma) + np.outer([0.0, np.cos(gamma), -np.sin(gamma)], by_theta)
-
-
 def solve(
     window: Window,
     local: LocalEarth,
@@ -192,8 +155,11 @@ def solve(
     platform: Platform = "ground",
     *,
     any_bias: bool = False,
+    otherwise: Otherwise = NOTHING,
 ) -> Solution:
     """Work out the biases of every IMU of the window; with `any_bias` also such as no part has.
+
+    What is known `otherwise` of the attitude fills in where there is no gradienter, or no compass.
 
     Raises:
         CalibrationRefusedError: the readings cannot be right together, accelerometers were asked for without
@@ -209,10 +175,13 @@ def solve(
                 " calibrate the gyros only"
             )
         warnings.append("no gradienter: gyros only, accelerometers not calibrated")
-    if compass is None:
+    if platform == "deck":
+        # It turns: of a yaw nobody knows when it was true.
+        otherwise = msgspec.structs.replace(otherwise, heading=None)
+    truth = truth_of(window, gradienter, compass, local, warnings, otherwise)
+    if compass is None and truth.heading_rad is None:
         unknown_heading = local.rate_in_body(np.eye(3), heading_known=False).covariance
         warnings += without_heading(window.imus, unknown_heading, local.remedies)
-    truth = truth_of(window, gradienter, compass, local, warnings)
     believed = window.imus if any_bias else believable(window.imus, truth.up, local)
     sailing = np.zeros(3) if window.turn_rad_s is None else np.array(window.turn_rad_s)
     shared = _shared(truth, local, window.turn, 0.0 if gradienter is None else gradienter.sigma_deg * DEG, sailing)
@@ -252,70 +221,14 @@ def solve(
     )
 
 
-def truth_of(
-    window: Window,
-    gradienter: GradienterModel | None,
-    compass: CompassModel | None,
-    local: LocalEarth,
-    warnings: list[str],
-) -> Truth:
-    """How the aircraft stood, from everything but its gyros; what is missing goes into `warnings`.
-
-    Raises:
-        CalibrationRefusedError: the readings cannot be right together.
-    """
-    by_reading: Matrix | None = None
-    reading_sigma = (0.0, 0.0)
-    if gradienter is not None and window.tilt is not None:
-        up, by_reading, up_covariance = _up(window.tilt, gradienter)
-        reading_sigma = (window.tilt.x_sigma_deg * DEG, window.tilt.y_sigma_deg * DEG)
-    else:
-        mean = np.mean([imu.accel_m_s2 for imu in window.imus], axis=0)
-        up = mean / np.linalg.norm(mean)
-        up_covariance = (np.eye(3) - np.outer(up, up)) * (LEVEL_BY_ACCELEROMETER_SIGMA_DEG * DEG) ** 2
-    if math.hypot(up[1], up[2]) < 0.1:
-        raise CalibrationRefusedError("the aircraft stands on its nose or tail (pitch beyond 84 deg): lay it down")
-    jacobian = attitude_error_jacobian(up)
-    without = Truth(up, up_covariance, jacobian @ up_covariance @ jacobian.T, by_reading, reading_sigma)
-    if compass is None or window.heading is None:
-        return without
-    tilt_covariance = None if by_reading is None else up_covariance
-    may_turn_deg = window.turn.at_most_rad_s / DEG * (window.end_s - window.start_s)
-    found = magnetic.assess(window.heading, window.field, compass, local, up, tilt_covariance, may_turn_deg)
-    warnings += found.warnings
-    if not found.is_usable:
-        return dataclasses.replace(without, magnetic=found.magnetic)
-    if compass.magnetic and local.site.declination_deg is None:
-        warnings.append("declination unknown (no position or date): magnetic heading used, sigma widened")
-    # A heading from the field takes part in the tilt's errors: one wrong tilt turns all three angles.
-    turned = jacobian - np.outer(up, found.heading_by_up)
-    return dataclasses.replace(
-        without,
-        attitude_covariance_rad2=turned @ up_covariance @ turned.T + np.outer(up, up) * found.sigma_rad**2,
-        heading_rad=found.heading_rad,
-        heading_sigma_rad=math.sqrt(found.sigma_rad**2 + found.heading_by_up @ up_covariance @ found.heading_by_up),
-        magnetic=found.magnetic,
-    )
-
-
-def _up(tilt: TiltWindow, model: GradienterModel) -> tuple[Array, Matrix, Matrix]:
-    """Up in the vehicle's axes, its derivatives by the readings (3x2), and its covariance (3x3, radian squared)."""
-    x_deg, y_deg = tilt.x_deg - model.offset_deg[0], tilt.y_deg - model.offset_deg[1]
-    try:
-        up = up_in_vehicle(model, tilt.x_deg, tilt.y_deg)
-        jacobian = model.vehicle_from_sensor @ up_jacobian(model.law, x_deg, y_deg)
-    except ValueError as error:
-        raise CalibrationRefusedError(str(error)) from None
-    variance = [(math.hypot(model.sigma_deg, sigma) * DEG) ** 2 for sigma in (tilt.x_sigma_deg, tilt.y_sigma_deg)]
-    return up, jacobian, jacobian @ np.diag(variance) @ jacobian.T
-
-
 def _pose(truth: Truth) -> Pose:
     gamma, theta = roll_pitch_from_up(truth.up)
     up, covariance, heading = truth.up, truth.up_covariance, truth.heading_rad
     by_gamma = np.array([0.0, up[2], -up[1]]) / (up[1] ** 2 + up[2] ** 2)
-    known = truth.up_by_reading is not None
+    known = truth.tilt_from is not None
     return Pose(
+        tilt_from=truth.tilt_from,
+        heading_from=truth.heading_from,
         theta_deg=theta / DEG if known else None,
         gamma_deg=gamma / DEG if known else None,
         psi_deg=(heading / DEG) % 360.0 if heading is not None else None,

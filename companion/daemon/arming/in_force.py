@@ -20,8 +20,7 @@ from companion.calibration.noise.allan import noise_profile
 from companion.calibration.request import What
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.record import ImuRecord, Record
-from companion.calibration.solution.site import local_earth
-from companion.calibration.solution.solve import Solution, solve
+from companion.calibration.solution.solve import Solution
 from companion.calibration.solution.validity import (
     Finding,
     Held,
@@ -36,9 +35,9 @@ from companion.component.service import JobResult
 from companion.config.sections import Config, Imu
 from companion.configured import models
 from companion.daemon.arming.offset_watch import OffsetWatch
-from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.held_back import HeldBack, Key
+from companion.daemon.calibrating.solver import Solver
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
@@ -60,13 +59,10 @@ SETTLED_EVERY_S: Final = 5
 class InForce:
     """The calibration in force; `poll` often, `measure` whenever there may be a new window."""
 
-    def __init__(
-        self, core: Core, imus: Mapping[str, AutopilotImu], conductor: Conductor, alignment: AlignmentInForce
-    ) -> None:
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], conductor: Conductor, solver: Solver) -> None:
         self._core, self._config, self._conductor = core, core.config, conductor
         config = core.config
-        self._vehicle, self._collector, self._offload = core.vehicle, core.collector, core.offload
-        self._imus, self._alignment = imus, alignment
+        self._imus, self._solver = imus, solver
         wanted = config.calibration
         self._limits = Limits(
             max_age_s=60.0 * wanted.max_age_min, max_temperature_change_k=wanted.max_temperature_change_degc
@@ -93,7 +89,7 @@ class InForce:
         """The last finished calibration of this run, while at least one of its values is in force."""
         self.undone = False
         conductor.on_ended.add(self._on_ended)
-        alignment.on_change.add(self._realigned)
+        solver.alignment.on_change.add(self._realigned)
 
     # --- what is known
 
@@ -297,12 +293,7 @@ class InForce:
         self._measured_s = window.end_s
         known = self._offsets.known()
         try:
-            where = models.whereabouts(self._config, self._vehicle)
-            poses = self._alignment.model(), models.compass_model(self._config.compass)
-            platform, any_bias = self._config.vehicle.platform, self._config.calibration.any_bias
-            solution: Solution = await self._offload(
-                lambda: solve(window, local_earth(where), *poses, self.what, platform, any_bias=any_bias)
-            )
+            solution, _ = await self._solver.solve(window, self.what)
         except CalibrationRefusedError:
             self._forget()
             return True

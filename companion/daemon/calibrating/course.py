@@ -24,16 +24,15 @@ from companion.calibration.solution.draft import Draft, unseen_turn
 from companion.calibration.solution.history import Point
 from companion.calibration.solution.joint import Weighed, weigh
 from companion.calibration.solution.prior import Expectation
-from companion.calibration.solution.site import Whereabouts, local_earth
-from companion.calibration.solution.solve import Solution, solve
+from companion.calibration.solution.solve import Solution
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity
 from companion.component.tunes import Tune
 from companion.config.sections import Platform
 from companion.configured import models
 from companion.daemon.calibrating import held_back
-from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.calibrating.bias_memory import BiasMemory
+from companion.daemon.calibrating.solver import Given, Solver
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, not_ready
 from companion.daemon.job import Job
@@ -175,10 +174,10 @@ class Measuring:
 class Solving:
     """Works out biases, and remembers those that have come to a good end."""
 
-    def __init__(self, core: Core, alignment: AlignmentInForce, memory: BiasMemory) -> None:
-        self._core, self._alignment, self._memory = core, alignment, memory
-        self.on_solved: Listeners[Window, Window, Whereabouts, What, Expectation] = Listeners()
-        """Told of every solution: the window measured and used, the place, what was asked for, what was known."""
+    def __init__(self, core: Core, solver: Solver, memory: BiasMemory) -> None:
+        self._core, self._solver, self._memory = core, solver, memory
+        self.on_solved: Listeners[Window, Window, Given, What, Expectation] = Listeners()
+        """Told of every solution: the window measured and used, what else was given, what was asked for and known."""
         self._written = {imu.name for imu in core.config.imu if imu.source == "autopilot" or imu.autopilot_instance}
         """IMUs whose offsets are in the autopilot."""
 
@@ -191,21 +190,15 @@ class Solving:
         Raises:
             AutopilotError: the offsets in force are not known at the moment.
         """
-        config, offload, memory = self._core.config, self._core.offload, self._memory
-        where = models.whereabouts(config, self._core.vehicle)
-        poses = self._alignment.model(), models.compass_model(config.compass)
-        platform = config.vehicle.platform
-        any_bias = config.calibration.any_bias
-        solution: Solution = await offload(
-            lambda: solve(window, local_earth(where), *poses, job.what, platform, any_bias=any_bias)
-        )
-        draft.alignment, draft.solution = self._alignment.used, solution
+        offload, memory = self._core.offload, self._memory
+        solution, given = await self._solver.solve(window, job.what)
+        draft.alignment, draft.solution = self._solver.alignment.used, solution
         draft.measured_s = (measured.start_s, measured.end_s)
         unix_s = draft.started_at.timestamp()
         for name, words in memory.forgotten().items():
             draft.warn(name, words)
         expectation: Expectation = await offload(memory.expectation, solution, unix_s)
-        self.on_solved.tell(measured, window, where, job.what, expectation)
+        self.on_solved.tell(measured, window, given, job.what, expectation)
         whole = memory.whole(solution)
         weighed: Weighed = await offload(weigh, solution, whole, expectation)
         started_at = draft.started_at.isoformat(timespec="milliseconds")

@@ -2,33 +2,31 @@
 
 from __future__ import annotations
 
-import datetime
-from typing import Final
+import asyncio
+from collections.abc import Mapping
 
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
-from companion.calibration.alignment.faces import BIAS, FIGURES, SCALE, Accelerometer
-from companion.calibration.solution.faces_record import FacesImuRecord, FacesRecord
-from companion.config.sections import Config
-from companion.daemon.core import Offload
+from companion.calibration.alignment.faces import BIAS, FIGURES, SCALE, SHEAR, Accelerometer
+from companion.calibration.means.windows import Window
+from companion.calibration.noise.allan import noise_profile
+from companion.calibration.solution.faces_record import FacesImuRecord, FacesRecord, Running
+from companion.calibration.solution.otherwise import Sides, aged_m_s2
+from companion.daemon.core import Core
+from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.physics.frames import Array
 from companion.physics.units import MG
-from companion.storage.learned import FacesStore
-
-FRESH_S: Final = 3600.0
-AGED_MG: Final = 0.3
-"""One sigma of what another power-up or hours make of a bias; the ordinary parts' own figure is not known better."""
-PER_KELVIN_MG: Final = 0.2
-UNKNOWN_K: Final = 5.0
-"""Change of temperature that is assumed where it is not known."""
+from companion.storage.learned import FacesStore, this_boot
 
 
 class FacesInForce:
     """The latest measurement, on disk and in memory."""
 
-    def __init__(self, config: Config, offload: Offload) -> None:
-        self._store, self._offload = FacesStore(config.storage.path), offload
+    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
+        self._store, self._offload = FacesStore(core.config.storage.path), core.offload
+        self._collector, self._profiles, self._imus = core.collector, core.profiles, imus
+        self._host = this_boot()
         self.record: FacesRecord | None = None
 
     def load(self) -> None:
@@ -44,6 +42,24 @@ class FacesInForce:
         await self._offload(self._store.write, record)
         self.record = record
 
+    def running(self, name: str) -> Running | None:
+        """Since when an IMU has been on; None where it does not tell."""
+        up_s = self._collector.up_s(name)
+        if up_s is None or not self._host:
+            return None
+        return Running(host=self._host, started_s=asyncio.get_running_loop().time() - up_s, up_s=up_s)
+
+    def sides(self, window: Window) -> dict[str, Sides]:
+        """By IMU, for a tilt from these means."""
+        found = {}
+        for imu in window.imus:
+            source = self._imus.get(imu.name)
+            calibration = None if source is None else source.calibration
+            known = None if calibration is None else self.known(imu.name, calibration, imu.temperature_degc)
+            if known is not None and calibration is not None:
+                found[imu.name] = Sides.of(known, calibration.orientation)
+        return found
+
     def known(self, name: str, calibration: ImuCalibration, temperature_degc: float | None) -> Accelerometer | None:
         """Of one IMU's output under what corrects it now, in its own axes; None where nothing is known of this part."""
         if self.record is None:
@@ -57,17 +73,15 @@ class FacesInForce:
             scale = np.array([kept.corrections[one] for one in names.accel_scale])
         except KeyError:
             return None
-        return _under(calibration, kept, offset, scale, self._widened(self.record, kept, temperature_degc))
+        return _under(calibration, kept, offset, scale, self._widened(kept, temperature_degc))
 
-    def _widened(self, record: FacesRecord, kept: FacesImuRecord, temperature_degc: float | None) -> float:
-        """What has come to the biases' sigma since, m/s^2."""
-        measured = datetime.datetime.fromisoformat(record.measured_at)
-        age_s = (datetime.datetime.now(tz=datetime.UTC) - measured).total_seconds()
-        if kept.temperature_degc is None or temperature_degc is None:
-            kelvin = UNKNOWN_K if age_s > FRESH_S else 0.0
-        else:
-            kelvin = temperature_degc - kept.temperature_degc
-        return float(np.hypot(AGED_MG if abs(age_s) > FRESH_S else 0.0, PER_KELVIN_MG * kelvin)) * MG
+    def _widened(self, kept: FacesImuRecord, temperature_degc: float | None) -> float:
+        """What has come to the biases' sigma since, m/s^2: drift and temperature, or another power-up."""
+        now, before = self.running(kept.name), kept.running
+        gap_s = now.up_s - before.up_s if now is not None and before is not None and before.is_same(now) else None
+        degrees = kept.temperature_degc, temperature_degc
+        kelvin = None if degrees[0] is None or degrees[1] is None else degrees[1] - degrees[0]
+        return aged_m_s2(noise_profile(self._profiles.of(kept.name)).accel, gap_s, kelvin)
 
 
 def _under(
@@ -83,6 +97,7 @@ def _under(
     now, taken_off = np.array(calibration.accel_scale), np.array(calibration.accel_offset_m_s2)
     figures, sigma = np.zeros(FIGURES), np.zeros(FIGURES)
     figures[BIAS], figures[SCALE] = now * (right_offset - taken_off), now / right_scale - 1.0
+    figures[SHEAR] = kept.accel_shear.value
     sigma[BIAS] = np.hypot(np.array(kept.accel_bias_mg.sigma) * MG, widened_m_s2)
-    sigma[SCALE] = kept.accel_scale.sigma
+    sigma[SCALE], sigma[SHEAR] = kept.accel_scale.sigma, kept.accel_shear.sigma
     return Accelerometer(figures, np.diag(sigma**2))

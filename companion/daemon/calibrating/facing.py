@@ -172,7 +172,13 @@ class Facing:
         degrees = {imu.name: imu.temperature_degc for imu in last.imus}
         calibrations = {name: self._imus[name].in_force for name in by_imu}
         return [
-            Measured(name=name, accel_id=one.accel_id, corrections=one.corrections, temperature_degc=degrees.get(name))
+            Measured(
+                name=name,
+                accel_id=one.accel_id,
+                corrections=one.corrections,
+                temperature_degc=degrees.get(name),
+                running=self._kept.running(name),
+            )
             for name, one in calibrations.items()
         ]
 

@@ -8,6 +8,7 @@ from typing import Final
 
 import msgspec
 
+from companion.autopilot.vehicle.own_attitude import OwnAttitude
 from companion.calibration.request import What, is_time_limit
 from companion.calibration.solution.record import Record
 from companion.component.service import Refusal
@@ -20,6 +21,7 @@ from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.course import Course, Measuring, Solving
 from companion.daemon.calibrating.faces_in_force import FacesInForce
 from companion.daemon.calibrating.facing import Facing
+from companion.daemon.calibrating.solver import Solver
 from companion.daemon.calibrating.stands import Stands
 from companion.daemon.calibrating.turning import TurnAsked, Turning
 from companion.daemon.calibrating.why_not import Rung
@@ -56,11 +58,13 @@ class Calibrating(Subsystem):
         self.alignment = AlignmentInForce(config, core.offload)
         self.memory = BiasMemory(core, imus, devices.sensors, self.alignment)
         measuring = Measuring(core, imus)
-        self.solving = Solving(core, self.alignment, self.memory)
+        self.faces = FacesInForce(core, imus)
+        own = OwnAttitude(core.vehicle, wanted=config.compass is None)
+        self.solver = Solver(core, self.alignment, self.faces, own)
+        self.solving = Solving(core, self.solver, self.memory)
         ditherer = Ditherer(core, imus, offsets.writer, offsets.ledger)
         self.conclusion = Conclusion(core, offsets.effect, offsets.firmware)
         course = Course(core, measuring, self.solving, ditherer, offsets.planner, offsets.pusher, self.conclusion)
-        self.faces = FacesInForce(config, core.offload)
         self.stands = stands = Stands(core, imus, measuring)
         writes = AccelWrites(core, imus, offsets, self.conclusion)
         aligner = Aligner(core, stands, self.alignment)

@@ -25,7 +25,7 @@ from companion.calibration.means.windows import Window
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.solution.record import ImuRecord
 from companion.calibration.solution.site import LocalEarth, Whereabouts, local_earth
-from companion.calibration.solution.solve import truth_of
+from companion.calibration.solution.truth import truth_of
 from companion.config.sections import Config, Imu
 from companion.configured import models
 from companion.daemon.arming.in_force import InForce

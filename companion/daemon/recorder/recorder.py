@@ -25,6 +25,7 @@ from companion.calibration.solution.site import Whereabouts
 from companion.component.service import JobResult
 from companion.config.sections import Config
 from companion.configured import models
+from companion.daemon.calibrating.solver import Given
 from companion.daemon.calibrating.subsystem import Calibrating
 from companion.daemon.core import Core, Handler, Subsystem, Task
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -147,15 +148,14 @@ class Recorder(Subsystem):
     def _on_serial(self, name: str, data: bytes | None, t_s: float) -> None:
         self._journal.raw(topics.SERIAL + name, t_s, data)
 
-    def _on_solved(
-        self, measured: Window, refined: Window, where: Whereabouts, what: What, expectation: Expectation
-    ) -> None:
+    def _on_solved(self, measured: Window, refined: Window, given: Given, what: What, expectation: Expectation) -> None:
         """A calibration's biases have been worked out; what from, besides the readings."""
         used = self._alignment.used
         solved = Solved(
             window=self._collector.number_of(measured),
             refined=refined if refined is not measured else None,
-            where=where,
+            where=given.where,
+            otherwise=given.otherwise,
             what=what.name,
             offsets=self._around.read_offsets(),
             alignment=None if used is None else (*used.offset_deg, used.sigma_deg),

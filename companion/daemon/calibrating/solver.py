@@ -1,0 +1,65 @@
+"""What the science needs besides a window's means, in one place.
+
+That is the site, gradienter and compass as they are in force, and what fills in where one of them is missing.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from companion.autopilot.vehicle.own_attitude import OwnAttitude
+from companion.calibration.means.windows import Window
+from companion.calibration.request import What
+from companion.calibration.solution.otherwise import NOTHING, Otherwise
+from companion.calibration.solution.site import Whereabouts, local_earth
+from companion.calibration.solution.solve import Solution, solve
+from companion.configured import models
+from companion.daemon.calibrating.alignment import AlignmentInForce
+from companion.daemon.calibrating.faces_in_force import FacesInForce
+from companion.daemon.core import Core
+
+
+class Given(NamedTuple):
+    """What a solution was made of, besides the readings."""
+
+    where: Whereabouts
+    otherwise: Otherwise
+
+
+class Solver:
+    """Works out biases from a window."""
+
+    def __init__(self, core: Core, alignment: AlignmentInForce, faces: FacesInForce, own: OwnAttitude) -> None:
+        self._core, self.alignment, self._faces, self._own = core, alignment, faces, own
+
+    async def solve(self, window: Window, what: What) -> tuple[Solution, Given]:
+        """The biases, and what else they were made of.
+
+        Raises:
+            CalibrationRefusedError: as `solve`.
+        """
+        config = self._core.config
+        given = Given(models.whereabouts(config, self._core.vehicle), self._otherwise(window))
+        poses = self.alignment.model(), models.compass_model(config.compass)
+        platform, any_bias = config.vehicle.platform, config.calibration.any_bias
+        found: Solution = await self._core.offload(
+            lambda: solve(
+                window,
+                local_earth(given.where),
+                *poses,
+                what,
+                platform,
+                any_bias=any_bias,
+                otherwise=given.otherwise,
+            )
+        )
+        return found, given
+
+    def _otherwise(self, window: Window) -> Otherwise:
+        config = self._core.config
+        if config.gradienter is not None and config.compass is not None:
+            return NOTHING
+        return Otherwise(
+            sides=self._faces.sides(window) if config.gradienter is None else {},
+            heading=self._own.heading() if config.compass is None else None,
+        )
