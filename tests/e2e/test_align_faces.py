@@ -250,7 +250,7 @@ def test_with_all_sides_known_later_calibrations_have_a_tilt_and_the_autopilots_
             await made.ready()
             before = await calibration()
             assert before.pose is not None
-            assert before.pose.tilt_from is before.pose.heading_from is before.pose.theta_deg is None
+            assert {before.pose.tilt_from, before.pose.heading_from, before.pose.theta_deg} == {None}
             result = await follow(made, hands, faced(made, write=firmware == "ardupilot"))
             assert result.outcome == "done", result
             hands.spot(made.aircraft.time_at(made.now_s), 3.0, -4.0)

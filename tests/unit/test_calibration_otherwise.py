@@ -65,7 +65,8 @@ class Wandering(Sensor):
 
     def later(self, known: Accelerometer, gap_s: float, step_m_s2: Floats, aged_m_s2: float) -> Later:
         """On some ground, with a bias that has stepped besides."""
-        pose = Pose(*self.rng.uniform(-8.0, 8.0, 2), self.rng.uniform(0.0, 360.0))
+        pitch, roll = map(float, self.rng.uniform(-8.0, 8.0, 2))
+        pose = Pose(pitch, roll, float(self.rng.uniform(0.0, 360.0)))
         truth = VirtualAircraft(pose, SITE).truth_at(0.0)
         force = TURN.T @ np.asarray(truth.force_m_s2)
         read = self.mean(EVERY_S * len(TWELVE) + gap_s, force) + step_m_s2
@@ -135,7 +136,7 @@ def test_without_sides_nobody_knows_the_tilt() -> None:
     later = sensor.later(sensor.known(), 60.0, np.zeros(3), 0.0)
     window = still(np.array([0.1, 0.2, -9.8]), GYRO_BIAS, sensor.stat, sensor.use)
     without = solve(window, LOCAL, None, None, What.BOTH).pose
-    assert without.tilt_from is without.theta_deg is without.gamma_deg is without.sigma_deg.theta is None
+    assert {without.tilt_from, without.theta_deg, without.gamma_deg, without.sigma_deg.theta} == {None}
     assert later.solution.imus[0].accel_m_s2 is None, "a tilt by the accelerometers says nothing of themselves"
     assert "tilt by the accelerometers of imu fc, known from all sides" in " ".join(later.solution.warnings)
 

@@ -170,14 +170,7 @@ class Vehicle:
     def hear(
         self, message: type[M], handler: Handler[M], rate_hz: float | None = None, of: Firmware | None = None
     ) -> None:
-        """Hand over every such message of the latched autopilot, and ask for them at a rate, if one is given.
-
-        Args:
-            message: which.
-            handler: told of each, with its time.
-            rate_hz: None: they come by themselves, or do not.
-            of: the firmware that has it, where not all do.
-        """
+        """Hand over every such message of the latched autopilot; with a rate, ask for it (`of` a firmware) too."""
         self._link.subscribe(message, self._of_ours(handler))
         if rate_hz is not None:
             self._wanted.add(message, rate_hz, of)
