@@ -87,7 +87,12 @@ class Facing:
             self._machine.on(Event.ENOUGH)
             where = models.whereabouts(self._core.config, self._core.vehicle)
             local = await self._core.offload(local_earth, where)
-            before, known = known, await self._core.offload(self._solve, windows, local)
+            try:
+                before, known = known, await self._core.offload(self._solve, windows, local)
+            except CalibrationRefusedError:
+                # Somebody's other offsets in between would do that.
+                await self._stands.check_offsets()
+                raise
             self._name_left_out(before, known)
         assert local is not None
         await self._stands.check_offsets()
