@@ -174,8 +174,8 @@ def test_without_a_compass_the_gyros_tell_the_turn(tmp_path: Path) -> None:
             await made.ready()
             job = started(made.service.calibrating.conductor.start_alignment(Plan("zero"), "test", 900.0))
             await moved(made, hands, job, 2, 100.0)
-            await made.until(lambda: "turn it by" in job.words and "deg more" in job.words, 60.0)
-            assert re.search(r"stands (99|100|101) deg from where it stood first, should be 180", job.words)
+            await made.until(lambda: "turn it by" in job.words and "degrees more" in job.words, 60.0)
+            assert re.search(r": (99|100|101) degrees, not 180: turn", job.words)
             hands.turn(made.aircraft.time_at(made.now_s), 80.0)
             await moved(made, hands, job, 3, -180.0)
             result = await job.finished

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import re
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
-from companion.daemon.calibrating.align_steps import Plan, Seen, objection, request, turned_deg
+from companion.calibration.alignment.missing import Missing, up_of
+from companion.daemon.calibrating.align_steps import Hold, Plan, Seen, hold, objection, request, turned_deg
+from companion.daemon.calibrating.stands import Asked
 
 
 def stands(heading_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Seen:
@@ -35,11 +40,11 @@ def test_there_and_back() -> None:
     plan = Plan("zero")
     assert "marked spot" in request(plan, [])
     assert objection(plan, [], LEVEL) is None
-    assert "by 180 deg" in request(plan, [LEVEL])
+    assert "by 180 degrees" in request(plan, [LEVEL])
     for heading in (170.0, 150.0, 195.0):
         assert objection(plan, [LEVEL], stands(heading)) is None
     said = objection(plan, [LEVEL], stands(90.0))
-    assert said == "it stands 100 deg from where it stood first, should be 180: turn it by 80 deg more"
+    assert said == "100 degrees, not 180: turn it by 80 degrees more"
     assert "turn it back" in request(plan, [LEVEL, stands(170.0)])
     assert objection(plan, [LEVEL, stands(170.0)], stands(5.0)) is None
     assert objection(plan, [LEVEL, stands(170.0)], stands(170.0)) is not None
@@ -50,8 +55,8 @@ def test_quarters_in_any_order() -> None:
     taken = [LEVEL, stands(260.0)]
     assert objection(plan, taken, stands(80.0)) is None
     assert objection(plan, taken, stands(170.0)) is None
-    assert "270 deg from the first was measured already" in (objection(plan, taken, stands(265.0)) or "")
-    assert "0 deg from the first was measured already" in (objection(plan, taken, stands(352.0)) or "")
+    assert "270 degrees again" in (objection(plan, taken, stands(265.0)) or "")
+    assert "0 degrees again" in (objection(plan, taken, stands(352.0)) or "")
     assert "make it 90, 180 or 270" in (objection(plan, taken, stands(350.0 + 45.0)) or "")
 
 
@@ -59,10 +64,10 @@ def test_tilts_to_sides_not_yet_taken() -> None:
     plan = Plan("tilts")
     spot = [stands(350.0), stands(80.0), stands(170.0), stands(260.0)]
     assert "nose up, nose down, left or right side down" in request(plan, spot)
-    assert "tilted by 5 deg only" in (objection(plan, spot, stands(3.0, 5.0)) or "")
+    assert "tilted by 5 degrees only" in (objection(plan, spot, stands(3.0, 5.0)) or "")
     taken = [*spot, stands(3.0, 22.0), stands(9.0, 0.0, -22.0)]
     assert "not nose up or left side down again" in request(plan, taken)
-    assert "nose up was measured already" in (objection(plan, taken, stands(0.0, 20.0, 5.0)) or "")
+    assert "nose up again" in (objection(plan, taken, stands(0.0, 20.0, 5.0)) or "")
     assert objection(plan, taken, stands(0.0, -20.0)) is None
     assert objection(plan, taken, stands(0.0, 1.0, 25.0)) is None
 
@@ -70,3 +75,51 @@ def test_tilts_to_sides_not_yet_taken() -> None:
 def test_a_turn_by_the_gyros() -> None:
     rate = math.radians(18.0)
     assert turned_deg([rate + 0.001] * 10, 0.001) == pytest.approx(180.0)
+
+
+SIDES = ("level", "on its back", "nose up", "nose down", "left side down", "right side down")
+EDGES = [
+    f"half way between {a} and {b}"
+    for a, b in itertools.combinations(SIDES, 2)
+    if SIDES.index(a) // 2 != SIDES.index(b) // 2
+]
+
+
+def every_request() -> Iterator[Asked]:
+    """With the longest words and numbers that there can be."""
+    for plan in (Plan("zero"), Plan("zero", headings=4, back=True), Plan("tilts")):
+        spot = [stands(heading) for heading in (0.0, 90.0, 180.0, 270.0, 0.0)][: plan.on_spot]
+        tilted = [stands(0.0, 22.0), stands(0.0, -22.0), stands(0.0, 0.0, -22.0), stands(0.0, 0.0, 22.0)]
+        taken = [*spot, *tilted][: plan.total]
+        for number in range(plan.total):
+            yield Asked(number + 1, plan.total, request(plan, taken[:number]), hold(plan, taken[:number]))
+    for side in (*SIDES, *EDGES):
+        wish = Missing(side, "z scale 0.46 %")
+        yield Asked(24, 24, str(wish), Hold(up_of(side)), wish.aloud)
+
+
+def test_what_is_asked_for_is_one_line_to_be_heard() -> None:
+    for asked in every_request():
+        assert len(asked.spoken) <= 50, asked.spoken
+        assert not re.search(r"\b(deg|mg|s)\b|[%/;]", asked.spoken), "no abbreviations: it is spoken"
+    spoken = [asked.spoken for asked in every_request()]
+    assert "2 of 3: turn it by 180 degrees, onto its marks" in spoken
+    assert "24 of 24: between level and nose up" in spoken
+
+
+def test_what_is_wrong_with_a_turn_or_a_tilt_is_one_line_too() -> None:
+    tilts = Plan("tilts")
+    spot = [stands(heading) for heading in (0.0, 90.0, 180.0, 270.0)]
+    tilted = [*spot, stands(0.0, 0.0, 22.0)]
+    said = [
+        objection(Plan("zero"), [LEVEL], stands(10.0)),
+        objection(Plan("zero"), [LEVEL, stands(180.0)], stands(180.0)),
+        objection(Plan("zero", headings=4), [LEVEL], stands(224.0)),
+        objection(Plan("zero", headings=4), [LEVEL, stands(270.0)], stands(270.0)),
+        objection(tilts, spot, stands(0.0, 12.0)),
+        objection(tilts, tilted, stands(0.0, 0.0, 25.0)),
+    ]
+    for words in said:
+        assert words is not None
+        assert len(words) <= 50, words
+        assert not re.search(r"\bdeg\b|[%/;]", words), words

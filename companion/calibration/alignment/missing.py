@@ -23,6 +23,7 @@ FACE_DEG: Final = 30.0
 _STAND_SIGMA_M_S2: Final = 0.03 * MG
 """What the mean of a coming stand will be good for, about."""
 _AXES: Final = "xyz"
+HALF_WAY: Final = "half way "
 _SIDES: Final = {
     "level": (0, 0, -1),
     "on its back": (0, 0, 1),
@@ -44,6 +45,11 @@ class Missing:
 
     def __str__(self) -> str:
         return f"{self.side} is missing: {self.figure}"
+
+    @property
+    def aloud(self) -> str:
+        """The stand alone, in 39 characters at most."""
+        return self.side.removeprefix(HALF_WAY)
 
 
 def missing(found: Faces, vehicle_from_sensor: Matrix) -> Missing | None:
@@ -99,7 +105,7 @@ def _not_seen(found: Faces, vehicle_from_sensor: Matrix) -> list[tuple[str, Arra
 def _all_sides(vehicle_from_sensor: Matrix) -> list[tuple[str, Array]]:
     faces = {name: np.array(up, dtype=np.float64) for name, up in _SIDES.items()}
     edges = {
-        f"half way between {a} and {b}": (faces[a] + faces[b]) / np.sqrt(2.0)
+        f"{HALF_WAY}between {a} and {b}": (faces[a] + faces[b]) / np.sqrt(2.0)
         for a, b in itertools.combinations(faces, 2)
         if not faces[a] @ faces[b]
     }

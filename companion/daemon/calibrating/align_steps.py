@@ -75,18 +75,19 @@ class Seen:
 
 
 def request(plan: Plan, taken: Sequence[Seen]) -> str:
-    """What the person at the aircraft should do now."""
+    """What the person at the aircraft should do now; up to a colon it is spoken aloud too (`Asked.spoken`)."""
     number = len(taken)
     if number == 0:
-        return "stand it on a firm, marked spot, hands off"
+        return "stand it on a firm, marked spot"
     if number >= plan.on_spot:
         done = [_side(taken[0].up, seen.up) for seen in taken[plan.on_spot :]]
-        already = f", not {' or '.join(done)} again" if done else ": nose up, nose down, left or right side down"
-        return f"tilt it 20 to 28 deg and prop it up{already}"
+        if done:
+            return f"tilt it to another side, prop it up: not {' or '.join(done)} again"
+        return "tilt it 20 to 28 degrees, prop it up: nose up, nose down, left or right side down"
     if plan.on_spot >= HEADINGS:
-        return "turn it by 90 deg on its spot"
+        return "turn it by 90 degrees on its spot"
     if number == 1:
-        return "turn it by 180 deg, onto its marks"
+        return "turn it by 180 degrees, onto its marks"
     return "turn it back onto its first marks"
 
 
@@ -114,28 +115,25 @@ def objection(plan: Plan, taken: Sequence[Seen], now: Seen) -> str | None:
         wanted = 180.0 if number == 1 else 0.0
         off = _wrapped(turned - wanted)
         if abs(off) > TURN_TOLERANCE_DEG:
-            return (
-                f"it stands {abs(turned):.0f} deg from where it stood first, should be {wanted:.0f}: turn it by"
-                f" {abs(off):.0f} deg more"
-            )
+            return f"{abs(turned):.0f} degrees, not {wanted:.0f}: turn it by {abs(off):.0f} degrees more"
         return None
     tilt_deg = math.degrees(math.acos(float(np.clip(now.up @ first.up, -1.0, 1.0))))
     if tilt_deg < LEAST_TILT_DEG:
-        return f"tilted by {tilt_deg:.0f} deg only: make it 20 to 28"
+        return f"tilted by {tilt_deg:.0f} degrees only: make it 20 to 28"
     for seen in taken[plan.on_spot :]:
         apart = abs(_wrapped(_azimuth(first.up, seen.up) - _azimuth(first.up, now.up)))
         if apart < APART_DEG:
-            return f"{_side(first.up, now.up)} was measured already: tilt it to another side"
+            return f"{_side(first.up, now.up)} again: tilt it to another side"
     return None
 
 
 def _quarter(taken: Sequence[Seen], turned_deg: float) -> str | None:
     near = round(turned_deg / QUARTER_DEG) * QUARTER_DEG
     if abs(_wrapped(turned_deg - near)) > TURN_TOLERANCE_DEG:
-        return f"it stands {turned_deg % 360.0:.0f} deg from where it stood first: make it 90, 180 or 270"
+        return f"{turned_deg % 360.0:.0f} degrees: make it 90, 180 or 270"
     for seen in taken:
         if abs(_wrapped(seen.heading_deg - taken[0].heading_deg - near)) <= APART_DEG:
-            return f"{near % 360.0:.0f} deg from the first was measured already: turn it on by 90 deg"
+            return f"{near % 360.0:.0f} degrees again: turn it on by 90 degrees"
     return None
 
 

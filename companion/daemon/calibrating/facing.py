@@ -47,6 +47,8 @@ class _Known(NamedTuple):
     """The stand that is missing, in words; None where nothing is."""
     hold: Hold = Hold(LEVEL)
     """The same as a picture."""
+    aloud: str = ""
+    """The same, to be heard."""
 
 
 class Facing:
@@ -126,7 +128,7 @@ class Facing:
                     return window, f"it stands as in stand {again + 1}: {known.wish}"
             return window, None
 
-        asked = Asked(number, max(EXPECTED, number), known.wish or "", known.hold)
+        asked = Asked(number, max(EXPECTED, number), known.wish or "", known.hold, known.aloud)
         # No stand hangs on another, so that a flight in between costs nothing.
         return await self._stands.next(job, asked, take, if_armed=None)
 
@@ -153,7 +155,9 @@ class Facing:
             wish = wish or missing(found, imu.calibration.orientation)
         if not by_imu:
             raise CalibrationRefusedError("no IMU whose accelerometers can be read")
-        return _Known(by_imu, None) if wish is None else _Known(by_imu, str(wish), Hold(up_of(wish.side)))
+        if wish is None:
+            return _Known(by_imu, None)
+        return _Known(by_imu, str(wish), Hold(up_of(wish.side)), wish.aloud)
 
     def _face(self, imu: ImuWindow) -> Face:
         """In the sensor's own axes, in which firmwares scale."""

@@ -17,7 +17,7 @@ import numpy as np
 from companion.calibration.alignment.align_model import ImuStand
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.component.service import JobResult
-from companion.component.statustext import Severity
+from companion.component.statustext import CHUNK_BYTES, Severity
 from companion.component.tunes import Tune
 from companion.daemon.calibrating.align_steps import LEVEL, Hold
 from companion.daemon.calibrating.course import POLL_S, Measuring
@@ -45,6 +45,13 @@ class Asked(NamedTuple):
     """How to stand it."""
     hold: Hold
     """The same as a picture."""
+    aloud: str = ""
+    """The same in at most 39 characters, where the wish up to its first colon is longer."""
+
+    @property
+    def spoken(self) -> str:
+        """One line of STATUSTEXT, to be heard."""
+        return f"{self.number} of {self.total}: {self.aloud or self.wish.partition(':')[0]}"
 
 
 class StandsShown(msgspec.Struct):
@@ -108,11 +115,13 @@ class Stands:
             JobCancelledError: cancelled.
         """
         loop = asyncio.get_running_loop()
-        number, total, wish, _ = asked
+        number, total, wish, *_ = asked
         shown = self._show(asked)
         if number > 1:
             self._core.tunes.play(Tune.NEXT)
-        self._say(Severity.NOTICE, f"Align {number}/{total}: {wish}")
+        self._say(Severity.NOTICE, asked.spoken)
+        if (whole := f"{number} of {total}: {wish}") != asked.spoken:
+            self._say(Severity.INFO, whole)
         # Whoever asks may yet put it down on a better spot: what was before that does not count.
         since_s = loop.time() if self._end_s is None else self._end_s
         moved, why, held = self._end_s is None, "", False
@@ -134,7 +143,7 @@ class Stands:
                 words = f"measuring, {max(still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
                 if not held:
                     held = True
-                    self._core.tunes.play(Tune.HOLD_STILL)
+                    self._core.prompt(Tune.HOLD_STILL, "Hold still")
             self._measuring.show(measuring=share > 0.0)
             job.progress(100.0 * (number - 1 + share) / total, f"{number} of {total}: {words}")
             shown.words, shown.share, shown.objection = words, round(share, 3), why or None
@@ -148,13 +157,21 @@ class Stands:
                     return found
                 moved, why = False, objection
                 self._measuring.show(measuring=False)
-                self._core.prompt(Tune.WRONG, f"Align: {objection}")
+                self._object(objection, asked)
             await job.pause(POLL_S)
 
     def _show(self, asked: Asked) -> StandsShown:
         assert self.shown is not None
-        self.shown.number, self.shown.total, self.shown.wish, self.shown.hold = asked
+        self.shown.number, self.shown.total, self.shown.wish, self.shown.hold, _ = asked
         return self.shown
+
+    def _object(self, objection: str, asked: Asked) -> None:
+        """In one line to be heard; where that holds no more than the reason, with what is asked for once more."""
+        if len(objection) <= CHUNK_BYTES:
+            self._core.prompt(Tune.WRONG, objection)
+        else:
+            self._core.prompt(Tune.WRONG, objection.partition(":")[0])
+            self._say(Severity.NOTICE, asked.spoken)
 
     @contextlib.contextmanager
     def imus_alone(self) -> Iterator[None]:
