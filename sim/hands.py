@@ -59,11 +59,19 @@ class Hands:
         placement_deg: one sigma of how the down axis misses the spot's normal each time, each axis.
         propped_deg: one sigma of how pitch and roll miss what was wanted, propped up by hand.
         seed: of both.
+        takes_s: how long each movement lasts.
     """
 
     def __init__(
-        self, aircraft: VirtualAircraft, *, placement_deg: float = 0.0, propped_deg: float = 0.0, seed: int = 0
+        self,
+        aircraft: VirtualAircraft,
+        *,
+        placement_deg: float = 0.0,
+        propped_deg: float = 0.0,
+        seed: int = 0,
+        takes_s: float = TAKES_S,
     ) -> None:
+        self._takes_s = takes_s
         self._aircraft, self._placement_deg, self._propped_deg = aircraft, placement_deg, propped_deg
         self._random = np.random.default_rng([seed, 31])
         pose = aircraft.pose
@@ -143,15 +151,15 @@ class Hands:
         self._aircraft.add(
             Turn(
                 start_s=t_s,
-                duration_s=TAKES_S,
+                duration_s=self._takes_s,
                 roll_deg=math.remainder(roll - before.roll_deg, 360.0),
                 pitch_deg=pitch - before.pitch_deg,
                 heading_deg=turn,
             )
         )
-        self._aircraft.add(Handling(start_s=t_s, duration_s=TAKES_S, seed=self._number))
+        self._aircraft.add(Handling(start_s=t_s, duration_s=self._takes_s, seed=self._number))
         self._now = Pose(pitch, roll, before.heading_deg + turn)
-        return t_s + TAKES_S
+        return t_s + self._takes_s
 
     def obey(self, line: str, t_s: float) -> str:
         """Do what one typed line says; returns what came of it."""
@@ -180,7 +188,7 @@ class Hands:
             return f"found {line.strip()!r}; allowed: {HELP} ({_EXAMPLES})"
         pose = self._now
         return (
-            f"moving for {TAKES_S:g} s; then pitch {pose.pitch_deg:.2f}, roll {pose.roll_deg:.2f},"
+            f"moving for {self._takes_s:g} s; then pitch {pose.pitch_deg:.2f}, roll {pose.roll_deg:.2f},"
             f" heading {pose.heading_deg % 360.0:.1f} deg"
         )
 

@@ -50,6 +50,8 @@ class Job:
         """Whether the autopilot is to be restarted once the result is stored."""
         self.automatic = automatic
         """Whether nobody asked for it."""
+        self.undid_stands = False
+        """Of an undo: whether what stands had told was put back, so that the last calibration is as it was."""
         self.was_armed = False
         """Whether the aircraft was armed since, be it for a moment."""
         self.deadline_s = deadline_s

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -13,7 +13,7 @@ import msgspec
 
 from companion.calibration.collector import trace as traces
 from companion.calibration.collector.trace import Trace
-from companion.calibration.solution.record import Record, from_json, to_json
+from companion.calibration.solution.record import Record, WrittenParameter, from_json, to_json
 from companion.errors import StorageError
 from companion.storage.state import UNREADABLE, read_regular, remove_durably, sealed, unsealed, write_atomically
 
@@ -31,6 +31,12 @@ MAX_TRACE_BYTES: Final = 4_000_000
 _NAME = re.compile(r"(\d{6,})\.json")
 _TRACE = re.compile(r"(\d{6,})\.trace\.json\.gz")
 _GZIP: Final = 16 + zlib.MAX_WBITS
+
+
+def is_of(record: Record, put_back: Mapping[str, WrittenParameter]) -> bool:
+    """Whether an undo took back what this calibration has written; so does one that found nothing to put back."""
+    written = {name: one.after for imu in record.imus for name, one in imu.written.items()}
+    return not put_back or any(written.get(name) == one.after for name, one in put_back.items())
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -128,8 +134,11 @@ class RecordStore:
             raise StorageError(f"{path}: belongs to the calibration of {trace.started_at}")
         return trace
 
-    def mark_undone(self, system_id: int, undone_at: str) -> None:
-        """Note in the latest record that has written to this vehicle that it was put back.
+    def mark_undone(self, system_id: int, undone_at: str, put_back: Mapping[str, WrittenParameter]) -> bool:
+        """Note in the latest record that has written to this vehicle that it was put back, if these values are its own.
+
+        Returns:
+            False: they are not.
 
         Raises:
             StorageError: it could not be written.
@@ -140,8 +149,11 @@ class RecordStore:
                 continue
             wrote = record.state == "done" and any(imu.written for imu in record.imus)
             if wrote and record.system_id == system_id:
+                if not is_of(record, put_back):
+                    return False
                 write_atomically(entry.path, sealed(to_json(msgspec.structs.replace(record, undone_at=undone_at))))
-                return
+                break
+        return True
 
     @staticmethod
     def _remove(path: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.earth import Array
-from sim.hands import AHEAD_S, SIDES, TAKES_S, Hands
+from sim.hands import AHEAD_S, SIDES, Hands
 from sim.imu_model import MG
 from sim.sitl.ground import GroundStation
 from sim.sitl.observe import mean_reading
@@ -81,18 +81,18 @@ async def attitude_error_deg(vehicle: SitlVehicle, ground: GroundStation) -> Arr
     if not seen:
         raise RuntimeError("no ATTITUDE came")
     told = np.mean([(message.roll, message.pitch) for message in seen], axis=0)
-    error: Array = np.degrees(told - np.array(vehicle.aircraft.angles_rad(vehicle.now_s)[:2]))
-    return error
+    off = told - np.array(vehicle.aircraft.angles_rad(vehicle.now_s)[:2])
+    wrapped: Array = np.degrees((off + np.pi) % (2.0 * np.pi) - np.pi)
+    return wrapped
 
 
 async def own_six_positions(vehicle: SitlVehicle, ground: GroundStation, hands: Hands) -> list[str]:
-    """The firmware's own calibration on six sides (param5 = 1), each held as it asks; what it said.
+    """The firmware's own calibration on six sides (param5 = 1), each held as it asks, level on its spot; what it said.
 
     Raises:
         TimeoutError: it does not end.
     """
-    loop = asyncio.get_running_loop()
-    since_s, said, at = loop.time(), list[str](), len(ground.heard)
+    said, at = list[str](), len(ground.heard)
     ground.send(
         mavlink.MAVLink_command_long_message(
             ground.vehicle, 1, mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0
@@ -107,19 +107,23 @@ async def own_six_positions(vehicle: SitlVehicle, ground: GroundStation, hands: 
                 if isinstance(message, mavlink.MAVLink_statustext_message) and message.get_srcComponent() == 1:
                     said.append(message.text.strip())
                     if (side := _px4_side(said)) is not None:
-                        await stand(vehicle, hands.hold(vehicle.now_s + AHEAD_S, *SIDES[side]))
+                        await _hold(vehicle, hands, side)
                 asked = _asked(message)
                 if asked is not None and asked > placed:  # it repeats itself while we hold it
                     placed = asked
-                    await stand(vehicle, hands.hold(vehicle.now_s + AHEAD_S, *SIDES[_POSITIONS[asked]]))
+                    await _hold(vehicle, hands, _POSITIONS[asked])
                     ground.send(
                         mavlink.MAVLink_command_long_message(
                             ground.vehicle, 1, mavlink.MAV_CMD_ACCELCAL_VEHICLE_POS, 0, float(asked), *[0.0] * 6
                         )
                     )
-    assert since_s < loop.time()
     await stand(vehicle, hands.back(vehicle.now_s + AHEAD_S))
     return said
+
+
+async def _hold(vehicle: SitlVehicle, hands: Hands, side: str) -> None:
+    at_s = vehicle.now_s + AHEAD_S
+    await stand(vehicle, hands.back(at_s) if side == "level" else hands.hold(at_s, *SIDES[side]))
 
 
 def _asked(message: mavlink.MAVLink_message) -> int | None:
@@ -144,6 +148,3 @@ def _px4_side(said: list[str]) -> str | None:
 async def stand(vehicle: SitlVehicle, until_s: float) -> None:
     """Wait until it stands, in aircraft time, and a little longer."""
     await vehicle.sleep(max(until_s - vehicle.now_s, 0.0) + STANDS_S)
-
-
-__all__ = ["TAKES_S", "Accelerometer", "attitude_error_deg", "judged", "own_six_positions", "stand"]

@@ -20,7 +20,7 @@ from sim.earth import mounting_matrix
 from sim.hands import Hands
 from sim.imu_model import MG
 from tests.e2e.test_align_faces import follow as by_sides
-from tests.e2e.test_calibration import started
+from tests.e2e.test_calibration import calibrated, started
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
 
@@ -178,6 +178,8 @@ def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restar
         made, hands = rig(tmp_path, STEEP, mounting_deg=board_deg, parameters=offsets)
         async with made.running():
             await made.ready()
+            result, calibration = await calibrated(made)
+            assert result.outcome == "done", result
             job = started(made.service.calibrating.conductor.start_turn(TurnAsked(4, level=True), "test", 900.0))
             result = await follow(made, hands, job)
             assert result.outcome == "done", result
@@ -196,6 +198,10 @@ def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restar
             assert not isinstance(undone, Refusal)
             assert (await undone.finished).outcome == "done"
             assert made.double.parameter("AHRS_TRIM_X") == made.double.parameter("AHRS_TRIM_Y") == 0.0
+            # What was calibrated before it is in force as it was.
+            assert made.service.arming.in_force.calibration == calibration
+            assert [one.undone_at for one in made.service.calibrating.store.history()] == [None]
+            assert not any("undone" in words for words in made.ground.texts())
 
     run_virtual(sides())
     run_virtual(level())

@@ -22,7 +22,7 @@ from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.history import Point, PowerUp
 from companion.calibration.solution.joint import Whole, points
 from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, expect, expect_today, pose_effect
-from companion.calibration.solution.record import Record
+from companion.calibration.solution.record import Record, WrittenParameter
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 from companion.component.statustext import Severity
 from companion.config.sections import Noise
@@ -34,7 +34,7 @@ from companion.errors import StorageError
 from companion.physics.frames import vector
 from companion.samples import Triad
 from companion.storage.learned import KEEP_POINTS, BiasStore, KnownImu, this_boot
-from companion.storage.records import RecordStore
+from companion.storage.records import RecordStore, is_of
 
 logger = logging.getLogger(__name__)
 
@@ -310,17 +310,25 @@ class Results:
             logger.error("%s", error)  # noqa: TRY400 - the traceback tells nothing more
             self._say(Severity.WARNING, f"Record not kept: {error}")
 
-    async def undone(self, system_id: int) -> None:
-        """What the last calibration of this vehicle has written is in force no more."""
+    async def undone(self, system_id: int, put_back: Mapping[str, WrittenParameter]) -> bool:
+        """Note that what the last calibration of this vehicle has written is in force no more, if this was of it.
+
+        Returns:
+            Whether it was.
+        """
         now = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
         last = self.last
-        if last is not None and last.state == "done" and last.system_id == system_id:
-            self.last = msgspec.structs.replace(last, undone_at=now) if has_written(last) else last
+        if last is not None and last.state == "done" and last.system_id == system_id and has_written(last):
+            if not is_of(last, put_back):
+                return False
+            self.last = msgspec.structs.replace(last, undone_at=now)
             await self._memory.forget(last.started_at)
         try:
-            await self._offload(self._store.mark_undone, system_id, now)
+            found: bool = await self._offload(self._store.mark_undone, system_id, now, put_back)
         except StorageError as error:
             logger.error("the history does not show the undo: %s", error)  # noqa: TRY400 - one line
+            found = True
+        return found
 
 
 def has_written(record: Record) -> bool:

@@ -295,7 +295,7 @@ class Conductor:
             written = await self._recovery.undo(force=force)
             job.deliver(written)
             if self._vehicle.system_id is not None:
-                await self._results.undone(self._vehicle.system_id)
+                job.undid_stands = not await self._results.undone(self._vehicle.system_id, written)
             self._machine.on(Event.CONCLUDED)
             return f"{len(written)} old values back"
 
