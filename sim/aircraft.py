@@ -153,10 +153,20 @@ class VirtualAircraft:
         """Temperature of the aircraft and everything on it."""
         return self._temperature(t_s) if callable(self._temperature) else self._temperature
 
+    def temperatures_degc(self, t_s: Array) -> Array:
+        """The same at times (n)."""
+        if not callable(self._temperature):
+            return np.full(len(t_s), self._temperature)
+        return np.array([self._temperature(t) for t in t_s.tolist()])
+
     def angles_rad(self, t_s: float) -> tuple[float, float, float]:
         """True roll, pitch, heading (not wrapped)."""
-        angles, _ = self._euler(np.array([t_s]))
-        return float(angles[0, 0]), float(angles[0, 1]), float(angles[0, 2])
+        roll, pitch, heading = self.angles_over(np.array([t_s]))[0].tolist()
+        return roll, pitch, heading
+
+    def angles_over(self, t_s: Array) -> Array:
+        """The same (n, 3) at times (n), ascending."""
+        return self._euler(t_s)[0]
 
     def pose_at(self, t_s: float) -> Pose:
         """The true pose, heading in [0, 360)."""

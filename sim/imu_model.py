@@ -334,8 +334,8 @@ class ImuModel:
         return drawn
 
     def _bias(self, t_s: Array) -> Array:
-        warm = np.array([self.aircraft.temperature_degc(float(t)) for t in _thin(t_s)])
-        kelvin = np.interp(t_s, _thin(t_s), warm) - self.spec.reference_degc
+        thin = _thin(t_s)
+        kelvin = np.interp(t_s, thin, self.aircraft.temperatures_degc(thin)) - self.spec.reference_degc
         out = self._turn_on + kelvin[:, None] * self._per_kelvin
         result: Array = out if self._slow.silent else out + self._slow.at(t_s)
         return result

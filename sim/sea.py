@@ -7,6 +7,7 @@ long waves a raft lies across the apparent vertical, and a fluid level on it fee
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Final
@@ -53,15 +54,6 @@ class Sea(Motion):
     """How long it takes to come up and to die away."""
     seed: int = 0
 
-    def components(self) -> tuple[Array, Array, Array]:
-        """Angular frequencies in rad/s, amplitudes in rad, phases in rad; (2, components), roll and pitch."""
-        random = np.random.default_rng([self.seed, 41])
-        shape = (2, COMPONENTS)
-        frequencies = [wave.frequency_hz * (1.0 + wave.spread * random.standard_normal(shape)) for wave in self.waves]
-        amplitudes = [np.full(shape, math.radians(wave.sway_deg) / math.sqrt(COMPONENTS)) for wave in self.waves]
-        phases = random.uniform(0.0, 2.0 * math.pi, (2, COMPONENTS * len(self.waves)))
-        return 2.0 * math.pi * np.abs(np.hstack(frequencies)), np.hstack(amplitudes), phases
-
     def _height(self, t_s: Array) -> tuple[Array, Array]:
         """How far it has come up, 0 to 1, and the derivative in 1/s."""
         rise_s = min(self.rise_s, self.duration_s / 2.0)
@@ -69,19 +61,21 @@ class Sea(Motion):
         down, down_slope = smooth_step((self.end_s - t_s) / rise_s)
         return up * down, (up_slope * down - up * down_slope) / rise_s
 
-    def _sums(self, t_s: Array, lead_rad: float) -> tuple[Array, Array]:
-        """Roll and pitch (n, 2) of waves that are so far ahead, and their derivatives."""
-        frequencies, amplitudes, phases = self.components()
-        angles, slopes = np.empty((len(t_s), 2)), np.empty((len(t_s), 2))
+    def _sums(self, t_s: Array) -> tuple[Array, Array, Array]:
+        """Roll and pitch (n, 2), what they are a quarter of a wave later, and their derivatives."""
+        frequencies, amplitudes, phases = _components(self.waves, self.seed)
+        angles, later, slopes = np.empty((3, len(t_s), 2))
         for axis in range(2):
-            argument = np.outer(t_s - self.start_s, frequencies[axis]) + phases[axis] + lead_rad
+            argument = np.outer(t_s - self.start_s, frequencies[axis]) + phases[axis]
+            cosines = np.cos(argument)
             angles[:, axis] = np.sin(argument) @ amplitudes[axis]
-            slopes[:, axis] = np.cos(argument) @ (amplitudes[axis] * frequencies[axis])
-        return angles, slopes
+            later[:, axis] = cosines @ amplitudes[axis]
+            slopes[:, axis] = cosines @ (amplitudes[axis] * frequencies[axis])
+        return angles, later, slopes
 
     def euler_rad(self, t_s: Array) -> tuple[Array, Array]:
         """Added angles and rates."""
-        angles, slopes = self._sums(t_s, 0.0)
+        angles, _, slopes = self._sums(t_s)
         height, rising = self._height(t_s)
         zero = np.zeros((len(t_s), 1))
         rates = height[:, None] * slopes + rising[:, None] * angles
@@ -89,17 +83,28 @@ class Sea(Motion):
 
     def level_acceleration_m_s2(self, t_s: Array) -> Array:
         """Surge, sway and heave: down the slope, and round."""
-        slope, _ = self._sums(t_s, self.surge_lead_rad)
-        circling, _ = self._sums(t_s, -math.pi / 2.0)
+        angles, later, _ = self._sums(t_s)
+        slope = math.cos(self.surge_lead_rad) * angles + math.sin(self.surge_lead_rad) * later
         height, _ = self._height(t_s)
         forward, right = -self.surge * slope[:, 1], self.surge * slope[:, 0]
-        down = self.heave * circling.sum(axis=1)
+        down = -self.heave * later.sum(axis=1)
         result: Array = STANDARD_GRAVITY_M_S2 * height[:, None] * np.column_stack([forward, right, down])
         return result
 
     def leaves_rad(self) -> Array:
         """Nothing."""
         return np.zeros(3)
+
+
+@functools.lru_cache(maxsize=16)
+def _components(waves: tuple[Wave, ...], seed: int) -> tuple[Array, Array, Array]:
+    """Angular frequencies in rad/s, amplitudes in rad, phases in rad; (2, components), roll and pitch."""
+    random = np.random.default_rng([seed, 41])
+    shape = (2, COMPONENTS)
+    frequencies = [wave.frequency_hz * (1.0 + wave.spread * random.standard_normal(shape)) for wave in waves]
+    amplitudes = [np.full(shape, math.radians(wave.sway_deg) / math.sqrt(COMPONENTS)) for wave in waves]
+    phases = random.uniform(0.0, 2.0 * math.pi, (2, COMPONENTS * len(waves)))
+    return 2.0 * math.pi * np.abs(np.hstack(frequencies)), np.hstack(amplitudes), phases
 
 
 TURN_DEG_S: Final = 0.3

@@ -139,7 +139,7 @@ def feed(deck: Deck, imu: ImuModel, seconds: int, random: np.random.Generator, c
 def _headings(aircraft: VirtualAircraft, seconds: int, random: np.random.Generator, sigma_deg: float) -> Array:
     """Magnetic, degrees: half of the error's variance is the same on all headings, half goes with them (iron)."""
     times = np.arange(seconds * HEADING_HZ) / HEADING_HZ
-    true = np.array([aircraft.angles_rad(t_s)[2] for t_s in times.tolist()])
+    true = aircraft.angles_over(times)[:, 2]
     constant, sine, cosine = random.normal(size=3) * sigma_deg * math.sqrt(0.5)
     error = constant + sine * np.sin(true) + cosine * np.cos(true)
     noise = random.normal(size=len(times)) * COMPASS_NOISE_DEG

@@ -182,7 +182,7 @@ class Platform:
             found.append((t_s, partial(collector.add_tilt, TiltSample(t_s, x, y))))
         if self.compass is not None:
             times = np.arange(0.03, end_s, 1.0 / COMPASS_HZ)
-            angles = np.array([math.degrees(self.aircraft.angles_rad(t_s)[2]) for t_s in times.tolist()])
+            angles = np.degrees(self.aircraft.angles_over(times)[:, 2])
             angles += random.standard_normal() - self.aircraft.site.declination_deg
             angles += random.normal(size=len(times)) * self.compass.noise_deg
             if self.compass.resolution_deg:
