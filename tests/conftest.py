@@ -87,6 +87,40 @@ def waits(function: Callable[..., Any]) -> bool:
     return False
 
 
+@functools.cache
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+@functools.cache
+def _imports(path: Path) -> frozenset[Path]:
+    """Modules of the tests that one of them imports."""
+    found = set()
+    for home, names in re.findall(r"^\s*from (tests[\w.]*) import (\([^)]*\)|.*)", _text(path), flags=re.MULTILINE):
+        module = TESTS.parent.joinpath(*home.split("."))
+        found |= {module.with_suffix(".py"), *(module / f"{name}.py" for name in re.findall(r"\w+", names))}
+    return frozenset(each for each in found if each.exists())
+
+
+def may_wait(path: Path) -> bool:
+    """Whether a file, or whatever of the tests it imports, has anything to do with the real clock; it is not run."""
+    seen, ahead = set(), [path]
+    while ahead:
+        if (here := ahead.pop()) in seen:
+            continue
+        seen.add(here)
+        if WAITS.search(_text(here)) or "real_clock" in _text(here):
+            return True
+        ahead += _imports(here)
+    return False
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Where only tests of the real clock are wanted, leave files alone that have none: eight processes would read them."""
+    wanted = config.getoption("markexpr").startswith("real_clock")
+    return True if wanted and collection_path.name.startswith("test_") and not may_wait(collection_path) else None
+
+
 def _functions(item: pytest.Item) -> list[Callable[..., Any]]:
     """The test, and the fixtures that it uses."""
     assert isinstance(item, pytest.Function)
@@ -106,6 +140,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if item.get_closest_marker("real_clock") is None and any(map(waits, _functions(item))):
             item.add_marker("real_clock")
+        if item.get_closest_marker("real_clock") is not None and not may_wait(item.path):
+            raise pytest.UsageError(f"{item.nodeid} waits for the real clock, and its file does not show it: import it")
     if LONG:
         _choose(config, items, lambda item: "extent" in vars(item.module) or hasattr(item.function, "hypothesis"))
     if config.getoption("quick"):

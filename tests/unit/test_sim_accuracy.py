@@ -14,14 +14,16 @@ import pytest
 
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
-from sim.accuracy import cli, deck_tables, experiments, paper, peers, tables
+from sim.accuracy import cli, deck_tables, experiments, paper, peers, tables, turning, warmup_table
 from sim.accuracy.experiments import FloorRun, IntegerRun, WhiteRun, floors, integers, predicted, white
 from sim.accuracy.figures import Claim, Figure, beside, covered, rms
 from sim.accuracy.stand import EXACT, POSTURES, Stand, biases, collected, samples, sites, solved, stand
 from sim.accuracy.tables import report
+from sim.accuracy.warmup import WARMING
 from sim.aircraft import Pose, Site, VirtualAircraft
 from sim.earth import Array
 from sim.imu_model import DEG_H, MG, PARTS, ImuModel
+from tests.support.extent import extent
 
 FOUR = 4.0
 
@@ -285,6 +287,9 @@ def test_all_sections_are_made_of_the_same_stands(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(tables, "NOISE_LSB", (0.5,))
     monkeypatch.setattr(deck_tables, "SPANS_S", (120,))
     monkeypatch.setattr(deck_tables, "STILL_S", (60,))
+    monkeypatch.setattr(turning, "RATES_DEG_S", extent(whole=turning.RATES_DEG_S, a_slice=(0.0, 0.4)))
+    for module in (tables, warmup_table):
+        monkeypatch.setattr(module, "WARMING", extent(whole=WARMING, a_slice=WARMING[:1]))
     said: list[str] = []
     found = report(4, 7, cli.SECTIONS, 1, said.append)
     assert tuple(found) == cli.SECTIONS
