@@ -116,7 +116,7 @@ def may_wait(path: Path) -> bool:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Where only tests of the real clock are wanted, leave files alone that have none: eight processes would read them."""
+    """Where only tests of the real clock are wanted, leave files without any alone: eight processes read all others."""
     wanted = config.getoption("markexpr").startswith("real_clock")
     return True if wanted and collection_path.name.startswith("test_") and not may_wait(collection_path) else None
 
