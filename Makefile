@@ -10,7 +10,7 @@ WAITING ?= 8
 # Where it is set, every process of every test compiles the whole program anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo quick test long check format bench accuracy campaign deb deb-test lock sbom audit clean
+.PHONY: help demo quick test long check format bench accuracy campaign pictures deb deb-test lock sbom audit clean
 
 help:
 	@echo 'make demo    watch a virtual aircraft being calibrated (about a minute)'
@@ -22,6 +22,7 @@ help:
 	@echo 'make bench   speed, as ratios within one run'
 	@echo 'make accuracy  how good a calibration is, beside the bound and what else is done (about ten minutes on two cores)'
 	@echo 'make campaign  every fault in every phase of a calibration (about 6 minutes on two cores)'
+	@echo 'make pictures  those of the documents, from real runs (needs Chromium; about three minutes)'
 	@echo 'make deb     a Debian package for machines like this one, in dist/'
 	@echo 'make deb-test  try that package in a clean root (as root; a minute or two)'
 	@echo 'make lock    requirements/*.txt anew: every dependency with its hashes (UPGRADE=1: the newest; needs the network)'
@@ -79,6 +80,12 @@ SEED ?= 7
 
 campaign: $(VENV)/.dev
 	@$(BIN)/python -m tests.campaign --seed $(SEED) --jobs $(JOBS)
+
+# Some of them alone: PICTURES='wiring demo page report'.
+PICTURES ?=
+
+pictures: $(VENV)/.dev
+	@$(BIN)/python -m tests.pictures $(PICTURES)
 
 # With Debian's Python, whatever PYTHON is: the package runs with it. EXTRAS= puts neither MQTT nor recording in.
 EXTRAS ?= mqtt,recording

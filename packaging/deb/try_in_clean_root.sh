@@ -64,13 +64,19 @@ expect 0 'ports\|no serial' companion ports
 expect 0 'arming:set_aux_auth_passed' companion lua
 expect 3 'companion' companion status
 expect 3 'companion' companion calibrate
-expect 1 'autopilot' companion check
+expect 1 'companion setup looks for it' companion check
 expect 1 'apt remove companion' companion uninstall-service
 expect 1 'systemctl enable --now companion' companion install-service
 expect 0 '' systemctl enable companion.service
 expect 0 '' systemd-analyze verify --man=no /usr/lib/systemd/system/companion.service
 [ $proc = yes ] || sed -i '/COMPANION_BOOT_ID=%b, ignoring/d' "$log"
 [ ! -s "$log" ] || fail 'systemd finds faults with the unit'
+
+say 'its first configuration, where nothing is connected'
+expect 1 'no autopilot was heard.*nothing was written' companion setup --yes --udp 14999
+expect 0 'Written: /etc/companion/companion.toml$' \
+    companion setup --yes --udp 14999 --mavlink udpin:127.0.0.1:14550 --no-check
+grep -q 'companion run ' "$log" || fail 'where no systemd runs the next step is another one'
 
 say 'the daemon, as nobody and without a writable place of its own, as the service has it'
 cat >"$root/etc/companion/companion.toml" <<'TOML'

@@ -62,10 +62,10 @@ class MavProxy:
 
 
 @contextlib.asynccontextmanager
-async def mavproxy(folder: Path, port: int) -> AsyncIterator[MavProxy]:
+async def mavproxy(folder: Path, port: int, modules: str = MODULES) -> AsyncIterator[MavProxy]:
     process = await asyncio.create_subprocess_exec(
         sys.executable, str(MAVPROXY), f"--master=udpout:127.0.0.1:{port}", "--no-state",
-        f"--default-modules={MODULES}", cwd=folder,
+        f"--default-modules={modules}", cwd=folder,
         stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
         env={**os.environ, "PYTHONUNBUFFERED": "1", "HOME": str(folder)},
     )  # fmt: skip
@@ -127,6 +127,26 @@ def test_what_the_documentation_says_to_type(tmp_path: Path) -> None:
             await station.type(message)
             await station.prints(r"Got COMMAND_ACK: USER_1: DENIED", after=place)
             await station.prints(r"AP: Calibration refused: armed: disarm first", after=place)
+
+    asyncio.run(main())
+
+
+def test_our_parameters_are_listed_without_waiting_for_files(tmp_path: Path) -> None:
+    """MAVProxy asks for a file of parameters first; the autopilot double is silent, and is waited for."""
+
+    async def main() -> None:
+        async with (
+            ground_line(tmp_path, "ardupilot") as line,
+            mavproxy(tmp_path, line.port, f"{MODULES},ftp") as station,
+        ):
+            await station.prints(r"FTP: request timed out")
+            await station.prints(r"Received \d+ parameters")
+            await station.type("vehicle 1:191")
+            await station.prints(r"Set vehicle 1:191")
+            place = len(station.printed)
+            await station.type("param fetch")
+            await station.prints(r"Received \d+ parameters", after=place)
+            assert "timed out" not in station.printed[place:]
 
     asyncio.run(main())
 

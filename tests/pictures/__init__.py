@@ -1,0 +1,1 @@
+"""`make pictures`: those of the documents, made anew from real runs."""
