@@ -21,6 +21,8 @@ SETTLE_S = 40.0
 """After a start: the estimator has its position, and gravity."""
 STANDS_S = 1.5
 """From the end of a movement until every filter has forgotten it."""
+STORED_S = 4.0
+"""By then PX4 has stored what was set."""
 SIX_WITHIN_S = 240.0
 _POSITIONS = {
     mavlink.ACCELCAL_VEHICLE_POS_LEVEL: "level",
@@ -74,6 +76,7 @@ async def attitude_error_deg(vehicle: SitlVehicle, ground: GroundStation) -> Arr
     Raises:
         RuntimeError: ATTITUDE does not come.
     """
+    await vehicle.sleep(STORED_S)
     await vehicle.power_cycle()
     await vehicle.sleep(SETTLE_S)
     await ground.stream(mavlink.MAVLINK_MSG_ID_ATTITUDE, 20.0)

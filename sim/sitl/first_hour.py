@@ -61,15 +61,7 @@ class Tape:
 
     async def setup(self) -> int:
         """`companion setup` by itself; returns the exit code."""
-        code = await self.type("setup", "--yes", "--udp", self.vehicle.url.rsplit(":", 1)[1])
-        if os.geteuid() == 0:
-            # As setup does for anybody else: what this machine's own companion keeps is not touched.
-            file = self.folder / "companion.toml"
-            text = file.read_text(encoding="utf-8")
-            for section, line in (("control", "socket"), ("storage", "directory")):
-                text = text.replace(f"[{section}]", f'[{section}]\n{line} = "{self.folder}/own-{section}"')
-            file.write_text(text, encoding="utf-8")
-        return code
+        return await self.type("setup", "--yes", "--udp", self.vehicle.url.rsplit(":", 1)[1])
 
     @contextlib.asynccontextmanager
     async def daemon(self) -> AsyncIterator[None]:
@@ -150,7 +142,10 @@ async def _companion(tape: Tape) -> int:
     async with tape.daemon():
         for words in (("calibrate", "--wait"), ("align", "turn", "--write")):
             codes.append(await tape.type(*words))
-        codes.append(await tape.type("align", "faces", "--write"))
+        for words in (("align", "faces", "--write"), ("align", "faces")):
+            if (code := await tape.type(*words)) == 0:
+                break
+        codes.append(code)
         await tape.type("status")
         await tape.judge("after faces")
         codes.append(await tape.type("align", "turn", "--level"))

@@ -133,12 +133,13 @@ class Stands:
             if moving:
                 moved, since_s = True, now_s
             still_s = min(status.still_s, now_s - since_s - SETTLE_S)
-            share = min(max(still_s, 0.0) / self._stand_s, 1.0) if moved and waiting_for is None else 0.0
+            # What only has to go on standing still is measured from its first second on, and told so.
+            standing = moved and (waiting_for is None or hold_still_s is not None)
+            share = min(max(still_s, 0.0) / self._stand_s, 1.0) if standing else 0.0
             if not moved:
                 words = f"{why or f'{number - 1} done. Now {wish}'}; waiting for it to move"
-            elif waiting_for is not None:
-                # Once it stands again, what to do is said by itself.
-                words = waiting_for if hold_still_s is not None else f"{why or wish}; {waiting_for}"
+            elif not standing:
+                words = f"{why or wish}; {waiting_for}"
             else:
                 words = f"measuring, {max(still_s, 0.0):.0f} of {self._stand_s:.0f} s, hands off"
                 if not held:
