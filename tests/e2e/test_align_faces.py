@@ -162,26 +162,37 @@ def test_who_asks_for_what_cannot_be_is_told_at_once(tmp_path: Path) -> None:
     run_virtual(main())
 
 
-def test_px4_is_measured_and_not_written(tmp_path: Path) -> None:
-    """It starts without scales that are near 1, whatever its parameters say: so they are only shown."""
-    made, hands = rig(tmp_path, firmware="px4", parameters={})
+@pytest.mark.parametrize("wrong", [(0.015, -0.012, 0.004), (0.003, -0.002, 0.002)], ids=["far from 1", "near 1"])
+def test_px4s_offsets_are_written_and_such_scales_as_it_starts_with(
+    tmp_path: Path, wrong: tuple[float, float, float]
+) -> None:
+    made, hands = rig(tmp_path, firmware="px4", parameters={}, accel_scale=wrong)
+    far = max(wrong) > 0.01
 
     async def main() -> None:
         async with made.running():
             await made.ready()
-            refused = made.service.calibrating.conductor.start_faces("test", 100.0, write=True)
-            assert isinstance(refused, Refusal)
-            assert "PX4 starts without scales" in refused.reason
-            job = faced(made, write=False)
+            names = [f"CAL_ACC0_{axis}{what}" for what in ("OFF", "SCALE") for axis in "XYZ"]
+            old = {name: made.autopilot.parameter(name) for name in names}
+            job = faced(made, write=True)
             result = await follow(made, hands, job)
             assert result.outcome == "done", result
             record = job.product
             assert isinstance(record, FacesRecord)
             (imu,) = record.imus
-            true_mg = made.model.true_bias(made.aircraft.time_at(made.now_s)).accel_m_s2 / MG
-            sigma = np.array(imu.accel_bias_mg.sigma)
-            assert (np.abs(np.subtract(imu.accel_bias_mg.value, true_mg)) < 3.0 * sigma).all()
-            assert sigma.max() < 0.5
+            assert set(imu.written) == set(names if far else names[:3])
+            assert {one.outcome for one in imu.written.values()} == {"verified"}
+            assert any("scales stay 1" in words for words in record.warnings) is not far
+            made.px4.reboot()
+            await asyncio.sleep(20.0)
+            hands.spot(made.aircraft.time_at(made.now_s), 0.0, 0.0)
+            await asyncio.sleep(10.0)
+            left_mg = np.array(made.autopilot.residual(1, made.now_s).accel_m_s2) / MG
+            np.testing.assert_allclose(left_mg, 0.0, atol=0.2)
+            undone = made.service.calibrating.conductor.start_undo("test")
+            assert not isinstance(undone, Refusal)
+            assert (await undone.finished).outcome == "done"
+            assert {name: made.autopilot.parameter(name) for name in names} == old
 
     run_virtual(main())
 

@@ -103,6 +103,7 @@ class Rig:
         parameters: dict[str, float] | None = None,
         imus: int = 2,
         mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        accel_scale: tuple[float, float, float] = (0.0, 0.0, 0.0),
         at_arm: str = "off",
         more: str = "",
         mavlink: str = "",
@@ -128,6 +129,7 @@ class Rig:
             accel_bias_m_s2=[value * MG for value in ACCEL_BIAS_MG],
             mounting_deg=mounting_deg,
             thermometer_off_k=THERMOMETER_OFF_K,
+            accel_scale=accel_scale,
         )
         if firmware == "px4":
             # Nobody looks at them, and half of the time goes there; but they are what a serial line has to carry.

@@ -43,9 +43,9 @@ class Stage(NamedTuple):
     async def write(self, *instances: int) -> list[ImuCalibration]:
         """Write a small change to each of these IMUs at once."""
         found = [await self.read(instance) for instance in instances]
-        targets = [(each, small_changes(each)) for each in found]
+        targets = [(each, small_changes(each), (0.0, 0.0, 0.0)) for each in found]
         async with self.writes.standing_by(targets) as look:
-            await self.writer.apply([change for _, changes in targets for change in changes], look)
+            await self.writer.apply([change for _, changes, _ in targets for change in changes], look)
         return found
 
 
@@ -242,7 +242,7 @@ def test_over_a_restart_nothing_is_concluded(tmp_path: Path) -> None:
     async def main() -> None:
         async with aboard(px4, tmp_path) as stage:
             found = await stage.read(1)
-            async with stage.writes.standing_by([(found, small_changes(found))]) as look:
+            async with stage.writes.standing_by([(found, small_changes(found), (0.0, 0.0, 0.0))]) as look:
                 assert look is not None
                 stage.client.vehicle.boots += 1
                 assert await look() is None
@@ -258,7 +258,7 @@ def test_old_values_that_are_back_are_in_use(tmp_path: Path) -> None:
         async with aboard(px4, tmp_path) as stage:
             found = await stage.read(1)
             changes = small_changes(found)
-            async with stage.writes.standing_by([(found, changes)]) as look:
+            async with stage.writes.standing_by([(found, changes, (0.0, 0.0, 0.0))]) as look:
                 await stage.writer.apply(changes, look)
             await asyncio.sleep(2.0)
             await stage.writer.undo(changes)
@@ -282,7 +282,7 @@ def test_while_the_aircraft_moves_nothing_is_concluded(tmp_path: Path) -> None:
             found = await stage.read(1)
             changes = small_changes(found)
 
-            async with stage.writes.standing_by([(found, changes)]) as look:
+            async with stage.writes.standing_by([(found, changes, (0.0, 0.0, 0.0))]) as look:
                 assert look is not None
                 for k, (gyro, accel) in enumerate(px4.raw):  # turned by hand: all IMUs feel it
                     px4.raw[k] = (gyro + np.array([0.3, 0.1, -0.2]), accel + np.array([1.0, 0.0, 0.1]))

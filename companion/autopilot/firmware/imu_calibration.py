@@ -27,7 +27,7 @@ from companion.autopilot.vehicle.vehicle import Firmware
 from companion.calibration.solution.solve import ImuSolution
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, vector
-from companion.physics.units import DEG
+from companion.physics.units import DEG, MG
 from companion.samples import Vector
 
 Acts = Literal["at a start", "while still", "after a flight"]
@@ -181,6 +181,7 @@ class FarStep:
 
     gyro_rad_s: Vector
     accel_m_s2: Vector
+    scale: Vector
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -206,6 +207,8 @@ class ImuCalibration:
     gyro_grid_rad_s: float = 0.0
     """Steps of the sensor's own readings behind the telemetry, where they are known and coarse; else 0."""
     accel_grid_m_s2: float = 0.0
+    scale_unused_within: float = 0.0
+    """Scales whose vector is no farther than this from 1 are not in use after a start."""
     accel_offset_may_be_unused: bool = False
     """The parameters may hold other accelerometer offsets than those that the firmware uses."""
     rivals: tuple[Rival, ...] = ()
@@ -225,6 +228,11 @@ class ImuCalibration:
     def corrections(self) -> dict[str, float]:
         """By parameter: everything that acts on this IMU's output, as far as single parameters tell."""
         return {**self.offsets, **dict(zip(self.parameters.accel_scale, self.accel_scale, strict=True))}
+
+    def in_use(self, accel_scale: Vector | None = None) -> Array:
+        """Of these scales, or of those that were read, what the firmware works with, (3,)."""
+        scale = np.asarray(self.accel_scale if accel_scale is None else accel_scale, dtype=np.float64)
+        return np.ones(3) if np.linalg.norm(scale - 1.0) <= self.scale_unused_within else scale
 
     def contradicts(self, values: Mapping[str, float]) -> bool:
         """Whether one of these parameters is among the corrections and has another value there."""
@@ -286,26 +294,32 @@ def vector_changes(names: tuple[str, str, str], before: Vector, after: Vector, f
 def whole_accelerometer(calibration: ImuCalibration, bias_m_s2: Vector, scale: Vector) -> list[Change]:
     """Offsets and scales that take a bias and a scale error out of the output, both of it as it is, in the IMU's axes.
 
-    Of output = (1 + scale) truth + bias: offset + bias / accel_scale, and accel_scale / (1 + scale).
+    Of output = (1 + scale) truth + bias: offset + bias / accel_scale, and accel_scale / (1 + scale). Where the firmware
+    would start without such scales, they become 1, and the offsets right for a level aircraft.
 
     Raises:
         CalibrationRefusedError: a value that is not plausible, see the limits at the top.
     """
     names, number = calibration.parameters, calibration.instance
-    before = np.asarray(calibration.accel_scale)
-    offset = _vector(np.asarray(calibration.accel_offset_m_s2) + np.asarray(bias_m_s2) / before)
+    before = calibration.in_use()
+    right = before / (1.0 + np.asarray(scale))
+    after = _vector(calibration.in_use(_vector(right)))
+    level = calibration.orientation.T @ (0.0, 0.0, -1e3 * MG)
+    left = level * (1.0 / right - 1.0 / np.asarray(after)) if calibration.scale_unused_within else np.zeros(3)
+    offset = _vector(np.asarray(calibration.accel_offset_m_s2) + np.asarray(bias_m_s2) / before + left)
     _require_plausible("accelerometer offset", offset, MAX_ACCEL_OFFSET_M_S2, 1.0, "m/s^2", number)
-    after = _vector(before / (1.0 + np.asarray(scale)))
     low, high = ACCEL_SCALE_RANGE
     for axis, value in zip(_AXES, after, strict=True):
         if not low <= value <= high:
             raise CalibrationRefusedError(
                 f"IMU {number}: accelerometer scale {axis} is {value:.3g}, allowed are {low} to {high}"
             )
-    return [
-        *map(Change, names.accel_offset, calibration.accel_offset_m_s2, offset),
-        *map(Change, names.accel_scale, calibration.accel_scale, after),
-    ]
+    far = calibration.far_step
+    by = (None, None) if far is None else (far.accel_m_s2, far.scale)
+    changes = vector_changes(names.accel_offset, calibration.accel_offset_m_s2, offset, by[0])
+    if not calibration.scale_unused_within or after != calibration.accel_scale:
+        changes += vector_changes(names.accel_scale, calibration.accel_scale, after, by[1])
+    return changes
 
 
 def output_step(
@@ -324,9 +338,10 @@ def output_step(
         np.array([by_name.get(name, 0.0) for name in each])
         for each in (names.gyro_offset, names.accel_offset, names.accel_scale)
     )
-    rotation, scale = calibration.orientation, np.asarray(calibration.accel_scale)
-    unscaled = rotation.T @ np.asarray(accel_m_s2) / scale
-    return vector(-rotation @ gyro), vector(rotation @ (stretch * unscaled - (scale + stretch) * accel))
+    rotation, before = calibration.orientation, calibration.in_use()
+    after = calibration.in_use(vector(calibration.accel_scale + stretch)) if stretch.any() else before
+    unscaled = rotation.T @ np.asarray(accel_m_s2) / before
+    return vector(-rotation @ gyro), vector(rotation @ ((after - before) * unscaled - after * accel))
 
 
 def whole_bias(

@@ -131,13 +131,15 @@ class SlotMemory:
 
 
 IGNORED_STEP: Final = 0.01
-"""A vector of offsets no farther than this (rad/s, m/s^2) from the one in use is ignored (autopilots 4.2)."""
+"""A vector of offsets no farther than this (rad/s, m/s^2) from the one in use is ignored (autopilots 4.2), and one of
+scales likewise: `set_scale` of src/lib/sensor_calibration/Accelerometer.cpp. After a start 1 is in use."""
 
 MARGIN: Final = 1.05
 """Both sides round to 32 bits."""
 
 FAR_GYRO_RAD_S: Final = 0.02
 FAR_ACCEL_M_S2: Final = 0.05
+FAR_SCALE: Final = 0.02
 
 FAR_SIGNS: Final[dict[int, Vector]] = {1: (1.0, 1.0, 1.0), 2: (-1.0, -1.0, -1.0), 3: (1.0, -1.0, 1.0)}
 """By instance: of several IMUs written at once each makes another far step, so that they cannot be mistaken."""
@@ -211,9 +213,11 @@ async def read_calibration(parameters: ParameterClient, instance: int, memory: S
         far_step=FarStep(
             gyro_rad_s=_times(FAR_GYRO_RAD_S, signs),
             accel_m_s2=_times(FAR_ACCEL_M_S2, signs),
+            scale=_times(FAR_SCALE, signs),
         ),
         gyro_grid_rad_s=SIMULATED_GYRO_GRID_RAD_S if _bus(gyro) == _SIMULATION_BUS else 0.0,
         accel_grid_m_s2=SIMULATED_ACCEL_GRID_M_S2 if _bus(accel) == _SIMULATION_BUS else 0.0,
+        scale_unused_within=MARGIN * IGNORED_STEP,
         accel_offset_may_be_unused=small and not memory.in_use(names.accel_offset, offset, boots),
         rivals=await read_rivals(parameters, memory.rivals),
     )

@@ -48,6 +48,15 @@ class AccelWrites:
             return "nothing is written while push.parameters is false"
         return None
 
+    async def prepare(self) -> None:
+        """Before the first stand: see that the offsets in force are those that are in use.
+
+        Raises:
+            AutopilotError: they cannot be read, or be made sure.
+            StorageError: the old values could not be kept.
+        """
+        await self._pusher.offsets_still_hold()
+
     async def write(self, job: Job, last: Window, changes: Mapping[str, Sequence[Change]], draft: Draft) -> None:
         """By IMU; the aircraft stands still as in the last stand.
 
@@ -123,4 +132,4 @@ class AccelWrites:
             warnings=(),
         )
         kind = self._imus[imu.name].stream.kind
-        return Target(imu.name, calibration, tuple(changes), solution, kind, watched=True)
+        return Target(imu.name, calibration, tuple(changes), solution, kind, watched=True, read_m_s2=imu.accel_m_s2)

@@ -70,10 +70,10 @@ class FacesInForce:
         names = calibration.parameters
         try:
             offset = np.array([kept.corrections[one] for one in names.accel_offset])
-            scale = np.array([kept.corrections[one] for one in names.accel_scale])
+            x, y, z = (kept.corrections[one] for one in names.accel_scale)
         except KeyError:
             return None
-        return _under(calibration, kept, offset, scale, self._widened(kept, temperature_degc))
+        return _under(calibration, kept, offset, calibration.in_use((x, y, z)), self._widened(kept, temperature_degc))
 
     def _widened(self, kept: FacesImuRecord, temperature_degc: float | None) -> float:
         """What has come to the biases' sigma since, m/s^2: drift and temperature, or another power-up."""
@@ -94,7 +94,7 @@ def _under(
     """Figures under other offsets and scales: output = scale (raw - offset), then and now."""
     bias, error = np.array(kept.accel_bias_mg.value) * MG, np.array(kept.accel_scale.value)
     right_offset, right_scale = offset + bias / scale, scale / (1.0 + error)
-    now, taken_off = np.array(calibration.accel_scale), np.array(calibration.accel_offset_m_s2)
+    now, taken_off = calibration.in_use(), np.array(calibration.accel_offset_m_s2)
     figures, sigma = np.zeros(FIGURES), np.zeros(FIGURES)
     figures[BIAS], figures[SCALE] = now * (right_offset - taken_off), now / right_scale - 1.0
     figures[SHEAR] = kept.accel_shear.value

@@ -6,7 +6,7 @@ It needs neither a gradienter nor a level spot. Every stand says what is still m
 from __future__ import annotations
 
 import datetime
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -62,9 +62,6 @@ class Facing:
 
     def why_not(self, *, write: bool) -> str | None:
         """Why there is nothing to measure, or nothing could be written; None where all is well."""
-        if write and self._core.vehicle.firmware == "px4":
-            # It compares with what is in use, which is 1 after a start.
-            return "PX4 starts without scales that are within 1 % of 1: align faces without --write shows them"
         return self._writes.why_not(write=write)
 
     async def run(self, job: Job, *, write: bool) -> str:
@@ -81,6 +78,8 @@ class Facing:
         windows: list[Window] = []
         known = _Known({}, _FIRST)
         local: LocalEarth | None = None
+        if write:
+            await self._writes.prepare()
         self._stands.begin(job)
         while known.wish is not None and len(windows) < MOST:
             if windows:
@@ -105,7 +104,9 @@ class Facing:
         measured = self._measured(windows[-1], known.by_imu)
         try:
             if write and known.wish is None:
-                await self._writes.write(job, windows[-1], self._changes(known.by_imu), draft)
+                changes = self._changes(known.by_imu)
+                draft.warnings += self._scales_left(known.by_imu)
+                await self._writes.write(job, windows[-1], changes, draft)
         finally:
             job.deliver(record := self._record(windows, known.by_imu, local, draft, measured))
         if known.wish is None:
@@ -173,6 +174,18 @@ class Facing:
             )
             for name, found in by_imu.items()
         }
+
+    def _scales_left(self, by_imu: dict[str, Faces]) -> Iterator[str]:
+        """What of the scales the firmware would not keep, in words."""
+        for name, found in by_imu.items():
+            calibration = self._imus[name].in_force
+            right = calibration.in_use() / (1.0 + found.figures[SCALE])
+            if calibration.scale_unused_within and (calibration.in_use(vector(right)) == 1.0).all():
+                off_mg = 2e3 * float(np.abs(right - 1.0).max())
+                yield (
+                    f"imu {name}: scales stay 1, for PX4 starts without such as are within 1 % of it; the offsets are"
+                    f" right when level, on another side up to {off_mg:.1f} mg off"
+                )
 
     # --- the record
 

@@ -128,9 +128,8 @@ class EffectWatch:
             gyro_residual=target.solution.gyro_rad_s,
             accel_residual=target.solution.accel_m_s2,
         )
-        on_the_way = OnTheWay(
-            self._px4.seen_far(target.calibration), *step_from_far(target.calibration, target.changes)
-        )
+        steps = step_from_far(target.calibration, target.changes, sides.before.accel_m_s2)
+        on_the_way = OnTheWay(self._px4.seen_far(target.calibration), *steps)
         profile = self._profiles.of(target.name)
         return judge_vectors(sides, target.calibration, list(target.changes), target.kind, profile, on_the_way)
 

@@ -25,6 +25,7 @@ from companion.daemon.offsets.rivalry import Rivalry
 from companion.errors import AutopilotError
 from companion.physics.frames import Array, vector
 from companion.physics.units import MG
+from companion.samples import Vector
 
 COARSE_ACCEL_MG: Final = 5.0
 """What the autopilots' own calibrations reach on a level table; a new offset known worse than that is worth a word."""
@@ -41,6 +42,8 @@ class Target:
     kind: StreamKind | None
     watched: bool
     """Whether its output is in the telemetry that we collect."""
+    read_m_s2: Vector = (0.0, 0.0, 0.0)
+    """What its accelerometers read before; needed where scales are changed."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -115,7 +115,7 @@ class Pusher:
         self, plan: Plan, firmware: GyroParameters | None, draft: Draft, go_on: Callable[[str], None]
     ) -> Plan:
         if firmware is None:
-            async with self._px4.standing_by([(t.calibration, t.changes) for t in plan.targets]) as look:
+            async with self._px4.standing_by([(t.calibration, t.changes, t.read_m_s2) for t in plan.targets]) as look:
                 plan.note(draft, await self._writer.apply(plan.changes, look))
             return plan
         done = await self._firmware.write(plan.changes, plan.gyros, firmware, go_on)

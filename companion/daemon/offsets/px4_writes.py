@@ -29,7 +29,7 @@ from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
 from companion.daemon.offsets.ledger import Ledger
 from companion.links.mavlink.link import MavlinkLink, Message
-from companion.physics.frames import Array
+from companion.physics.frames import Array, vector
 from companion.samples import Vector
 from companion.storage.changes import ChangeSet
 
@@ -235,10 +235,13 @@ class Px4Writes:
 
     @contextlib.asynccontextmanager
     async def standing_by(
-        self, targets: Sequence[tuple[ImuCalibration, Sequence[Change]]]
+        self, targets: Sequence[tuple[ImuCalibration, Sequence[Change], Vector]]
     ) -> AsyncIterator[Look | None]:
-        """Over a write of these changes; gives what to call while the far values are in force (None: no need)."""
-        steps = [step for calibration, changes in targets for step in far_steps(calibration, changes)]
+        """Over a write of these changes; gives what to call while the far values are in force (None: no need).
+
+        The last of each target is what its accelerometers read.
+        """
+        steps = [step for calibration, changes, read in targets for step in far_steps(calibration, changes, read)]
         try:
             async with self._watch.watching(steps) as look:
                 yield look
@@ -251,7 +254,7 @@ class Px4Writes:
                 raise WriteFailedError("without effect", error.reason, error.written, error.left_changed) from error
             raise
         # Only a write that came to its end comes here.
-        for calibration, changes in targets:
+        for calibration, changes, _ in targets:
             if calibration.far_step is not None:
                 after = _offsets(calibration, changes)
                 self._memory.brought_into_use(calibration.parameters.accel_offset, after, self._vehicle.boots)
@@ -273,7 +276,7 @@ class Px4Writes:
         if not changes:
             return False
         logger.info("bringing offsets into use that PX4 may have ignored: %s", ", ".join(c.parameter for c in changes))
-        targets = [(imu.in_force, _again(imu.in_force)) for imu in unsure]
+        targets = [(imu.in_force, _again(imu.in_force), (0.0, 0.0, 0.0)) for imu in unsure]
         try:
             async with self._ledger.transaction(ChangeSet.of(self._vehicle.system_id, changes)):
                 with changing(unsure):
@@ -287,10 +290,11 @@ class Px4Writes:
         return True
 
 
-def far_steps(calibration: ImuCalibration, changes: Sequence[Change]) -> list[FarStep]:
-    """What the output must do when the far values of these changes come into force."""
-    far = [dataclasses.replace(c, after=c.via, via=None) for c in changes if c.via is not None]
-    gyro, accel = output_step(calibration, far)
+def far_steps(
+    calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector = (0.0, 0.0, 0.0)
+) -> list[FarStep]:
+    """What the output must do when the far values of these changes come into force; it reads `accel_m_s2` before."""
+    gyro, accel = output_step(calibration, _far(changes), accel_m_s2)
     names, found = calibration.parameters, []
     for sensor, device_id, name, step in (
         ("gyro", calibration.gyro_id, names.gyro_id, gyro),
@@ -302,10 +306,17 @@ def far_steps(calibration: ImuCalibration, changes: Sequence[Change]) -> list[Fa
     return found
 
 
-def step_from_far(calibration: ImuCalibration, changes: Sequence[Change]) -> tuple[Vector, Vector]:
+def step_from_far(
+    calibration: ImuCalibration, changes: Sequence[Change], accel_m_s2: Vector = (0.0, 0.0, 0.0)
+) -> tuple[Vector, Vector]:
     """By how much the output must move from the far values to the new ones: gyro rad/s, accelerometer m/s^2."""
-    back = [dataclasses.replace(c, before=c.via, via=None) for c in changes if c.via is not None]
-    return output_step(calibration, back)
+    indirect = [change for change in changes if change.via is not None]
+    whole, there = (output_step(calibration, each, accel_m_s2) for each in (indirect, _far(indirect)))
+    return vector(np.subtract(whole[0], there[0])), vector(np.subtract(whole[1], there[1]))
+
+
+def _far(changes: Sequence[Change]) -> list[Change]:
+    return [dataclasses.replace(c, after=c.via, via=None) for c in changes if c.via is not None]
 
 
 def _again(calibration: ImuCalibration) -> list[Change]:
