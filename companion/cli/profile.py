@@ -293,8 +293,7 @@ def _lines(result: Result) -> list[str]:
             unit, unit_name, digits = _UNITS[each.triad]
             sizes = [f"{value / unit:.{digits}f} {unit_name}" for value in (each.sigma_use, each.rms)]
             shares = [f"{share:.1%}" for share in (each.share, each.share_strict, each.share_naive)]
-            over = f"{each.rms / each.sigma_use:.2f}"
-            lines.append(_row(each.triad, (f"{each.mean_s}", *sizes, over, *shares), widths))
+            lines.append(_row(each.triad, (f"{each.mean_s}", *sizes, f"{each.ratio:.2f}", *shares), widths))
     lines += _used_lines(result)
     lines += [f"note: {note}" for note in result.notes]
     return lines + [f"DO NOT USE: {words}" for words in result.broken]

@@ -16,7 +16,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.calibration.noise.robust import median
+from companion.calibration.profiling.coverage import Held
 from companion.calibration.solution.record import ImuRecord
 from companion.errors import StorageError
 from companion.physics.frames import Floats, roll_pitch_from_up, rotation_matrix
@@ -46,21 +46,13 @@ class Refused(msgspec.Struct, frozen=True):
     """Of the first."""
 
 
-class AxisKept(msgspec.Struct, frozen=True, kw_only=True):
+class AxisKept(Held, frozen=True, kw_only=True):
     """How often one axis came out as was said, rad/s or m/s^2."""
 
     axis: str
     next_s: float
     """So long after the window."""
     pairs: int
-    sigma_use: float
-    """Median."""
-    rms: float
-    """Of the difference."""
-    ratio: float
-    """Rms of the difference over its sigma; 1 where sigma is right."""
-    share: float
-    """Within 2 sigma; that what comes after has white noise of its own is allowed for."""
 
 
 class Windows(msgspec.Struct, frozen=True, kw_only=True):
@@ -160,27 +152,18 @@ def _counted(whys: Sequence[str]) -> tuple[Refused, ...]:
 
 def _kept(found: Sequence[_Found | None], span: int, next_s: float) -> list[AxisKept]:
     """Every window against the mean of the `span` ones after it."""
-    misses, uses, sigmas = [], [], []
+    misses, uses, seen = [], [], []
     for at, one in enumerate(found):
         after = [each for each in found[at + 1 : at + 1 + span] if each is not None]
         if one is None or len(after) < span:
             continue
         misses.append(one.bias - np.mean([each.bias for each in after], axis=0))
-        own = np.mean([np.square(each.stat) for each in after], axis=0) / span
-        uses.append(one.use)
-        sigmas.append(np.sqrt(np.square(one.use) + own))
+        uses.append(np.square(one.use))
+        seen.append(np.mean([np.square(each.stat) for each in after], axis=0) / span)
     if not misses:
         return []
-    miss, sigma, use = np.array(misses), np.array(sigmas), np.array(uses)
+    columns = zip(*(np.array(each).T for each in (misses, uses, seen)), _AXES, strict=True)
     return [
-        AxisKept(
-            axis=axis,
-            next_s=next_s,
-            pairs=len(miss),
-            sigma_use=float(median(use[:, column])),
-            rms=float(np.sqrt(np.square(miss[:, column]).mean())),
-            ratio=float(np.sqrt(np.square(miss[:, column] / sigma[:, column]).mean())),
-            share=float((np.abs(miss[:, column]) <= 2.0 * sigma[:, column]).mean()),
-        )
-        for column, axis in enumerate(_AXES)
+        AxisKept.against(miss, use, own, axis=axis, next_s=next_s, pairs=len(misses))
+        for miss, use, own, axis in columns
     ]

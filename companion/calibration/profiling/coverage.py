@@ -7,7 +7,7 @@ that the window itself shows, and V(T, H) of the profile.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final, Self
 
 import msgspec
 import numpy as np
@@ -28,7 +28,36 @@ SIGMAS: Final = 2.0
 _AT_ONCE: Final = 100
 
 
-class Kept(msgspec.Struct, frozen=True, kw_only=True):
+class Held(msgspec.Struct, frozen=True, kw_only=True):
+    """What was said of the time after windows, against what came."""
+
+    sigma_use: float
+    """Median of sqrt(V(T, H)), rad/s or m/s^2."""
+    rms: float
+    """Of the misses."""
+    ratio: float
+    """Rms of a miss over its sigma; 1 where sigma is right."""
+    share: float
+    """Within 2 sigma; that what comes after has white noise of its own is allowed for."""
+
+    @classmethod
+    def against(cls, miss: Floats, use: Floats, seen: Floats, **rest: Any) -> Self:
+        """From misses, variances that were said, and variances of what was seen afterwards, all of one shape."""
+        return cls(
+            sigma_use=float(np.sqrt(median(np.ravel(use)))),
+            rms=float(np.sqrt(np.square(miss).mean())),
+            ratio=float(np.sqrt((np.square(miss) / (use + seen)).mean())),
+            share=within(miss, use + seen),
+            **rest,
+        )
+
+
+def within(miss: Floats, variance: Floats) -> float:
+    """Share of misses within 2 sigma."""
+    return float((np.square(miss) <= SIGMAS**2 * variance).mean())
+
+
+class Kept(Held, frozen=True, kw_only=True):
     """How often the minute after a window of T seconds came out as one triad had said."""
 
     triad: Triad
@@ -36,12 +65,6 @@ class Kept(msgspec.Struct, frozen=True, kw_only=True):
     windows: int
     minutes: float
     """How many windows fit beside one another: what the share is worth."""
-    rms: float
-    """Of the misses, rad/s or m/s^2."""
-    sigma_use: float
-    """Median of sqrt(V(T, H))."""
-    share: float
-    """Within 2 sigma of the bias; that the minute's own white noise is in what is seen of it is allowed for."""
     share_strict: float
     """Within 2 sigma_use as it stands."""
     share_naive: float
@@ -160,20 +183,17 @@ def _naive(window: Sequence[Batch]) -> Floats:
 
 
 def _summary(triad: Triad, columns: slice, mean_s: int, misses: _Misses) -> Kept:
-    miss = np.square(np.concatenate(misses.miss)[:, columns])
-    use, seen, naive = (np.concatenate(each)[:, columns] for each in (misses.use, misses.seen, misses.naive))
-
-    def share(variance: Floats) -> float:
-        return float((miss <= SIGMAS**2 * variance).mean())
-
-    return Kept(
+    miss, use, seen, naive = (
+        np.concatenate(each)[:, columns] for each in (misses.miss, misses.use, misses.seen, misses.naive)
+    )
+    return Kept.against(
+        miss,
+        use,
+        seen,
         triad=triad,
         mean_s=mean_s,
         windows=len(miss),
         minutes=misses.minutes,
-        rms=float(np.sqrt(miss.mean())),
-        sigma_use=float(np.sqrt(median(np.ravel(use)))),
-        share=share(use + seen),
-        share_strict=share(use),
-        share_naive=share(naive),
+        share_strict=within(miss, use),
+        share_naive=within(miss, naive),
     )
