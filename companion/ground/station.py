@@ -344,7 +344,7 @@ class Station:
         if silent_s >= SILENCE_WORTH_A_WORD_S:
             stage = f"nothing heard for {max(silent_s // 5 * 5, SILENCE_WORTH_A_WORD_S):.0f} s"
         elif percent < MEASURED_PERCENT:
-            stage = "measuring: keep the aircraft still"
+            stage = "measuring"
         elif percent < WRITTEN_PERCENT:
             stage = "writing to the autopilot"
         else:

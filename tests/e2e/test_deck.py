@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from companion.calibration.deck.estimate import DeckWork
 from companion.calibration.request import What
@@ -16,11 +17,12 @@ from companion.daemon.calibrating.align_steps import Plan
 from sim.imu_model import DEG_H, MG
 from sim.motions import SlowTurn
 from sim.sea import DAY_S, Sea, Wave
-from tests.e2e.test_arm_gate import AUTHORISED_BY_US, texts, try_to_arm
+from tests.e2e.test_arm_gate import AUTHORISED_BY_US, spied, texts, try_to_arm, tunnelled
 from tests.e2e.test_calibration import started
 from tests.e2e.test_record_replay import replayed, ring, same
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
+from tests.unit.test_lua_arming_script import LUA, SILENT, Script, received, tunnel
 
 DECK = '[vehicle]\nplatform = "deck"\n'
 BOAT = (Sea(start_s=-20.0, waves=(Wave(0.2, 5.0), Wave(0.05, 1.0)), seed=4),)
@@ -85,6 +87,38 @@ def test_px4_on_a_boat_is_calibrated_by_itself_and_then_arms(tmp_path: Path) -> 
             assert "Armed: calibrated" in texts(rig)
 
     run_virtual(main())
+
+
+@pytest.mark.skipif(LUA is None, reason="needs lua5.3 (Debian: apt install lua5.3)")
+def test_ardupilots_script_lets_a_boat_arm_once_it_is_calibrated(tmp_path: Path) -> None:
+    """Every verdict of a boat goes through the script that is installed: what it says is whole, and what opens it."""
+
+    script = Script("both")
+
+    async def main() -> None:
+        seen: list[tuple[str, str]] = []
+        async with boat(tmp_path, at_arm="gate").running() as rig:
+            spied(rig)
+            await rig.ready()
+            rig.service.core.wanted.retarget(target_gyro_sigma_rad_s=20 * DEG_H, target_accel_sigma_m_s2=0.5 * MG)
+            while len(seen) < 200 and [state for state, _ in seen[-10:]] != ["passed"] * 10:
+                await asyncio.sleep(1.0)
+                payload = tunnelled(rig, rig.now_s - 0.6)[-1]
+                script(received(tunnel(7, payload)))
+                seen.append(script("run 1000")[:2])
+                # What the script shows is what the companion said, nothing cut off.
+                assert seen[-1][0] == "passed" or seen[-1][1] == f"Companion: {payload[6:].decode()}"
+        reasons = [reason for state, reason in seen if state != "passed"]
+        assert any(reason.startswith("Companion: wait: at least ") for reason in reasons), reasons
+        assert not any("still" in reason for reason in reasons), reasons
+        assert len(seen) < 200, reasons
+        # It has gone on swaying all the time; without a companion it closes.
+        assert script("run 3400")[:2] == ("failed", SILENT)
+
+    try:
+        run_virtual(main())
+    finally:
+        script.close()
 
 
 def test_the_gate_answers_while_a_small_board_works_for_seconds(tmp_path: Path) -> None:

@@ -76,6 +76,11 @@ def sent(verdict: str = "accept", words: str = "", at_arm: str = "gate") -> mavl
     return message
 
 
+def tunnel(system: int, payload: bytes) -> mavlink.MAVLink_tunnel_message:
+    """The same with a payload that was sent elsewhere."""
+    return mavlink.MAVLink_tunnel_message(system, 1, 33191, len(payload), list(payload.ljust(128, b"\0")))
+
+
 def received(message: mavlink.MAVLink_tunnel_message, system: int = 7, component: int = 191, number: int = 385) -> str:
     """`receive` with the bytes as ArduPilot's scripts get them: the C structure of a message, payload at byte 12."""
     header = struct.pack("<HBBBBBBB", 0, 0xFD, 133, 0, 0, 5, system, component) + number.to_bytes(3, "little")

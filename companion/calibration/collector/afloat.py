@@ -95,9 +95,7 @@ class Afloat:
         """
         slots = self._slots(since_s)
         if slots is None:
-            raise CalibrationRefusedError(
-                f"measured {self.seconds} s of at least {MIN_S if since_s is None else MIN_LOOK_S} s"
-            )
+            raise CalibrationRefusedError(self._at_least(MIN_S if since_s is None else MIN_LOOK_S))
         kept = self._kept.get(since_s)
         known = kept[1] if kept is not None and kept[0] == slots else None
         return DeckMeasurement(
@@ -116,9 +114,8 @@ class Afloat:
         kept = self._kept.get(None)
         found = None if kept is None else kept[1]
         if found is None or self.seconds < MIN_S:
-            left_s = max(MIN_S - self.seconds, 1)
             share = min(self.seconds / MIN_S, 1.0) / 4.0
-            left = f"at least {left_s} s more"
+            left = self._at_least(MIN_S)
             return Progress(enough=False, share=share, words=left, left=left)
         if isinstance(found, CalibrationRefusedError):
             return Progress(enough=False, share=0.0, words=str(found))
@@ -128,11 +125,14 @@ class Afloat:
         if all(each.sigma <= each.goal for each, _, _ in aims):
             return Progress(enough=True, share=1.0, words="sigma is good enough")
         if self.seconds >= MAX_S:
-            return Progress(enough=True, share=1.0, words=f"measured for {MAX_S // 60} min, no longer")
+            return Progress(enough=True, share=1.0, words=f"{MAX_S // 60} min measured")
         left_s = max(last.whole_s - self.seconds, 1)
         left = more(left_s)
         share = self.seconds / (self.seconds + left_s)
         return Progress(enough=False, share=share, words=f"{left}: {last.in_words(unit, name)}", left=left)
+
+    def _at_least(self, needed: int) -> str:
+        return f"at least {max(needed - self.seconds, 1)} s more"
 
     def _slots(self, since_s: float | None) -> range | None:
         slots = self._deck.slots(since_s)

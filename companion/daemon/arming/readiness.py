@@ -92,7 +92,7 @@ class Forecast:
         words = _IN_THE_MIDDLE[state]
         if state is State.SETTLING:
             left_s = self._left_s(state, self._job_s, now_s)
-            return ArmAnswer("wait", f"{words}: wait, {left_s:.0f} s at most")
+            return ArmAnswer("wait", f"{words}: {left_s:.0f} s at most")
         if state in (State.UNDOING, State.RESTARTING):
             return ArmAnswer("wait", f"{words}: wait")
         return ArmAnswer.hold_still(self._left_s(state, self._estimate_s(state, now_s), now_s), words)
@@ -240,7 +240,8 @@ class Readiness:
         if answer.hold_still_s is None:
             return answer
         status = self._collector.status(now_s)
-        return ArmAnswer("wait", f"wait: {answer.meanwhile or status.left or status.measuring}")
+        meanwhile = "" if answer.meanwhile == BY_ITSELF else answer.meanwhile
+        return ArmAnswer("wait", f"wait: {meanwhile or status.left or status.measuring}")
 
     def until_calibrated_s(self, now_s: float) -> float:
         """Seconds of holding still until a calibration by itself would be in force."""

@@ -55,8 +55,8 @@ _WATCHING: Final = "watching the telemetry take the new offsets"
 POLL_S: Final = 0.2
 """A complete second is looked at when it is; this is how often for whatever else may change."""
 SAY_WAITING_EVERY_S: Final = 10.0
-SAY_LEFT_EVERY_S: Final = 60.0
-"""Through minutes in which nothing is in the way."""
+SAY_LEFT_EVERY_S: Final = 75.0
+"""Through minutes in which nothing is in the way; the first minute of a deck says nothing yet."""
 READ_ATTEMPTS: Final = 2
 """How often, within one calibration, the autopilot's offsets may fail to be read."""
 MOST_UPSETS: Final = 5

@@ -116,7 +116,7 @@ class Headlines:
         if answer.hold_still_s is not None:
             return _hold_still(answer.hold_still_s, answer.meanwhile)
         if answer.verdict == "wait":
-            return Headline("WAIT", answer.words, "wait")
+            return Headline("WAIT", answer.words.removeprefix("wait: "), "wait")
         return self._failed() or Headline("NOT READY", answer.words, "bad")
 
     def _uncalibrated(self, words: str, now_s: float) -> Headline:

@@ -97,7 +97,7 @@ class EffectWatch:
                 try:
                     after = await self._core.window(since_s=since_s)
                 except CalibrationRefusedError as error:
-                    words = str(error)
+                    words = f"checking the new offsets: {error}"
                 else:
                     verdicts = {target.name: self._judge(target, before, after) for target in watched}
                     words = _inconclusive(verdicts, loop.time() - since_s)
