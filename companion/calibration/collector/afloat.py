@@ -125,7 +125,7 @@ class Afloat:
         if all(each.sigma <= each.goal for each, _, _ in aims):
             return Progress(enough=True, share=1.0, words="sigma is good enough")
         if self.seconds >= MAX_S:
-            return Progress(enough=True, share=1.0, words=f"{MAX_S // 60} min measured")
+            return Progress(enough=True, share=1.0, words=f"measured for {MAX_S // 60} min")
         left_s = max(last.whole_s - self.seconds, 1)
         left = more(left_s)
         share = self.seconds / (self.seconds + left_s)
