@@ -46,3 +46,27 @@ async def played_last(instance: int) -> tuple[float, float]:
     out, _ = await asyncio.wait_for(shell.communicate(), 10.0)
     found = dict(re.findall(r"(frequency|duration): (\d+)", out.decode()))
     return float(found["frequency"]), float(found["duration"])
+
+
+@pytest.mark.only("px4")
+def test_px4_reads_on_in_a_new_tune_where_it_was_in_the_old_one(autopilot: Autopilot) -> None:
+    """Therefore `APART_S`: the notes are the new ones, from the third on, and their tempo is the old one."""
+    slow = "MFT32L1O4A"  # one note of 7.5 s
+
+    async def main(craft: Craft) -> None:
+        async with craft.companion() as station:
+            await craft.heartbeats()
+            for tune in (slow, Tune.DONE.value):
+                station.send(mavlink.MAVLink_play_tune_message(craft.ground.vehicle, 1, tune.encode(), b""))
+                await asyncio.sleep(APART_S)
+            if isinstance(craft, DoubleCraft):
+                assert craft.double.buzzer.broken_off == 1
+            else:
+                assert isinstance(craft, SitlCraft)
+                assert isinstance(craft.vehicle, Px4Sitl)
+                frequency_hz, duration_us = await played_last(craft.vehicle.instance)
+                new = [note for note in notes_of(Tune.DONE.value) if note.frequency_hz]
+                assert any(frequency_hz == pytest.approx(note.frequency_hz, abs=1.0) for note in new)
+                assert duration_us * 1e-6 > 3.0 * max(note.seconds for note in new[:3])
+
+    autopilot.run(main)
