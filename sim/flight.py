@@ -193,6 +193,8 @@ class MovingAircraft(VirtualAircraft):
         self._known: dict[bytes, Truth] = {}
         self._box = _matrices(np.radians([[pose.roll_deg, pose.pitch_deg, 0.0]]))[0]
         """Vehicle to box."""
+        self._coriolis = 2.0 * np.cross(self._earth_rate_ned, np.eye(3))
+        """(3, 3), what each component of a velocity, north, east and down, is accelerated by."""
 
     def still_at(self, t_s: float) -> bool:
         """Before the route, and while no motion acts."""
@@ -204,14 +206,11 @@ class MovingAircraft(VirtualAircraft):
         vehicle: Array = self._box @ _matrices(angles)
         return vehicle
 
-    def angles_rad(self, t_s: float) -> tuple[float, float, float]:
-        """True roll, pitch, heading of the box, heading in [-pi, pi]."""
-        c = self.matrices(np.array([t_s]))[0]
-        return (
-            math.atan2(c[1, 2], c[2, 2]),
-            -math.asin(max(-1.0, min(1.0, float(c[0, 2])))),
-            math.atan2(c[0, 1], c[0, 0]),
-        )
+    def angles_over(self, t_s: Array) -> Array:
+        """True roll, pitch, heading of the box (n, 3), heading in [-pi, pi]."""
+        c = self.matrices(t_s).transpose(1, 2, 0)
+        pitch = -np.arcsin(np.clip(c[0, 2], -1.0, 1.0))
+        return np.column_stack([np.arctan2(c[1, 2], c[2, 2]), pitch, np.arctan2(c[0, 1], c[0, 0])])
 
     def body_from_ned(self, t_s: float) -> Array:
         """The attitude matrix (3, 3)."""
@@ -247,7 +246,7 @@ class MovingAircraft(VirtualAircraft):
         cross = np.einsum("nij,nkj->nik", turning, turn)
         rate = np.column_stack([cross[:, 2, 1], cross[:, 0, 2], cross[:, 1, 0]])
         velocity = self._velocity(t_s)
-        acceleration = _derivative(self._velocity, t_s) + 2.0 * np.cross(self._earth_rate_ned, velocity)
+        acceleration = _derivative(self._velocity, t_s) + velocity @ self._coriolis
         force = np.einsum("nij,nj->ni", turn, acceleration - self._gravity_ned)
         rate = rate + np.einsum("nij,j->ni", turn, self._earth_rate_ned)
         for motion in self._motions:
@@ -273,5 +272,4 @@ def _matrices(angles_rad: Array) -> Array:
         [sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp],
         [cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp],
     ]
-    result: Array = np.moveaxis(np.array(rows), 2, 0)
-    return result
+    return np.array(rows).transpose(2, 0, 1)

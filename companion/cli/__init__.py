@@ -56,7 +56,7 @@ def _fail(options: argparse.Namespace, state: str, reason: str) -> None:
 
 
 def _parser() -> Parser:
-    from companion.cli import client, ground, local, monitor, profile, recordings, setup
+    from companion.cli import client, ground, local, monitor, profile, recordings
 
     # -c and --json may stand before or after the subcommand: SUPPRESS keeps the later parser from undoing the first.
     common = Parser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -74,7 +74,7 @@ def _parser() -> Parser:
         sub.set_defaults(command=command)
         return sub
 
-    setup.add_command(add)
+    local.add_command(add)
     run = add("run", local.run, "run the daemon in the foreground")
     run.add_argument("-v", "--verbose", action="store_true", help="log what happens in detail")
     check = add("check", local.check, "check configuration, ports, sensors and autopilot; say what is wrong")

@@ -23,6 +23,41 @@ if TYPE_CHECKING:
     from companion.links.serial.ports import SerialPort
 
 
+def add_command(add: AddCommand) -> None:
+    """Add `companion setup`, which comes first."""
+    parser = add("setup", setup, "find autopilot and sensors, ask what cannot be found out, write the configuration")
+    parser.add_argument(
+        "ports", nargs="*", metavar="PORT", help="serial ports to listen to (default: all that nobody holds)"
+    )
+    parser.add_argument("--yes", action="store_true", help="ask nothing: take what would stand in brackets")
+    parser.add_argument("--mavlink", metavar="URL", help="where the autopilot is; otherwise it is looked for")
+    parser.add_argument(
+        "--udp", type=_udp_port, action="append", metavar="PORT",
+        help="a UDP port to listen to, instead of the usual ones; may be given again",
+    )  # fmt: skip
+    parser.add_argument("--platform", metavar="WHERE", help="ground or deck")
+    parser.add_argument("--law", metavar="LAW", help="of the gradienter: axis, slope or euler")
+    parser.add_argument(
+        "--mounting", action="append", default=[], metavar="DEVICE=HOW",
+        help="of gradienter, compass or imu: degrees clockwise from above, ROLL,PITCH,YAW, or ROTATION_...",
+    )  # fmt: skip
+    parser.add_argument("--no-check", action="store_true", help="write the file only")
+    parser.add_argument("--no-service", action="store_true", help="do not offer to start it at every boot")
+
+
+def _udp_port(text: str) -> int:
+    if not text.isdigit() or not 1 <= int(text) <= 65535:
+        raise argparse.ArgumentTypeError(f"found {text!r}; allowed: a port from 1 to 65535")
+    return int(text)
+
+
+async def setup(options: argparse.Namespace) -> int:
+    """`companion setup`: what it needs is nothing to other commands."""
+    from companion.cli import setup as session
+
+    return await session.setup(options)
+
+
 def add_commands(add: AddCommand) -> None:
     """Add those that have options of their own: to install, to uninstall, and to report."""
     for name, command, words in (

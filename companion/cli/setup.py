@@ -13,7 +13,7 @@ from typing import Any, Final
 from companion import config
 from companion.cli.asking import Asking
 from companion.cli.show import finding_lines
-from companion.cli.terminal import DONE, FAILED, AddCommand, config_path, load_config, print_json
+from companion.cli.terminal import DONE, FAILED, config_path, load_config, print_json
 from companion.config.sections import Config, Imu
 from companion.config.words import shown
 from companion.errors import CompanionError, ConfigError, DaemonDeniedError, DaemonUnreachableError
@@ -34,34 +34,6 @@ WITHOUT: Final = {
 }
 IMUS_S: Final = 4.0
 CHECK_S: Final = 5.0
-
-
-def add_command(add: AddCommand) -> None:
-    """Add it to the parser of the command line."""
-    parser = add("setup", setup, "find autopilot and sensors, ask what cannot be found out, write the configuration")
-    parser.add_argument(
-        "ports", nargs="*", metavar="PORT", help="serial ports to listen to (default: all that nobody holds)"
-    )
-    parser.add_argument("--yes", action="store_true", help="ask nothing: take what would stand in brackets")
-    parser.add_argument("--mavlink", metavar="URL", help="where the autopilot is; otherwise it is looked for")
-    parser.add_argument(
-        "--udp", type=_udp_port, action="append", metavar="PORT",
-        help=f"a UDP port to listen to, instead of {', '.join(map(str, USUAL_PORTS))}; may be given again",
-    )  # fmt: skip
-    parser.add_argument("--platform", metavar="WHERE", help="ground or deck")
-    parser.add_argument("--law", metavar="LAW", help="of the gradienter: axis, slope or euler")
-    parser.add_argument(
-        "--mounting", action="append", default=[], metavar="DEVICE=HOW",
-        help="of gradienter, compass or imu: degrees clockwise from above, ROLL,PITCH,YAW, or ROTATION_...",
-    )  # fmt: skip
-    parser.add_argument("--no-check", action="store_true", help="write the file only")
-    parser.add_argument("--no-service", action="store_true", help="do not offer to start it at every boot")
-
-
-def _udp_port(text: str) -> int:
-    if not text.isdigit() or not 1 <= int(text) <= 65535:
-        raise argparse.ArgumentTypeError(f"found {text!r}; allowed: a port from 1 to 65535")
-    return int(text)
 
 
 async def setup(options: argparse.Namespace) -> int:

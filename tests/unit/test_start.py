@@ -22,7 +22,7 @@ from tests.support.virtual_time import run_virtual
 
 NOT_YET = (
     "aiomqtt", "companion.daemon.heading.attitude_service", "companion.daemon.process.check",
-    "companion.ground",
+    "companion.cli.setup", "companion.ground", "companion.installation", "companion.setup",
     "companion.replay", "companion.report", "csv", "email", "http", "importlib.metadata", "lxml", "lz4", "mavsdk",
     "mcap", "multiprocessing", "numpy.fft", "numpy.ma", "numpy.polynomial", "numpy.random", "numpy.testing", "paho",
     "pymavlink.mavutil", "rich", "sqlite3", "unittest", "urllib.request", "xml", "zipfile", "zstandard",
