@@ -232,8 +232,12 @@ class VirtualAircraft:
             if t_s[0] >= motion.end_s:
                 angles += motion.leaves_rad()
                 continue
-            inside = np.clip(t_s, motion.start_s, motion.end_s)
-            added, slopes = motion.euler_rad(inside)
+            if motion.start_s <= t_s[0] and t_s[-1] < motion.end_s:
+                added, slopes = motion.euler_rad(t_s)
+                angles += added
+                rates += slopes
+                continue
+            added, slopes = motion.euler_rad(np.clip(t_s, motion.start_s, motion.end_s))
             acting = (t_s >= motion.start_s) & (t_s < motion.end_s)
             over = t_s >= motion.end_s
             angles += np.where(over[:, None], motion.leaves_rad(), np.where(acting[:, None], added, 0.0))
@@ -245,16 +249,13 @@ class VirtualAircraft:
         roll, pitch, yaw = angles.T
         sr, cr, sp, cp, sy, cy = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch), np.sin(yaw), np.cos(yaw)
         to_body = np.empty((len(t_s), 3, 3))
-        to_body[:, 0] = np.column_stack([cp * cy, cp * sy, -sp])
-        to_body[:, 1] = np.column_stack([sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp])
-        to_body[:, 2] = np.column_stack([cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp])
-        turning = np.column_stack(
-            [
-                slopes[:, 0] - sp * slopes[:, 2],
-                cr * slopes[:, 1] + sr * cp * slopes[:, 2],
-                -sr * slopes[:, 1] + cr * cp * slopes[:, 2],
-            ]
-        )
+        to_body[:, 0] = np.array([cp * cy, cp * sy, -sp]).T
+        to_body[:, 1] = np.array([sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp]).T
+        to_body[:, 2] = np.array([cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp]).T
+        rolling, pitching, yawing = slopes.T
+        turning = np.array(
+            [rolling - sp * yawing, cr * pitching + sr * cp * yawing, -sr * pitching + cr * cp * yawing]
+        ).T
         force = -(to_body @ self._gravity_ned)
         for motion in self._motions:
             acting = (t_s >= motion.start_s) & (t_s < motion.end_s)
@@ -262,6 +263,6 @@ class VirtualAircraft:
                 force[acting] += motion.acceleration_m_s2(t_s[acting])
                 forward, right, down = motion.level_acceleration_m_s2(t_s[acting]).T
                 c, s = cy[acting], sy[acting]
-                ned = np.column_stack([c * forward - s * right, s * forward + c * right, down])
+                ned = np.array([c * forward - s * right, s * forward + c * right, down]).T
                 force[acting] += np.einsum("nij,nj->ni", to_body[acting], ned)
         return Truth(turning + to_body @ self._earth_rate_ned, force)

@@ -20,7 +20,7 @@ Euler = tuple[float, float, float]
 
 def smooth_step(u: Array) -> tuple[Array, Array]:
     """A step from 0 to 1 over u in [0, 1] with continuous second derivative, and its derivative in u."""
-    u = np.clip(u, 0.0, 1.0)
+    u = np.minimum(np.maximum(u, 0.0), 1.0)
     return u**3 * (10.0 - 15.0 * u + 6.0 * u**2), 30.0 * u**2 * (1.0 - u) ** 2
 
 
@@ -80,19 +80,14 @@ class SlowTurn(Motion):
         """Added angles and rates: the rate rises smoothly over `ramp_s`, stays, and falls likewise."""
         ramp = min(self.ramp_s, self.duration_s / 2.0)
         since, until = t_s - self.start_s, self.end_s - t_s
-        u = np.clip(np.minimum(since, until) / ramp, 0.0, 1.0)
-        rate = np.radians(self.rate_deg_s) * u**2 * (3.0 - 2.0 * u)
-
-        def turned(elapsed: Array) -> Array:
-            v = np.clip(elapsed / ramp, 0.0, 1.0)
-            return ramp * (v**3 - v**4 / 2.0) + np.maximum(elapsed - ramp, 0.0)
-
-        half = self.duration_s / 2.0
-        whole = 2.0 * turned(np.array([half]))[0]
-        angle = np.where(since <= half, turned(since), whole - turned(np.maximum(until, 0.0)))
-        zero = np.zeros_like(t_s)
-        angle = np.radians(self.rate_deg_s) * np.where(since <= 0.0, 0.0, angle)
-        return np.column_stack([zero, zero, angle]), np.column_stack([zero, zero, rate])
+        near = np.minimum(since, until)  # to the beginning or to the end: it ends as it has begun
+        u = np.minimum(np.maximum(near / ramp, 0.0), 1.0)
+        turned = ramp * (u**3 - u**4 / 2.0) + np.maximum(near - ramp, 0.0)
+        angles, rates = np.zeros((2, len(t_s), 3))
+        rate_rad_s = math.radians(self.rate_deg_s)
+        angles[:, 2] = rate_rad_s * np.where(since <= until, turned, self.duration_s - ramp - turned)
+        rates[:, 2] = rate_rad_s * u**2 * (3.0 - 2.0 * u)
+        return angles, rates
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

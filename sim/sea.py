@@ -77,9 +77,10 @@ class Sea(Motion):
         """Added angles and rates."""
         angles, _, slopes = self._sums(t_s)
         height, rising = self._height(t_s)
-        zero = np.zeros((len(t_s), 1))
-        rates = height[:, None] * slopes + rising[:, None] * angles
-        return np.hstack([height[:, None] * angles, zero]), np.hstack([rates, zero])
+        turned, rates = np.zeros((2, len(t_s), 3))
+        turned[:, :2] = height[:, None] * angles
+        rates[:, :2] = height[:, None] * slopes + rising[:, None] * angles
+        return turned, rates
 
     def level_acceleration_m_s2(self, t_s: Array) -> Array:
         """Surge, sway and heave: down the slope, and round."""
@@ -88,7 +89,7 @@ class Sea(Motion):
         height, _ = self._height(t_s)
         forward, right = -self.surge * slope[:, 1], self.surge * slope[:, 0]
         down = -self.heave * later.sum(axis=1)
-        result: Array = STANDARD_GRAVITY_M_S2 * height[:, None] * np.column_stack([forward, right, down])
+        result: Array = STANDARD_GRAVITY_M_S2 * height[:, None] * np.array([forward, right, down]).T
         return result
 
     def leaves_rad(self) -> Array:
