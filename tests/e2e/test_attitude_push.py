@@ -463,7 +463,8 @@ def test_a_fault_of_ours_costs_the_push_and_nothing_else(tmp_path: Path, monkeyp
 
 def test_off_is_off() -> None:
     """Neither imported nor listening."""
-    code = "import companion.daemon.process.service, sys; print([m for m in sys.modules if 'attitude' in m])"
+    ours = "('companion.attitude', 'companion.daemon.heading.attitude_service')"
+    code = f"import companion.daemon.process.service, sys; print([m for m in sys.modules if m.startswith({ours})])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
 
