@@ -197,6 +197,18 @@ def test_a_sway_that_turns_back_is_no_end_of_a_range() -> None:
     assert "hits the end of its range" in verdict.words
 
 
+def test_integers_of_a_turn_that_comes_to_rest_are_a_motion_and_no_end_of_a_range() -> None:
+    """A second of PX4's SCALED_IMU: the hand takes off 3 deg/s, and the rest of the second reads 0."""
+    times = np.arange(250) / 250.0
+    turn = np.outer(np.maximum(1.0 - 2.0 * times, 0.0) ** 2, [0, 0, 0.05, 0, 0, 0])
+    noise = np.random.default_rng(6).normal(0.0, 1.0, (250, 6)) * [1e-4, 1e-4, 1e-4, 0.01, 0.01, 0.01]
+    batch = batch_of(np.round((REST + turn + noise) / 1e-3) * 1e-3)
+    assert batch.clipped
+    verdict = ImuGate("fc", noise_profile(None), (1e-3, 1e-3)).judge(batch)
+    assert not verdict.still
+    assert "deg/s >" in verdict.words
+
+
 def test_a_quantised_constant_stream_is_not_stuck() -> None:
     gate = ImuGate("fc", noise_profile(None), (1e-3, 9.80665e-3))
     batch = batch_of(np.tile(REST, (50, 1)))

@@ -204,7 +204,9 @@ class ImuGate:
         if batch.largest_gap_s > MAX_IMU_GAP_S:
             return _fault(f"imu {name} was silent for {batch.largest_gap_s:.1f} s > {MAX_IMU_GAP_S}")
         if batch.clipped and not (self._sways and _is_within(batch)):
-            return _fault(f"imu {name} hits the end of its range")
+            # Whole numbers pile up at one end too in the second in which it comes to rest.
+            ends = self._moving(batch) if _is_within(batch) else None
+            return ends or _fault(f"imu {name} hits the end of its range")
         distinct = batch.distinct.tolist()
         if batch.n >= STUCK_SAMPLES and 1 in distinct:
             same = [count == 1 and step == 0.0 for count, step in zip(distinct, self._steps.told, strict=True)]
