@@ -29,7 +29,7 @@ from companion.setup.survey import Survey, same_port, same_url, survey
 
 KINDS: Final[tuple[Kind, ...]] = ("gradienter", "compass", "imu")
 WITHOUT: Final = {
-    "gradienter": "no gradienter: gyros only (it may be connected later: companion setup again)",
+    "gradienter": "no gradienter: gyros only, accelerometers by hand (connected later: companion setup again)",
     "compass": "no compass: the gyros' sigmas are a little wider",
 }
 IMUS_S: Final = 4.0
@@ -141,7 +141,8 @@ class _Session:
             self.asking.say(f"  {place}: {words}")
 
         found = await survey(ports, udp, tell, draft.lines)
-        self.asking.say("", "Enter takes what stands in [brackets]; Ctrl-C ends, and nothing is written.")
+        if not self.asking.yes:
+            self.asking.say("", "Enter takes what stands in [brackets]; Ctrl-C ends, and nothing is written.")
         return found
 
     async def _take_autopilot(self, draft: Draft, found: Survey) -> None:
@@ -349,6 +350,9 @@ def _next_steps(parsed: Config, command: str, *, is_old: bool, runs: bool, good:
     if parsed.gradienter is not None:
         yield f"{command} align zero   (once: the gradienter's zero)"
     yield f"{command} calibrate --wait   (disarmed, standing still, hands off)"
+    ashore = parsed.vehicle.platform == "ground"
+    if ashore and parsed.gradienter is None and any(imu.source == "autopilot" for imu in parsed.imu):
+        yield f"{command} align faces --write   (once: accelerometers too, held on all sides by hand, 5 min)"
 
 
 def _absolute(port: str) -> str:

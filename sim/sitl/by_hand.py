@@ -45,9 +45,16 @@ class Accelerometer(NamedTuple):
     bias_mg: Array
     scale_percent: Array
 
+    @property
+    def level_mg(self) -> Array:
+        """What it reads too much when level: up is -1 g on z."""
+        return self.bias_mg + np.array([0.0, 0.0, -10.0]) * self.scale_percent
+
     def __str__(self) -> str:
-        bias, scale = (" ".join(f"{value:+8.3f}" for value in part) for part in self)
-        return f"bias {bias} mg, scale {scale} %"
+        bias, scale, level = (
+            " ".join(f"{value:+8.3f}" for value in part) for part in (self.bias_mg, self.scale_percent, self.level_mg)
+        )
+        return f"bias {bias} mg, scale {scale} %; when level {level} mg"
 
 
 async def judged(vehicle: SitlVehicle, ground: GroundStation, hands: Hands, instance: int = 1) -> Accelerometer:

@@ -376,7 +376,7 @@ def test_where_no_systemd_runs_it_is_started_by_hand(
     answer = json.loads(capsys.readouterr().out)
     assert answer["steps"] is None
     assert [step.split("   ")[0] for step in answer["next"]] == [
-        "companion run", "companion check", "companion calibrate --wait",
+        "companion run", "companion check", "companion calibrate --wait", "companion align faces --write",
     ]  # fmt: skip
 
 
