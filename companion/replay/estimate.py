@@ -224,6 +224,7 @@ class _Pass:
         self._found: list[Measurement] = []
         self._still_s = 0.0
         self._obstacle = ""
+        self._longest_s = 0.0
         self._verdicts: dict[int, tuple[str, str]] = {}
         """By second, why it was not still, and without the figures of a movement; empty where it was."""
         self._verdicts_from_s = 0.0
@@ -261,6 +262,7 @@ class _Pass:
         """At the end of a second: is it worth while to measure?"""
         collector = self._collector
         glance = collector.glance(now_s)
+        self._longest_s = max(self._longest_s, glance.still_s)
         if glance.obstacle is not None:
             if glance.obstacle.hold_still_s is None:
                 self._obstacle = glance.obstacle.words
@@ -284,7 +286,11 @@ class _Pass:
         """What is in the way where no second of it could be judged."""
         (imu, *_) = self._collector.status(seconds + _FIRST_S).sources
         worst = max(imu.dropped, key=lambda why: imu.dropped[why], default="")
-        return f"{imu.dropped[worst]} samples dropped: {worst}" if worst else f"it is {seconds:.1f} s long"
+        if worst:
+            return f"{imu.dropped[worst]} samples dropped: {worst}"
+        if self._given.platform == "deck":
+            return f"the longest is {self._longest_s:.0f} s, without its first"
+        return f"it is {seconds:.1f} s long"
 
     def _aged(self, measurement: Measurement) -> Measurement:
         """With what is known of the time before the log, where nothing was silent since."""

@@ -83,6 +83,14 @@ def test_the_same_log_as_ground_names_the_option(log: Path, capsys: pytest.Captu
     assert "vehicle.platform" not in said
 
 
+def test_less_than_a_minute_is_too_little(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    short = tmp_path / "short.csv"
+    short.write_text("".join(log.read_text().splitlines(keepends=True)[: 60 * RATE_HZ + 1]), encoding="utf-8")
+    assert companion(["replay", str(short), *PLACE, "--platform", "deck"]) == 1
+    # The second in which a stream begins does not count.
+    assert "no 60 s without a gap in it: the longest is 59 s, without its first" in capsys.readouterr().out
+
+
 def test_a_heading_that_stands_still_is_no_decks(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert companion(["replay", str(log), "--platform", "deck", "--heading-deg", "40"]) == 2
     assert capsys.readouterr().err.strip() == (
