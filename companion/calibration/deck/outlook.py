@@ -13,12 +13,13 @@ from companion.calibration.deck.deck import EVERY_S
 from companion.calibration.deck.estimate import MAX_S, MIN_S, ByHeading, Known, followed_walk, wandered
 from companion.calibration.means.windows import WHITE_SHARE
 
-_FALLS: Final = 3.0
-"""What more seconds take away of a variance falls with this power of the time: a slope through waves or white noise."""
+_FALLS: Final = 2.0
+"""What more seconds take away of a variance falls with this power of the time, as long as nothing shows it: of a slope
+through waves or white noise with the third, of a sensor's own white noise with the first."""
 _FALLS_LEAST: Final = 1.0
-"""White noise of the sensor itself."""
-_APART: Final = 1.3
-"""So many times longer than another is an estimate that shows the power."""
+_FALLS_MOST: Final = 3.0
+_APART: Final = 1.15
+"""So many times longer than the first is an estimate that shows the power."""
 _STEP_S: Final = 20.0
 _IN_MINUTES_S: Final = 90.0
 
@@ -76,13 +77,12 @@ def _left(past: Sequence[Past], at: int, whole_s: int) -> float:
 
 
 def _falls(past: Sequence[Past], at: int) -> float:
-    seconds, white = past[-1].seconds, past[-1].known[at].white
-    for shorter in reversed(past):
-        was = shorter.known[at].white
-        if shorter.seconds * _APART <= seconds and was > white > 0.0:
-            fell = math.log(was / white) / math.log(seconds / shorter.seconds)
-            return min(max(fell, _FALLS_LEAST), _FALLS)
-    return _FALLS
+    first, latest = past[0], past[-1]
+    was, white = first.known[at].white, latest.known[at].white
+    if first.seconds * _APART > latest.seconds or white <= 0.0:
+        return _FALLS
+    fell = math.log(max(was, white) / white) / math.log(latest.seconds / first.seconds)
+    return min(max(fell, _FALLS_LEAST), _FALLS_MOST)
 
 
 def _slope_variance(whole_s: float, by: ByHeading) -> float:
