@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from companion.cli.terminal import print_lines
@@ -26,13 +26,23 @@ class Asking:
     def __init__(self, *, yes: bool, error: bool) -> None:
         self.yes, self._error = yes, error
         self._rest = b""
+        self._echoes = yes or not sys.stdin.isatty()
 
     def say(self, *lines: str) -> None:
         """Tell something."""
         print_lines(*lines, error=self._error)
 
-    async def ask(self, question: str, now: str, put: Callable[[str], None], hint: str = "") -> None:
+    async def ask(
+        self, question: str, now: str, put: Callable[[str], None], hint: str = "", choices: Sequence[str] = ()
+    ) -> None:
         """Ask until `put` takes the answer; an empty one is what holds now.
+
+        Args:
+            question: in words.
+            now: the answer that holds if none is given.
+            put: takes an answer; raises ConfigError, in one line, where it is none.
+            hint: what helps to answer.
+            choices: usual answers, for a page that makes buttons of them.
 
         Raises:
             CompanionError: there is nobody to answer any more.
@@ -41,7 +51,7 @@ class Asking:
         while True:
             print_lines(f"  [{now}] >" if now else "  >", error=self._error, end=" ")
             answer = now if self.yes else (await self._line()).strip() or now
-            if self.yes or not sys.stdin.isatty():
+            if self._echoes:
                 self.say(answer)
             try:
                 put(answer)
@@ -62,7 +72,7 @@ class Asking:
                 raise ConfigError(f"found {shown(words)}; allowed: yes or no")
             found = words.lower().startswith("y")
 
-        await self.ask(question, "yes" if by_default else "no", put)
+        await self.ask(question, "yes" if by_default else "no", put, choices=("yes", "no"))
         return found
 
     async def _line(self) -> str:

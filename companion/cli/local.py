@@ -6,15 +6,23 @@ import argparse
 import dataclasses
 import datetime
 import faulthandler
-import io
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import quote
 
 from companion.cli import logs, show
-from companion.cli.terminal import DONE, FAILED, USAGE, AddCommand, config_path, load_config, print_json, print_lines
+from companion.cli.terminal import (
+    DONE,
+    FAILED,
+    USAGE,
+    AddCommand,
+    config_path,
+    load_config,
+    print_address,
+    print_json,
+    print_lines,
+)
 from companion.errors import CompanionError, ConfigError, StorageError
 
 if TYPE_CHECKING:
@@ -28,6 +36,9 @@ def add_command(add: AddCommand) -> None:
     parser = add("setup", setup, "find autopilot and sensors, ask what cannot be found out, write the configuration")
     parser.add_argument(
         "ports", nargs="*", metavar="PORT", help="serial ports to listen to (default: all that nobody holds)"
+    )
+    parser.add_argument(
+        "--page", metavar="ADDRESS:PORT", help="ask on a page there, for a phone (0.0.0.0:8191) or the board itself"
     )
     parser.add_argument("--yes", action="store_true", help="ask nothing: take what would stand in brackets")
     parser.add_argument("--mavlink", metavar="URL", help="where the autopilot is; otherwise it is looked for")
@@ -169,25 +180,9 @@ async def web_token(options: argparse.Namespace) -> int:
     token = None if is_loopback(host) else kept_token(config.storage.path)
     if getattr(options, "json", False):
         print_json({"url": url, "token": token})
-    elif token is None:
-        print_lines(f"{url} needs no token: only this board can reach it")
     else:
-        whole = f"{url}#token={quote(token)}"
-        print_lines(f"token: {token}")
-        print_lines(f"open once on the phone: {whole}")
-        if sys.stdout.isatty() and (sys.stdout.encoding or "").lower().startswith("utf"):
-            print_lines("or let its camera read this:")
-            sys.stdout.write(_code(whole))
+        print_address(url, token)
     return DONE
-
-
-def _code(text: str) -> str:
-    """A QR code of a text for a terminal, dark on light whatever its colours are."""
-    import segno
-
-    drawn = io.StringIO()
-    segno.make(text, error="l", micro=False).terminal(drawn, border=2, compact=True)
-    return "".join(f"\x1b[97;40m{line}\x1b[0m\n" for line in drawn.getvalue().splitlines())
 
 
 async def check(options: argparse.Namespace) -> int:

@@ -14,6 +14,7 @@ from companion import config
 from companion.cli.asking import Asking
 from companion.cli.show import finding_lines
 from companion.cli.terminal import DONE, FAILED, config_path, load_config, print_json
+from companion.config.rules import bind_problem
 from companion.config.sections import Config, Imu
 from companion.config.words import shown
 from companion.errors import CompanionError, ConfigError, DaemonDeniedError, DaemonUnreachableError
@@ -39,7 +40,31 @@ CHECK_S: Final = 5.0
 async def setup(options: argparse.Namespace) -> int:
     """`companion setup`."""
     as_json = getattr(options, "json", False)
-    session = _Session(options, Asking(yes=options.yes, error=as_json))
+    if options.page is None:
+        session = _Session(options, Asking(yes=options.yes, error=as_json))
+        await _to_the_end(session)
+    else:
+        from companion.cli.by_page import PageAsking
+
+        async with PageAsking(_bind(options)) as asking:
+            session = _Session(options, asking)
+            await _to_the_end(session)
+            await asking.agrees("Read all of it? Then this page closes.")
+    if as_json:
+        print_json(session.answer)
+    return DONE if session.answer["state"] != "failed" else FAILED
+
+
+def _bind(options: argparse.Namespace) -> str:
+    if options.yes or getattr(options, "json", False):
+        raise ConfigError("--page asks a person: it goes neither with --yes nor with --json")
+    if (wrong := bind_problem(options.page, "--page")) is not None:
+        raise ConfigError(wrong)
+    page: str = options.page
+    return page
+
+
+async def _to_the_end(session: _Session) -> None:
     try:
         await session.run()
     except asyncio.CancelledError:
@@ -48,9 +73,6 @@ async def setup(options: argparse.Namespace) -> int:
     except CompanionError as error:
         kind = ConfigError if isinstance(error, ConfigError) else CompanionError
         raise kind(f"{error}; {session.so_far}") from None
-    if as_json:
-        print_json(session.answer)
-    return DONE if session.answer["state"] != "failed" else FAILED
 
 
 class _Session:
@@ -78,6 +100,8 @@ class _Session:
         is_new = draft.is_new
         if is_new and self._path != config.DEFAULT_PATH:
             draft.keep_beside(self._path)
+        if self._options.page is not None:
+            draft.show_page(self._options.page)
         given = self._given()
         found = await self._listen(draft)
         await self._take_autopilot(draft, found)
@@ -205,7 +229,8 @@ class _Session:
                 raise ConfigError(f"found {shown(words)}; allowed: 1 to {len(names)}")
             chosen = names[int(words) - 1]
 
-        await self.asking.ask(f"{what}: which?", "1", put)
+        numbers = [str(number) for number in range(1, len(names) + 1)]
+        await self.asking.ask(f"{what}: which?", "1", put, choices=numbers)
         return chosen
 
     async def _ask(self, draft: Draft, given: dict[str, str]) -> None:
@@ -221,7 +246,7 @@ class _Session:
                     raise ConfigError(f"{question.key}: {error}") from None
                 self.asking.say(f"{question.words} {given[question.key]}")
             elif not self.asking.yes:
-                await self.asking.ask(question.words, question.now, question.put, question.hint)
+                await self.asking.ask(question.words, question.now, question.put, question.hint, question.choices)
             else:
                 guess = " (a guess)" if question.key in draft.guessed else ""
                 self.asking.say(f"{question.words} {question.now}{guess}")

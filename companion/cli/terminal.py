@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import io
 import json
 import math
 import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any, Final, NoReturn
+from urllib.parse import quote
 
 from companion import config
 from companion.config import SavedProfiles
@@ -39,6 +41,29 @@ def print_lines(*lines: object, error: bool = False, end: str = "\n") -> None:
     for line in lines:
         stream.write(printable(str(line)) + end)
     stream.flush()
+
+
+def print_address(url: str, token: str | None) -> None:
+    """Where a page is, with the token that its buttons need: as words, and as a picture for a phone's camera."""
+    if token is None:
+        print_lines(f"{url} needs no token: only this board can reach it")
+        return
+    whole = f"{url}#token={quote(token)}"
+    print_lines(f"token: {token}")
+    print_lines(f"open once on the phone: {whole}")
+    if sys.stdout.isatty() and (sys.stdout.encoding or "").lower().startswith("utf"):
+        print_lines("or let its camera read this:")
+        sys.stdout.write(_code(whole))
+        sys.stdout.flush()
+
+
+def _code(text: str) -> str:
+    """A QR code of a text for a terminal, dark on light whatever its colours are."""
+    import segno
+
+    drawn = io.StringIO()
+    segno.make(text, error="l", micro=False).terminal(drawn, border=2, compact=True)
+    return "".join(f"\x1b[97;40m{line}\x1b[0m\n" for line in drawn.getvalue().splitlines())
 
 
 def load_config(options: argparse.Namespace, *, profiles: bool = False, forgiving: bool = False) -> Config:

@@ -44,8 +44,8 @@ def _complaints(config: Config) -> Iterator[str]:
     yield from _ports_differ(config)
     yield from _mavlink_url(config.mavlink.url)
     yield from _access(config.mavlink)
-    if config.web is not None:
-        yield from _bind(config.web.bind)
+    if config.web is not None and (wrong := bind_problem(config.web.bind, "'web.bind'")) is not None:
+        yield wrong
     if config.mqtt is not None:
         yield from _mqtt(config.mqtt)
     if (config.vehicle.latitude_deg is None) != (config.vehicle.longitude_deg is None):
@@ -173,15 +173,19 @@ def _mavlink_url(url: str) -> Iterator[str]:
 _BIND = re.compile(r"(?:\[(?P<six>[0-9a-fA-F:.]+)\]|(?P<host>[^:\[\]]+)):(?P<port>\d{1,5})")
 
 
-def _bind(bind: str) -> Iterator[str]:
-    """Numbers only: what a name stands for may change with the network, and with it who can reach the page."""
+def bind_problem(bind: str, name: str) -> str | None:
+    """Why a page cannot be bound there; None where it can.
+
+    Numbers only: what a name stands for may change with the network, and with it who can reach the page.
+    """
     match = _BIND.fullmatch(bind)
     host = (match["six"] or match["host"]) if match else ""
-    if not (match and int(match["port"]) <= LAST_PORT and (host == "localhost" or is_address(host))):
-        yield (
-            f"'web.bind': found {bind!r}; allowed: ADDRESS:PORT, such as 127.0.0.1:8191 (this board only),"
-            " 192.168.4.1:8191 or [::1]:8191"
-        )
+    if match and int(match["port"]) <= LAST_PORT and (host == "localhost" or is_address(host)):
+        return None
+    return (
+        f"{name}: found {bind!r}; allowed: ADDRESS:PORT, such as 127.0.0.1:8191 (this board only),"
+        " 192.168.4.1:8191 or [::1]:8191"
+    )
 
 
 def is_address(host: str) -> bool:

@@ -42,6 +42,8 @@ class Question:
     """The answer that holds if none is given."""
     put: Callable[[str], None]
     """Take an answer; raises ConfigError, in one line, where it is none."""
+    choices: Sequence[str]
+    """Usual answers."""
 
 
 @dataclass
@@ -115,6 +117,15 @@ class Draft:
         self._put("storage", "directory", str(folder / "companion-state"))
         self._put("control", "socket", str(folder / "companion.sock"))
 
+    def show_page(self, bind: str) -> None:
+        """Let the daemon have its page there, unless it has one.
+
+        Raises:
+            ConfigError: it is no address.
+        """
+        if "web" not in self.wanted:
+            self._put("web", "bind", bind)
+
     def section(self, kind: Kind) -> Table | None:
         """What there is of a device: of IMUs the first on a port of its own."""
         if kind == "imu":
@@ -169,6 +180,7 @@ class Draft:
             "",
             self.wanted.get("vehicle", {}).get("platform", "ground"),
             lambda words: self._put("vehicle", "platform", _one_of(words, get_args(Platform)), "ground"),
+            get_args(Platform),
         )
         if (gradienter := self.section("gradienter")) is not None:
             known = PROTOCOLS["gradienter"][gradienter["protocol"]].law
@@ -180,6 +192,7 @@ class Draft:
                 else "Its data sheet tells, or docs/calibration.md. A wrong one costs milli-g.",
                 gradienter["law"],
                 lambda words: self._put("gradienter", "law", _one_of(words, get_args(Law))),
+                get_args(Law),
             )
         kinds: Sequence[Kind] = ("gradienter", "compass", "imu")
         for kind in kinds:
@@ -190,6 +203,7 @@ class Draft:
                     "Degrees clockwise; 0: its front is to the aircraft's front. Or ROLL PITCH YAW, or ROTATION_...",
                     mounting_words(section.get("mounting", "ROTATION_NONE")),
                     functools.partial(self._put_mounting, kind),
+                    ("0", "90", "180", "270"),
                 )
 
     def _put_mounting(self, kind: Kind, words: str) -> None:

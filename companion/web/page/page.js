@@ -35,6 +35,8 @@ function headline(tone, word, reason) {
 }
 function show(status) {
   headline(status.headline.tone, status.headline.word, status.headline.reason);
+  firstRun(status.setup || null);
+  if (status.setup) return;
   $("vehicle").textContent = status.vehicle.summary;
   busy = status.progress !== null;
   $("progress").hidden = !busy;

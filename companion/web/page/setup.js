@@ -1,0 +1,37 @@
+"use strict";
+// The first run: what `companion setup` says and asks. It thinks; here its words are shown and answers go back.
+let asked = 0;
+
+function firstRun(found) {
+  document.body.classList.toggle("setup", found !== null);
+  $("setup").hidden = found === null;
+  if (found === null) return;
+  $("vehicle").textContent = "companion setup";
+  const told = found.lines.join("\n").trim();
+  if ($("told").textContent !== told) {
+    $("told").textContent = told;
+    $("told").scrollTop = $("told").scrollHeight;
+  }
+  const question = found.question;
+  $("answer").hidden = question === null;
+  if (question === null || question.number === asked) return;
+  asked = question.number;
+  $("question").textContent = question.words;
+  $("hint").textContent = question.hint;
+  $("words").value = question.now;
+  $("choices").replaceChildren(...question.choices.map(words => {
+    const button = make("button", words);
+    button.type = "button";
+    button.addEventListener("click", () => reply(words));
+    if (words === question.now) button.className = "now";
+    return button;
+  }));
+  $("typed").hidden = question.choices.length > 0 && question.choices.every(words => ["yes", "no"].includes(words));
+}
+async function reply(words) {
+  await act("answer", "answer", {number: asked, words});
+}
+document.getElementById("answer").addEventListener("submit", event => {
+  event.preventDefault();
+  reply($("words").value.trim());
+});
