@@ -204,6 +204,21 @@ def test_a_phone_on_the_field(tmp_path: Path) -> None:
             ]
             assert await tab.value("awake.join()") == "screen,released"
 
+            # An alignment is asked for in the same way, shown with its picture, and its end stays on the page.
+            await tab.value("$('align').open = true")
+            button = "#align button[data-name='align turn']"
+            await tab.value(f"document.querySelector({button!r}).scrollIntoView({{block: 'center'}})")
+            await tab.touch(button)
+            await tab.until("$('wish').textContent === 'stand it on a firm, marked spot, hands off'")
+            await tab.lift()
+            assert await tab.value("$('standing').textContent") == "turn on the spot: stand 1 of 5"
+            assert await tab.value("document.querySelectorAll('#how .nose').length") == 4
+            await tab.value("scrollTo(0, 0)")
+            await here.picture("phone_align")
+            await tab.touch("#cancel")
+            await tab.lift()
+            await tab.until("$('result').textContent === \"cancelled by the page's cancel\"")
+
             # The daemon goes away, is noticed, and comes back; the page's old token is none any more.
             assert here.line.daemon is not None
             here.line.daemon.kill()
