@@ -103,7 +103,7 @@ class PageAsking(Asking):
             latest = next((line for line in reversed(self._lines) if line.strip()), "")
             headline = {"word": "SETTING UP", "reason": latest.strip(), "tone": "busy"}
         else:
-            headline = {"word": "YOUR ANSWER", "reason": question["hint"], "tone": "wait"}
+            headline = {"word": "YOUR ANSWER", "reason": "", "tone": "wait"}
         return {"headline": headline, "setup": {"lines": self._lines, "question": question}}
 
 
