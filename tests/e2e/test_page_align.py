@@ -40,6 +40,10 @@ def test_who_follows_the_pictures_alone_makes_the_stands_and_a_page_opened_later
                 await made.until(lambda: shown()["share"] > 0.5, 60.0)
                 assert headline(made)[1].startswith("MEASURING")
             await made.until(lambda: shown()["number"] == 4, 60.0)
+            # Three stands leave much open: each figure once, the one that the wish names among them.
+            unknown = shown()["unknown"]
+            assert 3 <= len(set(unknown)) == len(unknown) <= 6
+            assert shown()["wish"].partition(": ")[2] in unknown
             assert len({tuple(round(value) for value in up) for up in held}) == 3
             for up, read in zip(held, shown()["done"], strict=True):
                 assert math.dist(up, read) < math.radians(15.0)  # hands, and a scale that is wrong
@@ -79,7 +83,8 @@ def status(stands: Object | None, **more: Any) -> Object:
 def stand(up: tuple[float, float, float], **more: Any) -> Object:
     return {
         "kind": "measurement on all sides", "number": 3, "total": 12, "wish": "nose down is missing: z scale 0.4 %",
-        "hold": {"up": up, "turn_deg": 0.0}, "words": "", "objection": None, "share": 0.25,
+        "hold": {"up": up, "turn_deg": 0.0}, "words": "", "unknown": ["z scale 0.4 %", "x bias 1 mg"],
+        "objection": None, "share": 0.25,
         "done": [(0.0, 0.0, -1.0), (1.0, 0.0, 0.0)], "outcome": None, **more,
     }  # fmt: skip
 
@@ -131,7 +136,7 @@ def test_the_page_shows_how_to_hold_it_and_asks_for_what_is_pressed(tmp_path: Pa
             nose_y, fin_y, root_y = await tab.value(TIPS)
             assert nose_y > fin_y + 50.0
             assert await tab.value("$('wish').textContent") == "nose down is missing"
-            assert await tab.value("$('still').textContent") == "z scale 0.4 %"
+            assert await tab.value("$('still').textContent") == "still unknown: z scale 0.4 %, x bias 1 mg"
             assert await tab.value("document.querySelectorAll('#done li').length") == 12
             assert await tab.value("document.querySelectorAll('#done svg.hold').length") == 2
             assert await tab.value("document.querySelector('#align button').disabled && !$('cancel').disabled")

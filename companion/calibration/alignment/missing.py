@@ -42,6 +42,8 @@ class Missing:
     side: str
     figure: str
     """Of which axis, with its sigma."""
+    unknown: tuple[str, ...] = ()
+    """All that are not known well enough, likewise, the worst first."""
 
     def __str__(self) -> str:
         return f"{self.side} is missing: {self.figure}"
@@ -75,7 +77,9 @@ def missing(found: Faces, vehicle_from_sensor: Matrix) -> Missing | None:
         words = "a stand does not fit, one more tells which" if found.in_doubt else "nothing checks the others yet"
         return Missing(max(told, key=lambda side: float(told[side].sum())), words)
     side = max(told, key=lambda side: float(told[side][open_figures].sum()))
-    return Missing(side, _figure(found, int(np.argmax(np.where(open_figures, told[side] * share, 0.0)))))
+    worst_first = [_figure(found, int(which)) for which in np.argsort(-share) if open_figures[which]]
+    told_most = int(np.argmax(np.where(open_figures, told[side] * share, 0.0)))
+    return Missing(side, _figure(found, told_most), tuple(worst_first))
 
 
 def seen_before(found: Faces, up: Array, vehicle_from_sensor: Matrix) -> int | None:
@@ -134,7 +138,7 @@ def _figure(found: Faces, which: int) -> str:
 
 def up_of(side: str) -> tuple[float, float, float]:
     """Up in the aircraft's axes, forward, right, down, of length 1, where it is held as `Missing.side` says."""
-    names = side.removeprefix("half way between ").split(" and ")
+    names = side.removeprefix(f"{HALF_WAY}between ").split(" and ")
     up = np.sum([_SIDES[name] for name in names], axis=0)
     x, y, z = (up / np.linalg.norm(up)).tolist()
     return x, y, z

@@ -49,6 +49,8 @@ class _Known(NamedTuple):
     """The same as a picture."""
     aloud: str = ""
     """The same, to be heard."""
+    unknown: tuple[str, ...] = ()
+    """As in `Missing`."""
 
 
 class Facing:
@@ -129,7 +131,7 @@ class Facing:
                     return window, f"it stands as in stand {again + 1}: {known.wish}"
             return window, None
 
-        asked = Asked(number, max(EXPECTED, number), known.wish or "", known.hold, known.aloud)
+        asked = Asked(number, max(EXPECTED, number), known.wish or "", known.hold, known.aloud, known.unknown)
         # No stand hangs on another, so that a flight in between costs nothing.
         return await self._stands.next(job, asked, take, if_armed=None)
 
@@ -158,7 +160,7 @@ class Facing:
             raise CalibrationRefusedError("no IMU whose accelerometers can be read")
         if wish is None:
             return _Known(by_imu, None)
-        return _Known(by_imu, str(wish), Hold(up_of(wish.side)), wish.aloud)
+        return _Known(by_imu, str(wish), Hold(up_of(wish.side)), wish.aloud, wish.unknown)
 
     def _face(self, imu: ImuWindow) -> Face:
         """In the sensor's own axes, in which firmwares scale."""

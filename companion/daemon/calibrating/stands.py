@@ -47,6 +47,8 @@ class Asked(NamedTuple):
     """The same as a picture."""
     aloud: str = ""
     """The same in at most 39 characters, where the wish up to its first colon is longer."""
+    unknown: tuple[str, ...] = ()
+    """What the stands so far leave open, the worst first."""
 
     @property
     def spoken(self) -> str:
@@ -62,6 +64,7 @@ class StandsShown(msgspec.Struct):
     total: int
     wish: str
     hold: Hold
+    unknown: tuple[str, ...] = ()
     words: str = ""
     """What is going on."""
     objection: str | None = None
@@ -162,9 +165,10 @@ class Stands:
             await job.pause(POLL_S)
 
     def _show(self, asked: Asked) -> StandsShown:
-        assert self.shown is not None
-        self.shown.number, self.shown.total, self.shown.wish, self.shown.hold, _ = asked
-        return self.shown
+        shown = self.shown
+        assert shown is not None
+        shown.number, shown.total, shown.wish, shown.hold, _, shown.unknown = asked
+        return shown
 
     def _object(self, objection: str, asked: Asked) -> None:
         """In one line to be heard; where that holds no more than the reason, with what is asked for once more."""

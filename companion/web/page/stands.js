@@ -77,7 +77,7 @@ function stands(found) {
   $("standing").textContent = running ? `${found.kind}: stand ${found.number} of ${found.total}` : `${found.kind}: ${found.outcome}`;
   $("stands").dataset.outcome = found.outcome || "";
   $("wish").textContent = wish;
-  $("still").textContent = found.objection || unknown || "";
+  $("still").textContent = found.objection || (found.unknown.length ? "still unknown: " + found.unknown.join(", ") : unknown || "");
   $("still").className = found.objection ? "objection" : "";
   $("how").replaceChildren(picture(found.hold.up, found.hold.turn_deg, wish));
   const left = Math.max(found.total - found.done.length, 0);
