@@ -147,7 +147,9 @@ def add_command(add: AddCommand) -> None:
         help="2: there, turned, back (of zero without it); 4: every 90 deg (of turn without it)",
     )
     parser.add_argument(
-        "--level", action="store_true", help="turn, after faces: write how the board sits (AHRS_TRIM), not offsets"
+        "--level",
+        action="store_true",
+        help="turn, after faces: write how the board sits (AHRS_TRIM, SENS_BOARD)",
     )
     parser.add_argument("--write", action="store_true", help="turn, faces: write what was found to the autopilot")
     parser.add_argument("--timeout", type=seconds, metavar="S", help="give up after so long (default 900)")

@@ -19,6 +19,7 @@ from sim.ardupilot.double import offset_names
 from sim.earth import mounting_matrix
 from sim.hands import Hands
 from sim.imu_model import MG
+from sim.px4.calibration import SensorCalibration
 from tests.e2e.test_align_faces import follow as by_sides
 from tests.e2e.test_calibration import calibrated, started
 from tests.support.rig import Rig
@@ -193,6 +194,7 @@ def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restar
             np.testing.assert_allclose(trim, true_deg, atol=0.05)
             assert (np.abs(trim - true_deg) < 3.0 * np.array(record.board.sigma_deg)).all()
             assert set(record.board.written) == {"AHRS_TRIM_X", "AHRS_TRIM_Y"}
+            assert {one.outcome for one in record.board.written.values()} == {"verified"}
             assert offsets == {name: made.double.parameter(name) for name in offsets}, "offsets stay as they are"
             undone = made.service.calibrating.conductor.start_undo("test")
             assert not isinstance(undone, Refusal)
@@ -205,3 +207,47 @@ def test_with_all_sides_known_the_boards_tilt_is_written_on_a_slope_and_a_restar
 
     run_virtual(sides())
     run_virtual(level())
+
+
+@pytest.mark.parametrize("follows", [True, False])
+def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, follows: bool
+) -> None:
+    """A board that sits 1.2 deg to the right and 0.8 deg nose down; its attitude follows only after a restart."""
+    board_deg = (1.2, -0.8, 0.0)
+    made, hands = rig(tmp_path, FLAT, "px4", mounting_deg=board_deg, parameters={"SENS_BOARD_X_OFF": 0.3})
+    names = ("SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF")
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            result = await by_sides(
+                made, hands, started(made.service.calibrating.conductor.start_faces("test", 2000.0, write=True))
+            )
+            assert result.outcome == "done", result
+            hands.spot(made.aircraft.time_at(made.now_s), STEEP.pitch_deg, STEEP.roll_deg)
+            await asyncio.sleep(15.0)
+            if not follows:
+                monkeypatch.setattr(SensorCalibration, "_set_rotation", lambda *_: None)
+            job = started(made.service.calibrating.conductor.start_turn(TurnAsked(4, level=True), "test", 900.0))
+            result = await follow(made, hands, job)
+            if not follows:
+                assert result.outcome == "failed"
+                assert result.reason == "the attitude did not follow the new level, or it moved; old values put back"
+                assert made.autopilot.parameter(names[0]) == pytest.approx(0.3)
+                return
+            assert result.outcome == "done", result
+            record = job.product
+            assert isinstance(record, TurnRecord)
+            assert record.board is not None
+            up = mounting_matrix(*board_deg).T @ np.array([0.0, 0.0, -1.0])
+            true_deg = np.degrees([np.arctan2(-up[1], -up[2]), np.arcsin(up[0])])
+            written = [made.autopilot.parameter(name) for name in names]
+            np.testing.assert_allclose(written, true_deg, atol=0.05)
+            assert {one.outcome for one in record.board.written.values()} == {"verified"}
+            undone = made.service.calibrating.conductor.start_undo("test")
+            assert not isinstance(undone, Refusal)
+            assert (await undone.finished).outcome == "done"
+            assert [made.autopilot.parameter(name) for name in names] == pytest.approx([0.3, 0.0])
+
+    run_virtual(main())

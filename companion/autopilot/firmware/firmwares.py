@@ -98,6 +98,8 @@ _CALTEMP: Final = Range(-300.0, 200.0, unit="deg C")
 _DEVICE_ID: Final = Range(0.0, 2.0**24, whole=True)
 _TRIM: Final = Range(-math.radians(10.0), math.radians(10.0), unit="rad")
 """ArduPilot cuts it off there."""
+_LEVEL: Final = Range(-45.0, 45.0, unit="deg")
+"""What is there before may be anything that a user has set."""
 _SWITCH: Final = Range(0.0, 255.0, whole=True)
 
 
@@ -118,7 +120,8 @@ def _ardupilot() -> dict[str, Range]:
 
 
 def _px4() -> dict[str, Range]:
-    return {name: one for slot in range(SLOTS) for name, one in _offsets(px4.parameters_of(slot, slot)).items()}
+    found = {name: one for slot in range(SLOTS) for name, one in _offsets(px4.parameters_of(slot, slot)).items()}
+    return found | dict.fromkeys(px4.LEVEL[:2], _LEVEL)
 
 
 CALIBRATION: Final[Mapping[Firmware, Ranges]] = {

@@ -41,6 +41,7 @@ from companion.samples import Vector
 Sensor = Literal["gyro", "accel"]
 
 SLOTS: Final = 4
+LEVEL: Final = ("SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF", "SENS_BOARD_Z_OFF")
 NO_IMU: Final = 0
 PREFIX: Final[dict[Sensor, str]] = {"gyro": "CAL_GYRO", "accel": "CAL_ACC"}
 WORDS: Final[dict[Sensor, str]] = {"gyro": "gyro", "accel": "accelerometer"}
@@ -256,13 +257,7 @@ def warnings_about(calibration: ImuCalibration, changes: Sequence[Change]) -> tu
 
 
 async def _read_rotation(parameters: ParameterClient, gyro: Slot, accel: Slot) -> Matrix:
-    level = rotation_matrix(
-        (
-            await _read_angle(parameters, "SENS_BOARD_X_OFF"),
-            await _read_angle(parameters, "SENS_BOARD_Y_OFF"),
-            await _read_angle(parameters, "SENS_BOARD_Z_OFF"),
-        )
-    )
+    level = rotation_matrix(await read_level(parameters))
     gyro_mounting = await _read_mounting(parameters, "gyro", gyro)
     accel_mounting = await _read_mounting(parameters, "accel", accel)
     if not np.array_equal(gyro_mounting, accel_mounting):
@@ -277,6 +272,16 @@ async def _read_rotation(parameters: ParameterClient, gyro: Slot, accel: Slot) -
 def _bus(slot: Slot) -> int:
     """The kind of bus in a device id."""
     return slot.device_id & 0b111
+
+
+async def read_level(parameters: ParameterClient) -> Vector:
+    """The level adjustment: degrees of roll, pitch, yaw.
+
+    Raises:
+        AutopilotError: as `ParameterClient.read`, or no angles.
+    """
+    x, y, z = LEVEL
+    return await _read_angle(parameters, x), await _read_angle(parameters, y), await _read_angle(parameters, z)
 
 
 async def _read_angle(parameters: ParameterClient, name: str) -> float:

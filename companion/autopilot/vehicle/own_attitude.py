@@ -8,15 +8,19 @@ good as a compass next to motors and wires is, and no better.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 from collections import deque
+from collections.abc import Iterator
 from typing import Final, NamedTuple
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import Vehicle
 from companion.calibration.solution.otherwise import OwnHeading
 from companion.calibration.solution.site import UNKNOWN_DECLINATION_SIGMA_DEG
+from companion.physics.frames import Array, body_from_ned
 from companion.physics.units import DEG
 
 HEADING_SIGMA_DEG: Final = 10.0
@@ -25,6 +29,10 @@ RATE_HZ: Final = 1.0
 STEADY_DEG: Final = 2.0
 """By how much yaw may move in `KEPT_S` while the aircraft stands: else the estimator is still looking for it."""
 KEPT_S: Final = 5.0
+QUICK_HZ: Final = 5.0
+LEAST: Final = 4
+LEAST_S: Final = 1.0
+LOOK_S: Final = 0.2
 OLD_S: Final = 5.0
 _MAGNETOMETER: Final[int] = mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
 
@@ -47,7 +55,7 @@ class OwnAttitude:
     """
 
     def __init__(self, vehicle: Vehicle, *, wanted: bool) -> None:
-        self._vehicle = vehicle
+        self._vehicle, self._wanted = vehicle, wanted
         self._seen: deque[Angles] = deque(maxlen=256)
         self._has_compass_s = self._agrees_s = -math.inf
         rate_hz = RATE_HZ if wanted else None
@@ -69,6 +77,34 @@ class OwnAttitude:
         # Without a place it knows no declination.
         north_deg = 0.0 if self._vehicle.place.position is not None else UNKNOWN_DECLINATION_SIGMA_DEG
         return OwnHeading((last + sum(turned) / len(turned)) / DEG % 360.0, math.hypot(HEADING_SIGMA_DEG, north_deg))
+
+    @contextlib.contextmanager
+    def asked(self) -> Iterator[None]:
+        """Meanwhile ATTITUDE comes several times a second."""
+        commands, message_id = self._vehicle.commands, int(mavlink.MAVLINK_MSG_ID_ATTITUDE)
+        commands.request_message_interval(message_id, QUICK_HZ)
+        try:
+            yield
+        finally:
+            # 0: the firmware's own rate.
+            interval_us = 1e6 / RATE_HZ if self._wanted else 0.0
+            commands.send(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us)
+
+    def up(self, since_s: float) -> Array | None:
+        """Mean direction of up in the vehicle's axes, (3,), of a second at least from then on; None before that."""
+        seen = self._since(since_s)
+        if len(seen) < LEAST or seen[-1].t_s - seen[0].t_s < LEAST_S:
+            return None
+        ups = [body_from_ned(one.roll, one.pitch, 0.0) @ (0.0, 0.0, -1.0) for one in seen]
+        return np.asarray(np.mean(ups, axis=0))
+
+    async def up_since(self, since_s: float) -> Array | None:
+        """Wait for it a few seconds; None: this autopilot does not tell."""
+        loop = asyncio.get_running_loop()
+        give_up_s = loop.time() + OLD_S
+        while (found := self.up(since_s)) is None and loop.time() < give_up_s:
+            await asyncio.sleep(LOOK_S)
+        return found
 
     def _since(self, t_s: float) -> list[Angles]:
         return [one for one in self._seen if one.t_s >= t_s]

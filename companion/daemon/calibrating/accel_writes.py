@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
 
-from companion.autopilot.firmware.ardupilot import TRIM
 from companion.autopilot.firmware.imu_calibration import output_step
 from companion.autopilot.firmware.px4 import warnings_about
 from companion.autopilot.parameters.change import Change
-from companion.calibration.alignment.spot import Mounting
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.record import WrittenParameter
 from companion.calibration.solution.solve import ImuSolution
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.daemon.core import Core
@@ -26,9 +22,7 @@ from companion.daemon.offsets.plan import Plan, Target
 from companion.daemon.offsets.push import Conclusion
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import CalibrationRefusedError
-from companion.storage.changes import ChangeSet
 
-MOST_TRIM_RAD: Final = math.radians(10.0)
 _WATCHING: Final = "watching the telemetry take the new offsets"
 
 
@@ -91,30 +85,6 @@ class AccelWrites:
                 plan.mark(draft, target.calibration.parameters.accel_scale, "verified")
         await self._conclusion.conclude(job, plan, last, draft)
         self._machine.on(Event.CONCLUDED)
-
-    async def write_level(self, job: Job, board: Mounting) -> dict[str, WrittenParameter]:
-        """How the board sits, into ArduPilot's trim; read back, and undone like every write.
-
-        Raises:
-            CompanionError: it failed, and why; the old values are back, or it is said which are not.
-            JobCancelledError: cancelled before anything was written.
-        """
-        after = (board.roll_rad, board.pitch_rad)
-        if max(map(abs, after)) > MOST_TRIM_RAD:
-            raise CalibrationRefusedError("the board would sit more than 10 deg askew: no trim is for that")
-        changes = [
-            Change(name, await self._core.parameters.read(name), value) for name, value in zip(TRIM, after, strict=True)
-        ]
-        job.check_cancelled()
-        self._machine.on(Event.WRITE)
-        job.progress(MEASURED_PERCENT, f"writing {len(changes)} parameters")
-        kept = ChangeSet.of(self._core.vehicle.system_id, changes)
-        async with self._ledger.transaction(kept):
-            written = await self._writer.apply(changes)
-            await self._ledger.done(kept)
-        for event in (Event.WRITTEN, Event.VERIFIED, Event.CONCLUDED):
-            self._machine.on(event)
-        return written
 
     def _target(self, imu: ImuWindow, changes: Sequence[Change]) -> Target:
         calibration = self._imus[imu.name].in_force

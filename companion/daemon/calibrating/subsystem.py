@@ -21,6 +21,7 @@ from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.course import Course, Measuring, Solving
 from companion.daemon.calibrating.faces_in_force import FacesInForce
 from companion.daemon.calibrating.facing import Facing
+from companion.daemon.calibrating.level_writes import LevelWrites
 from companion.daemon.calibrating.solver import Solver
 from companion.daemon.calibrating.stands import Stands
 from companion.daemon.calibrating.turning import TurnAsked, Turning
@@ -69,7 +70,8 @@ class Calibrating(Subsystem):
         writes = AccelWrites(core, imus, offsets, self.conclusion)
         aligner = Aligner(core, stands, self.alignment)
         facing = Facing(core, imus, stands, writes, self.faces)
-        turning = Turning(core, imus, stands, writes, self.faces)
+        levels = LevelWrites(core, imus, offsets, own)
+        turning = Turning(core, imus, stands, writes, levels, self.faces)
         self._results = Results(core, self.store, self.memory)
         self.conductor = Conductor(core, course, aligner, facing, turning, offsets.recovery, self._results)
 

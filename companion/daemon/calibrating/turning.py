@@ -21,11 +21,13 @@ from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.record import WrittenParameter
 from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.calibration.solution.turn_record import BoardRecord, TurnRecord, turn_imu_record
+from companion.component.statustext import Severity
 from companion.configured import models
 from companion.daemon.calibrating import align_steps
 from companion.daemon.calibrating.accel_writes import AccelWrites
 from companion.daemon.calibrating.align_steps import Plan, Seen
 from companion.daemon.calibrating.faces_in_force import FacesInForce
+from companion.daemon.calibrating.level_writes import LevelWrites
 from companion.daemon.calibrating.stands import Asked, Stands, imu_stand
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -62,10 +64,16 @@ class Turning:
     """Measures so; who may start it is the conductor's."""
 
     def __init__(
-        self, core: Core, imus: Mapping[str, AutopilotImu], stands: Stands, writes: AccelWrites, known: FacesInForce
+        self,
+        core: Core,
+        imus: Mapping[str, AutopilotImu],
+        stands: Stands,
+        writes: AccelWrites,
+        levels: LevelWrites,
+        known: FacesInForce,
     ) -> None:
         self._core, self._machine, self._imus = core, core.machine, imus
-        self._stands, self._writes, self._known = stands, writes, known
+        self._stands, self._writes, self._levels, self._known = stands, writes, levels, known
 
     def why_not(self, asked: TurnAsked) -> str | None:
         """Why there is nothing to measure, or nothing could be written; None where all is well."""
@@ -73,8 +81,6 @@ class Turning:
             return "either --write (offsets) or --level (the board's tilt): what is in one is not in the other"
         if asked.level and self._known.record is None:
             return "the board's tilt needs accelerometers known from all sides: companion align faces --write first"
-        if asked.level and self._core.vehicle.firmware == "px4":
-            return "the level is not written to PX4: align turn without --level shows it"
         return self._writes.why_not(write=asked.write or asked.level)
 
     async def run(self, job: Job, asked: TurnAsked) -> str:
@@ -121,7 +127,10 @@ class Turning:
                 }
                 await self._writes.write(job, taken[-1].window, changes, draft)
             elif asked.level and board is not None:
-                sits = await self._writes.write_level(job, board)
+                sits, warning = await self._levels.write(job, board, taken[-1].window)
+                draft.warnings += [] if warning is None else [warning]
+                if warning is not None:
+                    self._core.say(Severity.WARNING, warning)
         finally:
             record = _record(taken, stands, found, draft)
             job.deliver(msgspec.structs.replace(record, board=self._as_record(found, board, sits)))
