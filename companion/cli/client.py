@@ -7,6 +7,7 @@ import asyncio
 import math
 from typing import Any
 
+from companion.calibration.solution.record import outcome_word
 from companion.cli import show
 from companion.cli.terminal import DONE, FAILED, AddCommand, load_config, print_json, print_lines, seconds
 from companion.daemon.faces.control import ask
@@ -215,7 +216,8 @@ def turn_lines(record: Object) -> list[str]:
 
 def _written_lines(written: Object) -> list[str]:
     return [
-        f"  {name:18} {one['before']:+.6f} -> {one['after']:+.6f}  {one['outcome']}" for name, one in written.items()
+        f"  {name:18} {one['before']:+.6f} -> {one['after']:+.6f}  {outcome_word(one['outcome'])}"
+        for name, one in written.items()
     ]
 
 

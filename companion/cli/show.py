@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from companion.calibration.solution.record import Magnetic
+from companion.calibration.solution.record import Magnetic, outcome_word
 from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:
@@ -30,7 +30,9 @@ def record_lines(record: Object) -> list[str]:
     if pose is not None:
         sigma = pose["sigma_deg"]
         angles = (
-            f"{words} {_number(pose[f'{key}_deg'], '.2f')} deg (sigma {_number(sigma[key], '.2f')})"
+            f"{words} unknown"
+            if pose[f"{key}_deg"] is None
+            else f"{words} {pose[f'{key}_deg']:.2f} deg (sigma {_number(sigma[key], '.2f')})"
             for words, key in (("pitch", "theta"), ("roll", "gamma"), ("heading", "psi"))
         )
         lines.append(f"pose: {', '.join(angles)}")
@@ -61,7 +63,8 @@ def _imu_lines(imu: Object) -> list[str]:
         lines.append(f"  {triad:5} bias {unit} {axes(imu[bias], imu[sigma], form, scale)}{_held_back(imu, triad)}")
     for name, written in imu["written"].items():
         lines.append(
-            f"  {name:16} {_number(written['before'], '+.6f')} -> {written['after']:+.6f}  {written['outcome']}"
+            f"  {name:16} {_number(written['before'], '+.6f')} -> {written['after']:+.6f}"
+            f"  {outcome_word(written['outcome'])}"
         )
     lines += [f"  warning: {warning}" for warning in imu["warnings"]]
     return lines
@@ -214,6 +217,8 @@ def _bias_lines(calibration: Object | None) -> list[str]:
 
 
 def _held_back(imu: Object, triad: str) -> str:
+    if triad in imu.get("unchanged", ()):
+        return "  right already: not written"
     return "  held back: not written" if triad in imu.get("held_back", ()) else ""
 
 

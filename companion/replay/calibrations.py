@@ -84,7 +84,9 @@ def record_again(recorded: Record, solution: Solution, solved_with: Mapping[str,
         calibration = solved_with.get(found.name)
         if calibration is not None and found.name in corrected:
             draft.whole[found.name] = whole_of(calibration, found)
-    words = in_words(solution)
+    draft.written = {imu.name: dict(imu.written) for imu in recorded.imus}
+    draft.unchanged = {(imu.name, triad) for imu in recorded.imus for triad in imu.unchanged}
+    words = in_words(draft)
     reason = recorded.reason
     if recorded.state == "done":
         reason = words + (reason[len(words) :] if reason.startswith(words) else "")
@@ -99,7 +101,7 @@ def record_again(recorded: Record, solution: Solution, solved_with: Mapping[str,
         duration_s=recorded.duration_s,
         warnings=_with_rest(again.warnings, recorded.warnings),
         imus=tuple(
-            msgspec.structs.replace(imu, written=was.written, warnings=_with_rest(imu.warnings, was.warnings))
+            msgspec.structs.replace(imu, warnings=_with_rest(imu.warnings, was.warnings))
             if (was := before.get(imu.name))
             else imu
             for imu in again.imus
@@ -232,4 +234,4 @@ class Calibrations:
             calibration = self.offsets.get(found.name)
             if calibration is not None:
                 draft.whole[found.name] = whole_of(calibration, found)
-        return draft.record("done", in_words(draft.solution), seconds)
+        return draft.record("done", in_words(draft), seconds)

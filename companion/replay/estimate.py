@@ -317,7 +317,7 @@ class _Pass:
             draft.solution = solve(posed, earth, *poses, what, given.platform, any_bias=given.any_bias)
         except CalibrationRefusedError as error:
             return draft.record("failed", str(error), seconds)
-        return draft.record("done", in_words(draft.solution), seconds)
+        return draft.record("done", in_words(draft), seconds)
 
     # --- what of it was used
 

@@ -9,7 +9,7 @@ from typing import Final
 import msgspec
 
 from companion.calibration.collector.trace import Trace
-from companion.calibration.solution.record import Arming, ImuRecord, Outcome, Record
+from companion.calibration.solution.record import Arming, ImuRecord, Outcome, Record, outcome_word
 from companion.report.markup import Child, Markup, join, number, tag
 from companion.report.page import (
     AXES,
@@ -96,11 +96,13 @@ def _in_short(record: Record) -> str:
     outcomes = [written.outcome for imu in record.imus for written in imu.written.values()]
     found = ", ".join(imu.name for imu in record.imus)
     words = f"Biases found of {found}. " if record.state == "done" and found else ""
+    if not outcomes and any(imu.unchanged for imu in record.imus):
+        return f"{words}The offsets in the autopilot are right already: nothing was written."
     if not outcomes:
         return f"{words}Nothing was written to the autopilot."
     if all(outcome == "verified" for outcome in outcomes):
         return f"{words}{len(outcomes)} parameters written, all verified."
-    counts = ", ".join(f"{outcomes.count(kind)} {kind.replace('_', ' ')}" for kind in _OUTCOMES if kind in outcomes)
+    counts = ", ".join(f"{outcomes.count(kind)} {outcome_word(kind)}" for kind in _OUTCOMES if kind in outcomes)
     return f"{words}Parameters: {counts}."
 
 
@@ -189,7 +191,11 @@ def _written(record: Record) -> Markup | None:
             seen.add(one.outcome)
             class_, _ = _OUTCOMES[one.outcome]
             rows += [
-                tag("tr", tag("td", name, ": ", tag("strong", one.outcome, class_=class_), colspan="3"), class_="name"),
+                tag(
+                    "tr",
+                    tag("td", name, ": ", tag("strong", outcome_word(one.outcome), class_=class_), colspan="3"),
+                    class_="name",
+                ),
                 tag(
                     "tr",
                     tag("td", tag("small", "before"), _setting(one.before), data_key=f"{name}.before"),
@@ -204,7 +210,7 @@ def _written(record: Record) -> Markup | None:
             tag("table", *rows, class_="setting"),
             tag("p", f"{more} more are not shown.") if more > 0 else None,
         ]
-    parts += [tag("p", f"{outcome}: {_OUTCOMES[outcome][1]}.", class_="soft") for outcome in sorted(seen)]
+    parts += [tag("p", f"{outcome_word(outcome)}: {_OUTCOMES[outcome][1]}.", class_="soft") for outcome in sorted(seen)]
     return tag("section", *parts)
 
 

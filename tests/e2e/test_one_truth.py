@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from companion.calibration.machine import State
 from companion.cli import show
 from companion.config.sections import AtArm
+from sim.motions import Handling
 from tests.e2e.test_calibration import calibrated
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
@@ -101,12 +103,14 @@ def test_after_a_success_nothing_turns_red_on_the_way_to_ready(tmp_path: Path, a
             await rig.ready()
             await calibrated(rig)
             was = rig.double.parameter("INS_GYROFFS_Y")
-            rig.double.write_as_another_station("INS_GYROFFS_Y", was + 7e-5)
+            rig.double.write_as_another_station("INS_GYROFFS_Y", was + 1.5e-4)
             await asyncio.sleep(20.0)
             faces = Faces(rig)
             result, record = await calibrated(rig)
             assert result.outcome == "done"
-            assert "stored" in {written.outcome for imu in record.imus for written in imu.written.values()}
+            assert [written.outcome for imu in record.imus for written in imu.written.values()] == ["stored"] * 3
+            (hidden,) = [line for line in record.imus[0].warnings if "telemetry" in line]
+            assert "INS_GYROFFS_X, INS_GYROFFS_Y, INS_GYROFFS_Z" in hidden
             await rig.until(lambda: rig.service.status()["headline"]["word"] == "READY", 5.0)
             await asyncio.sleep(3.0)
             seen = faces.stop()
@@ -141,5 +145,54 @@ def test_after_a_restart_of_the_daemon_a_calibration_is_not_denied(tmp_path: Pat
             status = rig.service.status()
             assert status["arming"]["in_force"] == "not confirmed since start"
             assert "not calibrated yet" not in " ".join(show.status_lines(status))
+
+    run_virtual(main())
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+def test_a_repeat_that_finds_only_noise_writes_nothing_and_says_so(
+    tmp_path: Path, firmware: Literal["ardupilot", "px4"]
+) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, firmware=firmware, imus=1, max_s=12.0).running() as rig:
+            await rig.ready()
+            await calibrated(rig)
+            written = len(rig.autopilot.writes)
+            await asyncio.sleep(30.0)
+            result, record = await calibrated(rig)
+            (fc,) = record.imus
+            assert len(rig.autopilot.writes) == written
+            assert (fc.written, fc.unchanged) == ({}, ("accel", "gyro"))
+            assert result.reason.startswith("unchanged, ")
+            await rig.until(lambda: f"Calibration done: {result.reason}" in rig.ground.texts(), 5.0)
+            status = rig.service.status()
+            assert status["headline"]["word"] == "READY"
+            assert not [line for line in fc.warnings if "telemetry" in line or "shelter" in line]
+            # The offsets are off by no more than is said of them.
+            left = rig.autopilot.residual(1, rig.now_s)
+            held = rig.service.arming.in_force
+            gyro, accel = held.sigma("gyro"), held.sigma("accel")
+            assert gyro is not None
+            assert accel is not None
+            assert np.abs(left.gyro_rad_s).max() < 3.0 * gyro
+            assert np.abs(left.accel_m_s2).max() < 3.0 * accel
+
+    run_virtual(main())
+
+
+def test_whoever_moves_it_while_the_new_offsets_are_looked_at_is_told(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with Rig(tmp_path, max_s=12.0).running() as rig:
+            await rig.ready()
+            faces = Faces(rig)
+            conductor = rig.service.calibrating.conductor
+            calibration = asyncio.create_task(calibrated(rig))
+            await rig.until(lambda: conductor.state is State.VERIFYING, 60.0)
+            rig.aircraft.add(Handling(start_s=rig.aircraft.time_at(rig.now_s) + 4.0, duration_s=6.0, seed=3))
+            result, _ = await calibration
+            assert result.outcome == "done"
+            seen = faces.stop()
+            assert ("HOLD STILL", "wait") in seen[seen.index(("CHECKING", "busy")) :]
+            assert any(line.startswith("Calibration: ") and " moves " in line for line in rig.ground.texts())
 
     run_virtual(main())

@@ -155,7 +155,9 @@ def test_a_slot_that_is_another_imus_is_put_back_and_the_same_job_finds_the_righ
             assert any("CAL_GYRO0 act on the gyro of IMU 2, not of IMU 1" in warning for warning in record.warnings), (
                 record.warnings
             )
-            # The next job knows.
+            # The next job that has something to write knows.
+            assert (await started(rig.service.calibrating.conductor.start_undo("test")).finished).outcome == "done"
+            await asyncio.sleep(2.0)
             writes = len(rig.px4.writes)
             result, record = await calibrated(rig)
             assert result.outcome == "done", result

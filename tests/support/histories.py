@@ -118,7 +118,7 @@ def white_trace(
     """A trace of every second; `moved`: it never stood still for long."""
     second = tuple(range(-5, seconds + 5))
     shaken = [moved and k % 9 in (3, 4) for k in range(len(second))]
-    words = tuple("gyro fc 0.31 deg/s > 0.10" if shake else None for shake in shaken)
+    words = tuple("gyro fc moves 0.31 deg/s, max 0.10" if shake else None for shake in shaken)
     names = [imu.name for imu in of.imus] or ["fc", "own"]
     still: tuple[str | None, ...] = (None,) * len(second)
     silent = tuple("no data from gradienter for 3 s" if moved and 20 < k < 26 else None for k in range(len(second)))
@@ -165,7 +165,9 @@ def a_season(directory: Path, number: int = 30) -> list[Record]:
     for k in range(number):
         if k % 7 == 3:
             made = record(
-                k, state="failed", reason="not finished in the time given: waiting for still: gyro fc 0.31 deg/s > 0.10"
+                k,
+                state="failed",
+                reason="not finished in the time given: waiting for still: gyro fc moves 0.31 deg/s, max 0.10",
             )
         elif k % 11 == 5:
             made = record(k, state="cancelled", reason="cancelled by companion cancel")

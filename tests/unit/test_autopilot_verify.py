@@ -39,7 +39,7 @@ def test_the_whole_step_is_seen_and_verified() -> None:
     assert verdict.ok
     assert verdict.fraction == pytest.approx(1.0, abs=0.01)
     assert verdict.outcome("INS_GYROFFS_Y") == "verified"
-    assert verdict.warnings == ()
+    assert verdict.hidden == ()
 
 
 def test_an_autopilot_that_echoes_but_does_not_use_the_value_is_named() -> None:
@@ -65,7 +65,7 @@ def test_a_step_within_the_noise_is_too_small_and_only_stored() -> None:
     assert words(verdict) == ["too small to see"] * 3
     assert verdict.ok
     assert verdict.outcome("INS_GYROFFS_X") == "stored"
-    assert len(verdict.warnings) == 2  # the one that was to stay is no news
+    assert len(verdict.hidden) == 2  # the one that was to stay is no news
 
 
 def test_an_axis_that_moves_although_it_should_not_is_wrong() -> None:
@@ -80,7 +80,7 @@ def test_three_axes_together_see_what_none_sees_alone() -> None:
     verdict = judge(observation((step, step, step), (step, step, step)))
     assert words(verdict) == ["too small to see"] * 3
     assert verdict.ok
-    assert verdict.warnings == ()
+    assert verdict.hidden == ()
     unused = judge(dataclasses.replace(observation((step, step, step), (0.0, 0.0, 0.0)), tolerance=1.0))
     assert not unused.ok
 

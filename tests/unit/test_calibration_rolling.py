@@ -90,10 +90,10 @@ def test_motion_is_said_with_figures_and_starts_the_count_again() -> None:
     feed.run(2.0)
     line = feed.waiting_for()
     assert line is not None
-    assert line.startswith("waiting for still: gyro fc 0.3")
-    assert " deg/s > 0.1" in line
+    assert line.startswith("waiting for still: gyro fc moves 0.3")
+    assert " deg/s, max 0.1" in line
     assert feed.collector.status(feed.now_s).progress == 0.0
-    with pytest.raises(CalibrationRefusedError, match=r"waiting for still: gyro fc 0\.3"):
+    with pytest.raises(CalibrationRefusedError, match=r"waiting for still: gyro fc moves 0\.3"):
         feed.collector.window(feed.now_s)
 
 
@@ -108,7 +108,7 @@ def test_each_source_has_its_own_verdict() -> None:
     assert sources["fc"].rate_hz == RATE_HZ
     assert sources["fc"].words == ""
     assert not sources["nose"].still
-    assert sources["nose"].words.startswith("gyro nose 0.")
+    assert sources["nose"].words.startswith("gyro nose moves 0.")
     assert sources["gradienter"].still
     assert sources["gradienter"].kind == "gradienter"
 

@@ -76,12 +76,12 @@ def test_motion_is_seen_from_the_first_second_on_and_said_in_words(rate_hz: int)
     verdict = imu.second(imu.sway(gyro=0.31 * DEG))
     assert not verdict.still
     what, found, unit, sign, allowed = verdict.words.rsplit(" ", 4)
-    assert (what, unit, sign) == ("gyro fc", "deg/s", ">")
+    assert (what, unit, sign) == ("gyro fc moves", "deg/s,", "max")
     assert float(found) == pytest.approx(0.31, rel=0.1)
     assert 0.10 <= float(allowed) < 0.14
     verdict = imu.second(imu.sway(accel=30.0 * MG))
     assert verdict.words.startswith("accel fc ")
-    assert " mg > 1" in verdict.words
+    assert " mg, max 1" in verdict.words
 
 
 def test_the_learned_likelihood_ratio_sees_less_than_the_absolute_gate() -> None:
@@ -91,7 +91,7 @@ def test_the_learned_likelihood_ratio_sees_less_than_the_absolute_gate() -> None
     # 0.05 deg/s rms is below the absolute gate, but triples the variance that was learned.
     verdict = imu.second(imu.sway(gyro=0.05 * DEG))
     assert not verdict.still
-    assert verdict.words.startswith("gyro fc 0.05")
+    assert verdict.words.startswith("gyro fc moves 0.05")
     # The same from a sensor that has always been so noisy is rest.
     noisy = Imu(100, gyro=0.06 * DEG)
     assert all(noisy.second().still for _ in range(20))
@@ -130,7 +130,7 @@ def test_a_running_motor_is_not_rest() -> None:
     assert imu.second(rotors * [2.0 * DEG, 0, 0, 0, 0, 0]).words.startswith("gyro fc shakes 1.1")
     shaken = imu.second(rotors * [0, 0, 0, 0, 0, 2.0])
     assert shaken.words.startswith("accel fc shakes 11")
-    assert shaken.words.endswith(" mg > 50.00")
+    assert shaken.words.endswith(" mg, max 50.00")
 
 
 def test_a_known_noisy_filtered_sensor_can_be_still() -> None:
@@ -206,7 +206,7 @@ def test_integers_of_a_turn_that_comes_to_rest_are_a_motion_and_no_end_of_a_rang
     assert batch.clipped
     verdict = ImuGate("fc", noise_profile(None), (1e-3, 1e-3)).judge(batch)
     assert not verdict.still
-    assert "deg/s >" in verdict.words
+    assert "deg/s, max" in verdict.words
 
 
 def test_a_quantised_constant_stream_is_not_stuck() -> None:
@@ -227,9 +227,9 @@ def test_gradienter_gate() -> None:
         assert gate.judge(batch).still
         gate.accept(batch)
     swing = 0.3 * np.sin(np.arange(10) * 0.6)[:, None]
-    assert gate.judge(batch_of(np.array([1.0, -2.0]) + swing)).words.startswith("gradienter 0.")
+    assert gate.judge(batch_of(np.array([1.0, -2.0]) + swing)).words.startswith("gradienter moves 0.")
     moved = gate.judge(batch_of(np.tile([1.25, -2.0], (10, 1))))
-    assert moved.words == "gradienter moved by 0.25 deg > 0.10"
+    assert moved.words == "gradienter moved by 0.25 deg, max 0.10"
     gate.new_stretch()
     assert gate.judge(batch_of(np.tile([1.25, -2.0], (10, 1)))).still
 
@@ -240,9 +240,9 @@ def test_compass_gate_works_across_north() -> None:
         batch = batch_of(np.mod(np.array([[-0.2], [0.2], [0.0], [0.1]]) + heading, 360.0), circle=True)
         assert gate.judge(batch).still
         gate.accept(batch)
-    assert gate.judge(batch_of(np.full((4, 1), 4.0), circle=True)).words == "compass moved by 3.98 deg > 3.00"
+    assert gate.judge(batch_of(np.full((4, 1), 4.0), circle=True)).words == "compass moved by 3.98 deg, max 3.00"
     turning = batch_of(np.array([[350.0], [354.0], [358.0], [2.0], [6.0]]), circle=True)
-    assert gate.judge(turning).words.startswith("compass 5.")
+    assert gate.judge(turning).words.startswith("compass moves 5.")
 
 
 def test_steady_seconds_are_those_since_the_last_bad_one() -> None:

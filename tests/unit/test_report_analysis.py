@@ -16,7 +16,7 @@ def test_verdicts_are_joined_where_they_are_of_one_kind() -> None:
     fc = next(one for one in trace.verdicts if one.name == "fc")
     found = runs(trace, fc)
     assert [(run.first, run.last) for run in found if run.state == "moving"] == [(-2, -1), (7, 8), (16, 17)]
-    assert {run.words for run in found if run.state == "moving"} == {"gyro fc 0.31 deg/s > 0.10"}
+    assert {run.words for run in found if run.state == "moving"} == {"gyro fc moves 0.31 deg/s, max 0.10"}
     assert sum(run.last - run.first + 1 for run in found) == len(trace.second)
     gradienter = next(one for one in trace.verdicts if one.kind == "gradienter")
     assert [(run.first, run.last) for run in runs(trace, gradienter) if run.state == "fault"] == [(16, 20)]

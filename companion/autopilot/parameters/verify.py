@@ -70,6 +70,7 @@ class AxisVerdict:
     made: float
     sigma: float
     words: str
+    """What is wrong with it, for people."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -82,7 +83,7 @@ class Verdict:
         fraction_sigma: its standard deviation.
         residual: mean after the write minus truth, vehicle FRD.
         problems: a line for each thing that is not right.
-        warnings: a line for each thing that could not be judged.
+        hidden: the parameters whose step could not be judged.
     """
 
     axes: tuple[AxisVerdict, AxisVerdict, AxisVerdict]
@@ -90,7 +91,7 @@ class Verdict:
     fraction_sigma: float | None
     residual: Vector
     problems: tuple[str, ...]
-    warnings: tuple[str, ...]
+    hidden: tuple[str, ...]
 
     @property
     def ok(self) -> bool:
@@ -133,37 +134,33 @@ def judge(seen: Observation) -> Verdict:
                 f"after the write {axis_name} is still off by {value:.3g} {seen.unit}, allowed are {limit:.2g}"
                 f" ({_family(seen.parameters)})"
             )
-    hidden = [axis.words for axis in axes if axis.word == "too small to see" and axis.expected != 0.0]
+    hidden = [axis.parameter for axis in axes if axis.word == "too small to see" and axis.expected != 0.0]
     return Verdict(
         axes=axes,
         fraction=fraction,
         fraction_sigma=fraction_sigma,
         residual=vector(residual),
         problems=tuple(problems),
-        warnings=tuple(hidden) if together != "seen" else (),
+        hidden=tuple(hidden) if together != "seen" else (),
     )
 
 
 def _judge_axis(parameter: str, expected: float, made: float, sigma: float, slack: float, unit: str) -> AxisVerdict:
     noise = SIGMAS * sigma + slack
-    figures = f"{parameter}: the output moved by {made:.3g} {unit}, expected {expected:.3g}, noise {sigma:.2g}"
     agrees = abs(made - expected) <= noise + SCALE_TOLERANCE * abs(expected)
-    word: AxisWord
+    word: AxisWord = "wrong"
     if not all(map(math.isfinite, (expected, made, sigma))):
-        word, words = "wrong", f"{figures}: not a number"
+        why = "not a number"
     elif abs(expected) < 2 * noise:
-        word, words = (
-            ("too small to see", f"{figures}: too small to see")
-            if agrees
-            else ("wrong", f"{figures}: it moved although it should not")
-        )
+        word, why = ("too small to see", "") if agrees else ("wrong", "it moved although it should not")
     elif agrees:
-        word, words = "seen", f"{figures}: seen"
+        word, why = "seen", ""
     elif abs(made) <= noise:
-        word, words = "not seen", f"{figures}: the autopilot stored the value but does not use it"
+        word, why = "not seen", "the autopilot stored the value but does not use it"
     else:
-        word, words = "wrong", f"{figures}: not the step that was written (sign, orientation, scale, or it moved)"
-    return AxisVerdict(parameter, word, expected, made, sigma, words)
+        why = "not the step that was written (sign, orientation, scale, or it moved)"
+    figures = f"the output moved by {made:.3g} {unit}, expected {expected:.3g}, noise {sigma:.2g}"
+    return AxisVerdict(parameter, word, expected, made, sigma, f"{parameter}: {figures}: {why}")
 
 
 def _matched_filter(made: Array, expected: Array, sigma: Array, resolution: float) -> tuple[float | None, float | None]:

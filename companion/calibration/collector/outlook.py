@@ -63,6 +63,12 @@ class Glance(msgspec.Struct, frozen=True, kw_only=True):
         """Whether a movement is in the way."""
         return self.obstacle is not None and self.obstacle.moving
 
+    @property
+    def moves(self) -> str | None:
+        """What moves at this moment; None where nothing does, however short a time it has been still."""
+        found = self.obstacle
+        return found.words if found is not None and found.moving and found.hold_still_s is None else None
+
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True):
     """How long and how good. A target that nobody asked for is `math.inf`."""

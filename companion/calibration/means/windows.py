@@ -361,7 +361,7 @@ def _hidden(imu: ImuInput, gyro: Estimate, accel: Estimate) -> dict[Triad, Hidde
             what = "around 0 the mean is not known" if useless else "up to half a step may be hidden, sigma widened"
             found[part] = Hidden(
                 f"{part} {imu.name} {axes}: integer steps of {step} and too little noise for them, {what}; set"
-                " push.dither = true (or use IMU 1 where it sends HIGHRES_IMU)",
+                " push.dither = true",
                 useless,
             )
         elif grid > 0.0 and (triad.edge_rms > EDGE_RMS).any():

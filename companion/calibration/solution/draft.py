@@ -48,12 +48,15 @@ class Draft:
 
     held_back: dict[tuple[str, Triad], Doubt] = dataclasses.field(default_factory=dict)
     """By IMU and triad, what is not to be written, and why."""
+    unchanged: set[tuple[str, Triad]] = dataclasses.field(default_factory=set)
+    """By IMU and triad, whose output is right with the offsets that it has."""
+    before: Record | None = None
+    """The calibration before, if what it has found was good and has not been undone."""
 
-    def warn(self, imu: str, words: str) -> None:
-        """Add a warning to one IMU, once."""
+    def warn(self, imu: str, *lines: str) -> None:
+        """Add warnings to one IMU, each once."""
         warnings = self.imu_warnings.setdefault(imu, [])
-        if words not in warnings:
-            warnings.append(words)
+        warnings += [words for words in dict.fromkeys(lines) if words not in warnings]
 
     def begin_again(self, why: str) -> None:
         """Forget what was found and written, but not why."""
@@ -63,6 +66,7 @@ class Draft:
         self.imu_warnings.clear()
         self.points.clear()
         self.held_back.clear()
+        self.unchanged.clear()
         self.warnings.append(why)
 
     def record(self, state: Literal["done", "failed", "cancelled"], reason: str, duration_s: float) -> Record:
@@ -108,6 +112,7 @@ class Draft:
             prior=estimate.prior,
             effective=estimate.effective,
             held_back=tuple(triad for name, triad in self.held_back if name == estimate.name),
+            unchanged=tuple(sorted(triad for name, triad in self.unchanged if name == estimate.name)),
         )
 
 
@@ -153,13 +158,15 @@ def _where_known(matrix: Matrix, rows: list[bool], columns: list[bool]) -> tuple
     return tuple(tuple(float(matrix[i, j]) if rows[i] and columns[j] else None for j in range(6)) for i in range(6))
 
 
-def in_words(solution: Solution | None) -> str:
+def in_words(draft: Draft) -> str:
     """The figures of a result: the largest sigma over axes and IMUs; short enough for one STATUSTEXT."""
+    solution = draft.solution
     if solution is None:
         return "nothing measured"
     parts: list[str] = []
-    gyros = [imu.gyro_sigma_use_rad_s for imu in solution.imus if imu.gyro_rad_s is not None]
-    accels = [imu.accel_sigma_use_m_s2 for imu in solution.imus if imu.accel_m_s2 is not None]
+    imus = draft.record("done", "", 0.0).imus
+    gyros = [sigma for imu in imus if (sigma := imu.sigma_in_force("gyro")) is not None]
+    accels = [sigma for imu in imus if (sigma := imu.sigma_in_force("accel")) is not None]
     if gyros:
         # Without decimals, so that it stays one STATUSTEXT.
         sigma_deg_h = np.max(gyros) / DEG_H
@@ -167,7 +174,8 @@ def in_words(solution: Solution | None) -> str:
     if accels:
         parts.append(f"{np.max(accels) / MG:.2f} mg")
     unknown = ", ".join(f"{triad} {name}" for name, triad in solution.unknown)
-    return f"sigma {', '.join(parts)}{f'; not known: {unknown}' if unknown else ''}"
+    begin = "unchanged," if draft.unchanged and not any(draft.written.values()) else "sigma"
+    return f"{begin} {', '.join(parts)}{f'; not known: {unknown}' if unknown else ''}"
 
 
 def _warms(solution: Solution) -> bool:

@@ -23,6 +23,11 @@ TiltFrom = Literal["gradienter", "accelerometers"]
 HeadingFrom = Literal["compass", "autopilot"]
 
 
+def outcome_word(outcome: str) -> str:
+    """What people read for an `Outcome`."""
+    return "put back" if outcome == "rolled_back" else outcome
+
+
 class PoseSigma(msgspec.Struct, frozen=True, kw_only=True):
     """One-sigma uncertainty of the pose."""
 
@@ -208,9 +213,23 @@ class ImuRecord(msgspec.Struct, frozen=True, kw_only=True):
     """None where the accelerometers were not determined."""
     held_back: tuple[Literal["gyro", "accel"], ...] = ()
     """Measured and not written, since it contradicts earlier ones and nobody had asked: the offsets are as before."""
+    unchanged: tuple[Literal["gyro", "accel"], ...] = ()
+    """Measured and not written, since the output is right with the offsets that it has."""
     gyro_sigma_warm_up_rad_s: Vector | None = None
     """The part of sigma_use for a warm-up too small to see, which only time takes away."""
     accel_sigma_warm_up_m_s2: Vector | None = None
+
+    def sigma_in_force(self, triad: Triad) -> Vector | None:
+        """sigma_use of what the offsets leave; those not written again are off by what was found, too."""
+        sigma, residual = (
+            (self.gyro_sigma_use_rad_s, self.residual_gyro_rad_s)
+            if triad == "gyro"
+            else (self.accel_sigma_use_m_s2, self.residual_accel_m_s2)
+        )
+        if sigma is None or residual is None or triad not in self.unchanged:
+            return sigma
+        x, y, z = map(math.hypot, sigma, residual)
+        return x, y, z
 
     def settled_sigma(self, triad: Triad) -> Vector | None:
         """sigma_use without that part, which moves old and new offsets alike."""

@@ -104,12 +104,12 @@ STILL: Final = Verdict(still=True)
 
 
 def _words(what: str, found: float, allowed: float, unit: str, hint: str = "") -> Verdict:
-    """'gyro fc 0.31 deg/s > 0.10' and a hint, with as many digits as it takes to see the difference."""
+    """'gyro fc moves 0.31 deg/s, max 0.10' and a hint, with as many digits as it takes to see the difference."""
     for digits in (2, 3, 4):
         left, right = f"{found:.{digits}f}", f"{allowed:.{digits}f}"
         if left != right:
             break
-    return Verdict(still=False, words=f"{what} {left} {unit} > {right}{hint}", what=what)
+    return Verdict(still=False, words=f"{what} {left} {unit}, max {right}{hint}", what=what)
 
 
 def _fault(words: str) -> Verdict:
@@ -236,7 +236,7 @@ class ImuGate:
                 allowed = math.sqrt(motion**2 + max(own.slow, 0.0) + _CHANCE * own.chance)
             hint = self._own.hint(number)
             if found > allowed:
-                return _words(f"{part} {name}", found / unit, allowed / unit, unit_name, hint)
+                return _words(f"{part} {name} moves", found / unit, allowed / unit, unit_name, hint)
             found = math.sqrt(_mean(variance[triad]))
             if found > shaking:
                 return _words(f"{part} {name} shakes", found / unit, shaking / unit, unit_name, hint)
@@ -269,9 +269,9 @@ class ImuGate:
         gyro, accel = _mean(ratio[:3]), _mean(ratio[3:])
         if gyro >= accel:
             found = math.sqrt(_mean(variance[:3])) / DEG
-            return _words(f"gyro {self._name}", found, found * math.sqrt(allowed / gyro), "deg/s")
+            return _words(f"gyro {self._name} moves", found, found * math.sqrt(allowed / gyro), "deg/s")
         found = math.sqrt(_mean(variance[3:])) / MG
-        return _words(f"accel {self._name}", found, found * math.sqrt(allowed / accel), "mg")
+        return _words(f"accel {self._name} moves", found, found * math.sqrt(allowed / accel), "mg")
 
     def _displaced(self, batch: Batch) -> Verdict | None:
         name, mean = self._name, batch.mean.tolist()
@@ -329,7 +329,7 @@ class PoseGate:
             variance, white = batch.variance.tolist(), batch.white.tolist()
             found, allowed = _motion(variance, white, batch.n, self._motion_deg, (0.0, self._motion_deg**2))
             if found > allowed:
-                return _words(self._name, found, allowed, "deg")
+                return _words(f"{self._name} moves", found, allowed, "deg")
         if self._start:
             # Against the first good second, so that averaging on the circle needs no care; the others refine it.
             first = self._start[0].tolist()

@@ -135,8 +135,7 @@ class InForce:
     @property
     def earlier(self) -> Record | None:
         """The last calibration, be it of before this start, if it was good and has not been undone."""
-        last = self._conductor.last
-        return last if last is not None and last.state == "done" and not (last.undone_at or self.undone) else None
+        return None if self.undone else self._conductor.last_good
 
     @property
     def worth_writing_s(self) -> float:
@@ -222,8 +221,8 @@ class InForce:
         """Hold what a calibration has found in one IMU, save what it has not written for doubt."""
         corrected = imu.name in self._imus
         halves: tuple[tuple[Triad, Vector | None, Vector | None, Vector | None], ...] = (
-            ("gyro", imu.gyro_sigma_use_rad_s, imu.gyro_bias_rad_s, imu.residual_gyro_rad_s),
-            ("accel", imu.accel_sigma_use_m_s2, imu.accel_bias_m_s2, imu.residual_accel_m_s2),
+            ("gyro", imu.sigma_in_force("gyro"), imu.gyro_bias_rad_s, imu.residual_gyro_rad_s),
+            ("accel", imu.sigma_in_force("accel"), imu.accel_bias_m_s2, imu.residual_accel_m_s2),
         )
         for triad, sigma, bias, residual in halves:
             key = (imu.name, triad)

@@ -208,7 +208,7 @@ class Readiness:
         if glance.obstacle is not None and not glance.moving:
             return ArmAnswer("refuse", glance.obstacle.words)
         if (reading := self.in_force.reading()) is not None:
-            return ArmAnswer("wait", f"reading {reading}")
+            return ArmAnswer("wait", reading)
         if (looked_at := self.looked_at(now_s)) is not None:
             return looked_at
         if findings := self.in_force.findings(now_s):

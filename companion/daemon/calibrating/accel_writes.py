@@ -63,8 +63,7 @@ class AccelWrites:
         means = {imu.name: imu for imu in last.imus}
         targets = tuple(self._target(means[name], each) for name, each in changes.items())
         for target in targets:
-            for words in warnings_about(target.calibration, target.changes):
-                draft.warn(target.name, words)
+            draft.warn(target.name, *warnings_about(target.calibration, target.changes))
         plan = Plan(targets, self._core.vehicle.boots)
         job.check_cancelled()
         self._machine.on(Event.WRITE)

@@ -282,6 +282,11 @@ class Results:
         self._collector, self._say, self._offload = core.collector, core.say, core.offload
         self.last: Record | None = None
 
+    @property
+    def good(self) -> Record | None:
+        """The latest one, if it was good and has not been undone."""
+        return self.last if self.last is not None and self.last.state == "done" and not self.last.undone_at else None
+
     def load(self) -> None:
         """Find the latest one of those on disk; blocking."""
         try:

@@ -88,6 +88,11 @@ class Conductor:
         return self.job if self.job is not None and self.job.is_running else None
 
     @property
+    def last_good(self) -> Record | None:
+        """The latest calibration, be it of before this start, if it was good and has not been undone."""
+        return self._results.good
+
+    @property
     def last(self) -> Record | None:
         """What the latest calibration has found, or has been found before this start."""
         return self._results.last
@@ -255,11 +260,11 @@ class Conductor:
     async def _calibrate(self, job: Job) -> None:
         loop = asyncio.get_running_loop()
         started_s = loop.time()
-        draft = Draft(datetime.datetime.now(tz=datetime.UTC), self._vehicle.system_id)
+        draft = Draft(datetime.datetime.now(tz=datetime.UTC), self._vehicle.system_id, before=self._results.good)
 
         async def run() -> str:
             await self._course.run(job, draft)
-            return "; ".join([in_words(draft.solution), *draft.notes])
+            return "; ".join([in_words(draft), *draft.notes])
 
         result = await _result(job, run())
         record = draft.record(result.outcome, result.reason, loop.time() - started_s)

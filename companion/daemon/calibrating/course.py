@@ -80,9 +80,11 @@ class Measuring:
         self._core, self._machine, self._imus = core, core.machine, imus
         self._upsets: dict[str, int] = {}
         """By IMU, how many there had been before this calibration."""
+        self._said, self._said_s = "", -math.inf
 
     def begin(self) -> None:
         """A calibration begins, which may measure more than once."""
+        self._said, self._said_s = "", -math.inf
         self._upsets = {name: imu.upsets for name, imu in self._imus.items()}
 
     async def read_state(self, job: Job, if_armed: str | None) -> Stand:
@@ -124,15 +126,11 @@ class Measuring:
         """
         collector = self._core.collector
         collector.retarget(self._wanted(job.what))
-        loop = asyncio.get_running_loop()
-        said, said_s = "", -math.inf
         failures = {name: imu.failures for name, imu in self._imus.items()}
         stop = collector.seconds.add(job.look_again)
         try:
             while True:
-                status, waiting_for, hold_still_s = await self.read_state(
-                    job, "armed during the measurement; nothing was written"
-                )
+                status, waiting_for, hold_still_s = await self.read_state(job, "armed; nothing written")
                 self._check_imus(failures)
                 self.show(measuring=waiting_for is None)
                 words = waiting_for or status.measuring
@@ -141,14 +139,18 @@ class Measuring:
                     self._machine.on(Event.ENOUGH)
                     job.progress(MEASURED_PERCENT, "working out the biases")
                     return await self._core.window()
-                now_s = loop.time()
-                every_s = SAY_WAITING_EVERY_S if waiting_for else SAY_LEFT_EVERY_S
-                if (waiting_for or status.left) and words != said and not job.automatic and now_s - said_s >= every_s:
-                    said, said_s = words, now_s
-                    self._core.say(Severity.INFO, f"Calibration: {words}")
+                if waiting_for or status.left:
+                    self.tell(job, words, SAY_WAITING_EVERY_S if waiting_for else SAY_LEFT_EVERY_S)
                 await job.pause(POLL_S)
         finally:
             stop()
+
+    def tell(self, job: Job, words: str, every_s: float = SAY_WAITING_EVERY_S) -> None:
+        """Tell whoever has asked what is waited for: news, and not too often."""
+        now_s = asyncio.get_running_loop().time()
+        if words != self._said and not job.automatic and now_s - self._said_s >= every_s:
+            self._said, self._said_s = words, now_s
+            self._core.say(Severity.INFO, f"Calibration: {words}")
 
     def _check_imus(self, failures: dict[str, int]) -> None:
         for name, imu in self._imus.items():
@@ -295,7 +297,7 @@ class Course:
     async def _measure_and_push(self, job: Job, draft: Draft) -> None:
         measured, window = await self._measure(job, draft)
         solution = await self._solving.solve(measured, window, job, draft)
-        plan = await self._planner.plan(solution, draft)
+        plan = await self._planner.plan(solution, draft, anyway=job.reboot)
         job.check_cancelled()
         if not plan.changes:
             self._machine.on(Event.NOTHING_TO_WRITE)
@@ -305,7 +307,10 @@ class Course:
 
         def go_on(words: str) -> None:
             job.check_cancelled()
-            still_s = self._core.collector.status(asyncio.get_running_loop().time()).still_s
+            now_s = asyncio.get_running_loop().time()
+            still_s = self._core.collector.status(now_s).still_s
+            if (moves := self._core.collector.glance(now_s).moves) is not None:
+                self._measuring.tell(job, moves)
             share = min(still_s / self._core.wanted.settings.min_still_s, 1.0)
             job.progress(WRITTEN_PERCENT + (100.0 - WRITTEN_PERCENT) * share, words or _WATCHING)
 

@@ -175,7 +175,7 @@ class AutopilotImu:
 
     def _invalidate(self, why: str) -> None:
         self.calibration = None
-        self.problem = f"offsets being read again: {why}"
+        self.problem = f"reading its offsets again ({why})"
         self._collector.reset(why, self.name)
         self._stale.set()
 

@@ -98,6 +98,8 @@ class Headlines:
             return Headline(state.word.upper(), "the old values are being written", "busy")
         if state is State.SETTLING:
             return Headline(state.word.upper(), words, "busy")
+        if state is State.VERIFYING and (moves := self._collector.glance(now_s).moves) is not None:
+            return Headline("HOLD STILL", moves, "wait")
         if state is not State.WAITING:
             return Headline(f"{state.word.upper()} {job.progress_percent} %", words, "busy")
         if self._vehicle.arm_state is ArmState.UNKNOWN:
@@ -121,7 +123,7 @@ class Headlines:
 
     def _uncalibrated(self, words: str, now_s: float) -> Headline:
         if (reading := self._readiness.in_force.reading()) is not None:
-            return Headline("WAIT", f"reading {reading}", "wait")
+            return Headline("WAIT", reading, "wait")
         if (looked_at := self._readiness.looked_at(now_s)) is not None and looked_at.hold_still_s is not None:
             return _hold_still(looked_at.hold_still_s, looked_at.meanwhile)
         if words == self._readiness.owed:

@@ -28,6 +28,7 @@ from companion.daemon.recorder.recorder import Recorder
 from companion.errors import ConfigError
 from companion.formats import Object
 from companion.physics.units import DEG_H, MG
+from companion.samples import Triad
 
 if TYPE_CHECKING:
     from companion.daemon.faces.mqtt.face import MqttFace
@@ -120,8 +121,8 @@ class Faces(Subsystem):
         if (record := job.record) is not None:
             parameters = self.component.parameters
             parameters.set("CMP_STATE", STATE_NUMBER[record.state])
-            parameters.set("CMP_GYR_SIG", _worst(record.imus, "gyro_sigma_use_rad_s", DEG_H))
-            parameters.set("CMP_ACC_SIG", _worst(record.imus, "accel_sigma_use_m_s2", MG))
+            parameters.set("CMP_GYR_SIG", _worst(record.imus, "gyro", DEG_H))
+            parameters.set("CMP_ACC_SIG", _worst(record.imus, "accel", MG))
 
     def status(self) -> Object:  # noqa: D102 - as in the base class
         return {
@@ -201,7 +202,7 @@ def _whole(name: str, value: float) -> int:
     return round(value)
 
 
-def _worst(imus: tuple[ImuRecord, ...], sigma: str, unit: float) -> float:
+def _worst(imus: tuple[ImuRecord, ...], triad: Triad, unit: float) -> float:
     """The largest sigma of all axes in its unit; 0 where nothing was found."""
-    values = [value for imu in imus for value in getattr(imu, sigma) or ()]
+    values = [value for imu in imus for value in imu.sigma_in_force(triad) or ()]
     return min(max(values, default=0.0) / unit, LARGEST)

@@ -253,7 +253,7 @@ def in_short(verdict: Verdict) -> str:
 def nearly_visible(verdict: Verdict) -> bool:
     """Whether a step that could not be seen might be with a longer look: at least 3 of the 8 sigmas it needs."""
     sigma = verdict.fraction_sigma
-    return verdict.ok and bool(verdict.warnings) and sigma is not None and sigma < 1 / 3
+    return verdict.ok and bool(verdict.hidden) and sigma is not None and sigma < 1 / 3
 
 
 def _drift_sigma(model: AllanModel, most_flicker: float, spans_s: tuple[float, float]) -> float:

@@ -19,16 +19,20 @@ from companion.autopilot.telemetry.imu_stream import StreamKind
 from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.record import Outcome, WrittenParameter
 from companion.calibration.solution.solve import ImuSolution, Solution
+from companion.calibration.solution.validity import WORTH_SIGMAS
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.offsets.rivalry import Rivalry
 from companion.errors import AutopilotError
 from companion.physics.frames import Array, vector
 from companion.physics.units import MG
-from companion.samples import Vector
+from companion.samples import Triad, Vector
 
 COARSE_ACCEL_MG: Final = 5.0
 """What the autopilots' own calibrations reach on a level table; a new offset known worse than that is worth a word."""
+
+AS_GOOD: Final = 1.5
+"""An earlier sigma of so many present ones at most is as good: a new write would better nothing worth its wear."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -100,8 +104,10 @@ class Planner:
         self._memory, self._rivalry, self._wanted = memory, rivalry, core.wanted
         self._sources = {imu.name: imu for imu in core.config.imu}
 
-    async def plan(self, solution: Solution, draft: Draft) -> Plan:
+    async def plan(self, solution: Solution, draft: Draft, *, anyway: bool = False) -> Plan:
         """Work out which parameter gets which value; fills the draft's whole biases and warnings.
+
+        Offsets of a calibration as good, under which the output is right, are not written again, unless `anyway`.
 
         Raises:
             AutopilotError: a parameter cannot be read, or the autopilot cannot be calibrated as it is.
@@ -115,14 +121,14 @@ class Planner:
             if imu is not None:
                 calibration = imu.in_force
                 draft.whole[found.name] = whole_of(calibration, whole)
+                found = found if anyway or not push else _less_noise(calibration, found, draft)
                 gyro, accel = found.gyro_rad_s, found.accel_m_s2
             elif source.autopilot_instance is not None:
                 calibration = await read_calibration(self._parameters, source.autopilot_instance, self._memory)
                 gyro, accel = _residual_of_consumer(calibration, found)
             else:
                 continue
-            for warning in self._rivalry.left_of(calibration):
-                draft.warn(found.name, warning)
+            draft.warn(found.name, *self._rivalry.left_of(calibration))
             changes = changes_for(
                 calibration, None if gyro is None else vector(gyro), None if accel is None else vector(accel)
             )
@@ -134,8 +140,7 @@ class Planner:
                         f"accel {found.name} is known to {coarse_mg:.0f} mg only: the gradienter is too coarse for it"
                         " (companion align, or calibrate --gyros)",
                     )
-                for warning in warnings_about(calibration, changes):
-                    draft.warn(found.name, warning)
+                draft.warn(found.name, *warnings_about(calibration, changes))
                 kind = imu.stream.kind if imu is not None else None
                 targets.append(Target(found.name, calibration, tuple(changes), found, kind, watched=imu is not None))
         self._refuse_shared(targets)
@@ -172,6 +177,25 @@ def _to_be_written(found: ImuSolution, draft: Draft) -> ImuSolution:
         gyro_rad_s=None if (found.name, "gyro") in draft.held_back else found.gyro_rad_s,
         accel_m_s2=None if (found.name, "accel") in draft.held_back else found.accel_m_s2,
     )
+
+
+def _less_noise(calibration: ImuCalibration, found: ImuSolution, draft: Draft) -> ImuSolution:
+    """What was found in one IMU, less the half where it only repeats a calibration as good: to write would be noise."""
+    before = None if draft.before is None else next((imu for imu in draft.before.imus if imu.name == found.name), None)
+    sigmas, left = np.sqrt(np.diag(found.covariance)), {"gyro": found.gyro_rad_s, "accel": found.accel_m_s2}
+    halves: tuple[tuple[Triad, Array, Vector, bool], ...] = (
+        ("gyro", sigmas[:3], calibration.gyro_offset_rad_s, False),
+        ("accel", sigmas[3:], calibration.accel_offset_m_s2, calibration.accel_offset_may_be_unused),
+    )
+    for triad, sigma, offset, unsure in halves:
+        residual, then = left[triad], None if before is None else before.sigma_in_force(triad)
+        # What has no offsets counts as uncalibrated to the autopilot itself.
+        if residual is None or then is None or unsure or not any(offset):
+            continue
+        if (np.abs(residual) <= WORTH_SIGMAS * sigma).all() and (np.asarray(then) <= AS_GOOD * sigma).all():
+            draft.unchanged.add((found.name, triad))
+            left[triad] = None
+    return dataclasses.replace(found, gyro_rad_s=left["gyro"], accel_m_s2=left["accel"])
 
 
 def _residual_of_consumer(calibration: ImuCalibration, found: ImuSolution) -> tuple[Array | None, Array | None]:

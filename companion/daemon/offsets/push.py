@@ -201,9 +201,9 @@ class Pusher:
     async def _wait_disarmed(self) -> None:
         await _heartbeat(self._vehicle, DISARMED_WITHIN_S)
         if self._vehicle.arm_state is ArmState.ARMED:
-            raise NotDisarmedError("armed before the biases could be written; nothing was written")
+            raise NotDisarmedError("armed; nothing written")
         if self._vehicle.arm_state is ArmState.UNKNOWN:
-            raise NotDisarmedError("no heartbeat, so nobody knows whether the aircraft is armed; nothing was written")
+            raise NotDisarmedError("no heartbeat; nothing written")
 
 
 async def _heartbeat(vehicle: Vehicle, within_s: float) -> None:
@@ -227,13 +227,15 @@ async def not_as_written(
 def _note_verdicts(plan: Plan, target: Target, verdicts: list[Verdict], draft: Draft) -> list[str]:
     """Set the outcomes of one IMU's parameters; returns what is wrong, in words."""
     problems = [f"imu {target.name}: {in_short(verdict)}" for verdict in verdicts if not verdict.ok]
+    hidden = () if target.solution.dithered else tuple(name for verdict in verdicts for name in verdict.hidden)
+    if hidden:
+        draft.warn(target.name, f"so small a change does not show in the telemetry: {', '.join(hidden)}")
     for verdict in verdicts:
-        for words in (*verdict.problems, *verdict.warnings):
-            draft.warn(target.name, words)
+        draft.warn(target.name, *verdict.problems)
         for axis in verdict.axes:
             # A vector whose step as a whole was seen is in use; an axis that hardly changed cannot show more.
             # Where the integers show no step at all, the dither has shown that they follow these parameters.
-            seen = verdict.ok and (not verdict.warnings or target.solution.dithered)
+            seen = verdict.ok and (not verdict.hidden or target.solution.dithered)
             plan.mark(draft, [axis.parameter], "verified" if seen else verdict.outcome(axis.parameter))
     return problems
 
@@ -287,9 +289,7 @@ class Conclusion:
             left_deg = self._stale[1] if self._stale is not None and self._stale[0] == boots else 0.0
             self._stale = (boots, max(left_deg, stale_tilt_deg(plan.changes)))
         if (owed := self.owed) is not None:
-            draft.warnings.append(
-                f"{owed} for minutes after such a step of the accelerometers (companion calibrate --reboot does it)"
-            )
+            draft.warnings.append(f"{owed} for minutes after such a step (companion calibrate --reboot does it)")
             self._say(Severity.WARNING, f"Before flight: {owed}", Weight.RESULT)
         self._machine.on(Event.VERIFIED)
         if self._vehicle.boots == boots:  # after a restart the EKF has started afresh

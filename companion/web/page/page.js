@@ -156,8 +156,8 @@ function links(status) {
   rows.push(link(alive, "autopilot", words));
   for (const device of status.devices) {
     const lost = Object.values(device.rejected || {}).reduce((sum, count) => sum + count, 0);
-    rows.push(link(device.good, device.name, device.summary + (lost ? `; ${lost} frames bad` : "")
-      + (device.reconnects ? `; came back ${device.reconnects} times` : "")));
+    rows.push(link(device.good, device.name, device.summary + (lost ? `; bad frames: ${lost}` : "")
+      + (device.reconnects ? `; reconnected: ${device.reconnects}` : "")));
   }
   if (!status.ground_stations.good) rows.push(link(false, "ground stations", status.ground_stations.summary));
   if (status.mqtt) rows.push(link(status.mqtt.good, "mqtt", status.mqtt.summary));
