@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import sys
 from collections.abc import AsyncIterator
@@ -65,15 +66,16 @@ class Tape:
 
     @contextlib.asynccontextmanager
     async def daemon(self) -> AsyncIterator[None]:
-        """`companion run`, from when it answers to the end of the block."""
+        """`companion run`, from when it has heard the autopilot to the end of the block."""
         self.say("$", "companion run &")
         process = await self._start("run")
         assert process.stdout is not None
         assert process.stderr is not None
         printing = [asyncio.create_task(self._print(stream, "log")) for stream in (process.stdout, process.stderr)]
         try:
-            while process.returncode is None and await self.type("status") != 0:
+            while process.returncode is None and not await self._hears():
                 await asyncio.sleep(_STARTED)
+            await self.type("status")
             yield
         finally:
             if process.returncode is None:
@@ -99,6 +101,12 @@ class Tape:
         """What ATTITUDE has wrong after a restart."""
         roll, pitch = await attitude_error_deg(self.vehicle, self.ground)
         self.say("TRUTH", f"{what}, restarted, on the slope: roll {roll:+.3f}, pitch {pitch:+.3f} deg off")
+
+    async def _hears(self) -> bool:
+        """Whether the daemon has heard the autopilot."""
+        process = await self._start("status", "--json")
+        output, _ = await process.communicate()
+        return process.returncode == 0 and json.loads(output)["vehicle"]["armed"] == "disarmed"
 
     async def _start(self, *words: str) -> asyncio.subprocess.Process:
         file = str(self.folder / "companion.toml")

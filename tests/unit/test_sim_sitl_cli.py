@@ -109,12 +109,15 @@ def test_it_says_how_to_connect_and_ctrl_c_ends_firmware_and_devices(tmp_path: P
     folder = tmp_path / "run"
     words = ["--binary", str(binary), "--dir", str(folder), "--udp", "127.0.0.1:14999", "--ground", "127.0.0.1:14998"]
     running = subprocess.Popen(
-        [sys.executable, "-m", "sim", "ardupilot", *words, "--gyro-bias", "1", "2", "3"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        [sys.executable, "-m", "sim", "ardupilot", *words, "--gyro-bias", "1", "2", "3", "--hands"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert running.stdout is not None
+    assert running.stdin is not None
+    running.stdin.write("wait 0.1\nhold 90 0\n")
+    running.stdin.flush()
     said = ""
-    while "[storage]" not in said:
+    while "[storage]" not in said or "# moving for 6 s; then pitch" not in said:
         line = running.stdout.readline()
         assert line, running.communicate()
         said += line
