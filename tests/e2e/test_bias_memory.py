@@ -13,6 +13,7 @@ import pytest
 
 from companion.calibration.solution.history import PowerUp
 from companion.calibration.solution.record import Record, Standing
+from companion.daemon.offsets import firmware_calibration
 from companion.daemon.job import Job
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
@@ -242,6 +243,12 @@ def test_a_damaged_file_costs_one_line_and_what_is_undone_is_forgotten(
     assert line.endswith("; set aside as biases.json.unusable")
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On ground that turns no EKF settles: nobody waits for it two and a half minutes, twice a test."""
+    monkeypatch.setattr(firmware_calibration, "SETTLE_ALONE_S", 2.0)
+
+
 def blind(rate_deg_s: float) -> Callable[[Rig], None]:
     """No compass, on a platform that turns so fast from before the beginning."""
 
@@ -254,6 +261,7 @@ def blind(rate_deg_s: float) -> Callable[[Rig], None]:
     return before
 
 
+@pytest.mark.usefixtures("impatient")
 def test_who_has_no_compass_and_no_history_is_told_what_was_assumed(tmp_path: Path) -> None:
     records, _, rig = power_up(tmp_path, 0, before=blind(0.15), times=2)
     for record in records:
@@ -263,6 +271,7 @@ def test_who_has_no_compass_and_no_history_is_told_what_was_assumed(tmp_path: Pa
     assert "assumed Earth-fixed" in "".join(rig.ground.texts())
 
 
+@pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("rate_deg_s", [-0.15, 0.0, 0.15, 1.0])
 def test_a_turn_that_no_compass_shows_is_bounded_by_earlier_power_ups(
     known: Path, tmp_path: Path, rate_deg_s: float
