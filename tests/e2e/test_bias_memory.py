@@ -13,8 +13,8 @@ import pytest
 
 from companion.calibration.solution.history import PowerUp
 from companion.calibration.solution.record import Record, Standing
-from companion.daemon.offsets import firmware_calibration
 from companion.daemon.job import Job
+from companion.daemon.offsets import firmware_calibration
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
 from companion.storage.learned import KEEP_POINTS, BiasStore
