@@ -251,3 +251,33 @@ def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
             assert [made.autopilot.parameter(name) for name in names] == pytest.approx([0.3, 0.0])
 
     run_virtual(main())
+
+
+@pytest.mark.parametrize("what", ["armed", "restarted"])
+def test_the_headings_so_far_outlive_an_arming_and_a_restart_of_the_autopilot(tmp_path: Path, what: str) -> None:
+    made, hands = rig(tmp_path, STEEP)
+
+    async def main() -> None:
+        async with made.running():
+            await made.ready()
+            job = turn(made, 4, write=False)
+            task = asyncio.ensure_future(follow(made, hands, job))
+            await made.until(lambda: job.words.startswith("3 of"), 200.0)
+            if what == "armed":
+                made.double.arm()
+                await made.until(lambda: "armed: it goes on once it is disarmed" in job.words, 30.0)
+                await asyncio.sleep(20.0)
+                made.double.armed = False
+            else:
+                made.double.reboot()
+            result = await task
+            assert result.outcome == "done", result
+            record = job.product
+            assert isinstance(record, TurnRecord)
+            assert len(record.stands) == 5
+            (imu,) = record.imus
+            off = np.abs(np.subtract(imu.level_bias_mg, residual_mg(made, record)))[:2]
+            assert (off < 3.0 * np.array(imu.level_sigma_mg)[:2]).all()
+            assert max(imu.level_sigma_mg[:2]) < 0.5
+
+    run_virtual(main())

@@ -136,7 +136,10 @@ class Aligner:
     def _turned_deg(self, before: Window, now: Window) -> float:
         """By the gyros: the first IMU's means, second by second, about down."""
         rates = self._collector.snapshot(before.end_s, None).rates_rad_s(now.imus[0].name)
-        return align_steps.turned_between_deg(rates, before, now)
+        turned_deg = align_steps.turned_between_deg(rates, before, now)
+        if turned_deg is None:
+            raise CalibrationRefusedError("the gyros fell silent while it was turned: align again")
+        return turned_deg
 
     # --- the result
 

@@ -38,6 +38,8 @@ from companion.physics.units import DEG, MG
 
 COUNTED_SIGMA_DEG: Final = 1.5
 """Of a turn by the gyros' means of seconds, besides their scale: hands do not turn about the vertical alone."""
+BY_EYE_SIGMA_DEG: Final = 10.0
+"""Of a turn that nobody counted, for the autopilot was restarted or armed meanwhile, and that was made as asked."""
 SLOPE_WARNING_DEG: Final = 1.0
 
 
@@ -47,6 +49,7 @@ class _Taken:
 
     window: Window
     seen: Seen
+    heading_sigma_deg: float
 
 
 class TurnAsked(NamedTuple):
@@ -166,17 +169,21 @@ class Turning:
 
         def take(window: Window) -> tuple[_Taken, str | None]:
             up = np.array(window.imus[0].accel_m_s2)
-            heading = self._turned_deg(taken[-1], window) if taken else 0.0
-            found = _Taken(window, Seen(up / np.linalg.norm(up), heading))
+            heading, sigma = self._heading_deg(plan, taken, window) if taken else (0.0, 0.01)
+            found = _Taken(window, Seen(up / np.linalg.norm(up), heading), sigma)
             return found, align_steps.objection(plan, seen, found.seen)
 
         asked = Asked(len(taken) + 1, plan.on_spot, align_steps.request(plan, seen), align_steps.hold(plan, seen))
-        return await self._stands.next(job, asked, take)
+        return await self._stands.next(job, asked, take, if_armed=None)
 
-    def _turned_deg(self, before: _Taken, now: Window) -> float:
-        """How it heads now, by the gyros of the first IMU since the stand before."""
+    def _heading_deg(self, plan: Plan, taken: list[_Taken], now: Window) -> tuple[float, float]:
+        """How it heads now, and one sigma: by the gyros of the first IMU since the stand before, else as was asked."""
+        before = taken[-1]
         rates = self._core.collector.snapshot(before.window.end_s, None).rates_rad_s(now.imus[0].name)
-        return before.seen.heading_deg + align_steps.turned_between_deg(rates, before.window, now)
+        turned_deg = align_steps.turned_between_deg(rates, before.window, now)
+        if turned_deg is None:
+            return align_steps.as_asked_deg(plan, [one.seen for one in taken]), BY_EYE_SIGMA_DEG
+        return before.seen.heading_deg + turned_deg, max(COUNTED_SIGMA_DEG, before.heading_sigma_deg)
 
     def _as_stands(self, taken: list[_Taken]) -> list[Stand]:
         names = [
@@ -186,16 +193,16 @@ class Turning:
         ]
         if not names:
             raise CalibrationRefusedError("no IMU whose accelerometers can be read")
-        return [self._as_stand(one, names, first=not k) for k, one in enumerate(taken)]
+        return [self._as_stand(one, names) for one in taken]
 
-    def _as_stand(self, taken: _Taken, names: list[str], *, first: bool) -> Stand:
+    def _as_stand(self, taken: _Taken, names: list[str]) -> Stand:
         by_name = {imu.name: imu for imu in taken.window.imus}
         return Stand(
             imus=tuple(imu_stand(by_name[name]) for name in names),
             tilt_deg=None,
             tilt_sigma_deg=(1.0, 1.0),
             heading_rad=taken.seen.heading_deg * DEG,
-            heading_sigma_rad=(0.01 if first else COUNTED_SIGMA_DEG) * DEG,
+            heading_sigma_rad=taken.heading_sigma_deg * DEG,
             on_spot=True,
         )
 
