@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from companion.calibration.solution.record import outcome_word
@@ -172,6 +173,7 @@ async def align(options: argparse.Namespace) -> int:
         found = answer["alignment"]
         if found:
             lines += {"faces": faces_lines, "turn": turn_lines}.get(found["kind"], alignment_lines)(found)
+        lines += sides_lines(answer.get("accelerometers", ()))
     good = answer.get("state") in ("done", "in force") or (action == "show" and answer.get("state") != "refused")
     return finish(options, reply, answer, lines, good=good)
 
@@ -190,6 +192,17 @@ def faces_lines(record: Object) -> list[str]:
             lines.append(f"  {words:16} {unit:6} {show.axes(found['value'], found['sigma'], form, scale)}")
         lines += _written_lines(imu["written"])
     return lines + [f"warning: {words}" for words in record["warnings"]]
+
+
+def sides_lines(imus: Sequence[Object]) -> list[str]:
+    """What accelerometers that were held on all sides have left now."""
+    lines = []
+    for imu in imus:
+        lines.append(f"{imu['name']}: known from all sides, {imu['measured_at'][:19]} UTC; its output has left")
+        bias = show.axes(imu["bias_left_mg"], imu["bias_sigma_mg"], "+.3f")
+        scale = show.axes(imu["scale_left"], imu["scale_sigma"], "+.4f", 0.01)
+        lines += [f"  {'accel bias':16} {'mg':6} {bias}", f"  {'accel scale':16} {'%':6} {scale}"]
+    return lines
 
 
 def turn_lines(record: Object) -> list[str]:

@@ -14,6 +14,7 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration, output_
 from companion.calibration.alignment.align_record import Determined
 from companion.calibration.alignment.faces import BIAS, SCALE
 from companion.calibration.solution.faces_record import FacesImuRecord, FacesRecord, Running
+from companion.cli.client import sides_lines
 from companion.config import parse
 from companion.daemon.calibrating.faces_in_force import FacesInForce
 from companion.daemon.core import Core
@@ -163,3 +164,23 @@ def test_of_another_sensor_nothing_is_known(tmp_path: Path) -> None:
     there = kept(tmp_path, running())
     assert there.known("fc", calibration(accel_id=8), 25.0) is None
     assert there.known("other", calibration(), 25.0) is None
+
+
+def test_what_is_in_force_is_shown_with_its_sigma(tmp_path: Path) -> None:
+    there = kept(tmp_path, running())
+    assert there.status() == [], "its offsets are not known at the moment"
+    there._imus = {"fc": Source()}  # type: ignore[dict-item]
+    (shown,) = there.status()
+    assert shown["name"] == "fc"
+    assert shown["bias_left_mg"] == pytest.approx(BIAS_MG)
+    assert shown["scale_left"] == pytest.approx(ERROR)
+    (first, bias, scale) = sides_lines([shown])
+    assert first == "fc: known from all sides, 2026-01-01T00:00:00 UTC; its output has left"
+    assert "x +3.000 +- 0.030" in bias
+    assert "x +0.4000 +- 0.0040" in scale
+
+
+class Source:
+    """An IMU whose offsets have been read."""
+
+    calibration = calibration()

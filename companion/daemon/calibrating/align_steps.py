@@ -23,7 +23,6 @@ LEAST_TILT_DEG: Final = 15.0
 """A tilt tells scale and misalignment from bias by what a cosine loses: little, below this."""
 APART_DEG: Final = 45.0
 """The least angle between two tilts to different sides."""
-MOST_MISSING_S: Final = 2
 TILTS: Final = 4
 LEVEL: Final = (0.0, 0.0, -1.0)
 _SIN, _COS = math.sin(24.0 * DEG), math.cos(24.0 * DEG)
@@ -161,14 +160,13 @@ def as_asked_deg(plan: Plan, taken: Sequence[Seen]) -> float:
     return taken[0].heading_deg + (180.0 if len(taken) == 1 else 0.0)
 
 
-def turned_between_deg(rates_rad_s: Mapping[int, Array], before: Window, now: Window) -> float | None:
-    """By how much it was turned between two stands: the first IMU's means of seconds about down, less its bias.
+def is_counted(rates_rad_s: Mapping[int, Array], before: Window, now: Window) -> bool:
+    """Whether no second between two stands is missing, as it is when the autopilot restarts or is armed."""
+    return all(second in rates_rad_s for second in range(math.ceil(before.end_s), math.floor(now.start_s)))
 
-    None where seconds are missing: the autopilot was restarted, or armed.
-    """
-    between = range(math.ceil(before.end_s), math.floor(now.start_s))
-    if sum(second not in rates_rad_s for second in between) > MOST_MISSING_S:
-        return None
+
+def turned_between_deg(rates_rad_s: Mapping[int, Array], before: Window, now: Window) -> float:
+    """By how much it was turned between two stands: the first IMU's means of seconds about down, less its bias."""
     bias = (before.imus[0].gyro_rad_s[2] + now.imus[0].gyro_rad_s[2]) / 2.0
     return turned_deg([float(rate[2]) for second, rate in rates_rad_s.items() if second < now.start_s], bias)
 

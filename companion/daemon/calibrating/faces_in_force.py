@@ -15,6 +15,7 @@ from companion.calibration.solution.faces_record import FacesImuRecord, FacesRec
 from companion.calibration.solution.otherwise import Sides, aged_m_s2
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
+from companion.formats import Object
 from companion.physics.frames import Array
 from companion.physics.units import MG
 from companion.storage.learned import FacesStore, this_boot
@@ -41,6 +42,29 @@ class FacesInForce:
         """
         await self._offload(self._store.write, record)
         self.record = record
+
+    def status(self) -> list[Object]:
+        """By IMU, what its output has left of bias and scale under what corrects it now, and how well that is known."""
+        found: list[Object] = []
+        for kept in () if self.record is None else self.record.imus:
+            source = self._imus.get(kept.name)
+            calibration = None if source is None else source.calibration
+            known = None if calibration is None else self.known(kept.name, calibration, kept.temperature_degc)
+            if self.record is None or known is None:
+                continue
+            sigma = np.sqrt(np.diag(known.covariance))
+            found.append(
+                {
+                    "name": kept.name,
+                    "measured_at": self.record.measured_at,
+                    "temperature_degc": kept.temperature_degc,
+                    "bias_left_mg": (known.figures[BIAS] / MG).round(4).tolist(),
+                    "bias_sigma_mg": (sigma[BIAS] / MG).round(4).tolist(),
+                    "scale_left": known.figures[SCALE].round(7).tolist(),
+                    "scale_sigma": sigma[SCALE].round(7).tolist(),
+                }
+            )
+        return found
 
     def running(self, name: str) -> Running | None:
         """Since when an IMU has been on; None where it does not tell."""

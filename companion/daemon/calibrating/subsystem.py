@@ -158,14 +158,15 @@ class Calibrating(Subsystem):
             }
 
     def _shown(self) -> Object:
-        alignment = self.alignment
-        if alignment.used is not None:
+        alignment, sides = self.alignment, self.faces.status()
+        if alignment.used is not None or (sides and alignment.settings() is None):
             state, reason = "in force", ""
         elif alignment.unused is not None:
             state, reason = "not used", alignment.unused
         else:
             state, reason = "none", "no alignment is kept: companion align zero measures one"
-        return {"state": state, "reason": reason, "alignment": msgspec.to_builtins(alignment.record)}
+        found = {"alignment": msgspec.to_builtins(alignment.record), "accelerometers": sides}
+        return {"state": state, "reason": reason, **found}
 
     def _start_alignment(self, request: Object, face: str) -> Job:
         action, headings = request.get("action"), request.get("headings")

@@ -180,9 +180,9 @@ class Turning:
         """How it heads now, and one sigma: by the gyros of the first IMU since the stand before, else as was asked."""
         before = taken[-1]
         rates = self._core.collector.snapshot(before.window.end_s, None).rates_rad_s(now.imus[0].name)
-        turned_deg = align_steps.turned_between_deg(rates, before.window, now)
-        if turned_deg is None:
+        if not align_steps.is_counted(rates, before.window, now):
             return align_steps.as_asked_deg(plan, [one.seen for one in taken]), BY_EYE_SIGMA_DEG
+        turned_deg = align_steps.turned_between_deg(rates, before.window, now)
         return before.seen.heading_deg + turned_deg, max(COUNTED_SIGMA_DEG, before.heading_sigma_deg)
 
     def _as_stands(self, taken: list[_Taken]) -> list[Stand]:
