@@ -84,8 +84,13 @@ def test_where_nothing_has_to_be_rebooted_nobody_says_so(tmp_path: Path) -> None
     async def main() -> None:
         async with Rig(tmp_path, firmware="px4", at_arm="warn", max_s=12.0).running() as rig:
             await rig.ready()
+            await asyncio.sleep(12.0)
+            faces = Faces(rig)
             result, record = await calibrated(rig)
             assert result.outcome == "done"
+            # Its offsets step far and back: that is no movement.
+            assert ("HOLD STILL", "wait") not in faces.stop()
+            assert " moves " not in told(rig)
             await rig.until(lambda: rig.service.status()["headline"]["word"] == "READY", 5.0)
             await asyncio.sleep(3.0)
             assert "eboot" not in told(rig)

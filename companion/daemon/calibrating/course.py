@@ -37,6 +37,7 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, not_ready
 from companion.daemon.job import Job
 from companion.daemon.offsets.dither import Ditherer
+from companion.daemon.offsets.effect import TELEMETRY
 from companion.daemon.offsets.plan import Planner
 from companion.daemon.offsets.push import Conclusion, Pusher
 from companion.errors import AutopilotError, CalibrationRefusedError
@@ -309,7 +310,8 @@ class Course:
             job.check_cancelled()
             now_s = asyncio.get_running_loop().time()
             still_s = self._core.collector.status(now_s).still_s
-            if (moves := self._core.collector.glance(now_s).moves) is not None:
+            moves = self._core.collector.glance(now_s).moves
+            if moves is not None and words != TELEMETRY:
                 self._measuring.tell(job, moves)
             share = min(still_s / self._core.wanted.settings.min_still_s, 1.0)
             job.progress(WRITTEN_PERCENT + (100.0 - WRITTEN_PERCENT) * share, words or _WATCHING)

@@ -19,6 +19,7 @@ from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.job import Job
+from companion.daemon.offsets.effect import TELEMETRY
 
 if TYPE_CHECKING:
     from companion.daemon.heading.attitude_service import AttitudeService
@@ -98,7 +99,8 @@ class Headlines:
             return Headline(state.word.upper(), "the old values are being written", "busy")
         if state is State.SETTLING:
             return Headline(state.word.upper(), words, "busy")
-        if state is State.VERIFYING and (moves := self._collector.glance(now_s).moves) is not None:
+        moves = self._collector.glance(now_s).moves
+        if state is State.VERIFYING and moves is not None and job.words != TELEMETRY:
             return Headline("HOLD STILL", moves, "wait")
         if state is not State.WAITING:
             return Headline(f"{state.word.upper()} {job.progress_percent} %", words, "busy")

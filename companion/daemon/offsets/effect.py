@@ -43,6 +43,8 @@ LOOK_LONGER_S: Final = 30.0
 """The longest look at a change that a few seconds do not show; beyond it flicker hides more than averaging shows."""
 TELEMETRY_S: Final = 2.0
 """How long after a write the telemetry may seem to be missing."""
+TELEMETRY: Final = "waiting for the telemetry"
+"""What is said until then: the step of the new offsets themselves looks like a movement."""
 POLL_S: Final = 0.2
 
 Verdicts = Mapping[str, list[Verdict]]
@@ -80,7 +82,7 @@ class EffectWatch:
             return None, "no autopilot IMU is in the telemetry"
         loop = asyncio.get_running_loop()
         written = Moment(self._vehicle)
-        words = "waiting for the telemetry"
+        words = TELEMETRY
         while not written.has_passed(settle_s(self._vehicle.firmware)):
             go_on(words)
             await asyncio.sleep(POLL_S)
@@ -118,7 +120,7 @@ class EffectWatch:
             if not words and status.still_s < self._look_s:
                 words = f"hold still {self._look_s - status.still_s:.0f} s more"
         if words and looked_s < TELEMETRY_S:
-            return "waiting for the telemetry"  # which was not taken during the write
+            return TELEMETRY  # which was not taken during the write
         return f"checking the new offsets: {words}" if words else ""
 
     def _judge(self, target: Target, before: Window, after: Window) -> list[Verdict]:
