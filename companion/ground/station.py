@@ -183,7 +183,7 @@ class Station:
         last = heard.RESULTS.get(found.get("CMP_STATE", -1.0))
         reason = {
             "busy": "calibrating or writing",
-            "idle": "ready",
+            "idle": "nothing is running",
             "fault": "something needs attention: `companion status` on the aircraft says what",
         }.get(state, "it does not say what it is doing")
         sigma = {
