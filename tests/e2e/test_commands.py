@@ -9,7 +9,7 @@ import os
 import signal
 import stat
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -93,11 +93,19 @@ async def _until_disarmed(config: Path) -> None:
 
 
 async def _until(config: Path, armed: str) -> None:
+    await _until_status(config, armed, lambda status: status["vehicle"]["armed"] == armed)
+
+
+async def _until_read(config: Path) -> None:
+    await _until_status(config, "good devices", lambda status: all(one["good"] for one in status["devices"]))
+
+
+async def _until_status(config: Path, what: str, holds: Callable[[Any], bool]) -> None:
     for _ in range(40):
         said = await companion("-c", str(config), "status", "--json")
-        if said.code == DONE and said.json["vehicle"]["armed"] == armed:
+        if said.code == DONE and holds(said.json):
             return
-    raise AssertionError(f"the daemon never said {armed}: {said}")
+    raise AssertionError(f"the daemon never said {what}: {said}")
 
 
 def test_a_day_at_the_flight_line(tmp_path: Path) -> None:
@@ -108,6 +116,7 @@ def test_a_day_at_the_flight_line(tmp_path: Path) -> None:
             assert stat.S_IMODE((tmp_path / "control.sock").stat().st_mode) == 0o600
             before = autopilot.parameter("INS_GYROFFS_X")
 
+            await _until_read(line.config)
             status = await companion("status", "-c", config)
             assert status.code == DONE
             for word in ("in force: ", "ArduPilot", "disarmed", "vectornav on", "hmr3300 on"):

@@ -189,11 +189,21 @@ def _holders_by_device(root: Path) -> dict[str, list[Holder]]:
                 target = os.readlink(descriptor)
             except OSError:
                 continue
-            if target.startswith("/dev/") and target not in seen:
+            if target.startswith("/dev/") and target not in seen and not _is_namesake(descriptor, target):
                 seen.add(target)
                 holder = Holder(int(process.name), _read(process / "comm") or "?")
                 found.setdefault(target, []).append(holder)
     return found
+
+
+def _is_namesake(descriptor: Path, target: str) -> bool:
+    """A container counts its own pseudoterminals from 0; its serial ports are ours."""
+    if not target.startswith("/dev/pts/"):
+        return False
+    try:
+        return descriptor.stat().st_dev != os.stat(target).st_dev
+    except OSError:
+        return False
 
 
 def _consoles(root: Path) -> set[str]:
