@@ -5,6 +5,7 @@ ARDUPILOT_SITL: path of `arducopter`. PX4_SITL: path of `px4`; its etc folder is
 
 from __future__ import annotations
 
+import faulthandler
 from collections.abc import Iterator
 
 import pytest
@@ -20,6 +21,12 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     kinds = [kind for kind in KINDS if all(word in kind for word in words)]
     values = [pytest.param(kind, marks=[pytest.mark.sitl] if kind in BINARIES else []) for kind in kinds]
     metafunc.parametrize("autopilot", values, indirect=True, scope="session")
+
+
+@pytest.fixture(autouse=True)
+def unhurried() -> None:
+    """Each of these tests has a bound of its own, some beyond the time after which others count as hanging."""
+    faulthandler.cancel_dump_traceback_later()
 
 
 @pytest.fixture(scope="session")
