@@ -40,6 +40,8 @@ def test_there_and_back() -> None:
     plan = Plan("zero")
     assert "marked spot" in request(plan, [])
     assert objection(plan, [], LEVEL) is None
+    propped = Seen(np.array([np.sin(np.radians(45.0)), 0.0, -np.cos(np.radians(45.0))]), 0.0)
+    assert objection(plan, [], propped) == "tilted by 45 degrees: stand it on its base"
     assert "by 180 degrees" in request(plan, [LEVEL])
     for heading in (170.0, 150.0, 195.0):
         assert objection(plan, [LEVEL], stands(heading)) is None

@@ -23,6 +23,8 @@ LEAST_TILT_DEG: Final = 15.0
 """A tilt tells scale and misalignment from bias by what a cosine loses: little, below this."""
 APART_DEG: Final = 45.0
 """The least angle between two tilts to different sides."""
+MOST_ASKEW_DEG: Final = 30.0
+"""On its base: a slope, an aircraft that sits on its tail, and a board put in by eye."""
 TILTS: Final = 4
 LEVEL: Final = (0.0, 0.0, -1.0)
 _SIN, _COS = math.sin(24.0 * DEG), math.cos(24.0 * DEG)
@@ -106,7 +108,8 @@ def objection(plan: Plan, taken: Sequence[Seen], now: Seen) -> str | None:
     """Why this is not the stand that was asked for, and what to do; None when it is."""
     number = len(taken)
     if number == 0:
-        return None
+        askew_deg = _apart_deg(now.up, np.array(LEVEL))
+        return f"tilted by {askew_deg:.0f} degrees: stand it on its base" if askew_deg > MOST_ASKEW_DEG else None
     first = taken[0]
     if number < plan.on_spot:
         turned = _wrapped(now.heading_deg - first.heading_deg)
@@ -117,7 +120,7 @@ def objection(plan: Plan, taken: Sequence[Seen], now: Seen) -> str | None:
         if abs(off) > TURN_TOLERANCE_DEG:
             return f"{abs(turned):.0f} degrees, not {wanted:.0f}: turn it by {abs(off):.0f} degrees more"
         return None
-    tilt_deg = math.degrees(math.acos(float(np.clip(now.up @ first.up, -1.0, 1.0))))
+    tilt_deg = _apart_deg(now.up, first.up)
     if tilt_deg < LEAST_TILT_DEG:
         return f"tilted by {tilt_deg:.0f} degrees only: make it 20 to 28"
     for seen in taken[plan.on_spot :]:
@@ -135,6 +138,10 @@ def _quarter(taken: Sequence[Seen], turned_deg: float) -> str | None:
         if abs(_wrapped(seen.heading_deg - taken[0].heading_deg - near)) <= APART_DEG:
             return f"{near % 360.0:.0f} degrees again: turn it on by 90 degrees"
     return None
+
+
+def _apart_deg(one: Array, other: Array) -> float:
+    return math.degrees(math.acos(float(np.clip(one @ other, -1.0, 1.0))))
 
 
 def _azimuth(level: Array, up: Array) -> float:
