@@ -219,10 +219,9 @@ def turn_lines(record: Object) -> list[str]:
         roll, pitch = board["sigma_deg"]
         lines.append(
             f"the board of {board['imu']} sits at roll {board['roll_deg']:+.3f} +- {roll:.3f},"
-            f" pitch {board['pitch_deg']:+.3f} +- {pitch:.3f} deg; the same in parameters:"
+            f" pitch {board['pitch_deg']:+.3f} +- {pitch:.3f} deg"
+            + ("" if board["written"] else "; companion align turn --level tells it the autopilot")
         )
-        x, y = math.radians(board["roll_deg"]), math.radians(board["pitch_deg"])
-        lines.append(f"  AHRS_TRIM_X = {x:.5f}, AHRS_TRIM_Y = {y:.5f} (ArduPilot; --level writes them)")
         lines += _written_lines(board["written"])
     return lines + [f"warning: {words}" for words in record["warnings"]]
 
