@@ -187,7 +187,9 @@ async def calibrated(machine: Machine) -> None:
     await machine.run("systemctl", "restart", "companion")
     await until(lambda: good(machine))
     history = await ask(machine, "history")
-    assert [one["state"] for one in history["records"]] == ["done"]  # type: ignore[attr-defined]
+    # What setup's own configuration had begun by itself was broken off with it, if it had come so far.
+    states = [one["state"] for one in history["records"]]  # type: ignore[attr-defined]
+    assert [state for state in states if state != "cancelled"] == ["done"]
 
 
 async def reloaded(machine: Machine, configuration: str) -> None:
