@@ -54,6 +54,15 @@ def test_rates_are_in_the_vehicles_axes_second_by_second() -> None:
         assert rate == pytest.approx([-y, x, z], abs=6.0 * GYRO_NOISE / math.sqrt(RATE_HZ))
 
 
+def test_a_second_with_a_hole_tells_no_rate() -> None:
+    feed = _feeder()
+    feed.run(5.3)
+    feed.now_s += 0.15  # of 1005, though its other 85 samples are there
+    feed.run(6.0)
+    rates = feed.collector.snapshot(1003.0, None).rates_rad_s("own")
+    assert list(rates) == [1003, 1004, *range(1006, 1011)]
+
+
 def test_a_movement_is_kept_in_the_words_of_its_gate_although_the_stretch_is_forgotten() -> None:
     feed = _feeder()
     feed.run(12.0)

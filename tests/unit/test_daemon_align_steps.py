@@ -6,12 +6,24 @@ import itertools
 import math
 import re
 from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from companion.calibration.alignment.missing import Missing, up_of
-from companion.daemon.calibrating.align_steps import Hold, Plan, Seen, hold, objection, request, turned_deg
+from companion.calibration.means.windows import Window
+from companion.daemon.calibrating.align_steps import (
+    Hold,
+    Plan,
+    Seen,
+    heading_by_gyros,
+    hold,
+    objection,
+    request,
+    turned_deg,
+)
 from companion.daemon.calibrating.stands import Asked
 
 
@@ -77,6 +89,34 @@ def test_tilts_to_sides_not_yet_taken() -> None:
 def test_a_turn_by_the_gyros() -> None:
     rate = math.radians(18.0)
     assert turned_deg([rate + 0.001] * 10, 0.001) == pytest.approx(180.0)
+
+
+@pytest.mark.parametrize(
+    ("plan", "number", "lost", "heading_deg"),
+    [
+        (Plan("zero"), 1, None, 172.0),
+        (Plan("zero"), 1, 13, 180.0),
+        (Plan("zero"), 2, 13, 0.0),
+        (Plan("zero", headings=4), 1, 13, 90.0),
+        (Plan("tilts"), 4, 13, 0.0),
+    ],
+)
+def test_a_turn_of_which_a_second_is_missing_is_taken_as_asked(
+    plan: Plan, number: int, lost: int | None, heading_deg: float
+) -> None:
+    before, now = window_of(2.5, 10.5), window_of(20.5, 28.5)
+    rates = {second: np.array([0.0, 0.0, math.radians(172.0 / 9.0) + 0.001]) for second in range(11, 20)}
+    rates[21] = np.array([0.0, 0.0, 9.9])
+    heading, counted = heading_by_gyros(
+        plan, [stands(0.0)] * number, {k: rate for k, rate in rates.items() if k != lost}, before, now
+    )
+    assert heading == pytest.approx(heading_deg)
+    assert counted is (lost is None)
+
+
+def window_of(start_s: float, end_s: float) -> Window:
+    still = SimpleNamespace(gyro_rad_s=(0.0, 0.0, 0.001))
+    return cast("Window", SimpleNamespace(start_s=start_s, end_s=end_s, imus=(still,)))
 
 
 SIDES = ("level", "on its back", "nose up", "nose down", "left side down", "right side down")

@@ -28,6 +28,9 @@ MAX_SECONDS: Final = 600
 """Kept; the oldest go first. Ten times the longest usual window;
 some 1 MB in memory, 100 kB on disk with three IMUs."""
 
+HOLE_S: Final = 0.05
+"""Beyond the stream's interval: an aircraft that hands turn by 60 deg/s turns by 3 degrees meanwhile."""
+
 MAX_WORDS: Final = 100
 _FARTHEST: Final = 100_000_000
 
@@ -132,13 +135,14 @@ class Snapshot(msgspec.Struct, frozen=True):
         )
 
     def rates_rad_s(self, imu: str) -> dict[int, Floats]:
-        """By second, the mean rate that an IMU has read, (3,) in the vehicle's axes."""
+        """By second without a hole, the mean rate that an IMU has read, (3,) in the vehicle's axes."""
         rotation = np.asarray(self.inputs[imu].rotation)
         return {
             slot: rotation @ one.batch.mean[:3]
             for slot, _, seen in self.seconds
             for one in seen
             if one.kind == "imu" and one.name == imu and one.batch is not None
+            if one.batch.largest_gap_s < 1.0 / one.batch.n + HOLE_S
         }
 
 

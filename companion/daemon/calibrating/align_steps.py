@@ -35,6 +35,8 @@ _TILTED: Final = {
     "right side down": (0.0, -_SIN, -_COS),
 }
 HEADINGS: Final = 4
+BY_EYE_SIGMA_DEG: Final = 10.0
+"""Of a turn that nobody counted and that was made as asked."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -160,22 +162,35 @@ def _wrapped(angle_deg: float) -> float:
     return (angle_deg + 180.0) % 360.0 - 180.0
 
 
-def as_asked_deg(plan: Plan, taken: Sequence[Seen]) -> float:
-    """How it heads if it was turned as was asked."""
+def heading_by_gyros(
+    plan: Plan, taken: Sequence[Seen], rates_rad_s: Mapping[int, Array], before: Window, now: Window
+) -> tuple[float, bool]:
+    """How it heads after another turn, in degrees, and whether that was counted: else it is as was asked.
+
+    Counted are the first IMU's means of seconds about down since the stand before, less its bias. One that is missing,
+    as when the autopilot restarts, is armed, or its link stutters, may hold any part of the turn.
+
+    Args:
+        plan: what was asked for.
+        taken: the stands before, at least one.
+        rates_rad_s: by second without a hole, (3,) in the vehicle's axes.
+        before: the last stand's.
+        now: this stand's.
+    """
+    between = range(math.ceil(before.end_s), math.floor(now.start_s))
+    if not all(second in rates_rad_s for second in between):
+        return _as_asked_deg(plan, taken), False
+    bias = (before.imus[0].gyro_rad_s[2] + now.imus[0].gyro_rad_s[2]) / 2.0
+    rates = [float(rate[2]) for second, rate in rates_rad_s.items() if second < now.start_s]
+    return taken[-1].heading_deg + turned_deg(rates, bias), True
+
+
+def _as_asked_deg(plan: Plan, taken: Sequence[Seen]) -> float:
+    if len(taken) >= plan.on_spot:  # a tilt
+        return taken[-1].heading_deg
     if plan.on_spot >= HEADINGS:
         return taken[-1].heading_deg + QUARTER_DEG
     return taken[0].heading_deg + (180.0 if len(taken) == 1 else 0.0)
-
-
-def is_counted(rates_rad_s: Mapping[int, Array], before: Window, now: Window) -> bool:
-    """Whether no second between two stands is missing, as it is when the autopilot restarts or is armed."""
-    return all(second in rates_rad_s for second in range(math.ceil(before.end_s), math.floor(now.start_s)))
-
-
-def turned_between_deg(rates_rad_s: Mapping[int, Array], before: Window, now: Window) -> float:
-    """By how much it was turned between two stands: the first IMU's means of seconds about down, less its bias."""
-    bias = (before.imus[0].gyro_rad_s[2] + now.imus[0].gyro_rad_s[2]) / 2.0
-    return turned_deg([float(rate[2]) for second, rate in rates_rad_s.items() if second < now.start_s], bias)
 
 
 def turned_deg(rates_down_rad_s: Sequence[float], bias_rad_s: float) -> float:

@@ -109,13 +109,13 @@ class Aligner:
         seen = [one.seen for one in taken]
 
         def take(window: Window) -> tuple[_Taken, str | None]:
-            found = self._taken(model, taken, window)
+            found = self._taken(plan, model, taken, window)
             return found, align_steps.objection(plan, seen, found.seen)
 
         asked = Asked(len(taken) + 1, plan.total, align_steps.request(plan, seen), align_steps.hold(plan, seen))
         return await self._stands.next(job, asked, take)
 
-    def _taken(self, model: GradienterModel, taken: list[_Taken], window: Window) -> _Taken:
+    def _taken(self, plan: Plan, model: GradienterModel, taken: list[_Taken], window: Window) -> _Taken:
         if window.tilt is None:
             raise CalibrationRefusedError("no reading of the gradienter in this stand")
         try:
@@ -127,16 +127,13 @@ class Aligner:
             heading = vehicle_heading_rad(compass, window.heading.heading_deg, up) / DEG
             sigma = math.hypot(compass.sigma_deg, window.heading.sigma_deg)
         elif taken:
-            heading = taken[-1].seen.heading_deg + self._turned_deg(taken[-1].window, window)
-            sigma = GYRO_TURN_SIGMA_DEG
+            before, seen = taken[-1].window, [one.seen for one in taken]
+            rates = self._collector.snapshot(before.end_s, None).rates_rad_s(window.imus[0].name)
+            heading, counted = align_steps.heading_by_gyros(plan, seen, rates, before, window)
+            sigma = GYRO_TURN_SIGMA_DEG if counted else align_steps.BY_EYE_SIGMA_DEG
         else:
             heading, sigma = 0.0, 0.1  # north is where it points first
         return _Taken(window, Seen(up, heading), sigma)
-
-    def _turned_deg(self, before: Window, now: Window) -> float:
-        """By the gyros: the first IMU's means, second by second, about down."""
-        rates = self._collector.snapshot(before.end_s, None).rates_rad_s(now.imus[0].name)
-        return align_steps.turned_between_deg(rates, before, now)
 
     # --- the result
 

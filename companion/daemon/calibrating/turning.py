@@ -38,8 +38,6 @@ from companion.physics.units import DEG, MG
 
 COUNTED_SIGMA_DEG: Final = 1.5
 """Of a turn by the gyros' means of seconds, besides their scale: hands do not turn about the vertical alone."""
-BY_EYE_SIGMA_DEG: Final = 10.0
-"""Of a turn that nobody counted, for the autopilot was restarted or armed meanwhile, and that was made as asked."""
 SLOPE_WARNING_DEG: Final = 1.0
 
 
@@ -180,10 +178,10 @@ class Turning:
         """How it heads now, and one sigma: by the gyros of the first IMU since the stand before, else as was asked."""
         before = taken[-1]
         rates = self._core.collector.snapshot(before.window.end_s, None).rates_rad_s(now.imus[0].name)
-        if not align_steps.is_counted(rates, before.window, now):
-            return align_steps.as_asked_deg(plan, [one.seen for one in taken]), BY_EYE_SIGMA_DEG
-        turned_deg = align_steps.turned_between_deg(rates, before.window, now)
-        return before.seen.heading_deg + turned_deg, max(COUNTED_SIGMA_DEG, before.heading_sigma_deg)
+        seen = [one.seen for one in taken]
+        heading_deg, counted = align_steps.heading_by_gyros(plan, seen, rates, before.window, now)
+        sigma = max(COUNTED_SIGMA_DEG, before.heading_sigma_deg) if counted else align_steps.BY_EYE_SIGMA_DEG
+        return heading_deg, sigma
 
     def _as_stands(self, taken: list[_Taken]) -> list[Stand]:
         names = [
