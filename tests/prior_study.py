@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.calibration.solution.history import Measured, Point, PowerUp
+from companion.calibration.records.history import Measured, Point, PowerUp
+from companion.calibration.records.record import Pose, PoseSigma, Site
 from companion.calibration.solution.joint import Weighed, weigh
 from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, PoseEffect, expect, pose_effect
-from companion.calibration.solution.record import Pose, PoseSigma, Site
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 
 Array = NDArray[np.float64]

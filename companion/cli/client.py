@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from companion.calibration.solution.record import outcome_word
+from companion.calibration.records.record import outcome_word
 from companion.cli import show
 from companion.cli.terminal import DONE, FAILED, AddCommand, load_config, print_json, print_lines, seconds
 from companion.daemon.faces.control import ask

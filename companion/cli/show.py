@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from companion.calibration.solution.record import Magnetic, outcome_word
+from companion.calibration.records.record import Magnetic, outcome_word
 from companion.physics.units import DEG_H, MG
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from companion.calibration.deck.stream import Surroundings
 from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import noise_profile
-from companion.calibration.solution.record import AlignmentUsed
+from companion.calibration.records.record import AlignmentUsed
 from companion.calibration.solution.site import Whereabouts
 from companion.calibration.stillness.stretch import AT_ONCE, Lag
 from companion.config.sections import Compass, Config, Gradienter, GradienterProtocol, Imu

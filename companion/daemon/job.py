@@ -6,12 +6,12 @@ import asyncio
 from collections.abc import Mapping
 from typing import Final
 
-from companion.calibration.alignment.align_record import AlignmentRecord
+from companion.calibration.records.align_record import AlignmentRecord
+from companion.calibration.records.faces_record import FacesRecord
+from companion.calibration.records.record import Record, WrittenParameter
+from companion.calibration.records.turn_record import TurnRecord
 from companion.calibration.request import What
 from companion.calibration.solution.doubt import Doubt
-from companion.calibration.solution.faces_record import FacesRecord
-from companion.calibration.solution.record import Record, WrittenParameter
-from companion.calibration.solution.turn_record import TurnRecord
 from companion.component.service import JobResult
 from companion.errors import CalibrationRefusedError
 from companion.samples import Triad

@@ -22,9 +22,9 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.windows import ImuInput, Window
+from companion.calibration.records.record import Record
 from companion.calibration.solution.otherwise import NOTHING, Otherwise
 from companion.calibration.solution.prior import Expectation
-from companion.calibration.solution.record import Record
 from companion.calibration.solution.site import Whereabouts
 from companion.calibration.turning.watch import Turn
 from companion.config.sections import Config

@@ -13,7 +13,7 @@ from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 
-from companion.calibration.solution.record import Record, to_json
+from companion.calibration.records.record import Record, to_json
 from companion.samples import ImuSample
 
 FORMAT_VERSION: Final = "2"

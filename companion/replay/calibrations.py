@@ -15,11 +15,11 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_o
 from companion.calibration.collector.measurement import Measurement
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.windows import Window
+from companion.calibration.records.record import AlignmentUsed, Record
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
 from companion.calibration.solution.joint import weigh
 from companion.calibration.solution.otherwise import NOTHING, Otherwise
-from companion.calibration.solution.record import AlignmentUsed, Record
 from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.calibration.solution.solve import ImuSolution, Solution, solve
 from companion.config.sections import Config

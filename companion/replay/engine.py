@@ -19,8 +19,8 @@ import msgspec
 from companion.autopilot.telemetry import imu_messages
 from companion.autopilot.telemetry.imu_messages import ImuMessage, Reading
 from companion.calibration.collector.rolling import RollingCollector
+from companion.calibration.records.record import Record, from_json
 from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.record import Record, from_json
 from companion.config.sections import Config
 from companion.configured import models
 from companion.configured.models import Role, SerialDevice, collect, parts_of, serial_devices

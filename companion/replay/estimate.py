@@ -20,9 +20,9 @@ from companion.calibration.deck.stream import Surroundings
 from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
 from companion.calibration.means.windows import ImuInput, Window
 from companion.calibration.noise.allan import noise_profile
+from companion.calibration.records.record import Record
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
-from companion.calibration.solution.record import Record
 from companion.calibration.solution.site import Remedies, Whereabouts, local_earth
 from companion.calibration.solution.solve import solve
 from companion.calibration.stillness.stretch import Lag

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from companion.calibration.profiling.coverage import Held
-from companion.calibration.solution.record import ImuRecord
+from companion.calibration.records.record import ImuRecord
 from companion.errors import StorageError
 from companion.physics.frames import Floats, roll_pitch_from_up, rotation_matrix
 from companion.physics.units import DEG

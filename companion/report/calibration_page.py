@@ -9,7 +9,7 @@ from typing import Final
 import msgspec
 
 from companion.calibration.collector.trace import Trace
-from companion.calibration.solution.record import Arming, ImuRecord, Outcome, Record, outcome_word
+from companion.calibration.records.record import Arming, ImuRecord, Outcome, Record, outcome_word
 from companion.report.markup import Child, Markup, join, number, tag
 from companion.report.page import (
     AXES,

@@ -12,7 +12,7 @@ from typing import Final
 import msgspec
 
 from companion import __version__
-from companion.calibration.solution.record import Arming, Record
+from companion.calibration.records.record import Arming, Record
 from companion.physics.units import DEG_H, MG
 from companion.report import svg
 from companion.report.markup import Child, Markup, join, number, tag

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from companion.calibration.solution.record import Arming, Record
+from companion.calibration.records.record import Arming, Record
 from companion.errors import StorageError
 from companion.report.calibration_page import Material
 from companion.storage.records import Entry, RecordStore

@@ -8,8 +8,7 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.alignment import align_record
-from companion.calibration.solution import faces_record, history
+from companion.calibration.records import align_record, faces_record, history
 from companion.storage.state import StateFile
 
 

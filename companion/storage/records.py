@@ -13,7 +13,7 @@ import msgspec
 
 from companion.calibration.collector import trace as traces
 from companion.calibration.collector.trace import Trace
-from companion.calibration.solution.record import Record, WrittenParameter, from_json, to_json
+from companion.calibration.records.record import Record, WrittenParameter, from_json, to_json
 from companion.errors import StorageError
 from companion.storage.state import UNREADABLE, read_regular, remove_durably, sealed, unsealed, write_atomically
 

@@ -11,11 +11,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from companion.calibration.records.record import Record
 from companion.calibration.request import What
-from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
-from companion.daemon.calibrating.align_steps import Plan
 from companion.daemon.job import Job
+from companion.daemon.stands.align_steps import Plan
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
 from sim.aircraft import Pose

@@ -12,9 +12,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from companion.calibration.records.faces_record import FacesRecord
+from companion.calibration.records.record import Record
 from companion.calibration.request import What
-from companion.calibration.solution.faces_record import FacesRecord
-from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
 from sim.ardupilot.double import offset_names

@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.solution.turn_record import TurnRecord
+from companion.calibration.records.turn_record import TurnRecord
 from companion.component.service import JobResult, Refusal
-from companion.daemon.calibrating.turning import TurnAsked
 from companion.daemon.job import Job
+from companion.daemon.stands.turning import TurnAsked
 from sim.aircraft import Pose
 from sim.ardupilot.double import offset_names
 from sim.earth import mounting_matrix

@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.solution.history import PowerUp
-from companion.calibration.solution.record import Record, Standing
+from companion.calibration.records.history import PowerUp
+from companion.calibration.records.record import Record, Standing
 from companion.daemon.job import Job
 from companion.daemon.offsets import firmware_calibration
 from companion.recording.walk import Recording

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from companion.autopilot.firmware.firmwares import read_calibration
+from companion.calibration.records.record import Record
 from companion.calibration.request import What
-from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
 from companion.daemon.offsets import plan

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from companion.calibration.deck.estimate import DeckWork
+from companion.calibration.records.record import Record
 from companion.calibration.request import What
-from companion.calibration.solution.record import Record
 from companion.component.service import Refusal
-from companion.daemon.calibrating.align_steps import Plan
+from companion.daemon.stands.align_steps import Plan
 from sim.imu_model import DEG_H, MG
 from sim.motions import SlowTurn
 from sim.sea import DAY_S, Sea, Wave

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from companion.calibration.means.dither import STEPS
+from companion.calibration.records.record import Record
 from companion.calibration.request import What
-from companion.calibration.solution.record import Record
 from companion.component.service import JobResult
 from companion.config.sections import Imu, Push
 from companion.daemon.job import Job

@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 
 from companion.calibration.noise.allan import PROFILES
+from companion.calibration.records.record import ImuRecord, Record
 from companion.calibration.request import What
-from companion.calibration.solution.record import ImuRecord, Record
 from companion.config import parse
 from companion.configured import models
 from companion.daemon.job import Job

@@ -14,11 +14,11 @@ import pytest
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.machine import State
 from companion.calibration.means.windows import Window
+from companion.calibration.records.record import Record
 from companion.calibration.request import What
-from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
-from companion.daemon.calibrating.course import Measuring
 from companion.daemon.job import Job
+from companion.daemon.stands.measuring import Measuring
 from companion.errors import ParameterTimeoutError
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from sim.ardupilot.double import ArduPilotDouble, offset_names

@@ -13,8 +13,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import ArmState
 from companion.calibration.machine import State
+from companion.calibration.records.validity import Why
 from companion.calibration.request import What
-from companion.calibration.solution.validity import Why
 from companion.component.service import Refusal
 from sim.ardupilot.double import offset_names
 from sim.imu_model import DEG_H

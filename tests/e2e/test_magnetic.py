@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.calibration.solution.record import Record
+from companion.calibration.records.record import Record
 from companion.cli.show import record_lines, status_lines
 from companion.config import parse
 from companion.physics.frames import wrap_deg

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import msgspec
 import pytest
 
-from companion.calibration.solution.record import Record, from_json
+from companion.calibration.records.record import Record, from_json
 from companion.storage.records import RecordStore
 from tests.e2e.test_calibration import calibrated
 from tests.e2e.test_commands import DONE, FAILED, FlightLine, _end, _until_disarmed, companion, flight_line

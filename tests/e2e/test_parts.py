@@ -12,8 +12,8 @@ import pytest
 from companion.autopilot.firmware.parts import part_of
 from companion.calibration.means.windows import Hidden, ImuWindow
 from companion.calibration.noise.allan import noise_profile
+from companion.calibration.records.record import ImuRecord
 from companion.calibration.request import What
-from companion.calibration.solution.record import ImuRecord
 from companion.calibration.solution.site import IN_CONFIGURATION
 from companion.calibration.solution.widened import without_heading
 from companion.config import parse

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from companion.calibration.records.record import Record
 from companion.calibration.request import What
-from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
 from companion.storage.changes import ChangeLog

@@ -19,8 +19,8 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from companion.autopilot.vehicle.vehicle import ArmState
+from companion.calibration.records.record import Record
 from companion.calibration.request import What
-from companion.calibration.solution.record import Record
 from companion.cli import main as companion
 from companion.config.sections import Config, Noise
 from companion.daemon.recorder import recorder as recorder_module

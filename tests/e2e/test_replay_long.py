@@ -13,7 +13,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from companion.calibration.solution.record import Record
+from companion.calibration.records.record import Record
 from companion.errors import StorageError
 from companion.recording import topics
 from companion.recording.walk import Message, Recording

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from companion.calibration.records.record import Record
 from companion.calibration.request import What
-from companion.calibration.solution.record import Record
 from companion.component.service import JobResult
 from companion.daemon.job import Job
 from sim.ardupilot.double import offset_names

@@ -11,7 +11,7 @@ import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.calibration.solution.record import Arming
+from companion.calibration.records.record import Arming
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from companion.storage.learned import SIGNING_FILE, AlignmentStore, BiasStore, FacesStore, signing_time_in
 from companion.storage.records import RecordStore

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from companion.calibration.collector.trace import Trace, VerdictTrace
-from companion.calibration.solution.record import (
+from companion.calibration.records.record import (
     Arming,
     ImuRecord,
     Pose,

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from companion.calibration.means.pose import CompassModel, GradienterModel
+from companion.calibration.records.history import PowerUp
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.history import PowerUp
 from companion.calibration.solution.joint import Weighed, Whole, points, weigh
 from companion.calibration.solution.prior import Expectation, Expected, ExpectedImu
 from companion.calibration.solution.site import Whereabouts, local_earth

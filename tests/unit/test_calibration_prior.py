@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.calibration.alignment.align_record import Determined, ImuAlignmentRecord
 from companion.calibration.noise.allan import noise_profile
-from companion.calibration.solution.history import Measured, Point, PowerUp, believed, by_power_up
+from companion.calibration.records.align_record import Determined, ImuAlignmentRecord
+from companion.calibration.records.history import Measured, Point, PowerUp, believed, by_power_up
 from companion.calibration.solution.prior import Expected, Now, expect, expect_today, pose_effect, student_limit
 from companion.samples import Triad
 from tests.prior_study import CASES, Case, study

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.calibration.noise.allan import PROFILES, AllanModel
-from companion.calibration.solution.validity import (
+from companion.calibration.records.validity import (
     DRIFT_SIGMAS,
     Held,
     Limits,

@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from companion import cli
-from companion.calibration.alignment.align_record import AlignmentRecord, GradienterSettings
+from companion.calibration.records.align_record import AlignmentRecord, GradienterSettings
 from companion.cli.client import alignment_lines
 from companion.errors import StorageError
 from companion.storage.learned import AlignmentStore

@@ -14,7 +14,7 @@ import pytest
 
 from companion.calibration.alignment.missing import Missing, up_of
 from companion.calibration.means.windows import Window
-from companion.daemon.calibrating.align_steps import (
+from companion.daemon.stands.align_steps import (
     Hold,
     Plan,
     Seen,
@@ -24,7 +24,7 @@ from companion.daemon.calibrating.align_steps import (
     request,
     turned_deg,
 )
-from companion.daemon.calibrating.stands import Asked
+from companion.daemon.stands.stands import Asked
 
 
 def stands(heading_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Seen:

@@ -14,7 +14,7 @@ from companion.attitude.estimator import Attitude
 from companion.attitude.quaternion import Quaternion
 from companion.autopilot.firmware.heading_parameters import changes_for
 from companion.autopilot.telemetry.attitude_messages import attitude_messages, vision_position_estimate
-from companion.calibration.solution.record import ImuRecord, Outcome, WrittenParameter
+from companion.calibration.records.record import ImuRecord, Outcome, WrittenParameter
 from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.config import parse
 from companion.config.sections import Imu

@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from companion.calibration.solution.validity import Why
+from companion.calibration.records.validity import Why
 from companion.component.service import JobResult
 from companion.daemon.arming.offset_watch import OffsetWatch
 

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.calibration.solution.record import Magnetic
+from companion.calibration.records.record import Magnetic
 from companion.cli import main
 from companion.physics.units import DEG_H, MG
 from companion.report import calibration_page as calibration

@@ -14,7 +14,7 @@ import msgspec
 import pytest
 
 from companion.calibration.collector.trace import Trace
-from companion.calibration.solution.record import ImuRecord, Record, WrittenParameter, to_json
+from companion.calibration.records.record import ImuRecord, Record, WrittenParameter, to_json
 from companion.errors import StorageError
 from companion.storage import records as records_module
 from companion.storage.changes import Changed, ChangeLog, ChangeSet

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from companion.calibration.solution.history import Measured, Point, PowerUp
+from companion.calibration.records.history import Measured, Point, PowerUp
 from companion.errors import StorageError
 from companion.storage.learned import KEEP_IMUS, KEEP_POINTS, BiasStore, KnownImu
 

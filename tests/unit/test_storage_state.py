@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from companion.calibration.solution.record import Arming
+from companion.calibration.records.record import Arming
 from companion.errors import StorageError
 from companion.storage.changes import Changed, ChangeLog, ChangeSet
 from companion.storage.learned import SIGNING_FILE, AlignmentStore, BiasStore, FacesStore, signing_time_in

@@ -24,7 +24,7 @@ from companion.autopilot.firmware.imu_calibration import (
 from companion.autopilot.firmware.px4 import SLOTS, SlotMemory
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.vehicle.vehicle import Firmware
-from companion.calibration.solution.record import Outcome, WrittenParameter
+from companion.calibration.records.record import Outcome, WrittenParameter
 from companion.errors import AutopilotError
 from companion.samples import Triad
 

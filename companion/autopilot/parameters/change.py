@@ -6,7 +6,7 @@ import dataclasses
 from typing import ClassVar, Literal
 
 from companion.autopilot.parameters.wire import float32
-from companion.calibration.solution.record import WrittenParameter
+from companion.calibration.records.record import WrittenParameter
 from companion.errors import AutopilotError, AutopilotRebootedError, NotDisarmedError
 
 FailureKind = Literal[

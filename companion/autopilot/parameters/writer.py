@@ -27,7 +27,7 @@ from companion.autopilot.parameters.change import (
 from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.vehicle.vehicle import ArmState, Moment, Vehicle
-from companion.calibration.solution.record import Outcome, WrittenParameter
+from companion.calibration.records.record import Outcome, WrittenParameter
 from companion.errors import (
     AutopilotError,
     AutopilotRebootedError,

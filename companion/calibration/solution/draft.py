@@ -8,9 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from companion.calibration.solution.doubt import Doubt
-from companion.calibration.solution.history import Point
-from companion.calibration.solution.record import (
+from companion.calibration.records.history import Point
+from companion.calibration.records.record import (
     AlignmentUsed,
     CrossCovariance,
     ImuRecord,
@@ -18,6 +17,7 @@ from companion.calibration.solution.record import (
     Standing,
     WrittenParameter,
 )
+from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.solve import ImuSolution, Solution
 from companion.physics.frames import Array, Matrix, vector
 from companion.physics.units import DEG, DEG_H, MG

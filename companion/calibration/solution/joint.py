@@ -24,10 +24,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from companion.calibration.records.history import Measured, Point, PowerUp
+from companion.calibration.records.record import AccelPrior, GyroPrior, Prior
 from companion.calibration.solution.doubt import Doubt, Witness, doubts
-from companion.calibration.solution.history import Measured, Point, PowerUp
 from companion.calibration.solution.prior import Expectation, Expected, ExpectedImu
-from companion.calibration.solution.record import AccelPrior, GyroPrior, Prior
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 from companion.calibration.turning.watch import CHANCE_SIGMAS, Turn
 from companion.physics.frames import Array, Matrix, vector

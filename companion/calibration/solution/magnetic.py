@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from companion.calibration.means.pose import CompassModel, FieldWindow, HeadingWindow, vehicle_heading_rad
-from companion.calibration.solution.record import Magnetic
+from companion.calibration.records.record import Magnetic
 from companion.calibration.solution.site import LocalEarth
 from companion.physics.earth import MagneticField
 from companion.physics.frames import Array, Matrix, wrap_deg

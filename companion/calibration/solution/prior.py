@@ -25,10 +25,10 @@ import msgspec
 import numpy as np
 
 from companion.calibration.alignment.align_model import Priors
-from companion.calibration.alignment.align_record import Determined, ImuAlignmentRecord
 from companion.calibration.noise.allan import AllanModel, floor_variance
-from companion.calibration.solution.history import Measured, Point, PowerUp, believed
-from companion.calibration.solution.record import Effective
+from companion.calibration.records.align_record import Determined, ImuAlignmentRecord
+from companion.calibration.records.history import Measured, Point, PowerUp, believed
+from companion.calibration.records.record import Effective
 from companion.physics.frames import Array, Floats, Matrix, skew, vector
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import Triad, Vector

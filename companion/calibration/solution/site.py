@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.solution.record import Site
+from companion.calibration.records.record import Site
 from companion.physics import earth
 from companion.physics.frames import Array, Matrix
 

@@ -35,10 +35,7 @@ from companion.calibration.means.pose import (
     GradienterModel,
 )
 from companion.calibration.means.windows import ImuWindow, Window
-from companion.calibration.request import What
-from companion.calibration.solution.believable import believable, untold, widened
-from companion.calibration.solution.otherwise import NOTHING, Otherwise
-from companion.calibration.solution.record import (
+from companion.calibration.records.record import (
     Effective,
     Magnetic,
     Pose,
@@ -46,6 +43,9 @@ from companion.calibration.solution.record import (
     Prior,
     Site,
 )
+from companion.calibration.request import What
+from companion.calibration.solution.believable import believable, untold, widened
+from companion.calibration.solution.otherwise import NOTHING, Otherwise
 from companion.calibration.solution.site import LocalEarth
 from companion.calibration.solution.truth import Truth, truth_of
 from companion.calibration.solution.widened import without_heading

@@ -10,9 +10,9 @@ import numpy as np
 
 from companion.calibration.means.pose import CompassModel, GradienterModel, TiltWindow, up_in_vehicle
 from companion.calibration.means.windows import Window
+from companion.calibration.records.record import HeadingFrom, Magnetic, TiltFrom
 from companion.calibration.solution import magnetic
 from companion.calibration.solution.otherwise import NOTHING, Otherwise, OwnHeading, tilt_in_words, up_by_sides
-from companion.calibration.solution.record import HeadingFrom, Magnetic, TiltFrom
 from companion.calibration.solution.site import LocalEarth, Uncertain
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up

@@ -12,7 +12,7 @@ from typing import Final
 import msgspec
 
 from companion.autopilot.vehicle.vehicle import VehicleEvent
-from companion.calibration.solution.record import Arming, Record
+from companion.calibration.records.record import Arming, Record
 from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.readiness import Readiness
 from companion.daemon.core import Core

@@ -21,7 +21,7 @@ from typing import Final
 import msgspec
 
 from companion.autopilot.vehicle.vehicle import ArmState
-from companion.calibration.solution.validity import Why
+from companion.calibration.records.validity import Why
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.daemon.arming.in_force import InForce

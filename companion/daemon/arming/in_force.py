@@ -17,11 +17,8 @@ import numpy as np
 
 from companion.autopilot.firmware.firmwares import outcomes_of
 from companion.calibration.noise.allan import noise_profile
-from companion.calibration.request import What
-from companion.calibration.solution.doubt import Doubt
-from companion.calibration.solution.record import ImuRecord, Record
-from companion.calibration.solution.solve import Solution
-from companion.calibration.solution.validity import (
+from companion.calibration.records.record import ImuRecord, Record
+from companion.calibration.records.validity import (
     Finding,
     Held,
     Limits,
@@ -31,6 +28,9 @@ from companion.calibration.solution.validity import (
     worst_axis,
     worth_writing,
 )
+from companion.calibration.request import What
+from companion.calibration.solution.doubt import Doubt
+from companion.calibration.solution.solve import Solution
 from companion.component.service import JobResult
 from companion.config.sections import Config, Imu
 from companion.configured import models

@@ -13,7 +13,7 @@ import msgspec
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration
 from companion.autopilot.vehicle.vehicle import Vehicle
-from companion.calibration.solution.validity import Why
+from companion.calibration.records.validity import Why
 from companion.component.service import JobResult
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import BY_STANDS, Job

@@ -13,7 +13,7 @@ from typing import Final, Literal
 
 from companion.autopilot.firmware.firmwares import settle_s
 from companion.calibration.machine import State
-from companion.calibration.solution.validity import Why
+from companion.calibration.records.validity import Why
 from companion.component.service import ArmAnswer
 from companion.config.sections import AtArm
 from companion.daemon.arming.automatic import Automatic

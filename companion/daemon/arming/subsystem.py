@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Mapping, Sequence
 
 import msgspec
 
-from companion.calibration.solution.record import ImuRecord
+from companion.calibration.records.record import ImuRecord
 from companion.daemon.arming.armings import Armings, with_armings
 from companion.daemon.arming.automatic import Automatic
 from companion.daemon.arming.gate_setup import GateSetup

@@ -16,20 +16,20 @@ import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
-from companion.calibration.alignment.align_record import ImuAlignmentRecord
 from companion.calibration.noise.allan import noise_profile
+from companion.calibration.records.align_record import ImuAlignmentRecord
+from companion.calibration.records.history import Point, PowerUp
+from companion.calibration.records.record import Record, WrittenParameter
 from companion.calibration.solution.doubt import Doubt
-from companion.calibration.solution.history import Point, PowerUp
 from companion.calibration.solution.joint import Whole, points
 from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, expect, expect_today, pose_effect
-from companion.calibration.solution.record import Record, WrittenParameter
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 from companion.component.statustext import Severity
 from companion.config.sections import Noise
-from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.sensors import SerialSensor
+from companion.daemon.stands.alignment import AlignmentInForce
 from companion.errors import StorageError
 from companion.physics.frames import vector
 from companion.samples import Triad

@@ -16,22 +16,22 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.autopilot.vehicle.vehicle import ArmState, VehicleEvent
 from companion.calibration.collector.outlook import Settings
 from companion.calibration.machine import Event, State
+from companion.calibration.records.record import Record
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, in_words
-from companion.calibration.solution.record import Record
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.component.tunes import Tune
-from companion.daemon.calibrating.align_steps import Plan
-from companion.daemon.calibrating.aligner import Aligner
 from companion.daemon.calibrating.bias_memory import Results, has_written
 from companion.daemon.calibrating.course import Course
-from companion.daemon.calibrating.facing import Facing
-from companion.daemon.calibrating.turning import TurnAsked, Turning
 from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
 from companion.daemon.core import Core
 from companion.daemon.job import ALIGNMENT, BY_STANDS, FACES, TURN, Job, JobCancelledError
 from companion.daemon.offsets.ledger import Recovery
+from companion.daemon.stands.align_steps import Plan
+from companion.daemon.stands.aligner import Aligner
+from companion.daemon.stands.facing import Facing
+from companion.daemon.stands.turning import TurnAsked, Turning
 from companion.errors import CompanionError
 from companion.links.system.listeners import Listeners
 

@@ -8,20 +8,17 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
 from collections.abc import Container, Mapping
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
 
 from companion.autopilot.parameters.change import WriteFailedError
-from companion.autopilot.vehicle.vehicle import ArmState
-from companion.calibration.collector.outlook import Settings, Status
-from companion.calibration.machine import Event, State
+from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
+from companion.calibration.records.history import Point
 from companion.calibration.request import What
 from companion.calibration.solution.draft import Draft, unseen_turn
-from companion.calibration.solution.history import Point
 from companion.calibration.solution.joint import Weighed, weigh
 from companion.calibration.solution.prior import Expectation
 from companion.calibration.solution.solve import Solution
@@ -29,18 +26,16 @@ from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity
 from companion.component.tunes import Tune
 from companion.config.sections import Platform
-from companion.configured import models
 from companion.daemon.calibrating import held_back
 from companion.daemon.calibrating.bias_memory import BiasMemory
 from companion.daemon.calibrating.solver import Given, Solver
 from companion.daemon.core import Core
-from companion.daemon.devices.autopilot_imu import AutopilotImu, not_ready
 from companion.daemon.job import Job
 from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.effect import TELEMETRY
 from companion.daemon.offsets.plan import Planner
 from companion.daemon.offsets.push import Conclusion, Pusher
-from companion.errors import AutopilotError, CalibrationRefusedError
+from companion.daemon.stands.measuring import Measuring
 from companion.links.system.listeners import Listeners
 from companion.samples import Triad
 
@@ -53,125 +48,6 @@ _STARTED: Final[dict[Platform, str]] = {
     "deck": "Calibration started: the deck may sway",
 }
 _WATCHING: Final = "watching the telemetry take the new offsets"
-POLL_S: Final = 0.2
-"""A complete second is looked at when it is; this is how often for whatever else may change."""
-SAY_WAITING_EVERY_S: Final = 10.0
-SAY_LEFT_EVERY_S: Final = 75.0
-"""Through minutes in which nothing is in the way; the first minute of a deck says nothing yet."""
-READ_ATTEMPTS: Final = 2
-"""How often, within one calibration, the autopilot's offsets may fail to be read."""
-MOST_UPSETS: Final = 5
-"""How often, within one calibration, other offsets may come into force, or the autopilot restart."""
-
-
-class Stand(NamedTuple):
-    """How the aircraft stands at this moment."""
-
-    status: Status
-    waiting_for: str | None
-    """What is in the way of measuring."""
-    hold_still_s: int | None
-    """For how long to hold still, where nothing else is."""
-
-
-class Measuring:
-    """Of one aircraft, for one job at a time."""
-
-    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu]) -> None:
-        self._core, self._machine, self._imus = core, core.machine, imus
-        self._upsets: dict[str, int] = {}
-        """By IMU, how many there had been before this calibration."""
-        self._said, self._said_s = "", -math.inf
-
-    def begin(self) -> None:
-        """A calibration begins, which may measure more than once."""
-        self._said, self._said_s = "", -math.inf
-        self._upsets = {name: imu.upsets for name, imu in self._imus.items()}
-
-    async def read_state(self, job: Job, if_armed: str | None) -> Stand:
-        """How it stands now.
-
-        Args:
-            job: what it is looked at for.
-            if_armed: why the job fails where it was armed since it began; None: it goes on once it is disarmed.
-
-        Raises:
-            CalibrationRefusedError: armed (in those words), or out of time.
-        """
-        armed = self._core.vehicle.arm_state is ArmState.ARMED
-        if if_armed is not None and (armed or job.was_armed):
-            raise CalibrationRefusedError(if_armed)
-        job.check_time()
-        await self._core.catch_up()
-        status = self._core.collector.status(asyncio.get_running_loop().time())
-        if armed:
-            return Stand(status, "armed: it goes on once it is disarmed", None)
-        other = not_ready(self._core.vehicle, self._imus) or models.place_doubt(self._core.config, self._core.vehicle)
-        if other is not None or status.obstacle is None:
-            return Stand(status, other, None)
-        return Stand(status, status.obstacle.words, status.obstacle.hold_still_s)
-
-    def show(self, *, measuring: bool) -> None:
-        """Let the state table follow."""
-        if measuring and self._machine.state is State.WAITING:
-            self._machine.on(Event.STILL)
-        elif not measuring and self._machine.state is State.COLLECTING:
-            self._machine.on(Event.MOVED)
-
-    async def measure(self, job: Job) -> Window:
-        """Wait for stillness and for enough of it; returns the averages.
-
-        Raises:
-            CalibrationRefusedError: armed in the middle, out of time, or the readings fail their checks.
-            JobCancelledError: cancelled.
-        """
-        collector = self._core.collector
-        collector.retarget(self._wanted(job.what))
-        failures = {name: imu.failures for name, imu in self._imus.items()}
-        stop = collector.seconds.add(job.look_again)
-        try:
-            while True:
-                status, waiting_for, hold_still_s = await self.read_state(job, "armed; nothing written")
-                self._check_imus(failures)
-                self.show(measuring=waiting_for is None)
-                words = waiting_for or status.measuring
-                job.progress(MEASURED_PERCENT * status.progress, words, hold_still_s)
-                if waiting_for is None and status.enough:
-                    self._machine.on(Event.ENOUGH)
-                    job.progress(MEASURED_PERCENT, "working out the biases")
-                    return await self._core.window()
-                if waiting_for or status.left:
-                    self.tell(job, words, SAY_WAITING_EVERY_S if waiting_for else SAY_LEFT_EVERY_S)
-                await job.pause(POLL_S)
-        finally:
-            stop()
-
-    def tell(self, job: Job, words: str, every_s: float = SAY_WAITING_EVERY_S) -> None:
-        """Tell whoever has asked what is waited for: news, and not too often."""
-        now_s = asyncio.get_running_loop().time()
-        if words != self._said and not job.automatic and now_s - self._said_s >= every_s:
-            self._said, self._said_s = words, now_s
-            self._core.say(Severity.INFO, f"Calibration: {words}")
-
-    def _check_imus(self, failures: dict[str, int]) -> None:
-        for name, imu in self._imus.items():
-            failures[name] = min(failures[name], imu.failures)
-            if imu.failures - failures[name] >= READ_ATTEMPTS:
-                # Patience is for what can change by itself; an autopilot that does not answer is a fault.
-                raise AutopilotError(f"imu {name}: {imu.problem}")
-            if (upsets := imu.upsets - self._upsets.get(name, 0)) >= MOST_UPSETS:
-                raise AutopilotError(
-                    f"{imu.upset}, {upsets} times now: does something else write, or pretend to be the autopilot?"
-                )
-
-    def _wanted(self, what: What) -> Settings:
-        """The targets of what was asked for; the rest may be as bad as it likes."""
-        settings = self._core.wanted.settings
-        return msgspec.structs.replace(
-            settings,
-            target_gyro_sigma_rad_s=settings.target_gyro_sigma_rad_s if what.gyros else math.inf,
-            target_accel_sigma_m_s2=settings.target_accel_sigma_m_s2 if what.accelerometers else math.inf,
-        )
 
 
 class Solving:

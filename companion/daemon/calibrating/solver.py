@@ -14,9 +14,9 @@ from companion.calibration.solution.otherwise import NOTHING, Otherwise
 from companion.calibration.solution.site import Whereabouts, local_earth
 from companion.calibration.solution.solve import Solution, solve
 from companion.configured import models
-from companion.daemon.calibrating.alignment import AlignmentInForce
-from companion.daemon.calibrating.faces_in_force import FacesInForce
 from companion.daemon.core import Core
+from companion.daemon.stands.alignment import AlignmentInForce
+from companion.daemon.stands.faces_in_force import FacesInForce
 
 
 class Given(NamedTuple):

@@ -9,22 +9,13 @@ from typing import Final
 import msgspec
 
 from companion.autopilot.vehicle.own_attitude import OwnAttitude
+from companion.calibration.records.record import Record
 from companion.calibration.request import What, is_time_limit
-from companion.calibration.solution.record import Record
 from companion.component.service import Refusal
-from companion.daemon.calibrating.accel_writes import AccelWrites
-from companion.daemon.calibrating.align_steps import HEADINGS, Plan
-from companion.daemon.calibrating.aligner import Aligner
-from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.calibrating.bias_memory import BiasMemory, Results
 from companion.daemon.calibrating.conductor import Conductor
-from companion.daemon.calibrating.course import Course, Measuring, Solving
-from companion.daemon.calibrating.faces_in_force import FacesInForce
-from companion.daemon.calibrating.facing import Facing
-from companion.daemon.calibrating.level_writes import LevelWrites
+from companion.daemon.calibrating.course import Course, Solving
 from companion.daemon.calibrating.solver import Solver
-from companion.daemon.calibrating.stands import Stands
-from companion.daemon.calibrating.turning import TurnAsked, Turning
 from companion.daemon.calibrating.why_not import Rung
 from companion.daemon.core import Core, Handler, Subsystem
 from companion.daemon.devices.subsystem import Devices
@@ -32,6 +23,16 @@ from companion.daemon.job import Job
 from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.push import Conclusion
 from companion.daemon.offsets.subsystem import Offsets
+from companion.daemon.stands.accel_writes import AccelWrites
+from companion.daemon.stands.align_steps import HEADINGS, Plan
+from companion.daemon.stands.aligner import Aligner
+from companion.daemon.stands.alignment import AlignmentInForce
+from companion.daemon.stands.faces_in_force import FacesInForce
+from companion.daemon.stands.facing import Facing
+from companion.daemon.stands.level_writes import LevelWrites
+from companion.daemon.stands.measuring import Measuring
+from companion.daemon.stands.stands import Stands
+from companion.daemon.stands.turning import TurnAsked, Turning
 from companion.errors import CalibrationRefusedError
 from companion.formats import Object
 from companion.storage.records import RecordStore

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, get_args
 
 import msgspec
 
-from companion.calibration.solution.record import ImuRecord
+from companion.calibration.records.record import ImuRecord
 from companion.component.component import Component
 from companion.component.own_parameters import Parameter
 from companion.component.service import JobResult

@@ -22,11 +22,11 @@ from companion.autopilot.vehicle.vehicle import Firmware
 from companion.component.statustext import Severity, Weight
 from companion.configured import models
 from companion.daemon.arming.in_force import InForce
-from companion.daemon.calibrating.alignment import AlignmentInForce
 from companion.daemon.core import Core
 from companion.daemon.devices.subsystem import Devices
 from companion.daemon.heading.carrier import SLOWEST_AIRSPEED_M_S, Carrier, carrying_imu, without_truncation
 from companion.daemon.heading.health import Difference, Health
+from companion.daemon.stands.alignment import AlignmentInForce
 from companion.formats import Object
 from companion.links.mavlink.link import MavlinkLink
 from companion.physics.units import DEG

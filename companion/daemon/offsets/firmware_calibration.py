@@ -34,7 +34,7 @@ from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.writer import ParameterWriter
 from companion.autopilot.vehicle.ekf import SETTLED_RAD_S, EkfWatch
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
-from companion.calibration.solution.record import WrittenParameter
+from companion.calibration.records.record import WrittenParameter
 from companion.config.sections import Platform
 from companion.daemon.offsets.ledger import Ledger
 from companion.errors import AutopilotError, AutopilotRebootedError, CompanionError, NotDisarmedError

@@ -19,7 +19,7 @@ from companion.autopilot.parameters.client import ParameterClient
 from companion.autopilot.parameters.wire import same_float32
 from companion.autopilot.parameters.writer import Change, ParameterWriter
 from companion.autopilot.vehicle.vehicle import ArmState, Firmware, Vehicle
-from companion.calibration.solution.record import WrittenParameter
+from companion.calibration.records.record import WrittenParameter
 from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.core import Offload
 from companion.errors import AutopilotError, ParameterRefusedError, StorageError

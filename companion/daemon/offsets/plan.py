@@ -16,10 +16,10 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration, changes
 from companion.autopilot.firmware.px4 import SlotMemory, warnings_about
 from companion.autopilot.parameters.writer import Change
 from companion.autopilot.telemetry.imu_stream import StreamKind
+from companion.calibration.records.record import Outcome, WrittenParameter
+from companion.calibration.records.validity import WORTH_SIGMAS
 from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.record import Outcome, WrittenParameter
 from companion.calibration.solution.solve import ImuSolution, Solution
-from companion.calibration.solution.validity import WORTH_SIGMAS
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.offsets.rivalry import Rivalry

@@ -14,7 +14,7 @@ from typing import Final
 
 import msgspec
 
-from companion.calibration.solution.record import to_json
+from companion.calibration.records.record import to_json
 from companion.config.sections import Mqtt
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.core import Core, Handler

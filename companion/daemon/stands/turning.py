@@ -13,25 +13,25 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import changes_for
 from companion.calibration.alignment.align import Alignment, in_words
 from companion.calibration.alignment.align_model import Ground, Stand
-from companion.calibration.alignment.align_record import stand_record
 from companion.calibration.alignment.spot import Mounting, mounting, turned
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
+from companion.calibration.records.align_record import stand_record
+from companion.calibration.records.record import WrittenParameter
+from companion.calibration.records.turn_record import BoardRecord, TurnRecord, turn_imu_record
 from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.record import WrittenParameter
 from companion.calibration.solution.site import LocalEarth, local_earth
-from companion.calibration.solution.turn_record import BoardRecord, TurnRecord, turn_imu_record
 from companion.component.statustext import Severity
 from companion.configured import models
-from companion.daemon.calibrating import align_steps
-from companion.daemon.calibrating.accel_writes import AccelWrites
-from companion.daemon.calibrating.align_steps import Plan, Seen
-from companion.daemon.calibrating.faces_in_force import FacesInForce
-from companion.daemon.calibrating.level_writes import LevelWrites
-from companion.daemon.calibrating.stands import Asked, Stands, imu_stand
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
+from companion.daemon.stands import align_steps
+from companion.daemon.stands.accel_writes import AccelWrites
+from companion.daemon.stands.align_steps import Plan, Seen
+from companion.daemon.stands.faces_in_force import FacesInForce
+from companion.daemon.stands.level_writes import LevelWrites
+from companion.daemon.stands.stands import Asked, Stands, imu_stand
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import vector
 from companion.physics.units import DEG, MG

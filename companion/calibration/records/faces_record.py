@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 
 from companion.calibration.alignment.align import DETERMINED
-from companion.calibration.alignment.align_record import Determined
 from companion.calibration.alignment.faces import (
     BIAS,
     PRIOR_BIAS_M_S2,
@@ -21,7 +20,8 @@ from companion.calibration.alignment.faces import (
     SHEAR,
     Faces,
 )
-from companion.calibration.solution.record import WrittenParameter
+from companion.calibration.records.align_record import Determined
+from companion.calibration.records.record import WrittenParameter
 from companion.physics.frames import vector
 from companion.physics.units import MG
 from companion.samples import Vector

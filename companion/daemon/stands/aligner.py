@@ -15,18 +15,18 @@ import numpy as np
 
 from companion.calibration.alignment.align import Alignment, align, in_words
 from companion.calibration.alignment.align_model import Ground, Stand
-from companion.calibration.alignment.align_record import AlignmentRecord, imu_record, stand_record
 from companion.calibration.machine import Event
 from companion.calibration.means.pose import GradienterModel, up_in_vehicle, vehicle_heading_rad
 from companion.calibration.means.windows import Window
+from companion.calibration.records.align_record import AlignmentRecord, imu_record, stand_record
 from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.configured import models
-from companion.daemon.calibrating import align_steps
-from companion.daemon.calibrating.align_steps import Plan, Seen
-from companion.daemon.calibrating.alignment import AlignmentInForce
-from companion.daemon.calibrating.stands import Asked, Stands, imu_stand
 from companion.daemon.core import Core
 from companion.daemon.job import Job
+from companion.daemon.stands import align_steps
+from companion.daemon.stands.align_steps import Plan, Seen
+from companion.daemon.stands.alignment import AlignmentInForce
+from companion.daemon.stands.stands import Asked, Stands, imu_stand
 from companion.errors import CalibrationRefusedError
 from companion.physics.units import DEG
 

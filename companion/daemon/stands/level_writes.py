@@ -22,7 +22,7 @@ from companion.autopilot.vehicle.own_attitude import OwnAttitude
 from companion.calibration.alignment.spot import Mounting
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
-from companion.calibration.solution.record import Outcome, WrittenParameter
+from companion.calibration.records.record import Outcome, WrittenParameter
 from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing

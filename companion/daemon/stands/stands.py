@@ -19,11 +19,11 @@ from companion.calibration.means.windows import ImuWindow, Window
 from companion.component.service import JobResult
 from companion.component.statustext import CHUNK_BYTES, Severity
 from companion.component.tunes import Tune
-from companion.daemon.calibrating.align_steps import LEVEL, Hold
-from companion.daemon.calibrating.course import POLL_S, Measuring
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
+from companion.daemon.stands.align_steps import LEVEL, Hold
+from companion.daemon.stands.measuring import POLL_S, Measuring
 from companion.errors import CalibrationRefusedError
 
 STAND_S: Final = 12.0

@@ -7,8 +7,8 @@ from typing import Literal
 import msgspec
 
 from companion.calibration.alignment.align import ImuAlignment
-from companion.calibration.alignment.align_record import Determined, StandRecord, imu_record
-from companion.calibration.solution.record import WrittenParameter
+from companion.calibration.records.align_record import Determined, StandRecord, imu_record
+from companion.calibration.records.record import WrittenParameter
 from companion.samples import Vector
 
 FORMAT_VERSION = 1

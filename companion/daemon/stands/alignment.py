@@ -6,9 +6,9 @@ import logging
 
 import msgspec
 
-from companion.calibration.alignment.align_record import AlignmentRecord, GradienterSettings
 from companion.calibration.means.pose import GradienterModel
-from companion.calibration.solution.record import AlignmentUsed
+from companion.calibration.records.align_record import AlignmentRecord, GradienterSettings
+from companion.calibration.records.record import AlignmentUsed
 from companion.config.sections import Config
 from companion.configured import models
 from companion.daemon.core import Offload

@@ -12,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.alignment.align_record import Kind
 from companion.calibration.means.windows import Window
+from companion.calibration.records.align_record import Kind
 from companion.physics.frames import Array
 from companion.physics.units import DEG
 

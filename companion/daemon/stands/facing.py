@@ -17,18 +17,18 @@ from companion.calibration.alignment.faces import BIAS, SCALE, Face, Faces, face
 from companion.calibration.alignment.missing import Missing, missing, seen_before, up_of
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import ImuWindow, Window
+from companion.calibration.records.faces_record import FaceRecord, FacesRecord, Measured, faces_imu_record
 from companion.calibration.solution.draft import Draft
-from companion.calibration.solution.faces_record import FaceRecord, FacesRecord, Measured, faces_imu_record
 from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.component.statustext import Severity
 from companion.configured import models
-from companion.daemon.calibrating.accel_writes import AccelWrites
-from companion.daemon.calibrating.align_steps import LEVEL, Hold
-from companion.daemon.calibrating.faces_in_force import FacesInForce
-from companion.daemon.calibrating.stands import Asked, Stands
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
+from companion.daemon.stands.accel_writes import AccelWrites
+from companion.daemon.stands.align_steps import LEVEL, Hold
+from companion.daemon.stands.faces_in_force import FacesInForce
+from companion.daemon.stands.stands import Asked, Stands
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, vector
 from companion.physics.units import MG
