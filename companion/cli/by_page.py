@@ -12,7 +12,6 @@ from typing import Any, Final, Self
 from companion.cli.asking import Asking
 from companion.cli.terminal import print_address
 from companion.errors import CalibrationRefusedError, CompanionError
-from companion.web.access import new_token
 from companion.web.server import Page
 
 Object = dict[str, Any]
@@ -26,17 +25,17 @@ class PageAsking(Asking):
 
     Args:
         bind: HOST:PORT of the page.
+        storage: the daemon's; its page takes the same token.
     """
 
-    def __init__(self, bind: str) -> None:
+    def __init__(self, bind: str, storage: Path) -> None:
         super().__init__(yes=False, error=False)
         self._echoes = True
         self._lines: list[str] = []
         self._question: Object | None = None
         self._answered: asyncio.Future[str] | None = None
         self._number = 0
-        self._token = new_token()
-        self._page = Page(bind, Path(), self._take, self._status, _on_the_spot, token=self._token)
+        self._page = Page(bind, storage, self._take, self._status, _on_the_spot)
 
     async def __aenter__(self) -> Self:
         """Open the page.
@@ -52,7 +51,7 @@ class PageAsking(Asking):
         if self._page.problem is not None:
             await self._close()
             raise CompanionError(f"the page cannot be opened: {self._page.problem}")
-        print_address(self._page.url, None if self._page.local else self._token)
+        print_address(self._page.url, None if self._page.local else self._page.access.token)
         return self
 
     async def __aexit__(
@@ -60,7 +59,7 @@ class PageAsking(Asking):
     ) -> None:
         """Close it."""
         if kind is None or issubclass(kind, CompanionError):
-            self.say("", f"ended: {error}" if error is not None else "All is done; this page closes.")
+            self.say("", f"ended: {error}" if error is not None else "All is done.")
             await asyncio.sleep(SHOWN_S)
         await self._close()
 

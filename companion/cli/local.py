@@ -9,7 +9,7 @@ import faulthandler
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from companion.cli import logs, show
 from companion.cli.terminal import (
@@ -17,6 +17,7 @@ from companion.cli.terminal import (
     FAILED,
     USAGE,
     AddCommand,
+    Parser,
     config_path,
     load_config,
     print_address,
@@ -93,8 +94,14 @@ def add_commands(add: AddCommand) -> None:
     )
 
 
+FIRST_RUN: Final = ("--page", "0.0.0.0:8191")
+"""How `run` calls `setup` where there is no configuration: whoever reads its output gets the token from it."""
+
+
 async def run(options: argparse.Namespace) -> int:
-    """`companion run`."""
+    """`companion run`; without a configuration a page asks for it first."""
+    if not hasattr(options, "config") and not config_path(options).exists():
+        await _first_run(config_path(options))
     config = load_config(options, profiles=True, forgiving=True)
     # Where the whole process stands still the watchdog's SIGABRT is the only witness: let it say where that was.
     faulthandler.enable()
@@ -106,6 +113,17 @@ async def run(options: argparse.Namespace) -> int:
 
     await process.run(config, config_path(options))
     return DONE
+
+
+async def _first_run(path: Path) -> None:
+    """Have it asked for, by whoever may write it; others are told by the daemon's own start that it is missing."""
+    from companion.cli import setup as session
+    from companion.setup.keeping import is_writable
+
+    if is_writable(path):
+        asks = Parser()
+        add_command(lambda *_: asks)
+        await session.setup(asks.parse_args(FIRST_RUN), goes_on=True)
 
 
 async def ports(options: argparse.Namespace) -> int:

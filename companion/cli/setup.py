@@ -8,6 +8,7 @@ import dataclasses
 import logging
 import os
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 from companion import config
@@ -15,7 +16,7 @@ from companion.cli.asking import Asking
 from companion.cli.show import finding_lines
 from companion.cli.terminal import DONE, FAILED, config_path, load_config, print_json
 from companion.config.rules import bind_problem
-from companion.config.sections import Config, Imu
+from companion.config.sections import Config, Imu, Storage
 from companion.config.words import shown
 from companion.errors import CompanionError, ConfigError, DaemonDeniedError, DaemonUnreachableError
 from companion.installation import install as installing
@@ -25,7 +26,7 @@ from companion.links.serial.ports import list_ports
 from companion.protocols.registry import Kind
 from companion.setup import keeping
 from companion.setup.document import active_lines
-from companion.setup.draft import Draft
+from companion.setup.draft import Draft, storage_beside
 from companion.setup.survey import Survey, same_port, same_url, survey
 
 KINDS: Final[tuple[Kind, ...]] = ("gradienter", "compass", "imu")
@@ -37,8 +38,13 @@ IMUS_S: Final = 4.0
 CHECK_S: Final = 5.0
 
 
-async def setup(options: argparse.Namespace) -> int:
-    """`companion setup`."""
+async def setup(options: argparse.Namespace, *, goes_on: bool = False) -> int:
+    """`companion setup`.
+
+    Args:
+        options: of the command line.
+        goes_on: the daemon starts behind it, in this process.
+    """
     as_json = getattr(options, "json", False)
     if options.page is None:
         session = _Session(options, Asking(yes=options.yes, error=as_json))
@@ -46,10 +52,11 @@ async def setup(options: argparse.Namespace) -> int:
     else:
         from companion.cli.by_page import PageAsking
 
-        async with PageAsking(_bind(options)) as asking:
-            session = _Session(options, asking)
+        async with PageAsking(_bind(options), _storage(options)) as asking:
+            session = _Session(options, asking, goes_on=goes_on)
             await _to_the_end(session)
-            await asking.agrees("Read all of it? Then this page closes.")
+            then = "the companion starts, and its own page follows" if goes_on else "this page closes"
+            await asking.agrees(f"Read all of it? Then {then}.")
     if as_json:
         print_json(session.answer)
     return DONE if session.answer["state"] != "failed" else FAILED
@@ -62,6 +69,15 @@ def _bind(options: argparse.Namespace) -> str:
         raise ConfigError(wrong)
     page: str = options.page
     return page
+
+
+def _storage(options: argparse.Namespace) -> Path:
+    """The storage that the daemon will have."""
+    path = config_path(options)
+    try:
+        return config.load(path).storage.path
+    except ConfigError:
+        return Storage().path if path == config.DEFAULT_PATH else storage_beside(path)
 
 
 async def _to_the_end(session: _Session) -> None:
@@ -78,8 +94,8 @@ async def _to_the_end(session: _Session) -> None:
 class _Session:
     """One run of it."""
 
-    def __init__(self, options: argparse.Namespace, asking: Asking) -> None:
-        self.asking = asking
+    def __init__(self, options: argparse.Namespace, asking: Asking, *, goes_on: bool = False) -> None:
+        self.asking, self._goes_on = asking, goes_on
         self.so_far = "nothing was written"
         self._options = options
         self._path = config_path(options)
@@ -95,7 +111,11 @@ class _Session:
             CompanionError: it cannot go on; `so_far` says what has become of the file.
         """
         say = self.asking.say
-        keeping.check_writable(self._path)
+        if not keeping.is_writable(self._path):
+            raise CompanionError(
+                f"{self._path} is not yours to write: sudo companion setup, or companion -c FILE setup for a file of"
+                " your own"
+            )
         draft = await self._begin()
         is_new = draft.is_new
         if is_new and self._path != config.DEFAULT_PATH:
@@ -278,7 +298,7 @@ class _Session:
             good = await self._check(parsed)
         elif runs:
             self.asking.say("", "Not checked: a companion runs, and has the ports.")
-        started = await self._service(runs=runs)
+        started = self._goes_on or await self._service(runs=runs)
         is_old = runs and not started and self.answer["state"] != "unchanged"
         steps = list(_next_steps(parsed, self._command, is_old=is_old, runs=runs or started, good=good, checks=checks))
         self.answer["next"] = steps

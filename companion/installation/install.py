@@ -38,13 +38,15 @@ class Shipped(NamedTuple):
 
 
 SERVICE: Final = Shipped("companion.service", "lib/systemd/system/companion.service")
+FIRST_RUN: Final = Shipped("companion-setup.service", "lib/systemd/system/companion-setup.service")
+UNITS: Final = (SERVICE, FIRST_RUN)
 RULES: Final = Shipped("rules.d/70-companion.rules", "lib/udev/rules.d/70-companion.rules")
 MODULES: Final = Shipped("modules-load.d/companion.conf", "lib/modules-load.d/companion.conf")
 SAMPLE: Final = Shipped("companion.toml", "companion.toml.sample")
-OURS: Final = (SERVICE, RULES, MODULES, SAMPLE)
+OURS: Final = (*UNITS, RULES, MODULES, SAMPLE)
 """What is replaced by a new version."""
-CONFIGURATION: Final = Shipped("companion.toml", "companion.toml")
-"""What is put there once and then belongs to the aircraft's owner."""
+CONFIGURATION: Final = "companion.toml"
+"""Its owner's, beside the sample: `companion setup` writes it."""
 
 
 def folder() -> Path:
@@ -67,7 +69,7 @@ def content(shipped: Shipped, *, executable: str = EXECUTABLE) -> bytes:
         CompanionError: it is missing, or the executable's path cannot stand in a unit.
     """
     text = (folder() / shipped.source).read_text(encoding="utf-8")
-    if shipped is SERVICE:
+    if shipped in UNITS:
         if not re.fullmatch(r"/[\w.+/@-]+", executable):
             raise CompanionError(f"{executable!r} cannot stand in a unit; allowed: an absolute path without spaces")
         text = text.replace(f"ExecStart={EXECUTABLE} ", f"ExecStart={executable} ")
@@ -77,12 +79,6 @@ def content(shipped: Shipped, *, executable: str = EXECUTABLE) -> bytes:
 def stamped(data: bytes) -> bytes:
     """The data behind a first line by which a later change by hand is recognised."""
     return f"{_STAMP}{hashlib.sha256(data).hexdigest()}\n".encode() + data
-
-
-def without_stamp(data: bytes) -> bytes:
-    """What was stamped."""
-    match = _STAMPED.match(data)
-    return data[match.end() :] if match is not None else data
 
 
 def is_untouched(data: bytes) -> bool:
@@ -173,24 +169,12 @@ def install(target: Target, run: Run | None = None) -> Iterator[Step]:
         _check_not_packaged(_START_PACKAGED)
         _check_user(target, "install-service")
         _check_reach(target.executable)
-    sample = content(CONFIGURATION)
-    before = _read(target.path(SAMPLE))
-    samples = [sample] if before is None else [sample, without_stamp(before)]
     for shipped in OURS:
         wanted = stamped(content(shipped, executable=target.executable))
         yield _put(target, target.path(shipped), wanted)
-    configuration = target.path(CONFIGURATION)
-    found = _read(configuration)
-    edited = found is not None and found not in samples
-    if edited:
-        yield Step(str(configuration), "kept", "yours; what is new is in companion.toml.sample")
-    elif found == sample:
-        yield Step(str(configuration), "unchanged", "still the sample: companion setup fills it in")
-    else:
-        outcome: Outcome = "written" if found is None else "updated"
-        yield _write(target, configuration, sample, outcome, "the sample: companion setup fills it in")
+    yield _configuration(target, "yours; what is new is in companion.toml.sample", "sudo companion setup makes it")
     if target.is_this_machine:
-        yield from _activate(target, run or _run, edited=edited)
+        yield from _activate(target, run or _run)
 
 
 def start_service(run: Run | None = None) -> Iterator[Step]:
@@ -222,10 +206,10 @@ def uninstall(target: Target, run: Run | None = None) -> Iterator[Step]:
         _check_user(target, "uninstall-service")
         if systemd_runs():
             yield _command(target, run or _run, "systemctl", "disable", "--now", "companion.service")
+            yield _command(target, run or _run, "systemctl", "stop", "companion-setup.service")
     for shipped in OURS:
-        yield _take(target, target.path(shipped), is_untouched, "changed by hand")
-    sample = content(CONFIGURATION)
-    yield _take(target, target.path(CONFIGURATION), lambda data: data == sample, "yours")
+        yield _take(target, target.path(shipped))
+    yield _configuration(target, "yours")
     if target.is_this_machine:
         yield from _reload(target, run or _run)
     state = target.root / "var/lib/private/companion"
@@ -250,12 +234,18 @@ def _write(target: Target, path: Path, data: bytes, outcome: Outcome, words: str
     return Step(str(path), outcome, words)
 
 
-def _take(target: Target, path: Path, is_ours: Callable[[bytes], bool], whose: str) -> Step:
+def _configuration(target: Target, there: str, absent: str = "") -> Step:
+    """It is never touched; what is said where there is one, and where there is none."""
+    path = target.path(SAMPLE).with_name(CONFIGURATION)
+    return Step(str(path), "kept", there) if path.exists() else Step(str(path), "absent", absent)
+
+
+def _take(target: Target, path: Path) -> Step:
     found = _read(path)
     if found is None:
         return Step(str(path), "absent")
-    if not is_ours(found):
-        return Step(str(path), "kept", whose)
+    if not is_untouched(found):
+        return Step(str(path), "kept", "changed by hand")
     if not target.dry_run:
         remove_durably(path)
     return Step(str(path), "removed")
@@ -321,16 +311,13 @@ def unreachable(path: Path) -> str | None:
     return None
 
 
-def _activate(target: Target, run: Run, *, edited: bool) -> Iterator[Step]:
+def _activate(target: Target, run: Run) -> Iterator[Step]:
     if not systemd_runs():
         yield Step("systemd", "skipped", "does not run here: nothing was started")
         return
     yield from _reload(target, run)
-    if edited:
-        yield _command(target, run, "systemctl", "enable", "companion.service")
-        yield _command(target, run, "systemctl", "restart", "companion.service")
-    else:
-        yield Step("companion.service", "skipped", "not started: sudo companion setup fills the configuration in first")
+    yield _command(target, run, "systemctl", "enable", "companion.service")
+    yield _command(target, run, "systemctl", "restart", "companion.service")
 
 
 def _reload(target: Target, run: Run) -> Iterator[Step]:

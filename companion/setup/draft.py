@@ -113,9 +113,8 @@ class Draft:
 
     def keep_beside(self, path: Path) -> None:
         """Let records and socket lie beside the file: where the service has them its owner may not write."""
-        folder = path.absolute().parent
-        self._put("storage", "directory", str(folder / "companion-state"))
-        self._put("control", "socket", str(folder / "companion.sock"))
+        self._put("storage", "directory", str(storage_beside(path)))
+        self._put("control", "socket", str(path.absolute().with_name("companion.sock")))
 
     def show_page(self, bind: str) -> None:
         """Let the daemon have its page there, unless it has one.
@@ -224,6 +223,11 @@ class Draft:
         except CompanionError as error:
             self.wanted = before
             raise ConfigError(str(error).removeprefix("answer: ")) from None
+
+
+def storage_beside(path: Path) -> Path:
+    """Where the records of a new configuration go that is somebody's own file."""
+    return path.absolute().with_name("companion-state")
 
 
 def _one_of(words: str, allowed: Sequence[str]) -> str:

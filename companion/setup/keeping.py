@@ -8,7 +8,7 @@ import stat
 from pathlib import Path
 
 from companion import config
-from companion.errors import CompanionError, ConfigError
+from companion.errors import ConfigError
 from companion.installation import install as installing
 from companion.setup.draft import Draft
 from companion.storage.state import read_regular, write_atomically
@@ -16,7 +16,7 @@ from companion.storage.state import read_regular, write_atomically
 
 def sample() -> str:
     """The sample configuration that this companion brings."""
-    return installing.content(installing.CONFIGURATION).decode()
+    return installing.content(installing.SAMPLE).decode()
 
 
 def begin(path: Path) -> Draft:
@@ -37,19 +37,12 @@ def begin(path: Path) -> Draft:
     return Draft(text, is_new=False)
 
 
-def check_writable(path: Path) -> None:
-    """Whether the file may be written, before anybody is asked anything.
-
-    Raises:
-        CompanionError: it may not; says what to type.
-    """
+def is_writable(path: Path) -> bool:
+    """Whether the file may be written, or made."""
     folder = path.parent
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
-    if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
-        raise CompanionError(
-            f"{path} is not yours to write: sudo companion setup, or companion -c FILE setup for a file of your own"
-        )
+    return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
 
 
 def holds(path: Path, text: str) -> bool:

@@ -72,7 +72,6 @@ class Page:
         answer: does what is asked.
         status: the state to show.
         offload: for the disk.
-        token: for a page of a while; None: the one of the storage.
     """
 
     def __init__(
@@ -82,13 +81,11 @@ class Page:
         answer: Answer,
         status: Callable[[], Awaitable[Object]],
         offload: Offload,
-        token: str | None = None,
     ) -> None:
         self._host, self._port = split_address(bind)
         self._directory, self._answer, self._status, self._offload = directory, answer, status, offload
         self.local = is_loopback(self._host)
-        self.access = Access(token or new_token(), handed_out=self.local)
-        self._is_kept = token is None and not self.local
+        self.access = Access(new_token(), handed_out=self.local)
         self.problem: str | None = "not open yet"
         """Why nobody can look, in one line; None while the page is there."""
         html = assembled()
@@ -113,7 +110,7 @@ class Page:
     async def _serve(self) -> str:
         server: asyncio.Server | None = None
         try:
-            if self._is_kept:
+            if not self.local:
                 self.access = Access(await self._offload(kept_token, self._directory), handed_out=False)
             server = await asyncio.start_server(self._accept, self._host, self._port, limit=KERNEL_BYTES)
             self._port = server.sockets[0].getsockname()[1]

@@ -47,11 +47,12 @@ ONLY_DIALECTS: Final = ("__init__.py", "ardupilotmega.py", "common.py", "minimal
 """Of MAVLink 2; each of the others is another 1 to 3 MB."""
 PLACES: Final = {
     "companion.service": "usr/lib/systemd/system/companion.service",
+    "companion-setup.service": "usr/lib/systemd/system/companion-setup.service",
     "rules.d/70-companion.rules": "usr/lib/udev/rules.d/70-companion.rules",
     "modules-load.d/companion.conf": "usr/lib/modules-load.d/companion.conf",
-    "companion.toml": "etc/companion/companion.toml",
+    "companion.toml": "usr/share/doc/companion/examples/companion.toml",
 }
-"""Of each file in systemd/; the unit as it is shipped names /opt/companion already."""
+"""Of each file in systemd/; the units as they are shipped name /opt/companion already."""
 SCRIPTS: Final = ("preinst", "postinst", "prerm", "postrm")
 
 
@@ -267,7 +268,7 @@ def refuse_traces(stage: Path, work: Path) -> None:
 
 
 def system_files(stage: Path) -> None:
-    """Unit, udev rules, modules, sample configuration, manual page."""
+    """Units, udev rules, modules, sample configuration, manual page."""
     for source, place in PLACES.items():
         target = stage / place
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -285,8 +286,6 @@ def documents(stage: Path, packages: Path, version: str) -> None:
     folder = stage / "usr/share/doc/companion"
     shutil.copytree(PROJECT / "docs", folder / "docs", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copyfile(PROJECT / "README.md", folder / "README.md")
-    (folder / "examples").mkdir()
-    shutil.copyfile(PROJECT / "systemd/companion.toml", folder / "examples/companion.toml")
     zip_to(folder / "changelog.gz", (PROJECT / "CHANGELOG.md").read_text())
     when = subprocess.run(
         ["date", "--utc", "--rfc-email", f"--date=@{os.environ['SOURCE_DATE_EPOCH']}"],
@@ -373,10 +372,9 @@ def admin(stage: Path, fields: dict[str, str]) -> None:
     """The DEBIAN folder."""
     folder = stage / "DEBIAN"
     (folder / "control").write_text("".join(f"{name}: {value}\n" for name, value in fields.items()))
-    (folder / "conffiles").write_text(f"/{PLACES['companion.toml']}\n")
     sums = ""
     for path in regular_files(stage):
-        if not path.is_relative_to(folder) and not path.is_relative_to(stage / "etc"):
+        if not path.is_relative_to(folder):
             digest = hashlib.md5(path.read_bytes(), usedforsecurity=False).hexdigest()
             sums += f"{digest}  {path.relative_to(stage)}\n"
     (folder / "md5sums").write_text(sums)

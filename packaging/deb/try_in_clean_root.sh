@@ -64,13 +64,14 @@ expect 0 'ports\|no serial' companion ports
 expect 0 'arming:set_aux_auth_passed' companion lua
 expect 3 'companion' companion status
 expect 3 'companion' companion calibrate
-expect 1 'companion setup looks for it' companion check
+expect 2 'companion setup makes it' companion check
 expect 1 'apt remove companion' companion uninstall-service
 expect 1 'systemctl enable --now companion' companion install-service
 expect 0 '' systemctl enable companion.service
-expect 0 '' systemd-analyze verify --man=no /usr/lib/systemd/system/companion.service
+expect 0 '' systemd-analyze verify --man=no /usr/lib/systemd/system/companion.service \
+    /usr/lib/systemd/system/companion-setup.service
 [ $proc = yes ] || sed -i '/COMPANION_BOOT_ID=%b, ignoring/d' "$log"
-[ ! -s "$log" ] || fail 'systemd finds faults with the unit'
+[ ! -s "$log" ] || fail 'systemd finds faults with the units'
 
 say 'its first configuration, where nothing is connected'
 expect 1 'no autopilot was heard.*nothing was written' companion setup --yes --udp 14999

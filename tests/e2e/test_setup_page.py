@@ -11,7 +11,8 @@ import pytest
 
 from tests.e2e.test_setup import bench
 from tests.support.browser import PHONE, chromium, find
-from tests.support.terminal import Terminal
+from tests.support.first_run import answer, take_all
+from tests.support.terminal import CTRL_C, Terminal
 
 PICTURES = os.environ.get("PAGE_PICTURES")
 
@@ -84,20 +85,52 @@ def test_beyond_the_board_it_needs_the_token_that_the_shell_shows(tmp_path: Path
             (port,) = re.findall(r":(\d+)/#token=", said)
             await terminal.says(r"on a deck.*\n(.*\n)*.*> ")
 
-            async def answer(body: bytes, given: str) -> bytes:
-                reader, writer = await asyncio.open_connection("127.0.0.1", int(port))
-                head = f"POST /answer HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: {len(body)}\r\n"
-                head += f"Content-Type: application/json\r\nX-Companion-Token: {given}\r\n\r\n"
-                writer.write(head.encode() + body)
-                said = await reader.read()
-                writer.close()
-                return said
-
-            assert b" 403 " in await answer(b'{"number": 1, "words": "deck"}', "2" * 12)
-            assert b"answered already" in await answer(b'{"number": 7, "words": "deck"}', token)
-            assert b" 200 " in await answer(b'{"number": 1, "words": "deck"}', token)
+            assert b" 403 " in await answer(int(port), "2" * 12, 1, "deck")
+            assert b"answered already" in await answer(int(port), token, 7, "deck")
+            assert b" 200 " in await answer(int(port), token, 1, "deck")
             await terminal.says(r"Write it\?")
             assert not (tmp_path / "companion.toml").exists()
+            assert (tmp_path / "companion-state/web-token").read_text() == f"{token}\n", (
+                "the daemon's page takes it too"
+            )
+
+    asyncio.run(main())
+
+
+def test_without_a_configuration_the_daemon_begins_with_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`companion run` and nothing else: the phone answers, and goes on with the daemon's page and the same token."""
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+
+    async def main() -> None:
+        async with bench(tmp_path) as made:
+            first = [*made.words("gradienter")[3:], "--page", "0.0.0.0:0"]
+            before = (
+                "from pathlib import Path; from companion import config; from companion.cli import local;"
+                f" config.DEFAULT_PATH = Path({str(made.file)!r}); local.FIRST_RUN = {first!r}"
+            )
+            async with Terminal(["run"], tmp_path, before) as terminal:
+                said = await terminal.says(r"open once on the phone: \S+")
+                ((port, token),) = re.findall(r":(\d+)/#token=(\S+)", said)
+                answering = asyncio.create_task(take_all(int(port), token))
+                await terminal.says("Next:")
+                assert made.configuration()["gradienter"]["port"] == str(tmp_path / "gradienter")
+                said = await terminal.says(r"ready: \S+control\.sock")
+                assert "the companion starts, and its own page follows" in said
+                assert "companion run" not in said, "it is there already"
+                # The daemon's page knows no answers, but it knows the token.
+                ((port,),) = [re.findall(r"page: \S+:(\d+)/", await terminal.says(r"page: \S+/"))]
+                assert b"unknown command" in await answer(int(port), token, 1, "")
+                assert await answering >= 5
+                terminal.types(CTRL_C)
+                assert await terminal.ended() == 0, terminal.screen
+            # What is broken is not asked for anew: one line, and the code for it.
+            made.file.write_text("[mavlink]\nurl = 1\n")
+            async with Terminal(["run"], tmp_path, before) as terminal:
+                await terminal.says("'mavlink.url'")
+                assert await terminal.ended() == 2
 
     asyncio.run(main())
 

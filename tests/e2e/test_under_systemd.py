@@ -10,6 +10,7 @@ import contextlib
 import grp
 import json
 import os
+import re
 import tomllib
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ import pytest
 
 from companion.installation import install as installing
 from tests.support.booted_systemd import Machine, booted, why_not
+from tests.support.first_run import take_all
 from tests.support.live_aircraft import QUICK, live_aircraft
 
 COMPANION = "/opt/companion/bin/companion"
@@ -85,22 +87,33 @@ def test_the_life_of_the_service(tmp_path: Path) -> None:
 
 
 async def set_up(machine: Machine, configuration: str) -> None:
-    # Without a configuration of its owner's nothing is started.
-    _, out, _ = await machine.run(*INSTALL)
-    assert f"written    {CONFIGURATION}: the sample: companion setup fills it in" in out
-    assert "not started: sudo companion setup" in out
-    assert (await machine.show("companion", "ActiveState"))["ActiveState"] == "inactive"
+    # Without a configuration the page asks for one; here it listens to the simulated ports only.
     wanted = tomllib.loads(configuration)
     ports = [wanted[name]["port"] for name in ("gradienter", "compass")]
-    _, out, told = await machine.run(
-        COMPANION, "setup", *ports, "--mavlink", wanted["mavlink"]["url"], "--yes", "--json", "--no-check"
-    )
-    answer = json.loads(out)
-    assert "Start the companion now, and at every boot?" in told
-    assert [step["outcome"] for step in answer["steps"] if step["what"].startswith("systemctl")] == ["done"] * 4
-    assert answer["configuration"]["gradienter"]["port"] == ports[0]
+    words = [COMPANION, "setup", *ports, "--mavlink", wanted["mavlink"]["url"], "--no-check", "--page", "0.0.0.0:0"]
+    drop_in = f"[Service]\nExecStart=\nExecStart={' '.join(words)}\n"
+    await machine.write("/etc/systemd/system/companion-setup.service.d/ports.conf", drop_in)
+    _, out, _ = await machine.run(*INSTALL)
+    assert f"absent     {CONFIGURATION}: sudo companion setup makes it" in out
+    shown = await machine.show("companion", "ActiveState", "UnitFileState")
+    assert shown == {"ActiveState": "inactive", "UnitFileState": "enabled"}
+    said = ""
+
+    async def is_asked() -> bool:
+        nonlocal said
+        _, said, _ = await machine.run("journalctl", "--identifier=companion", "--output=cat", "--no-pager")
+        return "on a deck" in said
+
+    await until(is_asked)
+    ((port, token),) = re.findall(r"open once on the phone: http://\S+:(\d+)/#token=(\S+)", said)
+    # Platform, law, two mountings, to write it, to start it, to end.
+    assert await take_all(int(port), token) == 7
     shown = await machine.show("companion", "ActiveState", "UnitFileState")
     assert shown == {"ActiveState": "active", "UnitFileState": "enabled"}
+    _, out, _ = await machine.run("cat", CONFIGURATION, "/var/lib/private/companion/web-token")
+    assert tomllib.loads(out.removesuffix(f"{token}\n"))["gradienter"]["port"] == ports[0]
+    assert out.endswith(f"{token}\n"), "the page of the daemon takes the same token"
+    assert (await machine.show("companion-setup", "ActiveState"))["ActiveState"] == "inactive"
     code, out, _ = await machine.run(COMPANION, "setup", *ports, "--yes", "--no-service", check=False)
     assert code == 0
     assert "says all this already" in out

@@ -23,10 +23,18 @@ def _take_terminal() -> None:
 
 
 class Terminal:
-    """An async context manager: starts `python -m companion` with these words, and ends it on leaving."""
+    """An async context manager: starts `python -m companion` with these words, and ends it on leaving.
 
-    def __init__(self, words: Sequence[str], folder: Path) -> None:
+    Args:
+        words: its arguments.
+        folder: where it is started.
+        before: Python to run in it first.
+    """
+
+    def __init__(self, words: Sequence[str], folder: Path, before: str = "") -> None:
         self._words, self._folder = words, folder
+        start = "from companion import cli; raise SystemExit(cli.main())"
+        self._program = ["-c", f"{before}; {start}"] if before else ["-m", "companion"]
         self.screen = ""
         self._new = asyncio.Event()
         self._read_to = 0
@@ -36,7 +44,7 @@ class Terminal:
         os.set_blocking(self._master, False)
         asyncio.get_running_loop().add_reader(self._master, self._on_output)
         self._process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "companion", *self._words, stdin=slave, stdout=slave, stderr=slave,
+            sys.executable, *self._program, *self._words, stdin=slave, stdout=slave, stderr=slave,
             env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}, cwd=self._folder,
             start_new_session=True, preexec_fn=_take_terminal,
         )  # fmt: skip

@@ -21,6 +21,7 @@ from companion.installation.install import Target, install, uninstall, unreachab
 from tests.support.systemd import SYSTEMD_ANALYZE, needs_systemd_analyze
 
 UNIT = "usr/local/lib/systemd/system/companion.service"
+FIRST_RUN = "usr/local/lib/systemd/system/companion-setup.service"
 RULES = "usr/local/lib/udev/rules.d/70-companion.rules"
 MODULES = "usr/local/lib/modules-load.d/companion.conf"
 CONFIGURATION = "etc/companion/companion.toml"
@@ -42,13 +43,14 @@ def tree(root: Path) -> dict[str, bytes]:
 
 def test_everything_is_put_in_place_once(tmp_path: Path) -> None:
     first = outcomes(tmp_path, list(install(target(tmp_path))))
-    assert first == dict.fromkeys((UNIT, RULES, MODULES, SAMPLE, CONFIGURATION), "written")
+    assert first == {**dict.fromkeys((UNIT, FIRST_RUN, RULES, MODULES, SAMPLE), "written"), CONFIGURATION: "absent"}
     placed = tree(tmp_path)
-    assert placed.keys() == first.keys()
+    assert placed.keys() == first.keys() - {CONFIGURATION}
     assert f"ExecStart={EXECUTABLE} -c /etc/companion/companion.toml run\n" in placed[UNIT].decode()
+    assert f"ExecStart={EXECUTABLE} setup --page 0.0.0.0:8191\n" in placed[FIRST_RUN].decode()
     assert all(stat.S_IMODE((tmp_path / name).stat().st_mode) == 0o644 for name in placed)
     again = outcomes(tmp_path, list(install(target(tmp_path))))
-    assert set(again.values()) == {"unchanged"}
+    assert set(again.values()) == {"unchanged", "absent"}
     assert tree(tmp_path) == placed
 
 
@@ -58,27 +60,19 @@ def test_what_its_owner_has_changed_is_kept_and_the_rest_brought_up_to_date(tmp_
     with (tmp_path / RULES).open("a") as rules:
         rules.write("# mine\n")
     again = outcomes(tmp_path, list(install(target(tmp_path, executable="/opt/companion/bin/companion"))))
-    assert again == {UNIT: "updated", RULES: "kept", MODULES: "unchanged", SAMPLE: "unchanged", CONFIGURATION: "kept"}
+    new = dict.fromkeys((UNIT, FIRST_RUN), "updated")
+    assert again == {**new, RULES: "kept", MODULES: "unchanged", SAMPLE: "unchanged", CONFIGURATION: "kept"}
     assert (tmp_path / CONFIGURATION).read_text() == "[mavlink]\n"
     assert (tmp_path / RULES).read_text().endswith("# mine\n")
     gone = outcomes(tmp_path, list(uninstall(target(tmp_path))))
-    assert gone == {UNIT: "removed", RULES: "kept", MODULES: "removed", SAMPLE: "removed", CONFIGURATION: "kept"}
+    assert gone.pop(RULES) == gone.pop(CONFIGURATION) == "kept"
+    assert gone == dict.fromkeys((UNIT, FIRST_RUN, MODULES, SAMPLE), "removed")
     assert tree(tmp_path).keys() == {RULES, CONFIGURATION}
-
-
-def test_an_unedited_sample_of_an_older_version_is_brought_up_to_date(tmp_path: Path) -> None:
-    list(install(target(tmp_path)))
-    new = (tmp_path / CONFIGURATION).read_bytes()
-    (tmp_path / CONFIGURATION).write_bytes(b"# older\n")
-    (tmp_path / SAMPLE).write_bytes(installing.stamped(b"# older\n"))
-    again = outcomes(tmp_path, list(install(target(tmp_path))))
-    assert (again[SAMPLE], again[CONFIGURATION]) == ("updated", "updated")
-    assert (tmp_path / CONFIGURATION).read_bytes() == new
 
 
 def test_uninstalling_leaves_nothing_and_can_be_repeated(tmp_path: Path) -> None:
     list(install(target(tmp_path)))
-    assert set(outcomes(tmp_path, list(uninstall(target(tmp_path)))).values()) == {"removed"}
+    assert set(outcomes(tmp_path, list(uninstall(target(tmp_path)))).values()) == {"removed", "absent"}
     assert tree(tmp_path) == {}
     assert set(outcomes(tmp_path, list(uninstall(target(tmp_path)))).values()) == {"absent"}
 
@@ -118,7 +112,7 @@ def test_the_command_says_line_by_line_what_it_does(tmp_path: Path, capsys: pyte
     assert cli.main([*words, "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert answer["state"] == "done"
-    assert [step["outcome"] for step in answer["steps"]] == ["written"] * 5
+    assert [step["outcome"] for step in answer["steps"]] == [*["written"] * 5, "absent"]
     assert cli.main(["uninstall-service", "--root", str(tmp_path), "--prefix", "/usr"]) == 0
     assert capsys.readouterr().out.count("removed    ") == 5
 
@@ -162,10 +156,11 @@ def test_the_files_are_found_in_a_checkout_and_in_a_wheel(tmp_path: Path, monkey
 
 
 @needs_systemd_analyze
-def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path) -> None:
+def test_systemd_finds_nothing_wrong_with_the_units(tmp_path: Path) -> None:
     list(install(target(tmp_path, executable="/bin/true")))
+    units = [str(tmp_path / unit) for unit in (UNIT, FIRST_RUN)]
     verified = subprocess.run(
-        [SYSTEMD_ANALYZE, "verify", "--man=no", str(tmp_path / UNIT)], capture_output=True, text=True, check=False
+        [SYSTEMD_ANALYZE, "verify", "--man=no", *units], capture_output=True, text=True, check=False
     )
     assert (verified.returncode, verified.stdout, verified.stderr) == (0, "", "")
 

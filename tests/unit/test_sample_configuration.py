@@ -14,7 +14,7 @@ from companion.config import parse
 from companion.config.sections import Config, Imu
 from companion.installation import install as installing
 
-SAMPLE = installing.content(installing.CONFIGURATION).decode()
+SAMPLE = installing.content(installing.SAMPLE).decode()
 EVERYTHING = re.sub(r"^#(?=[a-z\[])", "", SAMPLE, flags=re.MULTILINE)
 """With every key that is commented out switched on."""
 

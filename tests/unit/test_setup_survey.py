@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.errors import CompanionError
+from companion import cli, config
 from companion.links.mavlink.listening import HeardUdp
 from companion.links.serial.listening import Heard
 from companion.protocols.guess import Candidate, Line
@@ -113,8 +113,17 @@ def test_the_old_file_is_kept_and_a_link_is_followed(tmp_path: Path) -> None:
     assert not keeping.holds(tmp_path / "none", "third")
 
 
-def test_where_nothing_can_be_written_that_is_said_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    keeping.check_writable(tmp_path / "not" / "yet" / "there.toml")
+def test_where_nothing_can_be_written_that_is_said_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert keeping.is_writable(tmp_path / "not" / "yet" / "there.toml")
     monkeypatch.setattr("os.access", lambda *_: False)
-    with pytest.raises(CompanionError, match="is not yours to write: sudo companion setup"):
-        keeping.check_writable(tmp_path / "c.toml")
+    missing = tmp_path / "c.toml"
+    assert cli.main(["-c", str(missing), "setup", "--yes"]) == 1
+    assert "is not yours to write: sudo companion setup" in capsys.readouterr().err
+    # The daemon's own start says the same with its own code: nobody is asked what cannot be kept.
+    monkeypatch.setattr(config, "DEFAULT_PATH", missing)
+    assert cli.main(["run"]) == 2
+    assert (
+        capsys.readouterr().err == f"{missing}: no such file: companion setup makes it (or give another with -c FILE)\n"
+    )
