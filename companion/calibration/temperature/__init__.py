@@ -1,0 +1,1 @@
+"""A bias by temperature: what still seconds of many power-ups tell of the next one."""
