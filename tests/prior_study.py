@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.calibration.noise.allan import AllanModel
 from companion.calibration.records.history import Measured, Point, PowerUp
 from companion.calibration.records.record import Pose, PoseSigma, Site
 from companion.calibration.solution.joint import Weighed, weigh
@@ -27,6 +28,8 @@ DEG_H = DEG / 3600.0
 MG = 9.80665e-3
 G = 9.8
 LEVEL = np.array([0.0, 0.0, -1.0])
+STEADY = AllanModel(0.0, 1e-9, 0.0)
+"""These biases do not wander within a power-up."""
 # Right side down lowers the right side's share of gravity, nose up raises the front's; FRD, level, method 2.1.
 BY_READING = -G * np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
 _POSE = Pose(theta_deg=0.0, gamma_deg=0.0, psi_deg=0.0, sigma_deg=PoseSigma(theta=None, gamma=None, psi=None))
@@ -191,8 +194,8 @@ def one_trial(case: Case, random: np.random.Generator, effect: PoseEffect) -> tu
         expected.append(
             ExpectedImu(
                 name=f"imu{k}",
-                gyro=expect(points, "gyro", now, effect),
-                accel=expect(points, "accel", now, effect),
+                gyro=expect(points, "gyro", now, effect, STEADY),
+                accel=expect(points, "accel", now, effect, STEADY),
                 effect=effect,
             )
         )

@@ -1,8 +1,8 @@
 """From earlier calibrations to what today's bias should be (method section 3, "prior / MAP" and "temperature").
 
 Run to run a MEMS bias scatters (an ADIS16405 by 70 deg/h and 2 mg, method section 1.3). What is expected of today is
-the mean of the earlier power-ups, or their line over temperature, and its sigma is that of *one more* power-up: the
-scatter, widened as Student's for few points, and the error of the mean.
+the mean of the earlier power-ups, or their curve over temperature (`temperature.curve`), and its sigma is that of *one
+more* power-up: the scatter, widened as Student's for few points, and the error of the mean.
 
 From three power-ups on that guards (`joint`), from five on it may take part in the estimate. Within one power-up the
 bias is the one it started with, moved by temperature and drift: that guards best of all, and takes no part.
@@ -29,6 +29,7 @@ from companion.calibration.noise.allan import AllanModel, floor_variance
 from companion.calibration.records.align_record import Determined, ImuAlignmentRecord
 from companion.calibration.records.history import Measured, Point, PowerUp, believed
 from companion.calibration.records.record import Effective
+from companion.calibration.temperature.curve import Node, PowerUpNodes, fit
 from companion.physics.frames import Array, Floats, Matrix, skew, vector
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import Triad, Vector
@@ -119,10 +120,6 @@ def _beside(values: Array) -> Matrix:
 GUARDS_FROM: Final = 3
 """Power-ups."""
 WEIGHS_FROM: Final = 5
-LINE_FROM: Final = 5
-LINE_OVER_K: Final = 5.0
-VALID_K: Final = 3.0
-"""How far beyond the temperatures seen the model holds (method section 3)."""
 GATE_SIGMAS: Final = 4.0
 TEMPERATURE_SIGMA_K: Final = 10.0
 """Between two calibrations of one power-up, where no temperature is told."""
@@ -130,8 +127,6 @@ CATALOGUE_SCATTER: Final[dict[Triad, float]] = {"gyro": 70.0 * DEG_H, "accel": 2
 """Method section 1.3; here it only weighs the points against one another."""
 CATALOGUE_PER_K: Final[dict[Triad, float]] = {"gyro": 54.0 * DEG_H, "accel": 0.2 * MG}
 """BMI088, the worse one of method section 2.1."""
-_AT_LEAST: Final = 0.5
-"""The least share of what the points show that counts as the sensor's scatter."""
 _IN_RUN_MEAN_S: Final = 30.0
 _SHORTEST_GAP_S: Final = 180.0
 
@@ -204,38 +199,47 @@ def student_limit(freedom: float) -> float:
     return x + first / n + second / n**2 + third / n**3
 
 
-def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect) -> Expected | None:
+def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, model: AllanModel) -> Expected | None:
     """What the earlier power-ups say of today; None where they are too few."""
-    chosen = [
-        _nearest(group, now.temperature_degc)
-        for group in believed(points, triad)
-        if not any(point.power_up.is_same(now.power_up) for point in group)
+    groups = [
+        group for group in believed(points, triad) if not any(point.power_up.is_same(now.power_up) for point in group)
     ]
-    count = len(chosen)
-    if count < GUARDS_FROM:
+    if len(groups) < GUARDS_FROM:
         return None
-    found = [_of(point, triad) for point in chosen]
-    bias, pose = _here(chosen, found, triad, now, effect)
-    stat = np.square([one.sigma_stat for one in found])
-    zeros = [point.zero_sigma_rad * now.gravity_m_s2 if triad == "accel" else 0.0 for point in chosen]
-    # A point that is worse known than its power-up scatters counts less.
-    weight = 1.0 / (CATALOGUE_SCATTER[triad] ** 2 + (stat + np.square(pose)).mean(axis=1) + np.square(np.array(zeros)))
-    temperature, excess_k = _temperatures(chosen, now.temperature_degc)
-    fit = _fitted(bias, weight, stat, None, 0.0, CATALOGUE_PER_K[triad] * excess_k)
-    if temperature is not None and count >= LINE_FROM and np.ptp(temperature) >= LINE_OVER_K:
-        line = _fitted(bias, weight, stat, temperature, excess_k, CATALOGUE_PER_K[triad] * excess_k)
-        if line.variance.mean() < fit.variance.mean():
-            fit = line
+    # Where a temperature is missing they all count as measured at one.
+    told = now.temperature_degc is not None and all(p.temperature_degc is not None for group in groups for p in group)
+    seen = [[_of(point, triad) for point in group] for group in groups]
+    here = [_here(group, found, triad, now, effect) for group, found in zip(groups, seen, strict=True)]
+    zeros = [group[-1].zero_sigma_rad * now.gravity_m_s2 if triad == "accel" else 0.0 for group in groups]
+    curve = fit(
+        [
+            PowerUpNodes(
+                [
+                    Node(degc=point.temperature_degc or 0.0 if told else 0.0, bias=vector(bias), variance=_stat2(one))
+                    for point, one, bias in zip(group, found, biases, strict=True)
+                ],
+                common_variance=float(np.square(pose).mean()) + zero**2,
+            )
+            for group, found, (biases, pose), zero in zip(groups, seen, here, zeros, strict=True)
+        ],
+        float(floor_variance(model.flicker, model.walk, _IN_RUN_MEAN_S, 2.0 * _SHORTEST_GAP_S)),
+        CATALOGUE_PER_K[triad],
+    )
+    assert curve is not None
+    degc = now.temperature_degc or 0.0
+    value, variance = curve.at(degc) if told else curve.at(0.0)
     # What one attitude or one place adds to all of them is not averaged away.
-    together = np.square(np.abs(fit.share) @ np.abs(pose)) + np.max(np.square([f.sigma_shared for f in found]), axis=0)
-    same, other = _zeros(chosen, fit.share, now.zero) if triad == "accel" else (0.0, 0.0)
+    pose = np.array([each.mean(axis=0) for _, each in here])
+    shared = [one.sigma_shared for found in seen for one in found]
+    together = np.square(curve.shares @ pose) + np.max(np.square(shared), axis=0)
+    same, other = _zeros([group[-1] for group in groups], curve.shares, now.zero) if triad == "accel" else (0.0, 0.0)
     return Expected(
-        value=vector(fit.value),
-        variance=vector(fit.variance + together),
-        limit=student_limit(fit.freedom),
-        power_ups=count,
-        weighs=count >= WEIGHS_FROM and excess_k == 0.0,
-        by_temperature=fit.by_temperature,
+        value=vector(value),
+        variance=vector(variance + together),
+        limit=student_limit(curve.freedom),
+        power_ups=len(groups),
+        weighs=len(groups) >= WEIGHS_FROM and (not told or curve.beyond_k(degc) == 0.0),
+        by_temperature=curve.order > 0,
         same_zero=same,
         other_zero_rad=other,
     )
@@ -272,79 +276,14 @@ def expect_today(last: Point, triad: Triad, now: Now, effect: PoseEffect, model:
     )
 
 
-class _Fit(msgspec.Struct, frozen=True):
-    value: Floats
-    variance: Floats
-    """Of one more point about it, (3,)."""
-    share: Floats
-    """Of every point in `value`, (points,); sums up to 1."""
-    freedom: float
-    by_temperature: bool
-
-
-def _fitted(
-    bias: Floats, weight: Floats, stat: Floats, temperature: Floats | None, beyond_k: float, least: float
-) -> _Fit:
-    """Mean, or line over temperature (of the points, less today's), and the variance of one more point about it.
-
-    Args:
-        bias: (points, 3).
-        weight: (points,).
-        stat: variance that the measurement of each point has left, (points, 3).
-        temperature: K; None for a mean.
-        beyond_k: so far today lies outside of what the points cover; the line ends there.
-        least: sigma that this adds at least.
-    """
-    count = len(bias)
-    share = weight / weight.sum()
-    residual = bias - share @ bias
-    freedom = count - 1.0
-    steepest = 0.0
-    if temperature is not None:
-        middle = float(share @ temperature)
-        about = temperature - middle
-        along = share * about / float(share @ np.square(about))
-        slope = along @ bias
-        residual = residual - np.outer(about, slope)
-        nearest = math.copysign(max(abs(middle) - beyond_k, 0.0), -middle)
-        share = share + nearest * along
-        freedom -= 1.0
-        steepest = float(np.abs(slope).max()) * beyond_k
-    each = (weight / weight.mean()) @ np.square(residual) / freedom
-    # Three axes know the scatter better than one, but one may scatter more than the others.
-    spread = np.maximum(each, each.mean())
-    freedom *= 3.0
-    measured = stat.mean(axis=0)
-    # The measurement's own noise is in it, and is no scatter of the sensor; but few points cannot tell them apart, and
-    # what is said of that noise may be too much (half a step of integers).
-    scatter = np.maximum(
-        spread * freedom / (freedom - 2.0) - measured, spread * max(math.sqrt(2.0 / freedom), _AT_LEAST)
-    )
-    variance = scatter + np.square(share) @ (scatter + stat) + max(least, steepest) ** 2
-    return _Fit(share @ bias, variance, share, freedom, temperature is not None)
-
-
-def _temperatures(points: Sequence[Point], today: float | None) -> tuple[Floats | None, float]:
-    """Of the points, less today's; and by how much today is beyond them, and `VALID_K`. None: not known of all."""
-    known = [point.temperature_degc for point in points if point.temperature_degc is not None]
-    if today is None or not known:
-        return None, 0.0
-    excess_k = max(min(known) - VALID_K - today, today - max(known) - VALID_K, 0.0)
-    return (np.array(known) - today if len(known) == len(points) else None), excess_k
-
-
-def _nearest(group: Sequence[Point], temperature: float | None) -> Point:
-    """The one of a power-up that was measured most nearly at this temperature; the last where that is not known."""
-    known = [point for point in reversed(group) if point.temperature_degc is not None]
-    if temperature is None or not known:
-        return group[-1]
-    return min(known, key=lambda point: abs((point.temperature_degc or 0.0) - temperature))
-
-
 def _of(point: Point, triad: Triad) -> Measured:
     found = point.of(triad)
     assert found is not None  # `believed` gives no others
     return found
+
+
+def _stat2(found: Measured) -> float:
+    return float(np.square(found.sigma_stat).mean())
 
 
 def _here(

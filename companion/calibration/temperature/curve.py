@@ -24,7 +24,6 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.calibration.noise.allan import AllanModel
 from companion.physics.frames import Array, Floats, Matrix
 from companion.samples import Vector
 
@@ -33,36 +32,125 @@ UNIT_K: Final = 20.0
 UNIT_K_S: Final = 1.0 / 60.0
 """Of the terms: 20 K, and a kelvin a minute."""
 _LAG_K: Final = 0.5
-"""The die is behind its thermometer by this at a kelvin a minute; one sigma."""
-_ORDERS: Final = (0, 1, 2, 3)
+"""By so much the die is behind its thermometer at a kelvin a minute; one sigma."""
+VALID_K: Final = 3.0
+"""How far beyond the temperatures seen the curve goes on (method section 3)."""
 FEWEST: Final = 3
 """Power-ups."""
+_ORDERS: Final = (0, 1, 2, 3)
 _BETTER: Final = 0.9
 """Of the mean square of what is foretold: a term more must be worth it."""
-_STEPS: Final = 40
+_AT_LEAST: Final = 0.5
+"""The least share of what the power-ups show that counts as their scatter; the noise said of them may be too much."""
+_RANGE: Final = 18.0
+"""Of the logarithm of the scatter's variance, about that of a kelvin."""
+_HALVINGS: Final = 25
+_PRIOR_K: Final = np.array([_LAG_K, UNIT_K, UNIT_K / 2.0, UNIT_K / 4.0])
+"""One sigma of each term's coefficient, in kelvin of what parts move."""
 
 
 class Node(msgspec.Struct, frozen=True, array_like=True):
-    """The mean of still seconds of one power-up at about one temperature; vehicle FRD, rad/s or m/s^2."""
+    """Still seconds of one power-up at about one temperature; vehicle FRD, rad/s or m/s^2."""
 
     degc: float
-    k_s: float
-    """How fast it rose meanwhile."""
-    seconds: float
     bias: Vector
-    group: int = 0
-    """Nodes of one group have an offset in common: a power-up, or a stand where only changes were seen."""
+    variance: float
+    """Of its white noise, the mean over the axes."""
+    k_s: float = 0.0
+    """How fast the temperature rose meanwhile."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class PowerUpNodes:
+    """One power-up."""
+
+    nodes: Sequence[Node]
+    common_variance: float = 0.0
+    """Of an error that all its nodes have in common, and perhaps those of others: it weighs less for it."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """What the next power-up's bias will be.
+
+    Attributes:
+        order: 0 a mean, 1 a line and so on; from 1 on with the lag.
+        coefficients: mean and those of the terms, (1 + terms, 3).
+        covariance: of these, for an axis that scatters as usual.
+        widening: of each axis, (3,).
+        scatter: variance of one more power-up about the curve, its wandering included, (3,).
+        foretold: mean square error of what was foretold of power-ups left out, (rad/s)^2 or (m/s^2)^2.
+        shares: of every power-up in the mean, (n,).
+        freedom: degrees of freedom of the scatter.
+        span_degc: lowest and highest temperature seen.
+        per_kelvin: one sigma of what a kelvin beyond that does.
+    """
+
+    order: int
+    coefficients: Matrix
+    covariance: Matrix
+    widening: Array
+    scatter: Array
+    foretold: float
+    shares: Array
+    freedom: float
+    span_degc: tuple[float, float]
+    per_kelvin: float
+
+    def beyond_k(self, degc: float) -> float:
+        """By how much a temperature lies beyond what is valid."""
+        return max(self.span_degc[0] - VALID_K - degc, degc - self.span_degc[1] - VALID_K, 0.0)
+
+    def at(self, degc: float, k_s: float = 0.0) -> tuple[Array, Array]:
+        """Bias of the next power-up at a temperature and its variance, (3,) each; it ends where it is not valid."""
+        x = _with_one(self._row(self._inside(degc), k_s)[None])[0]
+        steepest = self.per_kelvin
+        if self.order:
+            low, high = self.span_degc
+            along = self._row(high, 0.0) - self._row(low, 0.0)
+            steepest = max(steepest, float(np.abs(along @ self.coefficients[1:]).max()) / max(high - low, VALID_K))
+        outside = (steepest * self.beyond_k(degc)) ** 2
+        return x @ self.coefficients, self.scatter + float(x @ self.covariance @ x) * self.widening + outside
+
+    def _inside(self, degc: float) -> float:
+        return min(max(degc, self.span_degc[0] - VALID_K), self.span_degc[1] + VALID_K)
+
+    def _row(self, degc: float, k_s: float) -> Array:
+        return _terms(np.array([degc]), np.array([k_s]))[0, _of_order(self.order)]
+
+
+def fit(power_ups: Sequence[PowerUpNodes], in_run_variance: float, per_kelvin: float) -> Curve | None:
+    """The curve of one triad of one IMU; None of fewer than three power-ups.
+
+    Args:
+        power_ups: at least one node each, in the order in which they were measured.
+        in_run_variance: by which a bias wanders within a power-up, (rad/s)^2 or (m/s^2)^2.
+        per_kelvin: one sigma of how much parts move, rad/s or m/s^2 a kelvin.
+    """
+    if len(power_ups) < FEWEST:
+        return None
+    sums = _Sums.of(power_ups, in_run_variance)
+    seen = [node.degc for one in power_ups for node in one.nodes]
+    best: Curve | None = None
+    for order in _ORDERS if max(seen) > min(seen) else _ORDERS[:1]:
+        found = _Fit(sums, order, in_run_variance, per_kelvin).curve((min(seen), max(seen)))
+        if best is None or found.foretold < _BETTER * best.foretold:
+            best = found
+    return best
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Sums:
-    """Of every power-up, axis 0, for the largest model: what least squares need of its nodes."""
+    """Of every power-up, axis 0, what least squares need of its nodes, for the largest model."""
 
-    weight: Floats
+    variance: Floats
+    """Of the weighted mean, (n,)."""
+    common: Floats
+    """(n,)."""
     mean: Floats
     """Weighted mean of the terms, (n, 4)."""
     bias: Floats
-    """Weighted mean, (n, 3)."""
+    """Likewise, (n, 3)."""
     normal: Floats
     """About the means, (n, 4, 4)."""
     right: Floats
@@ -72,139 +160,90 @@ class _Sums:
     first_bias: Floats
     first_variance: Floats
 
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Curve:
-    """What the next power-up's bias will be.
-
-    Attributes:
-        terms: of the model: 0 a mean, 1 a line and so on; from 1 on with the lag.
-        coefficients: mean, then those of the terms, (1 + terms, 3).
-        covariance: of these for an axis of the usual scatter, (1 + terms, 1 + terms).
-        scatter: variance of one more power-up about the curve, what it wanders by itself included, (3,).
-        error: mean square of what was foretold of power-ups left out, over all axes, rad^2/s^2 or m^2/s^4.
-        power_ups: how many it is made of.
-        span_degc: lowest and highest temperature seen.
-    """
-
-    terms: int
-    coefficients: Matrix
-    covariance: Matrix
-    widening: Array
-    scatter: Array
-    error: float
-    power_ups: int
-    span_degc: tuple[float, float]
-
-    def at(self, degc: float, k_s: float = 0.0) -> tuple[Array, Array]:
-        """Bias of the next power-up at a temperature and its variance, (3,) each."""
-        x = _with_one(_terms(np.array([degc]), np.array([k_s]))[:, _of_order(self.terms)])[0]
-        return x @ self.coefficients, self.scatter + float(x @ self.covariance @ x) * self.widening
-
-    def change(self, degc: float, then_degc: float) -> tuple[Array, Array]:
-        """By how much the bias at `then_degc` is more than that at `degc`, in one power-up, and its variance."""
-        x = np.diff(_terms(np.array([degc, then_degc]), np.zeros(2)), axis=0)[:, _of_order(self.terms)][0]
-        return x @ self.coefficients[1:], float(x @ self.covariance[1:, 1:] @ x) * self.widening
+    @classmethod
+    def of(cls, power_ups: Sequence[PowerUpNodes], in_run_variance: float) -> _Sums:
+        rows = []
+        for one in power_ups:
+            terms = _terms(np.array([node.degc for node in one.nodes]), np.array([node.k_s for node in one.nodes]))
+            bias = np.array([node.bias for node in one.nodes])
+            variance = np.array([node.variance for node in one.nodes]) + in_run_variance
+            share = 1.0 / variance
+            total = float(share.sum())
+            mean, mean_bias = share @ terms / total, share @ bias / total
+            about = (terms - mean) * share[:, None]
+            rows.append((
+                1.0 / total, one.common_variance, mean, mean_bias,
+                about.T @ (terms - mean), about.T @ (bias - mean_bias), terms[0], bias[0], variance[0],
+            ))  # fmt: skip
+        return cls(*(np.array(each) for each in zip(*rows, strict=True)))
 
 
-def fit(power_ups: Sequence[Sequence[Node]], noise: AllanModel, per_kelvin: float) -> Curve | None:
-    """The curve of one triad of one IMU; None of fewer than three power-ups.
+class _Fit:
+    """One order."""
 
-    Args:
-        power_ups: the nodes of each, in the order in which they were measured.
-        noise: of the triad.
-        per_kelvin: one sigma of how much parts move, rad/s or m/s^2 a kelvin.
-    """
-    if len(power_ups) < FEWEST:
-        return None
-    sums = _summed(power_ups, noise)
-    span = [node.degc for nodes in power_ups for node in nodes]
-    best: Curve | None = None
-    for order in _ORDERS:
-        found = _fitted(sums, order, noise, per_kelvin, (min(span), max(span)))
-        if best is None or found.error < _BETTER * best.error:
-            best = found
-    return best
+    def __init__(self, sums: _Sums, order: int, in_run_variance: float, per_kelvin: float) -> None:
+        some = _of_order(order)
+        self._sums, self._order, self._in_run, self._per_kelvin = sums, order, in_run_variance, per_kelvin
+        self._first, between = _with_one(sums.first[:, some]), _with_one(sums.mean[:, some])
+        self._squares = between[:, :, None] * between[:, None, :]
+        self._products = between[:, :, None] * sums.bias[:, None, :]
+        self._within, self._within_right = np.zeros_like(self._squares), np.zeros_like(self._products)
+        self._within[:, 1:, 1:] = sums.normal[:, some][:, :, some]
+        self._within_right[:, 1:] = sums.right[:, some]
+        self._base = np.diag([0.0, *(1.0 / np.square(per_kelvin * _PRIOR_K[some]))])
 
+    def curve(self, span_degc: tuple[float, float]) -> Curve:
+        """With the scatter by which the power-ups left out are foretold as well as is said."""
+        scatter = self._scatter()
+        error, variance = self._foretold(scatter)
+        shares, normal, right = self._equations(scatter)
+        covariance = np.linalg.inv(self._base + normal.sum(axis=0))
+        squares = np.mean(np.square(error), axis=0)
+        # Three axes know the scatter better than one, but one may scatter more than the others.
+        freedom = 3.0 * max(len(shares) - 1.0 - (self._order > 0), 1.0)
+        widening = np.maximum(np.mean(np.square(error) / variance[:, None], axis=0), 1.0) * freedom / (freedom - 2.0)
+        return Curve(
+            order=self._order,
+            coefficients=covariance @ right.sum(axis=0),
+            covariance=covariance,
+            widening=widening,
+            scatter=np.maximum((scatter + self._in_run) * widening, _AT_LEAST * np.maximum(squares, squares.mean())),
+            foretold=float(squares.mean()),
+            shares=shares / shares.sum(),
+            freedom=freedom,
+            span_degc=span_degc,
+            per_kelvin=self._per_kelvin,
+        )
 
-def _fitted(sums: _Sums, order: int, noise: AllanModel, per_kelvin: float, span_degc: tuple[float, float]) -> Curve:
-    some = _of_order(order)
-    prior = _prior(per_kelvin)[some]
-    count = len(sums.weight)
-    first = _with_one(sums.first[:, some])
-    between = _with_one(sums.mean[:, some])
-    squares = between[:, :, None] * between[:, None, :]
-    products = between[:, :, None] * sums.bias[:, None, :]
-    within = np.zeros_like(squares)
-    within[:, 1:, 1:] = sums.normal[:, some][:, :, some]
-    within_right = np.zeros_like(products)
-    within_right[:, 1:] = sums.right[:, some]
-    base = np.diag([0.0, *(1.0 / np.square(prior))])
+    def _scatter(self) -> float:
+        """By which the mean square of what is foretold is what was said."""
+        unit = math.log(self._per_kelvin**2)
+        low, high = unit - _RANGE, unit + _RANGE
+        for _ in range(_HALVINGS):
+            middle = (low + high) / 2.0
+            error, variance = self._foretold(math.exp(middle))
+            if float((error * error / variance[:, None]).mean()) > 1.0:
+                low = middle
+            else:
+                high = middle
+        return math.exp(high)
 
-    def normal(tau2: float) -> tuple[Floats, Floats]:
-        u = 1.0 / (tau2 + 1.0 / sums.weight)
-        return within + u[:, None, None] * squares, within_right + u[:, None, None] * products
+    def _equations(self, scatter: float) -> tuple[Floats, Floats, Floats]:
+        """Weights of the power-ups' means, and the normal equations of each."""
+        u = 1.0 / (scatter + self._sums.variance + self._sums.common)
+        return (
+            u,
+            self._within + u[:, None, None] * self._squares,
+            self._within_right + u[:, None, None] * self._products,
+        )
 
-    def foretold(tau2: float) -> tuple[Floats, Floats]:
-        """Errors (n, 3) and their variance (n,)."""
-        a, r = normal(tau2)
-        inverse = np.linalg.inv(base + a.sum(axis=0) - a)
-        solved = inverse @ (r.sum(axis=0) - r)
-        error = sums.first_bias - np.einsum("ij,ijk->ik", first, solved)
-        return error, tau2 + sums.first_variance + np.einsum("ij,ijk,ik->i", first, inverse, first)
-
-    low, high = math.log(1e-6 * per_kelvin**2), math.log(1e6 * per_kelvin**2)
-    for _ in range(_STEPS):
-        middle = (low + high) / 2.0
-        error, variance = foretold(math.exp(middle))
-        if float(np.mean(np.square(error) / variance[:, None])) > 1.0:
-            low = middle
-        else:
-            high = middle
-    tau2 = math.exp(high)
-    error, variance = foretold(tau2)
-    a, r = normal(tau2)
-    covariance = np.linalg.inv(base + a.sum(axis=0))
-    # Three axes know the scatter better than one, but one may scatter more than the others.
-    freedom = 3.0 * (count - 1.0)
-    student = freedom / (freedom - 2.0)
-    widening = np.maximum(np.mean(np.square(error) / variance[:, None], axis=0), 1.0) * student
-    return Curve(
-        terms=order,
-        coefficients=covariance @ r.sum(axis=0),
-        covariance=covariance,
-        widening=widening,
-        scatter=tau2 * widening + noise.flicker**2,
-        error=float(np.mean(np.square(error))),
-        power_ups=count,
-        span_degc=span_degc,
-    )
-
-
-def _summed(power_ups: Sequence[Sequence[Node]], noise: AllanModel) -> _Sums:
-    found = [_summed_one(nodes, noise) for nodes in power_ups]
-    return _Sums(*(np.array(each) for each in zip(*found, strict=True)))
-
-
-def _summed_one(nodes: Sequence[Node], noise: AllanModel) -> tuple[float | Floats, ...]:
-    terms = _terms(np.array([node.degc for node in nodes]), np.array([node.k_s for node in nodes]))
-    bias = np.array([node.bias for node in nodes])
-    seconds = np.array([node.seconds for node in nodes])
-    variance = noise.white**2 / seconds + noise.flicker**2
-    weight = 1.0 / variance
-    total = float(weight.sum())
-    mean, mean_bias = weight @ terms / total, weight @ bias / total
-    about = (terms - mean) * weight[:, None]
-    return (
-        total,
-        mean,
-        mean_bias,
-        about.T @ (terms - mean),
-        about.T @ (bias - mean_bias),
-        terms[0],
-        bias[0],
-        variance[0],
-    )
+    def _foretold(self, scatter: float) -> tuple[Floats, Floats]:
+        """By how much each power-up's first node is off what the others say, (n, 3), and the variance of it, (n,)."""
+        _, normal, right = self._equations(scatter)
+        others = np.concatenate([self._first[:, :, None], right.sum(axis=0) - right], axis=2)
+        solved = self._first[:, None, :] @ np.linalg.solve(self._base + normal.sum(axis=0) - normal, others)
+        said, variance = solved[:, 0, 1:], solved[:, 0, 0] + self._sums.first_variance + scatter
+        return self._sums.first_bias - said, variance
 
 
 def _terms(degc: Floats, k_s: Floats) -> Floats:
@@ -215,11 +254,6 @@ def _terms(degc: Floats, k_s: Floats) -> Floats:
 
 def _of_order(order: int) -> slice:
     return slice(0, 1 + order if order else 0)
-
-
-def _prior(per_kelvin: float) -> Floats:
-    """One sigma of each coefficient."""
-    return per_kelvin * np.array([_LAG_K, UNIT_K, UNIT_K / 2.0, UNIT_K / 4.0])
 
 
 def _with_one(terms: Floats) -> Floats:

@@ -141,8 +141,8 @@ class BiasMemory:
         gyro, accel = self._reference(name, "gyro"), self._reference(name, "accel")
         return ExpectedImu(
             name=name,
-            gyro=expect(earlier, "gyro", now, effect),
-            accel=expect(earlier, "accel", now, effect),
+            gyro=expect(earlier, "gyro", now, effect, profile.gyro),
+            accel=expect(earlier, "accel", now, effect, profile.accel),
             gyro_today=expect_today(gyro, "gyro", now, effect, profile.gyro) if gyro is not None else None,
             accel_today=expect_today(accel, "accel", now, effect, profile.accel) if accel is not None else None,
             effect=effect,

@@ -1,0 +1,116 @@
+"""The curve over temperature: against a mixed model written out in full, and against simulated parts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from companion.calibration.temperature.curve import Node, PowerUpNodes, fit
+
+Array = NDArray[np.float64]
+PER_K = 54.0
+"""Everything here is in deg/h."""
+
+
+def power_up(bias: Array, degc: Array, *, noise: float = 1.0, k_s: Array | None = None) -> PowerUpNodes:
+    rates = np.zeros(len(degc)) if k_s is None else k_s
+    rows = zip(degc.tolist(), bias, rates.tolist(), strict=True)
+    return PowerUpNodes([Node(t, (one[0], one[1], one[2]), noise**2, rate) for t, one, rate in rows])
+
+
+def part(
+    random: np.random.Generator, scatter: float, curve: Sequence[float], count: int, per: int = 6
+) -> tuple[list[PowerUpNodes], Array]:
+    """Power-ups of a few kelvin each, somewhere between 5 and 45 degC, and their offsets."""
+    offsets = random.normal(0.0, scatter, (count, 3))
+    found = []
+    for offset in offsets:
+        degc = random.uniform(5.0, 35.0) + np.arange(float(per))
+        shape = np.polyval([*curve[::-1], 0.0], degc - 35.0)
+        found.append(power_up(offset + shape[:, None] + random.normal(0.0, 1.0, (per, 3)), degc))
+    return found, offsets
+
+
+def test_it_is_the_generalised_least_squares_of_all_nodes_with_an_offset_a_power_up() -> None:
+    random = np.random.default_rng(4)
+    nodes, _ = part(random, 30.0, (8.0,), 7)
+    curve = fit(nodes, 4.0, PER_K)
+    assert curve is not None
+    assert curve.order == 1
+    rows = [(k, node) for k, one in enumerate(nodes) for node in one.nodes]
+    of = np.array([k for k, _ in rows])
+    # One more power-up scatters by `scatter`: what it wanders by and Student's factor are in that.
+    freedom = 3.0 * 5.0
+    tau2 = curve.scatter.min() / (freedom / (freedom - 2.0)) - 4.0
+    whole = np.where(of[:, None] == of, tau2, 0.0) + np.diag(np.full(len(rows), 1.0 + 4.0))
+    x = np.array([[1.0, (node.degc - 35.0) / 20.0] for _, node in rows])
+    prior = np.diag([0.0, (PER_K * 20.0) ** -2.0])
+    inverse = np.linalg.inv(whole)
+    expected = np.linalg.solve(x.T @ inverse @ x + prior, x.T @ inverse @ np.array([node.bias for _, node in rows]))
+    said, _ = curve.at(21.0)
+    np.testing.assert_allclose(said, np.array([1.0, -0.7]) @ expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("curve", "orders"), [((), (0,)), ((20.0,), (1,)), ((20.0, 0.5), (2,)), ((9.0, 0.0, 0.05), (3,))]
+)
+def test_as_many_terms_as_foretell_better(curve: tuple[float, ...], orders: tuple[int, ...]) -> None:
+    found = []
+    for seed in range(20):
+        nodes, _ = part(np.random.default_rng(seed), 20.0, curve, 12, per=4)
+        one = fit(nodes, 1.0, PER_K)
+        assert one is not None
+        found.append(one.order)
+    assert sum(order in orders for order in found) >= 16
+
+
+@pytest.mark.parametrize("count", [4, 8, 20])
+def test_one_more_power_up_lies_where_it_says(count: int) -> None:
+    inside, errors = [], []
+    for seed in range(60):
+        random = np.random.default_rng([count, seed])
+        shape = random.normal(0.0, (20.0, 0.5, 0.01)).tolist()
+        nodes, offsets = part(random, 30.0, shape, count + 1)
+        curve = fit(nodes[:-1], 1.0, PER_K)
+        assert curve is not None
+        degc = nodes[-1].nodes[0].degc
+        truth = offsets[-1] + np.polyval([*shape[::-1], 0.0], degc - 35.0)
+        said, variance = curve.at(degc)
+        errors.append(truth - said)
+        inside.append(np.abs(truth - said) < 2.0 * np.sqrt(variance))
+    assert 0.92 < np.mean(inside) < 0.99
+    if count == 20:
+        assert np.sqrt(np.mean(np.square(errors))) < 1.3 * 30.0
+
+
+def test_heating_and_cooling_differ_by_the_lag_of_the_die() -> None:
+    random = np.random.default_rng(1)
+    nodes = []
+    for k in range(10):
+        degc = np.arange(10.0, 30.0) + random.uniform(-3.0, 3.0)
+        rate = np.full(20, 0.03 if k % 2 else -0.03)
+        bias = 10.0 * (degc - 20.0 * rate)
+        nodes.append(power_up(random.normal(0.0, 1.0, 3) + bias[:, None] + np.zeros(3), degc, k_s=rate))
+    curve = fit(nodes, 1.0, PER_K)
+    assert curve is not None
+    heating, cooling = curve.at(20.0, 0.03)[0], curve.at(20.0, -0.03)[0]
+    np.testing.assert_allclose(cooling - heating, 10.0 * 20.0 * 0.06, atol=2.0)
+
+
+def test_beyond_what_was_seen_it_ends_and_says_so() -> None:
+    nodes, _ = part(np.random.default_rng(2), 10.0, (20.0,), 8)
+    curve = fit(nodes, 1.0, PER_K)
+    assert curve is not None
+    low, high = curve.span_degc
+    assert curve.beyond_k(high + 3.0) == curve.beyond_k(low - 3.0) == 0.0
+    assert curve.beyond_k(high + 10.0) == pytest.approx(7.0)
+    assert (curve.at(high + 10.0)[0] == curve.at(high + 3.0)[0]).all()
+    assert np.sqrt(curve.at(high + 10.0)[1]).min() > 7.0 * PER_K
+
+
+def test_two_power_ups_tell_nothing_of_a_third() -> None:
+    nodes, _ = part(np.random.default_rng(2), 10.0, (20.0,), 2)
+    assert fit(nodes, 1.0, PER_K) is None
