@@ -98,14 +98,7 @@ class HeadingAid:
         self._refused_since_s: float | None = None
 
     def gain(self, t_s: float, innovation_rad: float, sigma_rad: float, compass_sigma_rad: float) -> float:
-        """The share of the innovation to turn by, `sigma_rad` being that of our heading; 0: it is refused.
-
-        Args:
-            t_s: of the reading.
-            innovation_rad: how much the attitude's heading should turn, in [-pi, pi].
-            sigma_rad: of the heading that we have.
-            compass_sigma_rad: of the reading.
-        """
+        """The share of the innovation to turn by, `sigma_rad` being that of our heading; 0: it is refused."""
         gate = max(GATE_LEAST_RAD, GATE_SIGMAS * math.hypot(sigma_rad, compass_sigma_rad))
         if not abs(innovation_rad) <= gate:
             if self._refused_since_s is None:

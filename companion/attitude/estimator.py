@@ -86,11 +86,7 @@ class Attitude(msgspec.Struct, frozen=True, gc=False):
 
 
 class AttitudeEstimator:
-    """One call per batch of samples. Nothing in a sample makes it raise.
-
-    Args:
-        settings: what is known beforehand; `settle` takes newer ones without losing the attitude.
-    """
+    """One call per batch of samples. Nothing in a sample makes it raise."""
 
     def __init__(self, settings: AttitudeSettings) -> None:
         self._strapdown = Strapdown()

@@ -33,6 +33,11 @@ REPEAT_S: Final = 0.05
 one does in SITL's lockstep, and then asks no more; and links lose packets. A second answer changes nothing for it."""
 ATTEMPT_S: Final = 1.5
 """A request so long after the first of an attempt, and no retransmission, begins a new one."""
+_RESULTS: Final = {
+    "accept": mavlink.MAV_RESULT_ACCEPTED,
+    "wait": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
+    "refuse": mavlink.MAV_RESULT_DENIED,
+}
 
 
 class ArmAuthoriser:
@@ -41,14 +46,7 @@ class ArmAuthoriser:
     def __init__(self, link: MavlinkLink, gate: ArmGate, say: Say) -> None:
         self._link, self._gate, self._say = link, gate, say
         self._attempt_s = -math.inf
-        self._repeat: asyncio.TimerHandle | None = None
-        self._unsubscribe = link.subscribe(mavlink.MAVLink_command_long_message, self._on_message)
-
-    def close(self) -> None:
-        """Answer nobody any more."""
-        self._unsubscribe()
-        if self._repeat is not None:
-            self._repeat.cancel()
+        link.subscribe(mavlink.MAVLink_command_long_message, self._on_message)
 
     def _on_message(self, message: mavlink.MAVLink_command_long_message, now_s: float) -> None:
         if message.command != mavlink.MAV_CMD_ARM_AUTHORIZATION_REQUEST:
@@ -63,20 +61,14 @@ class ArmAuthoriser:
         if self._gate.at_arm == "off":
             return
         answer, gate = self._gate.answer(), self._gate.at_arm == "gate"
-        result = mavlink.MAV_RESULT_ACCEPTED
-        if gate:
-            result = {
-                "accept": mavlink.MAV_RESULT_ACCEPTED,
-                "wait": mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
-                "refuse": mavlink.MAV_RESULT_DENIED,
-            }[answer.verdict]
+        result = _RESULTS[answer.verdict] if gate else mavlink.MAV_RESULT_ACCEPTED
         accepted = result == mavlink.MAV_RESULT_ACCEPTED
         progress = TOLD_BY_US if result == mavlink.MAV_RESULT_DENIED else 0
         ack = mavlink.MAVLink_command_ack_message(
             message.command, result, progress, VALID_S if accepted else 0, *sender
         )
         self._link.send(ack)
-        self._repeat = asyncio.get_running_loop().call_later(REPEAT_S, self._link.send, ack)
+        asyncio.get_running_loop().call_later(REPEAT_S, self._link.send, ack)
         if self._begins_attempt(message.confirmation, now_s) and answer.verdict != "accept":
             words = f"{'Not armed' if gate else 'Arming uncalibrated'}: {answer.words}"
             self._say(Severity.WARNING, words, Weight.REFUSAL)
@@ -122,10 +114,7 @@ class ArmingScript:
         verdict = VERDICTS[answer.verdict] if self._gate.at_arm == "gate" else NOT_GATING
         reason = to_ascii(answer.words).encode("ascii")[:REASON_BYTES]
         data = MARK + bytes([verdict]) + reason
+        payload = list(data.ljust(_TUNNEL_BYTES, b"\0"))
         return mavlink.MAVLink_tunnel_message(
-            system_id,
-            mavlink.MAV_COMP_ID_AUTOPILOT1,
-            PAYLOAD_TYPE,
-            len(data),
-            list(data.ljust(_TUNNEL_BYTES, b"\0")),
+            system_id, mavlink.MAV_COMP_ID_AUTOPILOT1, PAYLOAD_TYPE, len(data), payload
         )

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.component.arm_authorisation import ArmAuthoriser, ArmingScript
 from companion.component.commands import CommandServer, Permission
 from companion.component.named_values import NamedValues
-from companion.component.no_files import NoFiles
+from companion.component.no_files import refuse_files
 from companion.component.own_parameters import OwnParameters, Parameter
 from companion.component.service import ArmGate, CalibrationService
 from companion.component.statustext import StatusText
@@ -49,11 +49,11 @@ class Component:
         self.permission = Permission(senders)
         self.parameters = OwnParameters(link, parameters, texts.say, self._woken.set, self.permission)
         self._commands = CommandServer(link, service, texts.say, self._woken.set, self.permission)
-        self._authoriser = ArmAuthoriser(link, gate, texts.say)
         self._script = ArmingScript(link, gate)
-        self._files = NoFiles(link)
         self._values = NamedValues(link, service, gate)
-        self._unsubscribe = link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
+        self._authoriser = ArmAuthoriser(link, gate, texts.say)
+        refuse_files(link)
+        link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
 
     async def run(self) -> None:
         """Be the component until cancelled."""
@@ -69,10 +69,6 @@ class Component:
                 finally:
                     timer.cancel()
         finally:
-            self._unsubscribe()
-            self._authoriser.close()
-            self._files.close()
-            self.parameters.close()
             self._commands.close(loop.time())
             self._texts.step(loop.time())
 

@@ -23,31 +23,19 @@ _OPENS: Final = (4, 6, 11)
 _UNKNOWN_COMMAND, _FILE_NOT_FOUND = 7, 10
 
 
-class NoFiles:
-    """Answers requests for files that are addressed to us."""
+def refuse_files(link: MavlinkLink) -> None:
+    """Answer requests for files that are addressed to us, from now on."""
 
-    def __init__(self, link: MavlinkLink) -> None:
-        self._link = link
-        self._unsubscribe = link.subscribe(mavlink.MAVLink_file_transfer_protocol_message, self._on_message)
-
-    def close(self) -> None:
-        """Answer nobody any more."""
-        self._unsubscribe()
-
-    def _on_message(self, message: mavlink.MAVLink_file_transfer_protocol_message, _t_s: float) -> None:
-        if (message.target_system, message.target_component) != (self._link.system_id, self._link.component_id):
-            return
+    def answer(message: mavlink.MAVLink_file_transfer_protocol_message, _t_s: float) -> None:
         sequence, session, opcode, *_ = _HEADER.unpack_from(bytes(message.payload))
+        if (message.target_system, message.target_component) != (link.system_id, link.component_id):
+            return
         if opcode >= _ANSWERS:
             return
         why = _FILE_NOT_FOUND if opcode in _OPENS else _UNKNOWN_COMMAND
         header = _HEADER.pack((sequence + 1) % 65536, session, _NAK, 1, opcode, 0, 0, 0)
-        payload = [*header, why]
-        self._link.send(
-            mavlink.MAVLink_file_transfer_protocol_message(
-                0,
-                message.get_srcSystem(),
-                message.get_srcComponent(),
-                payload + [0] * (_PAYLOAD_BYTES - len(payload)),
-            )
-        )
+        payload = list((header + bytes([why])).ljust(_PAYLOAD_BYTES, b"\0"))
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        link.send(mavlink.MAVLink_file_transfer_protocol_message(0, *sender, payload))
+
+    link.subscribe(mavlink.MAVLink_file_transfer_protocol_message, answer)

@@ -15,6 +15,7 @@ import dataclasses
 import logging
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -67,11 +68,9 @@ class OwnParameters:
         """By index."""
         self._pending: dict[str, None] = {}
         self._next_s = -math.inf
-        self._subscriptions = (
-            link.subscribe(mavlink.MAVLink_param_request_list_message, self._on_request_list),
-            link.subscribe(mavlink.MAVLink_param_request_read_message, self._on_request_read),
-            link.subscribe(mavlink.MAVLink_param_set_message, self._on_set),
-        )
+        link.subscribe(mavlink.MAVLink_param_request_list_message, self._on_request_list)
+        link.subscribe(mavlink.MAVLink_param_request_read_message, self._on_request_read)
+        link.subscribe(mavlink.MAVLink_param_set_message, self._on_set)
 
     def get(self, name: str) -> float:
         """The value in force; KeyError when there is no such parameter."""
@@ -115,11 +114,6 @@ class OwnParameters:
             self._next_s = now_s + 1.0 / VALUES_PER_S
         return self._next_s if self._pending else math.inf
 
-    def close(self) -> None:
-        """Answer nobody any more."""
-        for unsubscribe in self._subscriptions:
-            unsubscribe()
-
     def _request(self, name: str) -> None:
         self._pending.setdefault(name)
         self._wake()
@@ -130,32 +124,33 @@ class OwnParameters:
             mavlink.MAVLink_param_value_message(name.encode("ascii"), self._values[name], _REAL32, count, index)
         )
 
-    def _addressed(self, target_system: int, target_component: int) -> bool:
-        return target_system in (0, self._link.system_id) and target_component in (0, self._link.component_id)
+    def _addressed(self, message: Any) -> bool:
+        target = self._link.system_id, self._link.component_id
+        return message.target_system in (0, target[0]) and message.target_component in (0, target[1])
 
     def _on_request_list(self, message: mavlink.MAVLink_param_request_list_message, _t_s: float) -> None:
-        if self._addressed(message.target_system, message.target_component):
+        if self._addressed(message):
             for name in self._names:
                 self._request(name)
 
     def _on_request_read(self, message: mavlink.MAVLink_param_request_read_message, _t_s: float) -> None:
-        if not self._addressed(message.target_system, message.target_component):
+        if not self._addressed(message):
             return
         index = message.param_index
         name = message.param_id if index < 0 else next(iter(self._names[index : index + 1]), "")
         if name in self._by_name:
             self._request(name)
         elif message.target_component == self._link.component_id:
-            self._send_unknown(message, message.param_id, message.param_index)
+            self._send_unknown(message, message.param_index)
 
     def _on_set(self, message: mavlink.MAVLink_param_set_message, _t_s: float) -> None:
-        if not self._addressed(message.target_system, message.target_component):
+        if not self._addressed(message):
             return
         parameter = self._by_name.get(message.param_id)
         if parameter is None:
             # To component 0 the name may be any other component's.
             if message.target_component == self._link.component_id:
-                self._send_unknown(message, message.param_id, -1)
+                self._send_unknown(message, -1)
             return
         sender = (message.get_srcSystem(), message.get_srcComponent())
         if sender == (self._link.system_id, self._link.component_id):
@@ -190,13 +185,7 @@ class OwnParameters:
         self._values[parameter.name] = value
         return ""
 
-    def _send_unknown(self, message: mavlink.MAVLink_message, name: str, index: int) -> None:
-        self._link.send(
-            mavlink.MAVLink_param_error_message(
-                message.get_srcSystem(),
-                message.get_srcComponent(),
-                name.encode("ascii", "replace")[:16],
-                index,
-                mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST,
-            )
-        )
+    def _send_unknown(self, message: Any, index: int) -> None:
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        name, why = message.param_id.encode("ascii", "replace")[:16], mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST
+        self._link.send(mavlink.MAVLink_param_error_message(*sender, name, index, why))

@@ -44,11 +44,7 @@ class Tune(enum.Enum):
 class Tunes:
     """Plays on the autopilot's buzzer while it is disarmed; `step` sends what may be sent now.
 
-    Args:
-        link: the connection.
-        vehicle: whose buzzer.
-        wanted: whether people want to hear any.
-        woken: set when there is something new to send.
+    `wanted`: whether people want to hear any; `woken` is set when there is something new to send.
     """
 
     def __init__(self, link: MavlinkLink, vehicle: Vehicle, wanted: Callable[[], bool], woken: asyncio.Event) -> None:

@@ -17,10 +17,7 @@ _IDS: Final = re.compile(r"(?:\*|([0-9]{1,3})(?:-([0-9]{1,3}))?)")
 
 
 class Senders:
-    """The senders that a list names.
-
-    Args:
-        entries: such as "255", "255:190", "250-255", "*:190", "*". An entry without a component means all of them.
+    """The senders that a list names: "255", "255:190", "250-255", "*:190", "*". Without a component it means all.
 
     Raises:
         ValueError: an entry is none; its words say which and why.

@@ -105,12 +105,9 @@ def doubtful(config: Config) -> list[str]:
 
 
 def imu_input(imu: Imu, kind: StreamKind | None, grid: tuple[float, float] = (0.0, 0.0)) -> ImuInput:
-    """One IMU as the collector takes it; an autopilot's telemetry is in the vehicle's axes already.
+    """One IMU as the collector takes it; an autopilot's telemetry, of that `kind`, is in the vehicle's axes already.
 
-    Args:
-        imu: its configuration.
-        kind: of an autopilot's telemetry.
-        grid: the sensor's own steps behind that, rad/s and m/s^2, where they are known to be coarse.
+    `grid`: the sensor's own steps behind that, rad/s and m/s^2, where they are known to be coarse.
     """
     integers = kind is not None and kind.truncates
     return ImuInput(

@@ -47,13 +47,8 @@ class Answer(NamedTuple):
 class Exchange:
     """A request under way; `run` it once.
 
-    Args:
-        link: an open one.
-        target: the companion.
-        command: MAV_CMD_*.
-        parameters: its first parameters; the rest are 0.
-        busy: whether the companion is at work, by a heartbeat later than a time; None: there was none.
-        on_progress: told how far it is and for how long nothing has come, several times a second.
+    `busy`: whether the companion is at work, by a heartbeat later than a time; None: there was none. `on_progress` is
+    told how far it is and for how long nothing has come, several times a second.
     """
 
     def __init__(
@@ -77,7 +72,7 @@ class Exchange:
 
     async def run(self) -> Answer:
         """Ask and wait for the end; without an answer or a heartbeat at most 20 s."""
-        stop_watching = self._link.watch_acks(self._take)
+        stop_watching = self._link.on_ack.add(self._take)
         try:
             if not await self._begin():
                 return Answer(None, begun=False)

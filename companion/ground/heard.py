@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Final, Literal, NamedTuple
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.component.statustext import CHUNK_BYTES, to_ascii
-from companion.links.system.listeners import Listeners, Unsubscribe
+from companion.links.system.listeners import Listeners
 
 FIRMWARES: Final = {mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot", mavlink.MAV_AUTOPILOT_PX4: "PX4"}
 _NO_VEHICLES: Final = frozenset({mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ONBOARD_CONTROLLER})
@@ -67,11 +67,7 @@ class Vehicle(NamedTuple):
 
 
 class Heard:
-    """Takes messages as they come; never raises, whatever they hold.
-
-    Args:
-        component_id: the companion's; what other components say is not kept.
-    """
+    """Takes messages as they come; never raises, whatever they hold. What other components say is not kept."""
 
     def __init__(self, component_id: int) -> None:
         self.component_id = component_id
@@ -80,7 +76,8 @@ class Heard:
         self.heartbeats: dict[Target, Heartbeat] = {}
         self.texts: list[tuple[int, Text]] = []
         """By the companions of all vehicles, with their system ids, oldest first; the oldest beyond 200 are gone."""
-        self._listeners: Listeners[[int, Text]] = Listeners()
+        self.on_text: Listeners[[int, Text]] = Listeners()
+        """Told of every text, with its system id."""
         self._unfinished: dict[tuple[int, int], dict[int, str]] = {}
 
     def update(self, name: str, source: Target, fields: Fields, now_s: float) -> None:
@@ -89,10 +86,6 @@ class Heard:
             self._heartbeat(source, fields, now_s)
         elif name == "STATUSTEXT" and source.component_id == self.component_id:
             self._chunk(source.system_id, fields, now_s)
-
-    def watch(self, callback: Callable[[int, Text], None]) -> Unsubscribe:
-        """Be told of every text, with its system id; returns how to stop that."""
-        return self._listeners.add(callback)
 
     def companions(self) -> list[int]:
         """The system ids of the vehicles whose companion was heard."""
@@ -159,7 +152,7 @@ class Heard:
         text = Text(_whole(fields, "severity"), to_ascii(words), now_s)
         self.texts.append((system_id, text))
         del self.texts[:-MAX_TEXTS]
-        self._listeners.tell(system_id, text)
+        self.on_text.tell(system_id, text)
 
 
 def _is_station(beat: Heartbeat) -> bool:

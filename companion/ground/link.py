@@ -28,19 +28,13 @@ from companion.ground.heard import Ack, Heard, Target
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.links.mavlink.signing import Signing
 from companion.links.mavlink.transport import parse_url, run_transport
-from companion.links.system.listeners import Listeners, Unsubscribe
+from companion.links.system.listeners import Listeners
 
 logger = logging.getLogger(__name__)
 
 
 class SignedLink:
-    """Between MAVSDK and the link.
-
-    Args:
-        sdk: a `mavsdk.Mavsdk` with a raw connection.
-        own: system and component that MAVSDK sends as.
-        key: 32 bytes.
-    """
+    """Between MAVSDK, with a raw connection, and the link; `own`: system and component that MAVSDK sends as."""
 
     def __init__(self, sdk: Any, own: tuple[int, int], key: bytes) -> None:
         self._sdk = sdk
@@ -49,7 +43,7 @@ class SignedLink:
         self._from_sdk.robust_parsing = True
         self.link = MavlinkLink(system_id=own[0], component_id=own[1])
         self.signing = Signing(required=True, key=key)
-        self.link.sign_with(self.signing)
+        self.link.signing = self.signing
         for kind in mavlink.mavlink_map.values():
             self.link.subscribe(kind, self._hand_over)
         sdk.subscribe_raw_bytes_to_be_sent(self._in_a_thread)
@@ -100,12 +94,7 @@ _HEARD: Final = ("HEARTBEAT", "STATUSTEXT", "COMMAND_ACK")
 class GroundLink:
     """A ground station on an open link; made by `open_link`.
 
-    Args:
-        sdk: a `mavsdk.Mavsdk`.
-        direct: its `MavlinkDirectServer`.
-        own: system and component that MAVSDK sends as.
-        heard: learns what comes.
-        unbelieved: what was dropped because of its signature, in words; empty: nothing.
+    `unbelieved`: what was dropped because of its signature, in words; empty: nothing.
     """
 
     def __init__(
@@ -113,7 +102,8 @@ class GroundLink:
     ) -> None:
         self.own, self.heard, self.unbelieved = own, heard, unbelieved
         self._sdk, self._direct = sdk, direct
-        self._ack_handlers: Listeners[[Ack]] = Listeners()
+        self.on_ack: Listeners[[Ack]] = Listeners()
+        """Told of every COMMAND_ACK to us."""
         self._loop = asyncio.get_running_loop()
         for name in _HEARD:
             direct.subscribe_message(name, self._in_a_thread)
@@ -135,10 +125,6 @@ class GroundLink:
             self._direct.send_message(message)
         except MavlinkDirectServerError as error:
             logger.debug("not sent: %s", error)
-
-    def watch_acks(self, handler: Callable[[Ack], None]) -> Unsubscribe:
-        """Call the handler with every COMMAND_ACK to us; returns how to stop that."""
-        return self._ack_handlers.add(handler)
 
     async def parameters(self, target: Target) -> dict[str, float]:
         """All parameters of a component; empty when it does not answer."""
@@ -197,7 +183,7 @@ class GroundLink:
             0,
             self.own.component_id,
         ):
-            self._ack_handlers.tell(
+            self.on_ack.tell(
                 Ack(source, *(fields.get(name, 0) for name in ("command", "result", "progress", "result_param2")))
             )
 

@@ -65,13 +65,7 @@ class Outcome:
 
 
 class Station:
-    """Speaks to the one companion that `find` found.
-
-    Args:
-        link: an open link.
-        url: its url, for words.
-        display: is shown what goes on.
-    """
+    """Speaks to the one companion that `find` found."""
 
     def __init__(self, link: GroundLink, url: str, display: Display) -> None:
         self._link, self._url, self._display = link, url, display
@@ -79,7 +73,7 @@ class Station:
         self._target = Target(0, self._heard.component_id)
         self._interrupted = asyncio.Event()
         self._why_cancelled = ""
-        self._heard.watch(self._on_text)
+        self._heard.on_text.add(self._on_text)
 
     @property
     def vehicle(self) -> Vehicle:

@@ -42,10 +42,9 @@ def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Matrix:
 
 
 def rotation_matrix(mounting: str | tuple[float, float, float]) -> Matrix:
-    """How a sensor is mounted: the 3x3 matrix from the sensor's axes to the vehicle's FRD axes.
+    """The 3x3 matrix from a sensor's axes to the vehicle's FRD axes.
 
-    Args:
-        mounting: a MAVLink rotation name, or (roll, pitch, yaw) in degrees.
+    Of a MAVLink rotation name, or of (roll, pitch, yaw) in degrees.
 
     Raises:
         KeyError: no rotation of that name (the configuration checks names before they come here).

@@ -63,9 +63,7 @@ def up_in_sensor(law: Law, x_deg: float, y_deg: float) -> Array:
 def readings_from_up(law: Law, up: Array) -> tuple[float, float]:
     """The two readings (qx, qy) in degrees that a gradienter of this law gives; the inverse of `up_in_sensor`.
 
-    Args:
-        law: of the sensor.
-        up: unit vector of specific force at rest in the sensor's own FRD axes, shape (3,).
+    `up`: unit vector of specific force at rest in the sensor's own FRD axes, shape (3,).
     """
     x, y, z = (float(value) for value in up)
     if law == "axis":

@@ -88,11 +88,7 @@ def likeliest(data: bytes) -> Candidate | None:
 
 
 def lines_to_try(first: Sequence[Line] = ()) -> Iterator[Line]:
-    """Line settings in the order in which trying them is worth most, each once.
-
-    Args:
-        first: what is believed already.
-    """
+    """Line settings in the order in which trying them is worth most, each once; what is believed already, first."""
     defaults = [Line(info.baud, info.parity) for kind in PROTOCOLS.values() for info in kind.values()]
     bauds = dict.fromkeys([*(line.baud for line in (*first, *defaults)), *COMMON_BAUDS])
     parities: tuple[Parity, ...] = ("none", "even", "odd")

@@ -72,12 +72,7 @@ class _Mark:
 
 
 class StreamHealth:
-    """Watches one stream.
-
-    Args:
-        protocol: its name in the configuration.
-        decoder: whose counts are looked at.
-    """
+    """Watches one stream; `protocol`: its name in the configuration."""
 
     def __init__(self, protocol: str, decoder: Decoder) -> None:
         self._protocol, self._decoder = protocol, decoder

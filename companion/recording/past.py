@@ -47,9 +47,7 @@ _NOT_IN_IT: Final = frozenset({topics.PAST, topics.START, topics.RECORD})
 class Past:
     """What has been in the journal lately. Used by one thread at a time.
 
-    Args:
-        longest_stretch_s: the longest still stretch that a calibration is made of.
-        replayed_imus: IMUs whose samples a replay takes from their messages: the autopilot's.
+    `replayed_imus`: those whose samples a replay takes from their messages: the autopilot's.
     """
 
     def __init__(self, longest_stretch_s: float, replayed_imus: Iterable[str]) -> None:

@@ -218,14 +218,7 @@ class Calibrations:
             self.again.append(Replayed(recorded, [], self._no_solution))
 
     def estimate(self, collector: RollingCollector, now_s: float, draft: Draft, seconds: float) -> Record:
-        """What a calibration would have found now.
-
-        Args:
-            collector: as it stands.
-            now_s: the samples' clock.
-            draft: of the record.
-            seconds: that it took.
-        """
+        """What a calibration that took so long would have found now."""
         try:
             draft.solution = self._solved(collector.window(now_s), What.BOTH)
         except CalibrationRefusedError as error:

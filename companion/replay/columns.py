@@ -126,13 +126,7 @@ class Columns(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def columns_of(names: Sequence[str], where: str, units: Sequence[str] = (), *, timed: bool = True) -> Columns:
-    """Which column holds what.
-
-    Args:
-        names: of all columns.
-        where: file and line, for words.
-        units: a row of units below the names, or nothing.
-        timed: there has to be a column of time.
+    """Which column holds what, by the names of all and a row of units below them, or nothing; one is time, if `timed`.
 
     Raises:
         StorageError: a quantity is missing, is there twice, or is in a unit that is none of its.

@@ -35,13 +35,7 @@ CONTINUED_S: Final = 60.0
 def read_logs(
     paths: Sequence[Path], columns: str | None = None, rate_hz: float | None = None, csv_name: str = NAME
 ) -> list[StillLog]:
-    """All IMUs in all files, one entry for each IMU and session.
-
-    Args:
-        paths: of any kind.
-        columns: as for `csv_log.read`, as the two that follow.
-        rate_hz: of CSV files.
-        csv_name: what the IMU of CSV files is called.
+    """All IMUs in all files of any kind, one entry for each IMU and session; the rest as for `csv_log.read`.
 
     Raises:
         StorageError: a file cannot be read, in one line.

@@ -55,11 +55,5 @@ def tag(element: str, /, *children: Child, **attributes: str | float | None) -> 
 
 
 def number(value: float, form: str, unit_value: float | None = None) -> Markup:
-    """A figure for people that carries its exact value for programs: <data value="…">.
-
-    Args:
-        value: as it stands in the record.
-        form: format of what people see.
-        unit_value: that value in the unit that people see; as it is if left out.
-    """
+    """A figure for people and its exact value for programs: <data value="…">; people see `unit_value`, if given."""
     return tag("data", format(value if unit_value is None else unit_value, form), value=repr(float(value)))

@@ -19,10 +19,6 @@ MAX_EARLIER: Final = 60
 def material(directory: Path, wanted: str | None) -> Material:
     """What the page of one calibration is made of, by its number or the beginning of its time; None: the latest.
 
-    Args:
-        directory: the storage folder.
-        wanted: which calibration.
-
     Raises:
         StorageError: there is nothing to make a page of, none of that number or time, or it cannot be read.
     """

@@ -82,16 +82,10 @@ def _nice(step: float) -> float:
 
 
 class Plot:
-    """One frame with axes; what is drawn first lies below.
+    """One frame with axes, of that height, the whole 360 wide; what is drawn first lies below.
 
-    Args:
-        x: the horizontal axis.
-        y: the vertical one.
-        name: what a screen reader says.
-        height: of the frame, in units of which the whole is 360 wide.
-        x_label: below the ticks; None: no ticks are written either, for a plot with another one below it.
-        y_label: above the frame.
-        left: room for what is written at the vertical axis.
+    Without an `x_label` no ticks are written either, for a plot with another one below it. `name` is what a screen
+    reader says, `left` the room for what is written at the vertical axis.
     """
 
     def __init__(
@@ -129,13 +123,7 @@ class Plot:
             self._below.append(_path("M" + "L".join(_xy(*self.at(*point)) for point in points), class_))
 
     def points(self, points: Sequence[Pair], class_: str, spans: Sequence[Pair]) -> None:
-        """Markers, each with an upright bar.
-
-        Args:
-            points: where.
-            class_: `sx` (circles), `sy` (squares) or `sz` (triangles).
-            spans: lower and upper end of every point's bar.
-        """
+        """Markers: `sx` (circles), `sy` (squares) or `sz` (triangles), each with an upright bar over its span."""
         bars: list[str] = []
         for (x, _), (low, high) in zip(points, spans, strict=True):
             across, bottom = self.at(x, low)

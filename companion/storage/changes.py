@@ -46,12 +46,9 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def of(
         cls, system_id: int | None, changes: Iterable[Change], unforeseen: Mapping[str, float] | None = None
     ) -> ChangeSet:
-        """What is kept of changes before the first of them is made.
+        """What is kept of changes before the first is made, and the old values of what the firmware will overwrite.
 
-        Args:
-            system_id: of the vehicle; of one that is not known nothing can be kept.
-            changes: ours.
-            unforeseen: what the firmware will overwrite, by name the old values.
+        Of a vehicle that is not known nothing can be kept.
         """
         found = [Changed(change.parameter, change.before, change.after, change.via) for change in changes]
         found += [Changed(name, before, None) for name, before in (unforeseen or {}).items()]

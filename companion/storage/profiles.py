@@ -99,9 +99,7 @@ def check_name(name: str) -> None:
 class ProfileStore:
     """The folder `profiles` of a storage directory.
 
-    Args:
-        directory: that.
-        forgiving: for the daemon, which no damaged file may end: the figures of the worst common parts, and a word.
+    `forgiving`: for the daemon, which no damaged file may end: the figures of the worst common parts, and a word.
     """
 
     def __init__(self, directory: Path, *, forgiving: bool = False) -> None:
@@ -183,11 +181,9 @@ def read_profile(path: Path) -> SavedProfile:
 
 
 def given_profile(wanted: str, directory: Callable[[], Path]) -> str | Noise:
-    """What somebody has named: a part of the catalogue, a saved profile, or the file of one.
+    """What somebody has named: a part of the catalogue, a saved profile, or the file of one (a slash in it, or .json).
 
-    Args:
-        wanted: a name, or a path (with a slash in it, or .json at its end).
-        directory: the storage directory, where names of saved profiles are looked for; only asked where it matters.
+    The storage directory is only asked for where it matters.
 
     Raises:
         ConfigError: no such profile; says what is allowed.

@@ -289,7 +289,7 @@ class Stage(Rig):
 
     def census(self) -> Census:
         """Of the living daemon."""
-        handlers = sum(len(each) for each in self.link._handlers.values()) + len(self.service.core.vehicle._listeners)
+        handlers = sum(len(each) for each in self.link._handlers.values()) + len(self.service.core.vehicle.on_event)
         return Census(len(tasks_of(self.owner)), handlers, len(os.listdir("/proc/self/fd")))
 
     def words(self) -> Iterator[str]:

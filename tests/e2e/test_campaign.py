@@ -113,7 +113,7 @@ def test_a_daemon_that_leaks_tasks_is_caught() -> None:
             if OWNER.get() == owner:
                 asyncio.get_running_loop().create_task(asyncio.sleep(1e6))
 
-        stage.service.core.vehicle.watch(leak)
+        stage.service.core.vehicle.on_event.add(leak)
 
     outcome = run_cell(FAULTS["link-cut"], "done", SEED, sabotage=sabotage)
     assert any("not as before the fault" in words for words in outcome.problems), outcome

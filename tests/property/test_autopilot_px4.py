@@ -96,7 +96,7 @@ def test_what_is_read_and_written_takes_the_residual_out(
         vehicle = Vehicle(link)
         client = ParameterClient(link, vehicle)
         async with flying_on(link, px4):
-            await vehicle.wait_found()
+            await vehicle.found.wait()
             await asyncio.sleep(1.0)
             # As after a restart: a small accelerometer vector is not in use, and it is known that it may not be.
             found = await read_calibration(client, 1)

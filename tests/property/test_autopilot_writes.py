@@ -83,7 +83,7 @@ def test_nothing_leaves_unless_disarmed_and_what_is_reported_is_true(
         writer = ParameterWriter(client, vehicle)
         autopilot = ScriptedAutopilot(parameters=BEFORE, param_errors=param_errors)
         async with flying_on(link, autopilot, seed=seed, loss=loss, duplicate=duplicate) as wire:
-            await vehicle.wait_found()
+            await vehicle.found.wait()
             await asyncio.sleep(rng.uniform(0, 2))
             trouble = asyncio.create_task(chaos(autopilot, rng, arming=arming, reboots=reboots))
             try:
@@ -137,7 +137,7 @@ def test_a_cancel_at_any_moment_leaves_the_old_values(seed: int, loss: float, af
         writer = ParameterWriter(client, vehicle)
         autopilot = ScriptedAutopilot(parameters=BEFORE)
         async with flying_on(link, autopilot, seed=seed, loss=loss):
-            await vehicle.wait_found()
+            await vehicle.found.wait()
             await asyncio.sleep(1.0)
             if vehicle.arm_state is not ArmState.DISARMED:
                 return

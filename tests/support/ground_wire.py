@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.ground.heard import Ack, Heard, Target
+from companion.links.system.listeners import Listeners
 from tests.support.component import Ground, command_message
 
 COMPANION = Target(1, 191)
@@ -22,7 +23,7 @@ class StationOnTheWire(Ground):
 
     def __init__(self) -> None:
         super().__init__(245, 190)
-        self.handlers: list[Callable[[Ack], None]] = []
+        self.on_ack: Listeners[[Ack]] = Listeners()
         self.confirmations: list[int] = []
         self.deaf_to: Callable[[mavlink.MAVLink_message], bool] = lambda message: False
         self.heard = Heard(COMPANION.component_id)
@@ -38,16 +39,12 @@ class StationOnTheWire(Ground):
             source = Target(message.get_srcSystem(), message.get_srcComponent())
             self.heard.update(message.get_type(), source, message.to_dict(), t_s)
             if isinstance(message, mavlink.MAVLink_command_ack_message):
-                for handler in [*self.handlers]:
-                    handler(Ack(source, message.command, message.result, message.progress, message.result_param2))
+                ack = Ack(source, message.command, message.result, message.progress, message.result_param2)
+                self.on_ack.tell(ack)
 
     def send_command(self, target: Target, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
         self.confirmations.append(confirmation)
         self.send(command_message(command, *parameters, target=target, confirmation=confirmation))
-
-    def watch_acks(self, handler: Callable[[Ack], None]) -> Callable[[], None]:
-        self.handlers.append(handler)
-        return lambda: self.handlers.remove(handler)
 
     async def parameters(self, target: Target) -> dict[str, float]:
         return self.values

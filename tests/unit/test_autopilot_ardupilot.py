@@ -58,7 +58,7 @@ def read(parameters: dict[str, float], instance: int = 1, autopilot: ScriptedAut
         autopilot_ = autopilot or ScriptedAutopilot()
         autopilot_.parameters = {name: f32(value) for name, value in parameters.items()}
         async with flying_on(link, autopilot_):
-            await vehicle.wait_found()
+            await vehicle.found.wait()
             await asyncio.sleep(2.0)
             try:
                 return await read_calibration(client, instance)

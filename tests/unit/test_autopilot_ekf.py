@@ -26,7 +26,7 @@ async def settle(
     """What settling says, how long it took, and its progress, with omegaI y told every `period_s`."""
     link, autopilot = MavlinkLink(), ScriptedAutopilot()
     vehicle = Vehicle(link)
-    watch = EkfWatch(link, vehicle)
+    watch = EkfWatch(vehicle)
     said: list[str] = []
     loop = asyncio.get_running_loop()
 
@@ -37,7 +37,7 @@ async def settle(
             autopilot.send(mavlink.MAVLink_ahrs_message(0.0, -rate, 0.0, 0, 0, 0, 0))
 
     async with flying_on(link, autopilot):
-        await vehicle.wait_found()
+        await vehicle.found.wait()
         await asyncio.sleep(1.0)
         begun_s = loop.time()
         telling = asyncio.create_task(tell(begun_s))

@@ -34,7 +34,7 @@ async def aboard(autopilot: ScriptedAutopilot) -> AsyncIterator[tuple[ParameterC
     vehicle = Vehicle(link)
     client = ParameterClient(link, vehicle)
     async with flying_on(link, autopilot) as wire:
-        await vehicle.wait_found()
+        await vehicle.found.wait()
         await asyncio.sleep(1.0)
         yield client, vehicle, wire
     vehicle.close()
@@ -404,7 +404,7 @@ def test_watch_hears_what_anybody_writes_and_others_do_not_count() -> None:
         stranger = ScriptedAutopilot(system=9, parameters={X: 7.0})
         heard: list[tuple[str, float]] = []
         async with aboard(autopilot) as (client, vehicle, _):
-            stop = client.watch(lambda name, value: heard.append((name, value)))
+            stop = client.on_value.add(lambda name, value: heard.append((name, value)))
             stranger.attach(lambda data: client._link.receive(data, asyncio.get_running_loop().time()))
             stranger.value(X)
             autopilot.value(Z)

@@ -42,7 +42,7 @@ async def aboard(px4: ScriptedPx4) -> AsyncIterator[Aboard]:
     vehicle = Vehicle(link)
     client = ParameterClient(link, vehicle)
     async with flying_on(link, px4):
-        await vehicle.wait_found()
+        await vehicle.found.wait()
         await asyncio.sleep(1.0)
         yield Aboard(px4, vehicle, client, ParameterWriter(client, vehicle))
     vehicle.close()

@@ -54,10 +54,10 @@ async def aboard(autopilot: ScriptedAutopilot, **wire: float) -> AsyncIterator[t
     link = MavlinkLink()
     vehicle = Vehicle(link)
     events: list[str] = []
-    vehicle.watch(events.append)
+    vehicle.on_event.add(events.append)
     async with flying_on(link, autopilot, **wire):  # type: ignore[arg-type]
         async with asyncio.timeout(30):
-            await vehicle.wait_found()
+            await vehicle.found.wait()
         await asyncio.sleep(0.3)
         yield vehicle, events
     vehicle.close()
@@ -80,7 +80,7 @@ def test_disarmed_is_believed_once_no_armed_heartbeat_has_come_for_three_seconds
         vehicle = Vehicle(link)
         events: list[tuple[float, str]] = []
         loop = asyncio.get_running_loop()
-        vehicle.watch(lambda event: events.append((round(loop.time() - 1000.0, 3), event)))
+        vehicle.on_event.add(lambda event: events.append((round(loop.time() - 1000.0, 3), event)))
         heartbeat(link, armed=True)
         for _ in range(4):
             await asyncio.sleep(0.9)
@@ -142,7 +142,7 @@ def test_a_restart_that_somebody_pretends_does_not_make_it_disarmed() -> None:
         vehicle = Vehicle(link)
         codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         events: list[str] = []
-        vehicle.watch(events.append)
+        vehicle.on_event.add(events.append)
         heartbeat(link, armed=True)
         for boot_ms in (60_000, 100):
             link.receive(mavlink.MAVLink_system_time_message(0, boot_ms).pack(codec), asyncio.get_running_loop().time())
@@ -160,7 +160,7 @@ def test_state_follows_heartbeats_and_is_unknown_two_seconds_after_the_last() ->
         vehicle = Vehicle(link)
         events: list[tuple[float, str]] = []
         loop = asyncio.get_running_loop()
-        vehicle.watch(lambda event: events.append((round(loop.time() - 1000.0, 3), event)))
+        vehicle.on_event.add(lambda event: events.append((round(loop.time() - 1000.0, 3), event)))
         heartbeat(link)
         assert state(vehicle) is ArmState.DISARMED
         await asyncio.sleep(1.0)

@@ -76,7 +76,7 @@ class Stage:
     async def running(self) -> AsyncIterator[None]:
         tasks = [asyncio.create_task(self.double.run()), asyncio.create_task(self.stream.run())]
         try:
-            await self.vehicle.wait_found()
+            await self.vehicle.found.wait()
             await asyncio.sleep(2.0)
             yield
         finally:

@@ -31,7 +31,7 @@ async def aboard(autopilot: ScriptedAutopilot) -> AsyncIterator[tuple[ParameterW
     vehicle = Vehicle(link)
     client = ParameterClient(link, vehicle)
     async with flying_on(link, autopilot) as wire:
-        await vehicle.wait_found()
+        await vehicle.found.wait()
         await asyncio.sleep(1.0)
         yield ParameterWriter(client, vehicle), vehicle, wire
     vehicle.close()

@@ -67,7 +67,7 @@ async def aboard(px4: ScriptedPx4, folder: Path) -> AsyncIterator[Stage]:
     ledger.load()
     writes = Px4Writes(link, vehicle, writer, ledger, memory, lambda *what: None)
     async with flying_on(link, px4):
-        await vehicle.wait_found()
+        await vehicle.found.wait()
         await asyncio.sleep(1.0)
         yield Stage(px4, client, writer, writes, memory)
     vehicle.close()

@@ -61,7 +61,7 @@ def test_progress_is_shown_and_the_end_is_the_companions() -> None:
             assert [percent for percent in (10, 40, 95) if percent in shown] == [10, 40, 95]
             assert shown == sorted(shown)
             assert station.confirmations == [0], "nothing was lost: nothing is to be repeated"
-            assert station.handlers == []
+            assert not station.on_ack
             assert b.service.started[0].what.name == "GYROS"  # type: ignore[union-attr]
 
     run_virtual(main())
@@ -192,8 +192,7 @@ def test_answers_to_others_and_of_others_are_not_ours() -> None:
                 (COMPANION._replace(system_id=2), CALIBRATE),
                 (COMPANION, UNDO),
             ):
-                for handler in [*station.handlers]:
-                    handler(Ack(source, command, mavlink.MAV_RESULT_DENIED, 0, 0))
+                station.on_ack.tell(Ack(source, command, mavlink.MAV_RESULT_DENIED, 0, 0))
             await asyncio.sleep(0.5)
             assert not asking.done()
             b.service.jobs[0].finish("done")

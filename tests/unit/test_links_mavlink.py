@@ -201,7 +201,7 @@ def test_a_stream_whose_reads_never_end_on_a_packets_end_is_not_kept_for_ever() 
 
 def test_a_recording_is_told_that_the_rest_of_a_cut_off_datagram_is_not_carried_on() -> None:
     link, taped = MavlinkLink(), list[tuple[str, bytes | None]]()
-    link.watch_bytes(lambda direction, data, _t_s: taped.append((direction, data)))
+    link.on_bytes.add(lambda direction, data, _t_s: taped.append((direction, data)))
     whole = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
     senders: list[tuple[int, int]] = []
     link.receive_datagram(whole + whole[:5], 0.0, senders.append)

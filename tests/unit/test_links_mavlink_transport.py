@@ -179,7 +179,7 @@ class TestUdpIn:
     def test_who_is_not_believed_gets_no_place(self, peer: socket.socket) -> None:
         async def main() -> None:
             link = MavlinkLink()
-            link.sign_with(Signing(required=True, key=bytes(32)))
+            link.signing = Signing(required=True, key=bytes(32))
             async with transport(link, "udpin:127.0.0.1:0") as states:
                 await until(lambda: states.connected)
                 peer.sendto(packet(), ("127.0.0.1", states.port))

@@ -39,12 +39,9 @@ _SETTLE_S: Final[dict[Firmware, float]] = {
 async def read_calibration(
     parameters: ParameterClient, instance: int, memory: SlotMemory | None = None
 ) -> ImuCalibration:
-    """Read afresh what the autopilot corrects one of its IMUs with.
+    """Read afresh what the autopilot corrects one of its IMUs (1 to 3) with.
 
-    Args:
-        parameters: of the autopilot.
-        instance: 1 to 3.
-        memory: what earlier writes have shown about PX4's slots.
+    `memory`: what earlier writes have shown about PX4's slots.
 
     Raises:
         AutopilotError: a firmware that is not known, or as the firmware's own `read_calibration`.

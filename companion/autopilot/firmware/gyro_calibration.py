@@ -93,10 +93,7 @@ async def calibrate_gyros(
 ) -> GyroCalibration:
     """Let the firmware calibrate its gyros, once; returns when it is surely over.
 
-    Args:
-        parameters: of the autopilot.
-        before: as read just now.
-        go_on: told now and then what is going on.
+    `before`: as read just now; `go_on`: told now and then what is going on.
 
     Raises:
         NotDisarmedError: not disarmed when the command was about to leave: nothing was done.

@@ -90,36 +90,24 @@ def rivals_of(firmware: Firmware | None) -> tuple[str, ...]:
     return tuple(_RIVALS.get(firmware or "other", {}))
 
 
-class RivalMemory:
-    """Which rivals were seen switched on since the autopilot's last boot."""
-
-    def __init__(self) -> None:
-        self._seen: dict[str, int] = {}
-
-    def saw(self, parameter: str, boots: int) -> None:
-        """It is on."""
-        self._seen[parameter] = boots
-
-    def was_on(self, parameter: str, boots: int) -> bool:
-        """Whether it was on since this boot."""
-        return self._seen.get(parameter) == boots
-
-
-async def read_rivals(parameters: ParameterClient, memory: RivalMemory | None = None) -> tuple[Rival, ...]:
+async def read_rivals(parameters: ParameterClient, seen: dict[str, int] | None = None) -> tuple[Rival, ...]:
     """Those that are switched on, and those that were and act until the next boot.
+
+    `seen` is kept here from one call to the next: by parameter, the boot (as counted) since which it was seen to be on.
 
     Raises:
         AutopilotError: as `ParameterClient.read_optional`.
     """
     found: list[Rival] = []
+    seen = {} if seen is None else seen
+    boots = parameters.vehicle.boots
     for name, kind in _RIVALS.get(parameters.vehicle.firmware or "other", {}).items():
         value = await read_integer(parameters, name)
         if value:
             words = f"{name} = {value}: {kind.what}; set it to 0 to keep them (push.stop_rivals = true does)"
             found.append(Rival(name, value, kind.acts, kind.accelerometers, words))
-            if memory is not None:
-                memory.saw(name, parameters.vehicle.boots)
-        elif kind.from_boot and memory is not None and memory.was_on(name, parameters.vehicle.boots):
+            seen[name] = boots
+        elif kind.from_boot and seen.get(name) == boots:
             words = f"{name} is off from the next boot on: until then {kind.what}; reboot the autopilot"
             found.append(Rival(name, 0, kind.acts, kind.accelerometers, words))
     return tuple(found)
@@ -155,18 +143,13 @@ _AXES: Final = "XYZ"
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class ImuParameters:
-    """The names of the parameters that correct one IMU; vectors are X, Y, Z."""
+    """The names of the parameters that correct one IMU; vectors are X, Y, Z in rad/s and m/s^2, an id of 0 is none."""
 
     gyro_offset: tuple[str, str, str]
-    """rad/s."""
     accel_offset: tuple[str, str, str]
-    """m/s^2."""
     accel_scale: tuple[str, str, str]
-    """No unit."""
     gyro_id: str
-    """The gyro's device id; 0 where there is none."""
     accel_id: str
-    """The accelerometer's device id; 0 where there is none."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -327,10 +310,7 @@ def output_step(
 ) -> tuple[Vector, Vector]:
     """By how much the output must move when the changes are in force: gyro rad/s, accelerometer m/s^2, vehicle FRD.
 
-    Args:
-        calibration: in force before them.
-        changes: of whatever is calibrated.
-        accel_m_s2: the accelerometers' output before them, which a change of scale stretches.
+    `accel_m_s2`: the accelerometers' output before them, which a change of scale stretches.
     """
     names = calibration.parameters
     by_name = {change.parameter: change.after - change.before for change in changes}

@@ -37,10 +37,7 @@ def port_names(firmware: Firmware | None) -> list[str]:
 def port_rows(firmware: Firmware | None, found: Mapping[str, float], baud: int | None) -> list[PortRow]:
     """What concerns the companion's port, of parameters as they were read.
 
-    Args:
-        firmware: which.
-        found: by name.
-        baud: of our own serial line to it; None: it is reached another way.
+    `baud`: of our own serial line to it; None: it is reached another way.
     """
     rows: list[PortRow] = []
     if firmware == "px4":

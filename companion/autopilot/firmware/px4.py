@@ -27,7 +27,6 @@ from companion.autopilot.firmware.imu_calibration import (
     FarStep,
     ImuCalibration,
     ImuParameters,
-    RivalMemory,
     read_rivals,
 )
 from companion.autopilot.parameters.change import Change
@@ -63,7 +62,8 @@ class SlotMemory:
         self._instance_of: dict[tuple[Sensor, int], int] = {}
         self._enabled: dict[Sensor, int] = {}
         self._in_use: dict[tuple[str, str, str], tuple[int, Vector]] = {}
-        self.rivals = RivalMemory()
+        self.rivals: dict[str, int] = {}
+        """As `read_rivals` keeps it."""
 
     def learn(self, sensor: Sensor, device_id: int, instance: int) -> None:
         """The offsets in the slot of this device act on the telemetry of this IMU (NO_IMU: of none)."""
@@ -93,13 +93,9 @@ class SlotMemory:
         return self._in_use.get(names) == (boots, vector)
 
     def choose(self, sensor: Sensor, instance: int, slots: tuple[Slot, ...], like: int | None = None) -> Slot:
-        """The slot to write for an IMU: the one that is known, else the best guess.
+        """The slot to write for an IMU (1 to 3), of all that hold a device id: the known one, else the best guess.
 
-        Args:
-            sensor: of which kind.
-            instance: 1 to 3.
-            slots: all that hold a device id, in order.
-            like: the device id of the IMU's other half; of a chip that is both, it is the same.
+        `like`: the device id of the IMU's other half; of a chip that is both, it is the same.
 
         Raises:
             AutopilotError: there is none.

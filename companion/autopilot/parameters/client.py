@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Final
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -38,7 +38,7 @@ from companion.errors import (
     ParameterTimeoutError,
 )
 from companion.links.mavlink.link import MavlinkLink
-from companion.links.system.listeners import Listeners, Unsubscribe
+from companion.links.system.listeners import Listeners
 from companion.samples import Vector
 
 _NO_ERROR: Final = 0
@@ -70,7 +70,8 @@ class ParameterClient:
         self._repeated = 0.0
         """Share of requests that were answered only after a repetition, of late."""
         self._inboxes: list[Inbox] = []
-        self._listeners: Listeners[[str, float]] = Listeners()
+        self.on_value: Listeners[[str, float]] = Listeners()
+        """Told of every PARAM_VALUE of the autopilot, whoever caused it."""
         self._answering: str | None = None
         self._absent: set[str] = set()
         """Names that this boot of the autopilot has shown not to have: told by silence, that takes seconds to learn."""
@@ -78,7 +79,7 @@ class ParameterClient:
         """MAV_PARAM_TYPE by name, as heard since the last restart; so these exist, however silent it is about them."""
         link.subscribe(mavlink.MAVLink_param_value_message, self._on_value)
         link.subscribe(mavlink.MAVLink_param_error_message, self._on_error)
-        vehicle.watch(self._on_event)
+        vehicle.on_event.add(self._on_event)
 
     async def read(self, name: str) -> float:
         """Ask for a parameter by name and return what comes.
@@ -214,10 +215,6 @@ class ParameterClient:
         """Whether the autopilot has answered a request since it started."""
         return self._answering is not None
 
-    def watch(self, callback: Callable[[str, float], None]) -> Unsubscribe:
-        """Be told of every PARAM_VALUE of the autopilot, whoever caused it; returns how to stop that."""
-        return self._listeners.add(callback)
-
     @property
     def _bytewise(self) -> bool:
         return integers_bytewise(self.vehicle.capabilities, self.vehicle.firmware)
@@ -315,7 +312,7 @@ class ParameterClient:
         for inbox in self._inboxes:
             if inbox.name == name or (inbox.name == "" and message.param_index == 0):
                 inbox.put(value)
-        self._listeners.tell(name, value)
+        self.on_value.tell(name, value)
 
     def _on_error(self, message: mavlink.MAVLink_param_error_message, _t_s: float) -> None:
         addressed = message.target_system in (0, self._link.system_id) and message.target_component in (

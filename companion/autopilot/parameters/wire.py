@@ -54,11 +54,7 @@ REAL32: Final[int] = mavlink.MAV_PARAM_TYPE_REAL32
 def integers_bytewise(capabilities: int | None, firmware: Firmware | None) -> bool:
     """Whether integer parameters travel as the bytes of an int32 in the float field, not as a number.
 
-    By the capability bit; else by who it is: older PX4 and ArduPilot set neither bit (autopilots 7.5).
-
-    Args:
-        capabilities: MAV_PROTOCOL_CAPABILITY bits; None: not known.
-        firmware: None: not known.
+    By the capability bits; else by who it is: older PX4 and ArduPilot set neither bit (autopilots 7.5).
     """
     if capabilities is not None:
         if capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE:

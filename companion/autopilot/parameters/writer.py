@@ -107,10 +107,8 @@ class ParameterWriter:
     ) -> dict[str, WrittenParameter]:
         """Write all changes or none; a parameter that already has its new value is not written again.
 
-        Args:
-            changes: the whole set.
-            on_the_way: called while the values on the way (`Change.via`) are in force, of which it may look at the
-                effect; what it returns is a reason to put everything back.
+        `on_the_way` is called while the values on the way (`Change.via`) are in force, and may look at their effect;
+        what it returns is a reason to put everything back.
 
         Returns:
             Every parameter as "stored": read back afresh, its effect not yet looked at.

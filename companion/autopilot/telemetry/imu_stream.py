@@ -20,6 +20,7 @@ from companion.autopilot.telemetry import imu_messages
 from companion.autopilot.telemetry.imu_messages import ImuMessage, Reading, StreamKind
 from companion.autopilot.vehicle.vehicle import Vehicle, VehicleEvent
 from companion.links.mavlink.link import MavlinkLink, Message
+from companion.links.system.waiting import comes
 from companion.samples import ImuSample
 
 __all__ = ["ImuStream", "StreamKind"]
@@ -77,16 +78,10 @@ class _Source:
 
 
 class ImuStream:
-    """Asks for one IMU's messages, keeps them coming and hands on their samples in vehicle FRD.
+    """Asks for one IMU's messages (1, 2 or 3), keeps them coming and hands on their samples in vehicle FRD.
 
-    Args:
-        link: the connection.
-        vehicle: whose IMU it is.
-        instance: 1, 2 or 3.
-        on_sample: called with every sample.
-        rate_hz: wanted; slower when the autopilot denies it.
-        on_kind_change: called before the first sample of another message (and with None when there is none any
-            more), so that nobody mixes two resolutions in one mean.
+    Slower than `rate_hz` when the autopilot denies that. `on_kind_change` is called before the first sample of another
+    message (and with None when there is none any more), so that nobody mixes two resolutions in one mean.
     """
 
     def __init__(
@@ -129,7 +124,7 @@ class ImuStream:
         """Keep the samples coming until cancelled; raises nothing else."""
         messages = {*imu_messages.ARDUPILOT[self._instance], *imu_messages.PX4[self._instance]}
         subscriptions = [self._link.subscribe(each.message, self._on_message) for each in messages]
-        subscriptions.append(self._vehicle.watch(self._on_event))
+        subscriptions.append(self._vehicle.on_event.add(self._on_event))
         try:
             while True:
                 try:
@@ -148,7 +143,9 @@ class ImuStream:
         """From finding the autopilot to losing it."""
         if not self._vehicle.alive:
             self._lose("no heartbeat from the autopilot")
-        await self._until_found()
+        self.turns += 1
+        while not await comes(self._vehicle.found, _TURN_S):
+            self.turns += 1
         self._restart.clear()
         if self._vehicle.firmware == "ardupilot":
             messages = imu_messages.ARDUPILOT[self._instance]
@@ -169,16 +166,6 @@ class ImuStream:
                     source.refused = False
             else:
                 await self._keep(found)
-
-    async def _until_found(self) -> None:
-        while True:
-            self.turns += 1
-            try:
-                async with asyncio.timeout(_TURN_S):
-                    await self._vehicle.wait_found()
-            except TimeoutError:
-                continue
-            return
 
     async def _find(self) -> _Source | None:
         """The first source, best first, that sends."""
@@ -219,11 +206,8 @@ class ImuStream:
         while not self._restart.is_set() and not source.absent:
             if source.last_s >= asked_s or loop.time() - source.last_s < _LOOK_S:
                 return True
-            try:
-                async with asyncio.timeout_at(deadline_s):
-                    self._arrived.clear()
-                    await self._arrived.wait()
-            except TimeoutError:
+            self._arrived.clear()
+            if not await comes(self._arrived, deadline_s - loop.time()):
                 break
         return False
 
@@ -290,17 +274,14 @@ class ImuStream:
 
     async def _pause(self, seconds: float) -> bool:
         """Wait, but not beyond the loss or restart of the autopilot; True when that came."""
-        deadline_s = asyncio.get_running_loop().time() + seconds
+        loop = asyncio.get_running_loop()
+        deadline_s = loop.time() + seconds
         while not self._restart.is_set():
             self.turns += 1
-            left_s = deadline_s - asyncio.get_running_loop().time()
+            left_s = deadline_s - loop.time()
             if left_s <= 0.0:
                 return False
-            try:
-                async with asyncio.timeout(min(left_s, _TURN_S)):
-                    await self._restart.wait()
-            except TimeoutError:
-                continue
+            await comes(self._restart, min(left_s, _TURN_S))
         return True
 
     # --- what arrives

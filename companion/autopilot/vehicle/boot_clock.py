@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.links.mavlink.link import MavlinkLink, Message
 from companion.links.mavlink.signing import EARLIEST_S
+from companion.links.system.waiting import comes
 
 _BACK_S: Final = 0.5
 """Late and repeated packets step back by milliseconds; a restart by all the time it was up."""
@@ -74,12 +75,9 @@ def _too_slow(boot_s: float, t_s: float, since: tuple[float, float]) -> bool:
 
 
 class BootWatch:
-    """Reads the time since boot from every message of the autopilot that carries it, and tells of restarts.
+    """Reads the time since boot from every message of the autopilot that carries it.
 
-    Args:
-        link: the connection.
-        sent: whether a message is the autopilot's.
-        on_restart: called when it has restarted, before anybody else hears of the message that shows it.
+    `on_restart` is called when it has restarted, before anybody else hears of the message that shows it.
     """
 
     def __init__(self, link: MavlinkLink, sent: Callable[[Message], bool], on_restart: Callable[[], None]) -> None:
@@ -107,12 +105,7 @@ class BootWatch:
     async def wait(self, timeout_s: float) -> bool:
         """Wait for the next message that carries the time since boot; False: none came in time."""
         self._heard.clear()
-        try:
-            async with asyncio.timeout(timeout_s):
-                await self._heard.wait()
-        except TimeoutError:
-            return False
-        return True
+        return await comes(self._heard, timeout_s)
 
     def _on_boot_ms(self, message: Any, t_s: float) -> None:
         if self._sent(message):

@@ -17,7 +17,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
-from companion.links.mavlink.link import MavlinkLink
+from companion.links.system.waiting import comes
 from companion.physics.units import DEG
 
 SETTLED_RAD_S: Final = 0.02 * DEG
@@ -35,12 +35,12 @@ _LOOK_S: Final = 0.25
 class EkfWatch:
     """Asks for AHRS while somebody wants to know, and averages what comes over 2 s."""
 
-    def __init__(self, link: MavlinkLink, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
         self._seen: deque[tuple[float, float, float, float]] = deque(maxlen=2048)
         self._arrived = asyncio.Event()
         self._asked = False
-        link.subscribe(mavlink.MAVLink_ahrs_message, self._on_ahrs)
+        vehicle.hear(mavlink.MAVLink_ahrs_message, self._on_ahrs)
 
     async def bias_rad_s(self) -> float | None:
         """The largest axis of the estimate, mean of the last 2 s (or less, where less has come).
@@ -52,19 +52,13 @@ class EkfWatch:
                 return found
             self._ask()
             self._arrived.clear()
-            try:
-                async with asyncio.timeout(_FIRST_WITHIN_S):
-                    await self._arrived.wait()
-            except TimeoutError:
-                continue
+            await comes(self._arrived, _FIRST_WITHIN_S)
         return self._mean(0.0)
 
     async def settle(self, within_s: float, go_on: Callable[[str], None]) -> str | None:
         """Wait until the estimate has settled; arming and a restart end the waiting.
 
-        Args:
-            within_s: so long at most.
-            go_on: told every look how far it is; what it raises ends the waiting too.
+        `go_on` is told every look how far it is; what it raises ends the waiting too.
 
         Returns:
             None when it has settled; else what a pilot should know.
@@ -129,7 +123,7 @@ class EkfWatch:
 
     def _on_ahrs(self, message: mavlink.MAVLink_ahrs_message, t_s: float) -> None:
         rates = (message.omegaIx, message.omegaIy, message.omegaIz)
-        if self._vehicle.sent(message) and all(map(math.isfinite, rates)):
+        if all(map(math.isfinite, rates)):
             self._seen.append((t_s, *rates))
             self._arrived.set()
 

@@ -47,12 +47,7 @@ class Angles(NamedTuple):
 
 
 class OwnAttitude:
-    """Listens to the latched autopilot.
-
-    Args:
-        vehicle: it.
-        wanted: ask for what the heading needs, all the time.
-    """
+    """Listens to the latched autopilot; `wanted`: asks for what the heading needs, all the time."""
 
     def __init__(self, vehicle: Vehicle, *, wanted: bool) -> None:
         self._vehicle, self._wanted = vehicle, wanted

@@ -28,7 +28,7 @@ from companion.autopilot.vehicle.heartbeats import (
 )
 from companion.autopilot.vehicle.whereabouts import TimeAndPlace
 from companion.links.mavlink.link import Handler, M, MavlinkLink, Message
-from companion.links.system.listeners import Listeners, Unsubscribe
+from companion.links.system.listeners import Listeners
 
 __all__ = ["ArmState", "Firmware", "Moment", "Vehicle", "VehicleEvent"]
 
@@ -54,18 +54,15 @@ _SLOWEST: Final = 5.0
 _POLL_S: Final = 0.05
 
 VehicleEvent = Literal["armed", "disarmed", "lost", "found", "rebooted"]
-"""What `Vehicle.watch` tells. "found": latched, or heard again after "lost". "armed" and "disarmed": the heartbeat
+"""What `Vehicle.on_event` tells. "found": latched, or heard again after "lost". "armed" and "disarmed": the heartbeat
 says so and the one before, if any, said otherwise; so the first heartbeat of all brings "found" and one of them.
 "disarmed" comes when that is believed: 3 s after the last armed heartbeat."""
 
 
 class Vehicle:
-    """The one autopilot that is calibrated.
+    """The one autopilot that is calibrated: the vehicle's of that system id, else the first real one that is heard.
 
-    Args:
-        link: the connection; its system id follows the vehicle's when that is latched.
-        system_id: the vehicle's, or None to latch the first real autopilot that is heard. Once latched it stays.
-        is_carried: whether the aircraft moves, or may fly: then its place changes rightly.
+    Once latched it stays, and the link's system id follows. `is_carried`: as for `TimeAndPlace`.
 
     A real autopilot is a heartbeat with a known autopilot type and the type of a vehicle: ground stations,
     gimbals, ADS-B receivers and the like are ignored, whatever they claim. Component 1 is taken at once; another
@@ -102,8 +99,10 @@ class Vehicle:
         self._conflict_logged = False
         self._lost = True
         self._trusted_from_s = -math.inf
-        self._listeners: Listeners[[VehicleEvent]] = Listeners()
-        self._found = asyncio.Event()
+        self.on_event: Listeners[[VehicleEvent]] = Listeners()
+        """Told of events, in the order in which they are seen."""
+        self.found = asyncio.Event()
+        """Set while the autopilot is being heard."""
         self._heartbeat_waiters: list[asyncio.Event] = []
         self._wanted = StandingRequests(self.commands)
         self._lost_timer: asyncio.TimerHandle | None = None
@@ -175,10 +174,6 @@ class Vehicle:
         if rate_hz is not None:
             self._wanted.add(message, rate_hz, of)
 
-    def watch(self, callback: Callable[[VehicleEvent], None]) -> Unsubscribe:
-        """Be told of events, in the order in which they are seen; returns how to stop that."""
-        return self._listeners.add(callback)
-
     async def hear_boot_time(self, timeout_s: float = 1.0) -> bool:
         """Ask for the time since boot and wait for it; afterwards `boots` counts every restart until now.
 
@@ -189,10 +184,6 @@ class Vehicle:
             return await self.boot.wait(timeout_s)
         finally:
             request.cancel()
-
-    async def wait_found(self) -> None:
-        """Wait, without limit, until the autopilot is being heard."""
-        await self._found.wait()
 
     async def fresh_heartbeat(self, within_s: float = FRESH_WITHIN_S) -> bool:
         """Ask for a heartbeat and wait for it, so that an arming is known at once and not at the next beat.
@@ -220,7 +211,7 @@ class Vehicle:
     def close(self) -> None:
         """Hear no heartbeat any more; the arm state is UNKNOWN from here on."""
         self._lost = True
-        self._found.clear()
+        self.found.clear()
         self._unsubscribe()
         for timer in (self._lost_timer, self._tick_timer):
             if timer is not None:
@@ -229,7 +220,7 @@ class Vehicle:
 
     def _tell(self, event: VehicleEvent) -> None:
         logger.log(logging.WARNING if event in ("lost", "rebooted") else logging.INFO, "%s: %s", self.name, event)
-        self._listeners.tell(event)
+        self.on_event.tell(event)
 
     # --- heartbeats
 
@@ -253,7 +244,7 @@ class Vehicle:
         self.system_status = message.system_status
         self.signs = bool(message.get_header().incompat_flags & mavlink.MAVLINK_IFLAG_SIGNED)
         self._lost = False
-        self._found.set()
+        self.found.set()
         for heard in self._heartbeat_waiters:
             heard.set()
         if self._lost_timer is not None:
@@ -314,7 +305,7 @@ class Vehicle:
 
     def _lose(self) -> None:
         self._lost = True
-        self._found.clear()
+        self.found.clear()
         self._tell("lost")
 
     # --- what is asked for

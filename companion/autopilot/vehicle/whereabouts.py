@@ -63,8 +63,7 @@ class _Claim:
 class TimeAndPlace:
     """Takes the autopilot's messages; whoever calls has made sure that they are the autopilot's.
 
-    Args:
-        is_carried: whether the aircraft moves, or may fly: then its place changes rightly.
+    `is_carried`: whether the aircraft moves, or may fly: then its place changes rightly.
     """
 
     def __init__(self, is_carried: Callable[[], bool] = lambda: False) -> None:

@@ -34,7 +34,7 @@ class Armings:
         self._file = BoundedList(core.config.storage.path / "armings.json", Arming, KEEP)
         self._queue: asyncio.Queue[Arming] = asyncio.Queue(QUEUE)
         self.last: Arming | None = None
-        core.vehicle.watch(self._on_event)
+        core.vehicle.on_event.add(self._on_event)
 
     async def run(self) -> None:
         """Keep every arming until cancelled; what is still waiting then is written as well."""

@@ -34,8 +34,8 @@ class GateSetup:
         self.problem: str | None = None
         """What has to be set, for people; None while all is well or not known yet."""
         self.known = False
-        core.vehicle.watch(self._on_event)
-        core.parameters.watch(self._on_parameter)
+        core.vehicle.on_event.add(self._on_event)
+        core.parameters.on_value.add(self._on_parameter)
 
     async def run(self) -> None:
         """Look whenever there is something new, until cancelled."""
@@ -43,7 +43,7 @@ class GateSetup:
             await self._stale.wait()
             while self._readiness.at_arm != "gate":  # may be set at the flight line
                 await asyncio.sleep(POLL_S)
-            await self._vehicle.wait_found()
+            await self._vehicle.found.wait()
             self._stale.clear()
             try:
                 self.problem = await self.find_missing()
@@ -76,8 +76,7 @@ class GateSetup:
     async def find_missing(self, script_starts_s: float = SCRIPT_STARTS_S) -> str | None:
         """What has to be set so that the autopilot asks, for people; None: nothing.
 
-        Args:
-            script_starts_s: how long ArduPilot's script is waited for where it does not run yet.
+        ArduPilot's script is waited for where it does not run yet.
 
         Raises:
             AutopilotError: it does not answer.

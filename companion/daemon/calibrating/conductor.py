@@ -64,7 +64,7 @@ class Conductor:
         """What the present state means, in words."""
         self.on_ended: Listeners[Job, JobResult] = Listeners()
         """Told of every end, before the requester is."""
-        core.vehicle.watch(self._on_event)
+        core.vehicle.on_event.add(self._on_event)
         core.wanted.on_retarget.add(self._retarget)
         recovery.on_recovered.add(self._recovered)
 

@@ -45,14 +45,7 @@ class _Announced(NamedTuple):
 
 
 class AutopilotImu:
-    """Gives the collector the samples of one autopilot IMU while the offsets behind them are known.
-
-    Args:
-        core: the autopilot, and the collector.
-        imu: which of its IMUs.
-        slots: what is known about PX4's slots.
-        rate_hz: asked of the autopilot.
-    """
+    """Gives the collector the samples of one autopilot IMU while the offsets behind them are known."""
 
     def __init__(self, core: Core, imu: Imu, slots: SlotMemory, rate_hz: float) -> None:
         self.name, self.instance = imu.name, imu.instance or 1
@@ -91,8 +84,8 @@ class AutopilotImu:
             rate_hz=rate_hz,
             on_kind_change=self._kind_changed,
         )
-        core.parameters.watch(self._on_parameter)
-        core.vehicle.watch(self._on_event)
+        core.parameters.on_value.add(self._on_parameter)
+        core.vehicle.on_event.add(self._on_event)
 
     async def run(self) -> None:
         """Ask for the telemetry and follow the offsets until cancelled."""
@@ -210,7 +203,7 @@ class AutopilotImu:
         while True:
             await self._stale.wait()
             self._stale.clear()
-            await self._vehicle.wait_found()
+            await self._vehicle.found.wait()
             if self._ours:
                 continue
             try:

@@ -39,7 +39,7 @@ class Reach:
         self._stale = asyncio.Event()
         self._stale.set()
         link.subscribe(mavlink.MAVLink_heartbeat_message, self._on_heartbeat)
-        vehicle.watch(self._on_event)
+        vehicle.on_event.add(self._on_event)
 
     @property
     def heard(self) -> bool:
@@ -94,7 +94,7 @@ class Reach:
         while True:
             await self._stale.wait()
             self._stale.clear()
-            await self._vehicle.wait_found()
+            await self._vehicle.found.wait()
             try:
                 await self._read()
             except AutopilotError as error:

@@ -61,10 +61,8 @@ class MotionWitness:
     def update(self, latest: Mapping[str, Batch], corrected: Callable[[str], Corrected | None]) -> None:
         """Take note of the last whole second of each IMU.
 
-        Args:
-            latest: by IMU.
-            corrected: what was done to its readings before they came to us; None while that is not known. It is taken
-                back: new offsets, or another orientation of the board, must not look like a tilt.
+        `corrected`: what was done to its readings before they came to us; None while that is not known. It is taken
+        back: new offsets, or another orientation of the board, must not look like a tilt.
         """
         for name, batch in latest.items():
             seconds = self._seconds.setdefault(name, deque(maxlen=REMEMBERED_S))

@@ -182,7 +182,7 @@ class LinkSigning:
         if self.mode != "off":
             # From the first byte on: what comes before the key is read is not believed either.
             self.signing = Signing(required=self.mode == "require")
-            link.sign_with(self.signing)
+            link.signing = self.signing
         self._watch = _SignatureWatch(link, vehicle, self.signing, say)
         link.subscribe(mavlink.MAVLink_setup_signing_message, self._on_setup)
 

@@ -26,12 +26,7 @@ from companion.samples import Sample
 
 
 class Devices(Subsystem):
-    """Where samples come from.
-
-    Args:
-        core: what all share.
-        imu_rate_hz: asked of the autopilot for each IMU, which may grant less; None: what the connection can carry.
-    """
+    """Where samples come from; without `imu_rate_hz` each IMU is asked for as many as the connection can carry."""
 
     def __init__(self, core: Core, imu_rate_hz: float | None = None) -> None:
         self._core = core

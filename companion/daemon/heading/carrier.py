@@ -64,11 +64,7 @@ def carrying_imu(config: Config) -> Imu:
 def settings_of(imu: Imu, record: ImuRecord, local: LocalEarth, gyro_step_rad_s: float) -> AttitudeSettings | None:
     """How the estimator is to take this IMU's samples; None where its gyros were not calibrated.
 
-    Args:
-        imu: its configuration.
-        record: of the calibration in force.
-        local: the place.
-        gyro_step_rad_s: of a stream of truncated integers, else 0.
+    `record`: of the calibration in force; `gyro_step_rad_s`: of a stream of truncated integers, else 0.
     """
     serial = imu.source == "serial"
     gyro = record.gyro_bias_rad_s if serial else _left(record, record.residual_gyro_rad_s, "gyro")
@@ -181,7 +177,7 @@ class Carrier:
         """What came on the ground within `KEPT_S`, read by read."""
         self._wanted = False
         self._checked_s = -math.inf
-        core.vehicle.watch(self._on_event)
+        core.vehicle.on_event.add(self._on_event)
 
     # --- what comes in, in the turn of the loop in which it was read
 

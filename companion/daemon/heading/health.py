@@ -53,11 +53,7 @@ _DOWN: Final[Triple] = (0.0, 0.0, 1.0)
 class Difference:
     """Listens to ATTITUDE of the latched autopilot; ours comes back from other stations under our own number.
 
-    Args:
-        link: the connection.
-        vehicle: whose attitude counts.
-        now: our attitude at the last sample.
-        kept_at: what is remembered of an instant before.
+    `now`: our attitude at the last sample; `kept_at`: what is remembered of an instant before.
     """
 
     def __init__(

@@ -198,7 +198,7 @@ class Recovery:
                 await asyncio.sleep(RETRY_S)
 
     async def _recover(self, open_set: ChangeSet) -> None:
-        await self._vehicle.wait_found()
+        await self._vehicle.found.wait()
         strange = self.ledger.strange_to(self._vehicle.firmware, open_set)
         if strange or open_set.system_id != self._vehicle.system_id:
             names = ", ".join(open_set.names)

@@ -32,7 +32,7 @@ class Rivalry:
         self._told: set[str] = set()
         self._disarmed_s = self._rebooted_s = -math.inf
         self._was_armed = False
-        core.vehicle.watch(self._on_event)
+        core.vehicle.on_event.add(self._on_event)
         for name, imu in imus.items():
             imu.on_read.add(functools.partial(self._on_read, name))
 

@@ -31,7 +31,7 @@ class Offsets(Subsystem):
         self.writer = ParameterWriter(parameters, vehicle)
         self.rivalry = Rivalry(core, imus)
         px4 = Px4Writes(core.link, vehicle, self.writer, self.ledger, devices.slots, core.say)
-        ekf, platform = EkfWatch(core.link, vehicle), config.vehicle.platform
+        ekf, platform = EkfWatch(vehicle), config.vehicle.platform
         self.firmware = FirmwareCalibration(vehicle, parameters, self.writer, self.ledger, ekf, platform)
         self.effect = EffectWatch(core, px4)
         self.planner = Planner(core, imus, devices.slots, self.rivalry)

@@ -110,10 +110,8 @@ def system_findings(config: Config, ours: Sequence[int], root: Path = ROOT) -> l
 async def sensor_findings(config: Config, status: Object, *, may_listen: bool) -> list[Finding]:
     """Why no good samples come from a sensor, as far as its bytes tell.
 
-    Args:
-        config: what was believed.
-        status: of a daemon, or of a check that has just listened.
-        may_listen: no daemon runs, so that ports may be tried at other settings.
+    `status`: of a daemon, or of a check that has just listened; `may_listen`: no daemon runs, so that ports may be
+    tried at other settings.
     """
     devices = {device["name"]: device for device in status["devices"]}
     sick = [

@@ -127,7 +127,7 @@ class Recorder(Subsystem):
         self._flushing = asyncio.Lock()
         self._around = Surroundings(config, core.vehicle, devices.imus.values(), self._journal)
         self._no_keys = KeyFilter()
-        link.watch_bytes(self._on_mavlink)
+        link.on_bytes.add(self._on_mavlink)
         for sensor in devices.sensors:
             sensor.on_bytes.add(self._on_serial)
         calibrating.solving.on_solved.add(self._on_solved)

@@ -121,15 +121,8 @@ class MavlinkLink:
         self._transmit: Callable[[bytes], object] | None = None
         self._attached = 0
         self._handlers: dict[str, Listeners[Message, float]] = {}
-        self._bytes: Listeners[Direction, bytes | None, float | None] = Listeners()
-
-    def watch_bytes(self, tell: Callable[[Direction, bytes | None, float | None], object]) -> None:
-        """Tell of everything that passes: direction, bytes, time of arrival; without bytes: some are missing here."""
-        self._bytes.add(tell)
-
-    def sign_with(self, signing: Signing) -> None:
-        """Sign what is sent, and believe what comes as far as this allows, from now on."""
-        self.signing = signing
+        self.on_bytes: Listeners[Direction, bytes | None, float | None] = Listeners()
+        """Told of everything that passes: direction, bytes, time of arrival; without bytes: some are missing here."""
 
     @property
     def system_id(self) -> int:
@@ -164,7 +157,7 @@ class MavlinkLink:
         self._transmit = transmit
         self._attached += 1
         self._forget_received()
-        self._bytes.tell("in", None, None)
+        self.on_bytes.tell("in", None, None)
 
     def send(self, message: mavlink.MAVLink_message) -> bool:
         """Send a message now; False (and counted) when no transport is attached or its buffer is full."""
@@ -175,8 +168,8 @@ class MavlinkLink:
         if self.signing is not None:
             data = self.signing.sign(data, message.crc_extra)
         self._codec.seq = (self._codec.seq + 1) % 256
-        if self._bytes:
-            self._bytes.tell("out", data, None)
+        if self.on_bytes:
+            self.on_bytes.tell("out", data, None)
         if self._transmit(data) is False:
             self.dropped += 1
             return False
@@ -202,8 +195,8 @@ class MavlinkLink:
 
     def receive(self, data: bytes, t_s: float) -> None:
         """Take bytes of a stream that arrived at `t_s` (monotonic); never raises, whatever they are."""
-        if self._bytes:
-            self._bytes.tell("in", data, t_s)
+        if self.on_bytes:
+            self.on_bytes.tell("in", data, t_s)
         attached = self._attached
         for name, _, message in self._frames(data):
             self._dispatch(name, message, t_s)
@@ -221,12 +214,12 @@ class MavlinkLink:
         `admit` is told who sent each message that may have an effect, before it has any; not of a radio's own, which
         anybody may send without a signature.
         """
-        if self._bytes:
-            self._bytes.tell("in", datagram, t_s)
+        if self.on_bytes:
+            self.on_bytes.tell("in", datagram, t_s)
         frames = list(self._frames(datagram))
         if self.half_received:
             self.received["bad"] += 1
-            self._bytes.tell("in", None, None)
+            self.on_bytes.tell("in", None, None)
         self._forget_received()
         for name, sender, message in frames:
             if name not in _ANYBODYS:

@@ -64,15 +64,7 @@ def ticks_of(unix_s: float) -> int:
 
 
 def sign(frame: bytes, crc_extra: int, key: bytes, link_id: int, ticks: int) -> bytes:
-    """A MAVLink 2 packet that is not signed yet, signed; the checksum covers the flag that says so.
-
-    Args:
-        frame: the whole packet.
-        crc_extra: of its kind of message: the checksum covers the flag that says "signed".
-        key: 32 bytes.
-        link_id: 0 to 255.
-        ticks: since 2015, 10 us each.
-    """
+    """A MAVLink 2 packet that is not signed yet, signed; the checksum covers the flag that says so."""
     head = bytearray(frame[:-2])
     head[2] |= _SIGNED
     crc = mavlink.x25crc(head[1:])
@@ -129,11 +121,8 @@ class SigningClock:
 class Signing:
     """Signs what one link sends and judges what it receives.
 
-    Args:
-        required: whether what is not signed with the key is dropped; else it is only counted.
-        key: 32 bytes; without it nothing can be signed or believed.
-        clock: of all links that have the key.
-        link_id: of this link.
+    Where a signature is `required`, what is not signed with the key (32 bytes) is dropped; else it is only counted.
+    Without a key nothing can be signed or believed. The clock is that of all links that have the key.
     """
 
     def __init__(

@@ -59,13 +59,9 @@ class Incoming(NamedTuple):
 class MqttLink:
     """Keeps a connection to the broker, sends what is in `outbox`, hands over what comes.
 
-    Args:
-        settings: which broker.
-        client_id: who we are to it; a second client of that name takes over from the first.
-        will: topic and payload that the broker publishes, retained, when we are gone without a word.
-        subscriptions: topics to hear; the will's should be among them, to know that what we say there comes through.
-        on_message: told of each message; must not block.
-        offload: runs a blocking call elsewhere.
+    A second client of the same id takes over from the first. The will, topic and payload, is what the broker publishes,
+    retained, when we are gone without a word; its topic should be among the subscriptions, to know that what we say
+    there comes through. `on_message` must not block.
     """
 
     def __init__(

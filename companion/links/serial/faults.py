@@ -40,12 +40,8 @@ def port_faults(
 ) -> list[PortFault]:  # fmt: skip
     """What is wrong with a configured port, worst first.
 
-    Args:
-        port: as configured; a path.
-        is_fast: a sensor whose samples must not come in bunches.
-        ours: processes that may have it open.
-        among: all ports, if somebody has listed them already.
-        root: of the file system.
+    `is_fast`: a sensor whose samples must not come in bunches; `ours`: processes that may have it open; `among`: all
+    ports, if somebody has listed them already.
     """
     device = resolve(root, port)
     ports = list_ports(root) if among is None else among

@@ -66,13 +66,7 @@ async def listen_to_all(
     first: Callable[[str], Sequence[Line]] = lambda _: (),
     tell: Callable[[str, Heard | str], None] | None = None,
 ) -> dict[str, Heard | str]:
-    """Who speaks on each port, or why that is not known; all at the same time.
-
-    Args:
-        names: the ports.
-        first: as for `listen`, by port.
-        tell: is told of each as soon as it is known.
-    """
+    """Who speaks on each port, or why that is not known, all at once; `tell` is told as soon as one is known."""
 
     async def one(port: str) -> Heard | str:
         found: Heard | str

@@ -46,11 +46,8 @@ class Backoff:
 class Reconnection:
     """One connection that is opened again for as long as it takes; a loss is warned of once, until it is back.
 
-    Args:
-        name: for the log.
-        backoff: the pauses between attempts.
-        worth_s: a connection that lasted so long starts the pauses afresh.
-        on_state: told of every change, of the reason too while attempts go on; must neither block nor raise.
+    A connection that lasted `worth_s` starts the pauses afresh. `on_state` is told of every change, of the reason too
+    while attempts go on; it must neither block nor raise.
     """
 
     def __init__(self, name: str, backoff: Backoff, *, worth_s: float, on_state: OnState | None = None) -> None:

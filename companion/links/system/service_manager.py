@@ -17,11 +17,9 @@ logger = logging.getLogger(__name__)
 
 
 class ServiceManager:
-    """Tells whoever started us; does nothing where nobody wants to be told.
+    """Tells whoever started us, at a path or "@" and an abstract name; does nothing where nobody wants to be told.
 
-    Args:
-        address: of the manager's datagram socket, a path or "@" and an abstract name; None: nobody listens.
-        watchdog_s: within so many seconds of the last `alive` we are taken for hung; None: nobody looks.
+    Within `watchdog_s` of the last `alive` we are taken for hung; None: nobody looks.
     """
 
     def __init__(self, address: str | None, watchdog_s: float | None = None) -> None:

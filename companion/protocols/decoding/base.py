@@ -34,11 +34,7 @@ class RejectedError(Exception):
 
 
 class Decoder(ABC):
-    """Bytes of one device to samples.
-
-    Args:
-        seconds_per_byte: line time of one byte; 0 where unknown (sockets, USB), which leaves the time of the read.
-    """
+    """Bytes of one device to samples; the line time of one byte is 0 where unknown (sockets, USB)."""
 
     device_clock_wraps_s: ClassVar[float | None] = None
     """`ImuSample.t_device_s` starts again at 0 after so long; None where the device has no clock, or it never does."""

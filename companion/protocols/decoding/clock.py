@@ -42,11 +42,7 @@ LATE: Final = "late"
 
 
 class DeviceClock:
-    """Maps one device's clock to the host's.
-
-    Args:
-        wraps_s: it starts again at 0 after so long, by its format; None where it never does.
-    """
+    """Maps one device's clock to the host's; it starts again at 0 after `wraps_s`, by its format, or never."""
 
     def __init__(self, wraps_s: float | None) -> None:
         self.restarts = 0
@@ -144,12 +140,7 @@ class DeviceClock:
 
 
 class SampleTimes:
-    """Gives the samples of one device their times, and unwraps its counter.
-
-    Args:
-        clock_wraps_s: of the device's clock, as in `DeviceClock`.
-        sequence_modulus: its counter counts modulo this; None where it has none.
-    """
+    """Gives the samples of one device their times, and unwraps its counter, which counts modulo `sequence_modulus`."""
 
     def __init__(self, clock_wraps_s: float | None = None, sequence_modulus: int | None = None) -> None:
         self.clock = DeviceClock(clock_wraps_s)

@@ -140,12 +140,9 @@ class _Known:
 
 
 class Requests:
-    """Takes requests and answers them.
+    """Takes requests and answers them; responses that may be dropped are refusals.
 
-    Args:
-        ask: who knows.
-        respond: where responses go; those that may be dropped are refusals.
-        on_retained: told once of each command of which a retained request lies at the broker.
+    `on_retained` is told once of each command of which a retained request lies at the broker.
     """
 
     def __init__(self, ask: Handler, respond: Respond, on_retained: Callable[[str], None]) -> None:
