@@ -31,8 +31,6 @@ class FacesStore(StateFile[faces_record.FacesRecord]):
 
 
 FORMAT_VERSION: Final = 1
-KEEP_POINTS: Final = 40
-"""The most points kept of each IMU: some 30 kB."""
 KEEP_IMUS: Final = 8
 
 
@@ -60,14 +58,14 @@ class BiasStore:
         return {} if found is None else found.imus
 
     def write(self, imus: dict[str, KnownImu]) -> None:
-        """Keep the latest points of the latest IMUs.
+        """Keep what is worth it of the latest IMUs.
 
         Raises:
             StorageError: it could not be written; what was there before still is.
         """
         latest = sorted(imus, key=lambda name: max((point.unix_s for point in imus[name].points), default=0.0))
         kept = {
-            name: msgspec.structs.replace(imus[name], points=imus[name].points[-KEEP_POINTS:])
+            name: msgspec.structs.replace(imus[name], points=history.kept(imus[name].points))
             for name in latest[-KEEP_IMUS:]
         }
         self._file.write(_File(imus=kept))

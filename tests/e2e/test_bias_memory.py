@@ -11,13 +11,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from companion.calibration.records.history import PowerUp
+from companion.calibration.records.history import KEEP_POINTS, PowerUp
 from companion.calibration.records.record import Record, Standing
 from companion.daemon.job import Job
 from companion.daemon.offsets import firmware_calibration
 from companion.recording.walk import Recording
 from companion.replay.engine import Replay
-from companion.storage.learned import KEEP_POINTS, BiasStore
+from companion.storage.learned import BiasStore
 from sim.devices import Gradienter
 from sim.imu_model import DEG_H, MG
 from sim.motions import SlowTurn
@@ -294,3 +294,30 @@ def test_a_turn_that_no_compass_shows_is_bounded_by_earlier_power_ups(
         side = "right" if rate_deg_s > 0.0 else "left"
         said = any(words.endswith("sigma widened") and side in words for words in record.warnings)
         assert said == bool(rate_deg_s), record.warnings
+
+
+def test_what_is_seen_while_it_warms_up_is_remembered_although_nobody_calibrates(tmp_path: Path) -> None:
+    async def main() -> None:
+        rig = Rig(tmp_path, part="icm42688p", at_arm="off", **FEW)
+        rig.model.temperature_degc = lambda t_s: 20.0 + 12.0 * min(t_s / 300.0, 1.0)  # type: ignore[method-assign]
+        truth: dict[float, Any] = {}
+        async with rig.running():
+            await rig.ready()
+            for _ in range(40):
+                await asyncio.sleep(10.0)
+                t_s = rig.aircraft.time_at(rig.now_s)
+                truth[rig.model.temperature_degc(t_s)] = rig.model.true_bias(t_s).gyro_rad_s
+            assert rig.service.calibrating.store.history() == []
+        (points,) = (imu.points for imu in BiasStore(tmp_path).read().values())
+        degc = [point.temperature_degc or 0.0 for point in points]
+        assert max(degc) - min(degc) > 8.0
+        assert min(np.diff(degc)) > 0.5
+        for point in points:
+            assert point.gyro is not None
+            true = truth[min(truth, key=lambda at: abs(at - (point.temperature_degc or 0.0)))]
+            off = np.subtract(point.gyro.bias, true)
+            # A window of some seconds is half a minute of warming old.
+            assert np.abs(off).max() < 4.0 * max(point.gyro.sigma_use) + 0.6 * 18.0 * DEG_H
+            assert point.k_s == pytest.approx(0.04, rel=0.3) or (point.temperature_degc or 0.0) > 31.0
+
+    run_virtual(main())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
 from pathlib import Path
@@ -10,19 +11,19 @@ from typing import Any
 import msgspec
 import pytest
 
-from companion.calibration.records.history import Measured, Point, PowerUp
+from companion.calibration.records.history import KEEP_POINTS, KEEP_POWER_UPS, Measured, Point, PowerUp, kept
 from companion.errors import StorageError
-from companion.storage.learned import KEEP_IMUS, KEEP_POINTS, BiasStore, KnownImu
+from companion.storage.learned import KEEP_IMUS, BiasStore, KnownImu
 
 ONE = Measured(bias=(0.1, 1e-17, -3.0), sigma_stat=(1.0, 2.0, 3.0), sigma_use=(4.0, 5.0, 6.0), sigma_shared=(0, 0, 0))
 
 
-def point(k: int) -> Point:
+def point(k: int, run: int = 0, degc: float | None = None, *, by_hand: bool = True) -> Point:
     return Point(
-        started_at=str(k),
+        started_at=str(k) if by_hand else "",
         unix_s=float(k),
-        power_up=PowerUp(host="here", since_unix_s=0.1 * k),
-        temperature_degc=None,
+        power_up=PowerUp(host=f"boot {run}", since_unix_s=86400.0 * run + 0.1 * k),
+        temperature_degc=degc,
         up=(0.0, 0.6, -0.8),
         zero="zero",
         zero_sigma_rad=1e-4,
@@ -39,11 +40,43 @@ def test_it_is_read_as_it_was_written_and_keeps_the_latest(tmp_path: Path) -> No
         for n in range(10)
     }
     store.write(imus)
-    kept = store.read()
-    assert sorted(kept) == [f"imu{n}" for n in range(10 - KEEP_IMUS, 10)]
-    for name, known in kept.items():
+    read = store.read()
+    assert sorted(read) == [f"imu{n}" for n in range(10 - KEEP_IMUS, 10)]
+    for name, known in read.items():
         assert known == msgspec.structs.replace(imus[name], points=imus[name].points[-KEEP_POINTS:])
     assert [path.name for path in tmp_path.iterdir()] == ["biases.json"]
+
+
+def test_of_a_power_up_the_ends_of_its_temperatures_stay_and_what_was_calibrated_before_what_was_seen() -> None:
+    warming = [point(k, degc=20.0 + 0.5 * k, by_hand=k % 10 == 0) for k in range(40)]
+    left = kept(warming)
+    assert len(left) == KEEP_POINTS
+    assert {str(k) for k in range(0, 40, 10)} < {each.started_at for each in left}
+    degc = [each.temperature_degc or 0.0 for each in left]
+    assert degc == sorted(degc)
+    assert (degc[0], degc[-1]) == (20.0, 39.5)
+    assert max(b - a for a, b in itertools.pairwise(degc)) < 6.0
+    decided = [msgspec.structs.replace(warming[1], gyro=msgspec.structs.replace(ONE, chosen=True)), *warming]
+    assert decided[0] in kept(decided)
+
+
+def test_winter_is_not_forgotten_in_summer() -> None:
+    winter = [point(k, run=k, degc=2.0 + 0.3 * k) for k in range(5)]
+    summer = [point(k, run=k, degc=25.0 + k % 7) for k in range(5, 200)]
+    left = kept([*winter, *summer])
+    assert len(left) == KEEP_POWER_UPS
+    assert sum(each in winter for each in left) >= 3
+    assert left[-10:] == tuple(summer[-10:])
+
+
+def test_two_years_of_days_are_small_and_read_at_once(tmp_path: Path) -> None:
+    points = [point(k, run=k // 12, degc=5.0 + (k // 12) % 30 + k % 12, by_hand=False) for k in range(12 * 730)]
+    months: tuple[Point, ...] = ()
+    for k in range(0, len(points), 12 * 10):
+        months = kept((*months, *points[k : k + 12 * 10]))
+    BiasStore(tmp_path).write({name: KnownImu(identity={}, points=months) for name in ("fc", "fc2", "fc3")})
+    assert (tmp_path / "biases.json").stat().st_size < 2**20
+    assert BiasStore(tmp_path).read()["fc3"].points == months
 
 
 @pytest.mark.parametrize(

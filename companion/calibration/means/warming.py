@@ -57,6 +57,11 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
     """How fast its thermometer goes up; None: it has none."""
     k_s_variance: float = 0.0
 
+    @property
+    def rate_k_s(self) -> float:
+        """How fast its temperature is known to rise; zero where that may be chance, or it has no thermometer."""
+        return self.k_s if self.k_s is not None and abs(self.k_s) > 2.0 * math.sqrt(self.k_s_variance) else 0.0
+
     def unseen(self, powered_s: float) -> Floats:
         """Variance (6,) that the next minute's biases have by slopes nobody sees: gyro (rad/s)^2, accel (m/s^2)^2.
 
@@ -81,8 +86,9 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
         unseen = self.unseen(powered_s)[:3]
         if unseen.max() <= other_variance[:3].max():
             return ""
-        if self.k_s is not None and abs(self.k_s) > 2.0 * math.sqrt(self.k_s_variance):
-            return f"gyro {name}: its temperature moves by {abs(self.k_s) * 60.0:.1f} K a minute, sigma allows for that"
+        if self.rate_k_s:
+            k_min = abs(self.rate_k_s) * 60.0
+            return f"gyro {name}: its temperature moves by {k_min:.1f} K a minute, sigma allows for that"
         words = f"gyro {name}: on for {_age(powered_s)}, may still be warming, sigma allows for that"
         at_s, sigma = self._better(powered_s, other_variance)
         return words if at_s is None else f"{words}; after {at_s / 60.0:.0f} min about {sigma / DEG_H:.0f} deg/h"

@@ -7,6 +7,9 @@ that the sensor has started with is in all of them.
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections import Counter
 from collections.abc import Sequence
 from typing import Final
 
@@ -19,6 +22,13 @@ MOST_M_S2: Final = 100.0
 """Of a whole bias and of its sigmas: beyond what the worst IMU could have, one with a wrong scale included."""
 NEW_AFTER: Final = 3
 """Power-ups in a row that contradict earlier ones and are no outliers any more: the sensor is another one now."""
+KEEP_POWER_UPS: Final = 48
+KEEP_POINTS: Final = 8
+"""Of a power-up."""
+NEAR_K: Final = 2.0
+"""Temperatures that tell the same."""
+_LATEST: Final = 10
+"""Power-ups that are kept whatever their temperature: a sensor ages."""
 SAME_START_S: Final = 60.0
 """Two power-ups whose beginnings differ by less are one: the wall clock is set in between, by a little."""
 
@@ -64,13 +74,15 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Point(msgspec.Struct, frozen=True, kw_only=True):
-    """One calibration of one IMU."""
+    """One calibration of one IMU, or one still window."""
 
     started_at: str
-    """Of its record."""
+    """Of its record; empty of a still window that nobody calibrated from."""
     unix_s: float
     power_up: PowerUp
     temperature_degc: float | None
+    k_s: float = 0.0
+    """How fast that rose."""
     up: Vector
     """Unit vector in the vehicle's axes: the attitude at which the accelerometers' bias was measured."""
     zero: str | None = None
@@ -114,12 +126,41 @@ def by_power_up(points: Sequence[Point]) -> list[list[Point]]:
     groups: list[list[Point]] = []
     for point in points:
         for group in reversed(groups):
-            if any(point.power_up.is_same(other.power_up) for other in group):
+            if any(point.power_up.is_same(other.power_up) for other in (group[0], group[-1])):
                 group.append(point)
                 break
         else:
             groups.append([point])
     return groups
+
+
+def kept(points: Sequence[Point]) -> tuple[Point, ...]:
+    """What of these points is worth keeping: winter is not forgotten in summer.
+
+    Where there are too many power-ups that one goes whose temperatures the others have told most often, of several the
+    oldest; where one has too many points, its latest and those at the most different temperatures stay.
+    """
+    groups = [_thinned(group) for group in by_power_up(points)]
+    while len(groups) > KEEP_POWER_UPS:
+        told = [{_step(point) for point in group} for group in groups]
+        often = Counter(step for steps in told for step in steps)
+        rarest = [min(often[step] for step in steps) for steps in told[:-_LATEST]]
+        del groups[rarest.index(max(rarest))]
+    return tuple(point for group in groups for point in group)
+
+
+def _thinned(group: Sequence[Point]) -> Sequence[Point]:
+    left = list(group)
+    while len(left) > KEEP_POINTS:
+        # Windows that nobody calibrated from go first, what somebody has decided for last.
+        ranks = [(any(_is_chosen(p, t) for t in ("gyro", "accel")), bool(p.started_at)) for p in left[:-1]]
+        steps = [abs((b.temperature_degc or 0.0) - (a.temperature_degc or 0.0)) for a, b in itertools.pairwise(left)]
+        del left[min(range(len(steps)), key=lambda k: (ranks[k], steps[k]))]
+    return left
+
+
+def _step(point: Point) -> int | None:
+    return None if point.temperature_degc is None else math.floor(point.temperature_degc / NEAR_K)
 
 
 def believed(points: Sequence[Point], triad: Triad) -> list[list[Point]]:

@@ -186,6 +186,7 @@ def points(
             unix_s=unix_s,
             power_up=power_ups[imu.name],
             temperature_degc=imu.temperature_degc,
+            k_s=imu.k_s,
             up=vector(shared.up),
             zero=zero if whole[imu.name][1] is not None else None,
             zero_sigma_rad=shared.zero_sigma_rad,

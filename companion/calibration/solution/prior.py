@@ -181,6 +181,7 @@ class Now(msgspec.Struct, frozen=True, kw_only=True):
     unix_s: float
     power_up: PowerUp
     temperature_degc: float | None
+    k_s: float = 0.0
     up: Vector
     gravity_m_s2: float
     zero: str | None
@@ -214,10 +215,7 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
     curve = fit(
         [
             PowerUpNodes(
-                [
-                    Node(degc=point.temperature_degc or 0.0 if told else 0.0, bias=vector(bias), variance=_stat2(one))
-                    for point, one, bias in zip(group, found, biases, strict=True)
-                ],
+                [_node(point, bias, one, told=told) for point, one, bias in zip(group, found, biases, strict=True)],
                 common_variance=float(np.square(pose).mean()) + zero**2,
             )
             for group, found, (biases, pose), zero in zip(groups, seen, here, zeros, strict=True)
@@ -227,7 +225,7 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
     )
     assert curve is not None
     degc = now.temperature_degc or 0.0
-    value, variance = curve.at(degc) if told else curve.at(0.0)
+    value, variance = curve.at(degc, now.k_s) if told else curve.at(0.0)
     # What one attitude or one place adds to all of them is not averaged away.
     pose = np.array([each.mean(axis=0) for _, each in here])
     shared = [one.sigma_shared for found in seen for one in found]
@@ -282,8 +280,9 @@ def _of(point: Point, triad: Triad) -> Measured:
     return found
 
 
-def _stat2(found: Measured) -> float:
-    return float(np.square(found.sigma_stat).mean())
+def _node(point: Point, bias: Array, found: Measured, *, told: bool) -> Node:
+    degc, k_s = (point.temperature_degc or 0.0, point.k_s) if told else (0.0, 0.0)
+    return Node(degc, vector(bias), float(np.square(found.sigma_stat).mean()), k_s)
 
 
 def _here(

@@ -78,6 +78,8 @@ class ImuSolution:
     covariance: Matrix
     warnings: tuple[str, ...]
     warm_up_variance: Array = dataclasses.field(default_factory=lambda: np.zeros(6))
+    k_s: float = 0.0
+    """How fast its temperature rose."""
     dithered: bool = False
     """The telemetry was seen to follow this IMU's offsets step by step."""
     prior: Prior | None = None
@@ -299,6 +301,7 @@ def _estimate(
         accel_sigma_stat_m_s2=np.array(imu.accel_sigma_stat_m_s2),
         covariance=covariance,
         warm_up_variance=unseen,
+        k_s=0.0 if imu.warming is None else imu.warming.rate_k_s,
         warnings=(*imu.warnings, *untold(imu, asked), *widened(imu, asked, powered_s, np.diag(covariance))),
         dithered=imu.dithered,
     )

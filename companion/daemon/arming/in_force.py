@@ -35,6 +35,7 @@ from companion.component.service import JobResult
 from companion.config.sections import Config, Imu
 from companion.configured import models
 from companion.daemon.arming.offset_watch import OffsetWatch
+from companion.daemon.calibrating.bias_memory import BiasMemory
 from companion.daemon.calibrating.conductor import Conductor
 from companion.daemon.calibrating.held_back import HeldBack, Key
 from companion.daemon.calibrating.solver import Solver
@@ -59,10 +60,12 @@ SETTLED_EVERY_S: Final = 5
 class InForce:
     """The calibration in force; `poll` often, `measure` whenever there may be a new window."""
 
-    def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], conductor: Conductor, solver: Solver) -> None:
+    def __init__(
+        self, core: Core, imus: Mapping[str, AutopilotImu], conductor: Conductor, solver: Solver, memory: BiasMemory
+    ) -> None:
         self._core, self._config, self._conductor = core, core.config, conductor
         config = core.config
-        self._imus, self._solver = imus, solver
+        self._imus, self._solver, self._memory = imus, solver, memory
         wanted = config.calibration
         self._limits = Limits(
             max_age_s=60.0 * wanted.max_age_min, max_temperature_change_k=wanted.max_temperature_change_degc
@@ -298,6 +301,7 @@ class InForce:
             return True
         if known == self._offsets.known():  # else the offsets have changed while it was worked out
             self._note(solution, window.end_s, window.end_s - window.start_s)
+            await self._memory.look(solution)
         return True
 
     def _note(self, solution: Solution, end_s: float, averaged_s: float) -> None:

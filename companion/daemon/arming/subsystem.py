@@ -28,7 +28,7 @@ class Arming(Subsystem):
     def __init__(self, core: Core, devices: Devices, offsets: Offsets, calibrating: Calibrating) -> None:
         self._core, self._store, self._conductor = core, calibrating.store, calibrating.conductor
         # In this order they hear of a calibration's end: who starts the next one asks what is in force.
-        self.in_force = InForce(core, devices.imus, calibrating.conductor, calibrating.solver)
+        self.in_force = InForce(core, devices.imus, calibrating.conductor, calibrating.solver, calibrating.memory)
         self.automatic = Automatic(core, devices.imus, calibrating.conductor, self.in_force)
         self.readiness = Readiness(core, calibrating.conclusion, calibrating.conductor, self.in_force, self.automatic)
         self.armings = Armings(core, self.readiness)

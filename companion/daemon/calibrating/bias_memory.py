@@ -6,8 +6,10 @@ powered all the while, is remembered besides: it says most.
 
 from __future__ import annotations
 
+import asyncio
 import datetime
 import logging
+import math
 import os
 from collections.abc import Mapping, Sequence
 from typing import Final
@@ -18,10 +20,10 @@ import numpy as np
 from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_of
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.align_record import ImuAlignmentRecord
-from companion.calibration.records.history import Point, PowerUp
+from companion.calibration.records.history import Point, PowerUp, kept
 from companion.calibration.records.record import Record, WrittenParameter
 from companion.calibration.solution.doubt import Doubt
-from companion.calibration.solution.joint import Whole, points
+from companion.calibration.solution.joint import Weighed, Whole, points, weigh
 from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, expect, expect_today, pose_effect
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
 from companion.component.statustext import Severity
@@ -30,14 +32,18 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.devices.sensors import SerialSensor
 from companion.daemon.stands.alignment import AlignmentInForce
-from companion.errors import StorageError
+from companion.errors import AutopilotError, StorageError
 from companion.physics.frames import vector
 from companion.samples import Triad
-from companion.storage.learned import KEEP_POINTS, BiasStore, KnownImu, this_boot
+from companion.storage.learned import BiasStore, KnownImu, this_boot
 from companion.storage.records import RecordStore, is_of
 
 logger = logging.getLogger(__name__)
 
+LOOK_K: Final = 1.0
+WRITE_EVERY_S: Final = 300.0
+"""What still windows tell is written so often at most: a power cut costs no more of it."""
+_MUCH_BETTER: Final = 0.7
 _TRIADS: Final[tuple[Triad, Triad]] = ("gyro", "accel")
 _IN_WORDS: Final = {
     "system": "vehicle",
@@ -76,6 +82,7 @@ class BiasMemory:
         self._store = BiasStore(config.storage.path)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], _Reference] = {}
+        self._written_s = -math.inf
         self._host = this_boot() or os.urandom(8).hex()
 
     def load(self) -> None:
@@ -132,6 +139,7 @@ class BiasMemory:
             unix_s=unix_s,
             power_up=self.power_up(name, unix_s),
             temperature_degc=imu.temperature_degc,
+            k_s=imu.k_s,
             up=vector(shared.up),
             gravity_m_s2=shared.gravity_m_s2,
             zero=self._zero(),
@@ -169,10 +177,48 @@ class BiasMemory:
         for name, point in found.items():
             known = self._known.get(name) or KnownImu(identity=self._identity(name))
             # As many as the disk keeps: what is asked must not depend on when the daemon was started.
-            self._known[name] = msgspec.structs.replace(known, points=(*known.points, point)[-KEEP_POINTS:])
+            self._known[name] = msgspec.structs.replace(known, points=kept((*known.points, point)))
             for triad in _TRIADS:
                 self._refer(name, triad, point)
         await self._write()
+
+    async def look(self, solution: Solution) -> None:
+        """Remember what a still window tells that nobody calibrated from: of each kelvin of a power-up the best."""
+        unix_s = datetime.datetime.now(tz=datetime.UTC).timestamp()
+        news = [imu.name for imu in solution.imus if self._tells_more(imu, unix_s)]
+        if not news:
+            return
+        try:
+            whole = self.whole(solution)
+        except AutopilotError:
+            return
+        expectation = await self._offload(self.expectation, solution, unix_s)
+        weighed: Weighed = await self._offload(weigh, solution, whole, expectation)
+        found = self.measured(solution, whole, weighed.doubts, "", unix_s)
+        for name in news:
+            point, known = found[name], self._known.get(name) or KnownImu(identity=self._identity(name))
+            if any(of is not None and of.is_outlier for of in (point.gyro, point.accel)):
+                continue
+            others = [earlier for earlier in known.points if not _is_window_like(earlier, point)]
+            self._known[name] = msgspec.structs.replace(known, points=kept((*others, point)))
+        now_s = asyncio.get_running_loop().time()
+        if now_s - self._written_s >= WRITE_EVERY_S:
+            await self._write()
+
+    def _tells_more(self, imu: ImuSolution, unix_s: float) -> bool:
+        """Whether a window is the first at its temperature since the power came, or much better than that one."""
+        known, power_up = self._known.get(imu.name), self.power_up(imu.name, unix_s)
+        if imu.gyro_rad_s is None or imu.temperature_degc is None:
+            return False
+        if known is None:
+            return True
+        same = [
+            point.gyro
+            for point in known.points
+            if point.gyro is not None and point.power_up.is_same(power_up) and _is_near(point, imu.temperature_degc)
+        ]
+        best = min((max(one.sigma_stat) for one in same), default=math.inf)
+        return known.identity == self._identity(imu.name) and imu.gyro_sigma_stat_rad_s.max() < _MUCH_BETTER * best
 
     async def forget(self, started_at: str) -> None:
         """Forget a calibration that was undone."""
@@ -188,6 +234,7 @@ class BiasMemory:
         await self._write()
 
     async def _write(self) -> None:
+        self._written_s = asyncio.get_running_loop().time()
         try:
             await self._offload(self._store.write, dict(self._known))
         except StorageError as error:
@@ -258,6 +305,16 @@ class BiasMemory:
         if record is None or self._alignment.unused is not None:
             return None
         return next((imu for imu in record.imus if imu.name == name), None)
+
+
+def _is_near(point: Point, degc: float) -> bool:
+    return point.temperature_degc is not None and abs(point.temperature_degc - degc) < LOOK_K
+
+
+def _is_window_like(earlier: Point, now: Point) -> bool:
+    """Whether it is a window that nobody calibrated from, of the same power-up and temperature."""
+    near = now.temperature_degc is not None and _is_near(earlier, now.temperature_degc)
+    return not earlier.started_at and near and earlier.power_up.is_same(now.power_up)
 
 
 def _of_autopilot(calibration: ImuCalibration) -> dict[str, str]:
