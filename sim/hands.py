@@ -83,14 +83,14 @@ class Hands:
     def turn(self, t_s: float, degrees: float) -> float:
         """Turn it on its spot from aircraft time `t_s` on; returns when it stands again."""
         self._turned_deg += degrees
-        return self.back(t_s)
+        return self.back(t_s, degrees)
 
-    def back(self, t_s: float) -> float:
-        """Put it onto its spot as it is turned."""
+    def back(self, t_s: float, turn_deg: float = 0.0) -> float:
+        """Put it onto its spot as it is turned, by about so much."""
         attitude = axis_rotation(2, -math.radians(self._turned_deg)) @ self._spot
         miss = np.radians(self._placement_deg) * self._random.standard_normal(2)
         attitude = axis_rotation(0, miss[0]) @ axis_rotation(1, miss[1]) @ attitude
-        return self._go(t_s, attitude)
+        return self._go(t_s, attitude, turn_deg)
 
     def tilt(self, t_s: float, pitch_deg: float, roll_deg: float) -> float:
         """Prop it up: nose up, right side down, from how it stands on its spot."""
@@ -121,8 +121,8 @@ class Hands:
             self.hold(t_s, math.degrees(math.asin(up[0])), math.degrees(math.atan2(-up[1], -up[2])))
         elif (asked := _TURN.search(words)) is not None:
             self.turn(t_s, float(asked[1]))
-        elif "turn it back onto its first marks" in words:
-            self.turn(t_s, -self._turned_deg)
+        elif "turn it the same way to its first marks" in words:
+            self.turn(t_s, math.copysign(360.0, self._turned_deg) - self._turned_deg)
         elif words.startswith("Place vehicle"):
             self.hold(t_s, *next(SIDES[side] for how, side in _PLACE.items() if how in words))
         else:
@@ -143,11 +143,13 @@ class Hands:
         tipped = axis_rotation(0, -math.radians(roll_deg)) @ axis_rotation(1, -math.radians(pitch_deg))
         self._spot = tipped @ self._spot
 
-    def _go(self, t_s: float, attitude: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> float:
+    def _go(
+        self, t_s: float, attitude: np.ndarray[tuple[int, ...], np.dtype[np.float64]], turn_deg: float = 0.0
+    ) -> float:
         roll, pitch, heading = (math.degrees(angle) for angle in angles_of(attitude))
         before, self._number = self._now, self._number + 1
-        # The short way round, as an arm goes.
-        turn = math.remainder(heading - before.heading_deg, 360.0)
+        # The way that was asked for; else the short one, as an arm goes.
+        turn = turn_deg + math.remainder(heading - before.heading_deg - turn_deg, 360.0)
         self._aircraft.add(
             Turn(
                 start_s=t_s,

@@ -214,7 +214,7 @@ class ImuModel:
         gyro_bias_rad_s, accel_bias_m_s2: bias at aircraft time 0 and reference temperature.
         gyro_scale, accel_scale: relative scale errors of the three axes.
         gyro_misalignment_rad, accel_misalignment_rad: small rotation of the triad.
-        accel_shear: how far x and y, x and z, y and z are from square.
+        gyro_shear, accel_shear: how far x and y, x and z, y and z are from square.
         mounting_deg: roll, pitch, yaw of the sensor's axes seen from the vehicle's (a MAVLink rotation's angles).
         thermometer_off_k: what its own thermometer shows too much.
     """
@@ -231,6 +231,7 @@ class ImuModel:
         accel_scale: Sequence[float] = (0.0, 0.0, 0.0),
         gyro_misalignment_rad: Sequence[float] = (0.0, 0.0, 0.0),
         accel_misalignment_rad: Sequence[float] = (0.0, 0.0, 0.0),
+        gyro_shear: Sequence[float] = (0.0, 0.0, 0.0),
         accel_shear: Sequence[float] = (0.0, 0.0, 0.0),
         mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
         thermometer_off_k: float = 0.0,
@@ -251,7 +252,7 @@ class ImuModel:
         self._noise = np.empty((0, 6))
         self._seen: Truth | None = None
         self._ideal = np.zeros(6)
-        self._gyro_matrix = _response(gyro_scale, gyro_misalignment_rad) @ self.mounting.T
+        self._gyro_matrix = _response(gyro_scale, gyro_misalignment_rad, gyro_shear) @ self.mounting.T
         self._accel_matrix = _response(accel_scale, accel_misalignment_rad, accel_shear) @ self.mounting.T
 
     def turn_on(self, gyro_bias_rad_s: Sequence[float] | Array, accel_bias_m_s2: Sequence[float] | Array) -> None:

@@ -69,7 +69,9 @@ def residual_mg(rig: Rig, record: TurnRecord) -> Any:
     return true_mg(rig) - np.array(before) / MG
 
 
-@pytest.mark.parametrize(("headings", "pose"), [(4, STEEP), (2, FLAT)], ids=["four on 5 deg", "half a turn"])
+@pytest.mark.parametrize(
+    ("headings", "pose"), [(4, STEEP), (2, STEEP), (2, FLAT)], ids=["four", "half a turn", "half, flat"]
+)
 def test_the_level_is_found_on_a_slope_and_written(tmp_path: Path, headings: int, pose: Pose) -> None:
     made, hands = rig(tmp_path, pose)
 
@@ -88,7 +90,9 @@ def test_the_level_is_found_on_a_slope_and_written(tmp_path: Path, headings: int
             assert record.slope_deg == pytest.approx(float(np.hypot(pose.pitch_deg, pose.roll_deg)), abs=0.06)
             (imu,) = record.imus
             sigma = np.array(imu.level_sigma_mg)[:2]
-            assert sigma.max() < 1.15 * TARGET_MG
+            # How the board leans across the slope is left open by half a turn.
+            assert sigma.max() < (1.5 if (headings, pose) == (2, STEEP) else 1.15) * TARGET_MG
+            assert not any("the same way" in warning for warning in record.warnings)
             off = np.abs(np.subtract(imu.level_bias_mg, residual_mg(made, record)))[:2]
             assert (off < 2.5 * sigma).all()
             assert {one.outcome for one in imu.written.values()} == {"verified"}
@@ -102,18 +106,22 @@ def test_the_level_is_found_on_a_slope_and_written(tmp_path: Path, headings: int
     run_virtual(main())
 
 
-def test_half_a_turn_on_a_steep_slope_says_how_little_it_knows(tmp_path: Path) -> None:
+def test_half_a_turn_and_back_on_a_steep_slope_says_how_little_it_knows(tmp_path: Path) -> None:
+    """The gyros' scale stays open."""
     made, hands = rig(tmp_path, STEEP)
 
     async def main() -> None:
         async with made.running():
             await made.ready()
             job = turn(made, 2, write=False)
-            result = await follow(made, hands, job)
+            for number, degrees in ((2, 180.0), (3, -180.0)):
+                await made.until(lambda: job.words.startswith(f"{number} of"), 60.0)  # noqa: B023
+                hands.turn(made.aircraft.time_at(made.now_s), degrees)
+            result = await job.finished
             assert result.outcome == "done", result
             record = job.product
             assert isinstance(record, TurnRecord)
-            assert "four headings" in record.warnings[-1]
+            assert "turn it the same way both times" in record.warnings[-1]
             (imu,) = record.imus
             assert max(imu.level_sigma_mg[:2]) > 0.5
             off = np.abs(np.subtract(imu.level_bias_mg, residual_mg(made, record)))[:2]

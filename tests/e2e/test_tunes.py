@@ -43,7 +43,7 @@ def test_a_turn_is_heard_step_by_step(tmp_path: Path) -> None:
                 "2 of 3: turn it by 180 degrees, onto its marks",
                 "Hold still",
                 "90 degrees, not 180: turn it by 90 degrees more",
-                "3 of 3: turn it back onto its first marks",
+                "3 of 3: turn it the same way to its first marks",
                 "Hold still",
                 "Turn on the spot done",
             ]

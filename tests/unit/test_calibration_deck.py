@@ -10,7 +10,7 @@ import pytest
 from companion.calibration.deck.deck import Deck
 from companion.calibration.deck.estimate import DeckFound
 from companion.calibration.deck.fluid import Fluid, Level, readings_deg
-from companion.calibration.deck.passage import passage, rotations, running_products
+from companion.calibration.deck.passage import passage
 from companion.calibration.deck.stream import Surroundings
 from companion.calibration.deck.waves import Wander, Waves, fit_waves, whitened
 from companion.calibration.means.pose import CompassModel, GradienterModel
@@ -18,6 +18,7 @@ from companion.calibration.means.windows import ImuInput
 from companion.calibration.noise.allan import PROFILES
 from companion.calibration.seconds.batch import summary
 from companion.errors import CalibrationRefusedError
+from companion.physics.frames import rotations, running_products
 from companion.physics.gradienter import Law, readings_from_up
 from sim.accuracy.deck import Voyage, feed, sail
 from sim.aircraft import Pose, Site, VirtualAircraft

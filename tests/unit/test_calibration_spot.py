@@ -68,8 +68,9 @@ def on_spot(
             t_s = hands.turn(t_s, heading - headings_deg[k - 1])
         read = imu.expected(t_s + 1.0)
         means = ImuStand("fc", read[3:], np.full(3, SIGMA), read[:3], np.full(3, 5.0 * DEG_H))
-        sigma_deg = 0.5 if k else 0.01
-        stands.append(Stand((means,), None, (1.0, 1.0), heading * counted * DEG, sigma_deg * DEG, on_spot=True))
+        sigma_rad = (0.15 if k else 0.01) * DEG
+        turned_rad = heading * counted * DEG
+        stands.append(Stand((means,), None, (1.0, 1.0), turned_rad, sigma_rad, on_spot=True, counted=k > 0))
     return stands
 
 
@@ -92,22 +93,41 @@ def test_level_bias_and_slope_are_found_on_any_slope(
     found = solved(on_spot(slope_deg, headings))
     assert found.complaint is None
     assert found.checked
-    # What the priors of bias and board leave of it is far below what marks can do.
-    np.testing.assert_allclose(found.imus[0].level_bias_m_s2[:2] / MG, level_bias()[:2] / MG, atol=0.05)
+    # What the priors of bias and board leave of it is far below what marks can do; they alone, with half a turn, share
+    # what the cosine of the slope takes of bias and lean.
+    atol = 0.05 if headings == QUARTERS else 0.07
+    np.testing.assert_allclose(found.imus[0].level_bias_m_s2[:2] / MG, level_bias()[:2] / MG, atol=atol)
     steepest = math.degrees(math.acos(math.cos(slope_deg[0] * DEG) * math.cos(slope_deg[1] * DEG)))
     assert found.slope_deg == pytest.approx(steepest, abs=0.03)
     sigma = np.sqrt(np.diag(found.imus[0].level_covariance_m2_s4))[:2] / MG
-    assert sigma.max() < (0.26 if headings == QUARTERS or max(map(abs, slope_deg)) < 1.0 else 0.75)
+    # Two headings leave it open how the board leans across the slope (3 deg, one sigma): 0.18 mg more.
+    assert sigma.max() < (0.26 if headings == QUARTERS or max(map(abs, slope_deg)) < 1.0 else 0.31)
 
 
-def test_a_gyro_that_counts_a_turn_wrong_costs_quarters_little_and_is_in_the_sigma_of_half_a_turn() -> None:
+@pytest.mark.parametrize("way", [1.0, -1.0], ids=["clockwise", "anticlockwise"])
+def test_a_whole_circle_tells_how_wrong_a_gyro_counts(way: float) -> None:
     """1.5 % of half a turn is 2.7 deg: 2 mg on 5 deg of slope, if it were believed."""
     for headings in (HALF, QUARTERS):
-        imu = solved(on_spot((5.0, 0.0), headings, counted=1.015)).imus[0]
-        off = np.abs(imu.level_bias_m_s2 - level_bias())[:2]
-        sigma = np.sqrt(np.diag(imu.level_covariance_m2_s4))[:2]
-        assert (off < 2.0 * sigma).all()
-        assert off.max() / MG < (0.05 if headings == QUARTERS else 1.5)
+        imu = solved(on_spot((5.0, 0.0), tuple(way * each for each in headings), counted=1.015)).imus[0]
+        assert np.abs(imu.level_bias_m_s2 - level_bias())[:2].max() / MG < 0.05
+
+
+def test_half_a_turn_and_back_leaves_the_gyros_scale_open_and_the_sigma_says_so() -> None:
+    imu = solved(on_spot((5.0, 0.0), (0.0, 180.0, 0.0), counted=1.015)).imus[0]
+    off = np.abs(imu.level_bias_m_s2 - level_bias())[:2]
+    sigma = np.sqrt(np.diag(imu.level_covariance_m2_s4))[:2]
+    assert (off < 2.0 * sigma).all()
+    assert sigma.max() > 0.7 * MG
+
+
+def test_a_turn_that_the_stands_contradict_is_named() -> None:
+    stands = on_spot((5.0, 0.0), QUARTERS)
+    for k in (2, 3):
+        stands[k] = dataclasses.replace(stands[k], heading_rad=stands[k].heading_rad + 12.0 * DEG)
+    found = solved(stands)
+    assert found.complaint is not None
+    said = in_words(found.complaint, gradienter=False)
+    assert said.startswith("stand 3: it was not turned as the gyros say, off by 12 deg")
 
 
 @pytest.mark.parametrize("headings", [HALF, QUARTERS], ids=["half", "quarters"])
@@ -169,7 +189,7 @@ def test_the_covariance_of_the_tilt_is_that_of_what_it_is_made_of() -> None:
 
 
 def test_priors_hold_boards_that_were_put_in_by_eye() -> None:
-    assert ALONE.misalignment_deg >= 5.0
+    assert ALONE.misalignment_deg >= 3.0
     tilted = solved(on_spot((2.0, 1.0), QUARTERS))
     assert tilted.imus[0].misalignment_rad.sigma.max() > 1.0 * DEG, "a spot does not tell a bias from a tilted board"
 
@@ -204,7 +224,7 @@ def test_hands_follow_what_is_asked_for(words: str, force_g: tuple[float, ...]) 
     np.testing.assert_allclose(aircraft.truth_at(10.0).force_m_s2, np.multiply(force_g, G), atol=1e-9)
     assert not hands.follow("2 of 12: measuring, 3 of 12 s, hands off", 10.0)
     assert hands.follow("1 of 5: 100 degrees, not 180: turn it by 80 degrees more", 10.0)
-    assert hands.follow("3 of 3: 2 done. Now turn it back onto its first marks", 20.0)
+    assert hands.follow("3 of 3: 2 done. Now turn it the same way to its first marks", 20.0)
     assert aircraft.pose_at(30.0).heading_deg == pytest.approx(40.0)
     assert aircraft.pose_at(30.0).pitch_deg == pytest.approx(1.0)
 

@@ -44,23 +44,22 @@ def test_every_second_of_the_window_has_the_verdict_of_every_source() -> None:
     assert all(words is None for one in trace.verdicts for words in one.words)
 
 
-def test_rates_are_in_the_vehicles_axes_second_by_second() -> None:
+def test_a_turn_is_counted_in_the_vehicles_axes_and_not_through_a_hole() -> None:
     feed = _feeder()
-    feed.run(12.0)
-    rates = feed.collector.snapshot(1004.0, None).rates_rad_s("own")
-    assert list(rates) == list(range(1004, 1012))
+    feed.run(3.0)
+    feed.collector.count_turns(wanted=True)
+    feed.run(8.3)
     x, y, z = BIAS
-    for rate in rates.values():
-        assert rate == pytest.approx([-y, x, z], abs=6.0 * GYRO_NOISE / math.sqrt(RATE_HZ))
-
-
-def test_a_second_with_a_hole_tells_no_rate() -> None:
-    feed = _feeder()
-    feed.run(5.3)
-    feed.now_s += 0.15  # of 1005, though its other 85 samples are there
+    counted = feed.collector.counted("own", 1005.0, 1010.0, np.array([-y, x, z - 0.2]))
+    assert counted is not None
+    assert counted.angle_rad == pytest.approx(1.0, abs=0.4 / RATE_HZ + 6.0 * GYRO_NOISE * math.sqrt(5.0 / RATE_HZ))
+    assert feed.collector.counted("own", 1002.0, 1010.0, np.zeros(3)) is None, "nothing was kept before"
+    feed.now_s += 0.15  # of 1011, though its other 85 samples are there
     feed.run(6.0)
-    rates = feed.collector.snapshot(1003.0, None).rates_rad_s("own")
-    assert list(rates) == [1003, 1004, *range(1006, 1011)]
+    assert feed.collector.counted("own", 1012.0, 1016.0, np.zeros(3)) is not None
+    assert feed.collector.counted("own", 1010.0, 1016.0, np.zeros(3)) is None
+    feed.collector.count_turns(wanted=False)
+    assert feed.collector.counted("own", 1012.0, 1016.0, np.zeros(3)) is None
 
 
 def test_a_movement_is_kept_in_the_words_of_its_gate_although_the_stretch_is_forgotten() -> None:

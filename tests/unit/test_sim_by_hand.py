@@ -71,10 +71,11 @@ def test_the_firmwares_put_the_slope_into_the_level(runs: list[HandRun]) -> None
     np.testing.assert_allclose(found, 5.0, atol=0.3)
 
 
-def test_half_a_turn_on_a_steep_slope_is_as_good_as_its_sigma_says_and_no_better(runs: list[HandRun]) -> None:
-    """A degree of turn costs 0.76 mg there; quarters tell their angles themselves."""
+def test_half_a_turn_on_a_steep_slope_is_nearly_as_good_as_four(runs: list[HandRun]) -> None:
+    """A degree of turn costs 0.76 mg there: it is known to a fifth of one, once the circle is closed."""
     sigma = np.array([run.turn_sigma for run in runs]).mean(axis=(0, 2)) / MG
     by = dict(zip(TURNS, sigma, strict=True))
-    assert by[2, 5.0] > 1.4 * by[4, 5.0]
+    assert by[2, 5.0] < 1.6 * by[4, 5.0]
     assert by[2, 0.5] < 0.25
-    assert rms(np.array([run.turn[5] for run in runs])).value / MG < 0.35
+    row = TURNS.index((2, 5.0))
+    assert rms(np.array([run.turn[row] for run in runs])).value / MG < 0.35

@@ -26,7 +26,7 @@ from companion.physics.gradienter import Law, up_in_sensor
 from companion.physics.units import DEG, MG
 
 MAX_ROUNDS: Final = 30
-_CONVERGED: Final = 1e-6
+_CONVERGED: Final = 1e-4
 """Of the prior sigma of each parameter."""
 W_LIMIT: Final = 4.5
 """|w| of one residual: passed by chance once in some thousand alignments of a hundred readings."""
@@ -159,6 +159,8 @@ def in_words(complaint: Complaint, *, gradienter: bool = True) -> str:
         )
     if row.group == "compass":
         return f"stand {row.stand}: the heading is off by {size / DEG:.0f} deg ({by}): iron near by? Begin again"
+    if row.group == "turn":
+        return f"stand {row.stand}: it was not turned as the gyros say, off by {size / DEG:.0f} deg ({by}): begin again"
     if row.group == "zero":
         return (
             f"the gradienter's zero would be off by {size / DEG:.1f} deg, more than can be ({by}): does the aircraft"
@@ -245,7 +247,7 @@ def _units(model: Model, row: Row) -> float:
     if row.stand == 0:
         return 1.0
     stand = model.stands[row.stand - 1]
-    if row.group == "compass":
+    if row.group in ("compass", "turn"):
         return stand.heading_sigma_rad
     if row.group == "gradienter":
         return math.hypot(*stand.tilt_sigma_deg) / math.sqrt(2.0) * DEG

@@ -11,6 +11,7 @@ turned about the vertical):
     accelerometer  f = (I + S) exp(-[m x]) g u + b                      S: scale on the diagonal, shear beside it
     gyro           w = C_k W + b_w
     compass        heading of C_k
+    turn           of C_k since the stand before, about the vehicle's z axis, (1 + s) times      s: a gyro's scale
     spot           down of the vehicle, seen from the ground, is the normal of the spot: C_k^T z = n + placement
 
 The last line is the level reversal (method section 3, "two headings"): the spot's true tilt is the same in the
@@ -28,15 +29,16 @@ from typing import Final, Literal
 
 import numpy as np
 
-from companion.physics.frames import Array, Matrix, skew
+from companion.physics.frames import Array, Matrix, rotations, skew, skews
 from companion.physics.gradienter import Law, readings_from_up, up_jacobian
 from companion.physics.units import DEG, MG
 
 DOWN: Final = np.array([0.0, 0.0, 1.0])
-Group = Literal["gradienter", "accelerometer", "gyro", "compass", "spot", "zero", "prior", "nothing"]
+Group = Literal["gradienter", "accelerometer", "gyro", "compass", "turn", "spot", "zero", "prior", "nothing"]
 
 _SHEAR: Final = np.array([[[0, 1, 0], [1, 0, 0], [0, 0, 0]], [[0, 0, 1], [0, 0, 0], [1, 0, 0]],
                           [[0, 0, 0], [0, 0, 1], [0, 1, 0]]], dtype=np.float64)  # fmt: skip
+_AXES: Final = skews(np.eye(3))
 _ANYHOW_RAD: Final = 1.0
 """Sigma about the first guess of what only the readings determine: it keeps the equations solvable."""
 
@@ -56,8 +58,7 @@ class ImuStand:
 class Stand:
     """One still window.
 
-    `heading_rad` counts from the same north in all stands, which need not be the true one. Counted by a gyro, it is
-    not wrapped: then it tells by how much the gyro has turned since the first stand (`Priors.turn_scale`).
+    `heading_rad` counts from the same north in all stands, which need not be the true one.
     """
 
     imus: tuple[ImuStand, ...]
@@ -68,6 +69,9 @@ class Stand:
     heading_sigma_rad: float
     on_spot: bool
     """On the one spot on which the aircraft was turned."""
+    counted: bool = False
+    """The heading is that of the stand before and what the gyros counted since (`seconds.counting`), not wrapped; its
+    sigma is that of this turn, but for the gyros' scale (`Priors.turn_scale`)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -93,8 +97,8 @@ class Priors:
     misalignment_deg: float = 1.0
     accel_bias_m_s2: float = 30.0 * MG
     gyro_bias_rad_s: float = 5.0 * DEG
-    turn_scale: float = 0.0
-    """Of a gyro by which all headings were counted, the same in all of them."""
+    turn_scale: float = 0.01
+    """Of the gyros that count turns, the same in all of them."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -229,7 +233,10 @@ class Model:
             for i, imu in enumerate(stand.imus):
                 self._accelerometer(rows, at, (k, i), imu, up)
                 self._gyro(rows, at, (k, i), imu)
-            self._heading(rows, at, k)
+            if stand.counted:
+                self._turn(rows, at, k)
+            else:
+                self._heading(rows, at, k)
             if stand.on_spot:
                 placement = np.full(2, self.priors.placement_deg * DEG)
                 by = rows.add(Row("spot", k + 1), at.spot - (attitude.T @ DOWN)[:2], placement)
@@ -252,11 +259,20 @@ class Model:
         forward = attitude.T[:, 0]
         turn = attitude.T @ -skew(np.array([1.0, 0.0, 0.0]))
         across = forward[0] ** 2 + forward[1] ** 2
-        counted = stand.heading_rad * (1.0 - at.turn_scale)
-        off = math.remainder(counted - math.atan2(forward[1], forward[0]), 2.0 * math.pi)
+        off = math.remainder(stand.heading_rad - math.atan2(forward[1], forward[0]), 2.0 * math.pi)
         by = rows.add(Row("compass", k + 1), np.array([off]), np.array([stand.heading_sigma_rad]))
         by[:, self.pose(k)] = (forward[0] * turn[1] - forward[1] * turn[0]) / max(across, 1e-6)
-        by[:, self.turn] = stand.heading_rad
+
+    def _turn(self, rows: _Rows, at: Unknowns, k: int) -> None:
+        counted = self.stands[k].heading_rad - self.stands[k - 1].heading_rad
+        turned = at.attitudes[k] @ at.attitudes[k - 1].T
+        sine, cosine = turned[0, 1] - turned[1, 0], turned[0, 0] + turned[1, 1]
+        off = math.remainder(counted * (1.0 - at.turn_scale) - math.atan2(sine, cosine), 2.0 * math.pi)
+        by = rows.add(Row("turn", k + 1), np.array([off]), np.array([self.stands[k].heading_sigma_rad]))
+        for stand, changes in ((k, -_AXES @ turned), (k - 1, turned @ _AXES)):
+            across = cosine * (changes[:, 0, 1] - changes[:, 1, 0]) - sine * (changes[:, 0, 0] + changes[:, 1, 1])
+            by[:, self.pose(stand)] = across / max(sine**2 + cosine**2, 1e-6)
+        by[:, self.turn] = counted
 
     def _gradienter(self, rows: _Rows, at: Unknowns, k: int, up: Array) -> None:
         stand = self.stands[k]
@@ -336,12 +352,7 @@ def _response(at: Unknowns, imu: int) -> Matrix:
 
 
 def _turned(vector_rad: Array) -> Matrix:
-    """Rodrigues: the rotation exp([v x])."""
-    angle = float(np.linalg.norm(vector_rad))
-    cross = skew(vector_rad)
-    if angle < 1e-8:
-        return np.eye(3) + cross
-    return np.asarray(np.eye(3) + math.sin(angle) / angle * cross + (1.0 - math.cos(angle)) / angle**2 * cross @ cross)
+    return np.asarray(rotations(vector_rad[None])[0])
 
 
 def _jacobian(vector_rad: Array) -> Matrix:

@@ -31,10 +31,8 @@ from companion.calibration.alignment.faces import (
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, roll_pitch_from_up
 
-ALONE: Final = Priors(
-    scale=PRIOR_SCALE, shear=PRIOR_SHEAR, misalignment_deg=5.0, accel_bias_m_s2=PRIOR_BIAS_M_S2, turn_scale=0.01
-)
-"""Of accelerometers that nobody has calibrated, on a board that was put in by eye, and of a gyro that counts turns."""
+ALONE: Final = Priors(scale=PRIOR_SCALE, shear=PRIOR_SHEAR, misalignment_deg=3.0, accel_bias_m_s2=PRIOR_BIAS_M_S2)
+"""Of accelerometers that nobody has calibrated, on a board that was put in by eye."""
 
 
 def turned(stands: Sequence[Stand], ground: Ground, priors: Priors = ALONE) -> Alignment:
@@ -43,7 +41,7 @@ def turned(stands: Sequence[Stand], ground: Ground, priors: Priors = ALONE) -> A
     Args:
         stands: on one spot, without a gradienter's readings.
         ground: gravity and the Earth's rate.
-        priors: `turn_scale` 0 where headings come from a compass.
+        priors: what was known before.
 
     Raises:
         CalibrationRefusedError: the readings cannot belong together.

@@ -15,10 +15,12 @@ from companion.calibration.deck.deck import Deck
 from companion.calibration.means.pose import CompassModel, FieldHeading, GradienterModel
 from companion.calibration.means.windows import ImuInput, integer_steps
 from companion.calibration.seconds.batch import Batch, BatchSource
+from companion.calibration.seconds.counting import Counted, TurnCounter
 from companion.calibration.stillness.gates import STILL, ImuGate, PoseGate, Verdict
 from companion.calibration.stillness.stretch import Lag, Settling
 from companion.calibration.turning.level import ImuKind
 from companion.calibration.turning.watch import Turn, TurnWatch
+from companion.physics.frames import Array
 from companion.samples import CompassSample, ImuSample, MagSample, TiltSample
 
 Kind = Literal["imu", "gradienter", "compass"]
@@ -168,6 +170,8 @@ class Intake(ABC):
         """By IMU whose device tells: a time, and for how long it had been on by then."""
         self._field = None if field_by is None else FieldHeading(*field_by, keep)
         self._turns = TurnWatch(span)
+        self._counters: dict[str, TurnCounter] = {}
+        """By IMU, while turns on a spot are counted."""
 
     @abstractmethod
     def _evaluate(self) -> None:
@@ -192,6 +196,8 @@ class Intake(ABC):
             self._breaks[name] = sample.breaks
             self._restarted_s[name] = sample.t_s
             self._forget(name)
+        if name in self._counters:
+            self._counters[name].add(sample)
         stamp = sample.sequence if sample.sequence is not None else sample.t_device_s
         row = sample.gyro_rad_s + sample.accel_m_s2
         if source.batches.add(sample.t_s, row, sample.temperature_degc, stamp):
@@ -296,6 +302,15 @@ class Intake(ABC):
     def up_s(self, name: str) -> float | None:
         """For how long the device of an IMU had been on when that was heard last; None where it does not tell."""
         return self._up[name][1] if name in self._up else None
+
+    def count_turns(self, *, wanted: bool) -> None:
+        """Begin to keep what turns on a spot are counted by, or stop it."""
+        self._counters = {name: TurnCounter() for name in self._imus} if wanted else {}
+
+    def counted(self, imu: str, start_s: float, end_s: float, bias_rad_s: Array) -> Counted | None:
+        """`TurnCounter.counted` of an IMU; None where nothing was kept of it."""
+        counter = self._counters.get(imu)
+        return None if counter is None else counter.counted(start_s, end_s, bias_rad_s, self._inputs[imu].rotation)
 
     @property
     def turn(self) -> Turn:

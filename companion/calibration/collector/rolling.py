@@ -245,7 +245,7 @@ class RollingCollector(Intake):
 
     def snapshot(self, started_s: float, measured_s: tuple[float, float] | None) -> Snapshot:
         """What was seen since `started_s`, or since the window `measured_s` (start, end) began; cheap."""
-        return self._trace.snapshot(self._inputs, started_s, measured_s)
+        return self._trace.snapshot(started_s, measured_s)
 
     # ------------------------------------------------------------------------------------------------- inside
 

@@ -8,18 +8,15 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import msgspec
-import numpy as np
 
 from companion import formats
 from companion.calibration.collector.intake import Kind, Source
-from companion.calibration.means.windows import ImuInput
 from companion.calibration.seconds.batch import Batch
 from companion.calibration.stillness.gates import Verdict
-from companion.physics.frames import Floats
 
 FORMAT_VERSION: Final = 2
 """Of 1 it leaves out the noise of each IMU."""
@@ -27,9 +24,6 @@ FORMAT_VERSION: Final = 2
 MAX_SECONDS: Final = 600
 """Kept; the oldest go first. Ten times the longest usual window;
 some 1 MB in memory, 100 kB on disk with three IMUs."""
-
-HOLE_S: Final = 0.05
-"""Beyond the stream's interval: an aircraft that hands turn by 60 deg/s turns by 3 degrees meanwhile."""
 
 MAX_WORDS: Final = 100
 _FARTHEST: Final = 100_000_000
@@ -101,7 +95,6 @@ class Snapshot(msgspec.Struct, frozen=True):
     """The seconds of one calibration, not packed yet; `trace` may run in another thread."""
 
     seconds: tuple[tuple[int, bool, tuple[_Seen, ...]], ...]
-    inputs: Mapping[str, ImuInput]
     started_s: float
     measured_s: tuple[float, float] | None
     cut: bool
@@ -134,17 +127,6 @@ class Snapshot(msgspec.Struct, frozen=True):
             ),
         )
 
-    def rates_rad_s(self, imu: str) -> dict[int, Floats]:
-        """By second without a hole, the mean rate that an IMU has read, (3,) in the vehicle's axes."""
-        rotation = np.asarray(self.inputs[imu].rotation)
-        return {
-            slot: rotation @ one.batch.mean[:3]
-            for slot, _, seen in self.seconds
-            for one in seen
-            if one.kind == "imu" and one.name == imu and one.batch is not None
-            if one.batch.largest_gap_s < 1.0 / one.batch.n + HOLE_S
-        }
-
 
 class TraceLog:
     """The latest seconds as they were judged, whatever became of them."""
@@ -160,16 +142,14 @@ class TraceLog:
         seen = (_Seen(each.kind, each.name, each.verdict, each.batches.batches.get(slot)) for each in sources)
         self._seconds.append((slot, good, tuple(seen)))
 
-    def snapshot(
-        self, inputs: Mapping[str, ImuInput], started_s: float, measured_s: tuple[float, float] | None
-    ) -> Snapshot:
+    def snapshot(self, started_s: float, measured_s: tuple[float, float] | None) -> Snapshot:
         """Everything since a calibration was asked for, or since its window began where that was earlier."""
         since_s = min(started_s, measured_s[0]) if measured_s is not None else started_s
         first = math.floor(since_s)
         full = len(self._seconds) == self._seconds.maxlen
         cut = full and self._seconds[0][0] > first
         kept = tuple(second for second in self._seconds if second[0] >= first)
-        return Snapshot(kept, dict(inputs), started_s, measured_s, cut)
+        return Snapshot(kept, started_s, measured_s, cut)
 
 
 def _words(seen: _Seen | None) -> str | None:

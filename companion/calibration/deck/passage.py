@@ -10,7 +10,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from companion.physics.frames import Floats, Matrix
+from companion.physics.frames import Floats, Matrix, rotations, running_products, skews
 
 
 class Passage(msgspec.Struct, frozen=True):
@@ -25,36 +25,6 @@ class Passage(msgspec.Struct, frozen=True):
     """(3,) integral of the specific force in the axes of the start."""
     velocity_by_bias: Matrix
     """(3, 3) d velocity / d (gyro bias): m/s per rad/s."""
-
-
-def rotations(vectors: Floats) -> Floats:
-    """(n, 3, 3) matrices of rotation vectors (n, 3) in rad (Rodrigues)."""
-    angle2 = np.einsum("ni,ni->n", vectors, vectors)
-    angle = np.sqrt(angle2)
-    small = angle < 1e-4
-    divisor = np.where(small, 1.0, angle)
-    sine = np.where(small, 1.0 - angle2 / 6.0, np.sin(angle) / divisor)
-    cosine = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(angle)) / np.square(divisor))
-    cross = skews(vectors)
-    return np.asarray(np.eye(3) + sine[:, None, None] * cross + cosine[:, None, None] * (cross @ cross))
-
-
-def skews(vectors: Floats) -> Floats:
-    """(n, 3, 3) cross-product matrices of (n, 3)."""
-    found = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors.T
-    found[:, 0, 1], found[:, 0, 2], found[:, 1, 2] = -z, y, -x
-    found[:, 1, 0], found[:, 2, 0], found[:, 2, 1] = z, -y, x
-    return found
-
-
-def running_products(turns: Floats) -> Floats:
-    """(n, 3, 3): the first, the first two, ... of (n, 3, 3) multiplied, in a few calls (Hillis and Steele's scan)."""
-    found, step = turns.copy(), 1
-    while step < len(found):
-        found[step:] = found[:-step] @ found[step:]
-        step *= 2
-    return found
 
 
 def passage(times_s: Floats, rates_rad_s: Floats, forces_m_s2: Floats) -> Passage:

@@ -20,9 +20,9 @@ from typing import Final
 
 import numpy as np
 
-from companion.calibration.deck.passage import Passage, rotations, running_products
+from companion.calibration.deck.passage import Passage
 from companion.calibration.deck.waves import Wander, Waves, fit_waves, whitened
-from companion.physics.frames import Array, Floats, Matrix
+from companion.physics.frames import Array, Floats, Matrix, rotations, running_products
 
 EARTH_RATE_NORTH_RAD_S: Final = 5.2e-5
 """W cos L halfway between the equator and 65 degrees: what is left of it, once the latitude is known, is linear."""

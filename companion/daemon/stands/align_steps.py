@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 
-from companion.calibration.means.windows import Window
 from companion.calibration.records.align_record import Kind
 from companion.physics.frames import Array
 from companion.physics.units import DEG
@@ -45,7 +44,7 @@ class Plan:
 
     kind: Kind
     headings: int = 2
-    """2: there, turned by 180 degrees, and back; 4: every quarter turn."""
+    """2: there, turned by 180 degrees, and on to the first; 4: every quarter turn."""
     back: bool = False
     """Of quarter turns: on to the first heading again, as a check."""
 
@@ -92,7 +91,7 @@ def request(plan: Plan, taken: Sequence[Seen]) -> str:
         return "turn it by 90 degrees on its spot"
     if number == 1:
         return "turn it by 180 degrees, onto its marks"
-    return "turn it back onto its first marks"
+    return "turn it the same way to its first marks"
 
 
 def hold(plan: Plan, taken: Sequence[Seen]) -> Hold:
@@ -103,7 +102,14 @@ def hold(plan: Plan, taken: Sequence[Seen]) -> Hold:
     if number >= plan.on_spot:
         done = {_side(taken[0].up, seen.up) for seen in taken[plan.on_spot :]}
         return Hold(next((up for side, up in _TILTED.items() if side not in done), LEVEL))
-    return Hold(LEVEL, QUARTER_DEG if plan.on_spot >= HEADINGS else 180.0)
+    return Hold(LEVEL, asked_turn_deg(plan, number))
+
+
+def asked_turn_deg(plan: Plan, number: int) -> float:
+    """By how much it is to be turned after so many stands."""
+    if number >= plan.on_spot:  # a tilt
+        return 0.0
+    return QUARTER_DEG if plan.on_spot >= HEADINGS else 180.0
 
 
 def objection(plan: Plan, taken: Sequence[Seen], now: Seen) -> str | None:
@@ -160,39 +166,3 @@ def _side(level: Array, up: Array) -> str:
 
 def _wrapped(angle_deg: float) -> float:
     return (angle_deg + 180.0) % 360.0 - 180.0
-
-
-def heading_by_gyros(
-    plan: Plan, taken: Sequence[Seen], rates_rad_s: Mapping[int, Array], before: Window, now: Window
-) -> tuple[float, bool]:
-    """How it heads after another turn, in degrees, and whether that was counted: else it is as was asked.
-
-    Counted are the first IMU's means of seconds about down since the stand before, less its bias. One that is missing,
-    as when the autopilot restarts, is armed, or its link stutters, may hold any part of the turn.
-
-    Args:
-        plan: what was asked for.
-        taken: the stands before, at least one.
-        rates_rad_s: by second without a hole, (3,) in the vehicle's axes.
-        before: the last stand's.
-        now: this stand's.
-    """
-    between = range(math.ceil(before.end_s), math.floor(now.start_s))
-    if not all(second in rates_rad_s for second in between):
-        return _as_asked_deg(plan, taken), False
-    bias = (before.imus[0].gyro_rad_s[2] + now.imus[0].gyro_rad_s[2]) / 2.0
-    rates = [float(rate[2]) for second, rate in rates_rad_s.items() if second < now.start_s]
-    return taken[-1].heading_deg + turned_deg(rates, bias), True
-
-
-def _as_asked_deg(plan: Plan, taken: Sequence[Seen]) -> float:
-    if len(taken) >= plan.on_spot:  # a tilt
-        return taken[-1].heading_deg
-    if plan.on_spot >= HEADINGS:
-        return taken[-1].heading_deg + QUARTER_DEG
-    return taken[0].heading_deg + (180.0 if len(taken) == 1 else 0.0)
-
-
-def turned_deg(rates_down_rad_s: Sequence[float], bias_rad_s: float) -> float:
-    """By how much the aircraft was turned, clockwise, from mean rates about down, one a second."""
-    return float(np.sum(np.asarray(rates_down_rad_s) - bias_rad_s)) / DEG

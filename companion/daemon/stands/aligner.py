@@ -32,19 +32,19 @@ from companion.physics.units import DEG
 
 READING_SIGMA_DEG: Final = 0.005
 """What one mean of a gradienter is good for besides its zero (the gradienter noise of method section 3's table)."""
-GYRO_TURN_SIGMA_DEG: Final = 3.0
-"""Sigma of a half turn by the gyros alone: scale errors of 1 %, and an axis that is not vertical."""
 SLOPE_WARNING_DEG: Final = 1.5
 OFFSET_WARNING_SIGMAS: Final = 4.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Taken:
-    """One stand, measured; its heading counts from the compass' own north."""
+    """One stand, measured; its heading counts from the compass' own north, else from the first stand."""
 
     window: Window
     seen: Seen
     heading_sigma_deg: float
+    counted: bool = False
+    """By how much it was turned since the stand before."""
 
 
 class Aligner:
@@ -56,7 +56,7 @@ class Aligner:
         stands: Stands,
         alignment: AlignmentInForce,
     ) -> None:
-        self._core, self._config, self._vehicle, self._collector = core, core.config, core.vehicle, core.collector
+        self._core, self._config, self._vehicle = core, core.config, core.vehicle
         self._offload, self._machine, self._alignment = core.offload, core.machine, alignment
         self._stands = stands
 
@@ -127,10 +127,8 @@ class Aligner:
             heading = vehicle_heading_rad(compass, window.heading.heading_deg, up) / DEG
             sigma = math.hypot(compass.sigma_deg, window.heading.sigma_deg)
         elif taken:
-            before, seen = taken[-1].window, [one.seen for one in taken]
-            rates = self._collector.snapshot(before.end_s, None).rates_rad_s(window.imus[0].name)
-            heading, counted = align_steps.heading_by_gyros(plan, seen, rates, before, window)
-            sigma = GYRO_TURN_SIGMA_DEG if counted else align_steps.BY_EYE_SIGMA_DEG
+            turn, sigma = self._stands.turned_deg(plan, [one.window for one in taken], window)
+            return _Taken(window, Seen(up, taken[-1].seen.heading_deg + turn), sigma, counted=True)
         else:
             heading, sigma = 0.0, 0.1  # north is where it points first
         return _Taken(window, Seen(up, heading), sigma)
@@ -168,6 +166,7 @@ class Aligner:
             heading_rad=(taken.seen.heading_deg + north_deg) * DEG,
             heading_sigma_rad=taken.heading_sigma_deg * DEG,
             on_spot=on_spot,
+            counted=taken.counted,
         )
 
     @property

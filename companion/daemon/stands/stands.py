@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple, TypeVar
 
 import msgspec
@@ -22,9 +22,11 @@ from companion.component.tunes import Tune
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
-from companion.daemon.stands.align_steps import LEVEL, Hold
+from companion.daemon.stands import align_steps
+from companion.daemon.stands.align_steps import LEVEL, Hold, Plan
 from companion.daemon.stands.measuring import POLL_S, Measuring
 from companion.errors import CalibrationRefusedError
+from companion.physics.units import DEG
 
 STAND_S: Final = 12.0
 """Seconds of stillness for each stand: averaging beyond 10 s buys an accelerometer nothing (method section 2.3)."""
@@ -92,10 +94,12 @@ class Stands:
     def begin(self, job: Job) -> None:
         """The next stand is the first, of this job."""
         self._end_s, self._first = None, {}
+        self._collector.count_turns(wanted=True)
         self.shown = shown = StandsShown(job.kind, 1, 1, "", Hold(LEVEL))
 
         def ended(result: asyncio.Future[JobResult]) -> None:
             shown.outcome, shown.words, shown.share = result.result().outcome, result.result().reason, 0.0
+            self._collector.count_turns(wanted=False)
 
         job.finished.add_done_callback(ended)
 
@@ -177,6 +181,18 @@ class Stands:
         else:
             self._core.prompt(Tune.WRONG, objection.partition(":")[0])
             self._say(Severity.NOTICE, asked.spoken)
+
+    def turned_deg(self, plan: Plan, taken: Sequence[Window], now: Window) -> tuple[float, float]:
+        """By how much it was turned since the last stand taken, and one sigma besides the gyros' scale.
+
+        By the gyros of the first IMU; where samples are missing, as when the autopilot restarts, as was asked.
+        """
+        before, (imu, *_) = taken[-1], now.imus
+        bias = (np.array(before.imus[0].gyro_rad_s) + np.array(imu.gyro_rad_s)) / 2.0
+        counted = self._collector.counted(imu.name, before.end_s, now.start_s, bias)
+        if counted is None:
+            return align_steps.asked_turn_deg(plan, len(taken)), align_steps.BY_EYE_SIGMA_DEG
+        return counted.angle_rad / DEG, counted.sigma_rad / DEG
 
     @contextlib.contextmanager
     def imus_alone(self) -> Iterator[None]:

@@ -36,18 +36,17 @@ from companion.errors import CalibrationRefusedError
 from companion.physics.frames import vector
 from companion.physics.units import DEG, MG
 
-COUNTED_SIGMA_DEG: Final = 1.5
-"""Of a turn by the gyros' means of seconds, besides their scale: hands do not turn about the vertical alone."""
-SLOPE_WARNING_DEG: Final = 1.0
+LOOSE_M_S2: Final = 0.5 * MG
+"""A level known worse than marks allow: on a slope of which it is not known how far it was turned."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Taken:
-    """One stand, measured; its heading is counted by the gyros from the first stand on, not wrapped."""
+    """One stand, measured; its heading is counted from the first stand on, not wrapped."""
 
     window: Window
     seen: Seen
-    heading_sigma_deg: float
+    turn_sigma_deg: float
 
 
 class TurnAsked(NamedTuple):
@@ -112,9 +111,9 @@ class Turning:
             raise CalibrationRefusedError(in_words(found.complaint, gradienter=False))
         draft = Draft(datetime.datetime.now(tz=datetime.UTC), self._core.vehicle.system_id)
         draft.warnings += local.warnings
-        if found.slope_deg > SLOPE_WARNING_DEG and plan.headings == 2:
+        if plan.headings == 2 and _sigma_m_s2(found) > LOOSE_M_S2:
             draft.warnings.append(
-                f"the spot slopes by {found.slope_deg:.1f} deg: four headings (--headings 4) know it better there"
+                f"the spot slopes by {found.slope_deg:.1f} deg: turn it the same way both times, or --headings 4"
             )
         board = self._board(found, local, taken[-1].window)
         if board is None and asked.level:
@@ -167,21 +166,15 @@ class Turning:
 
         def take(window: Window) -> tuple[_Taken, str | None]:
             up = np.array(window.imus[0].accel_m_s2)
-            heading, sigma = self._heading_deg(plan, taken, window) if taken else (0.0, 0.01)
+            heading, sigma = 0.0, 0.01
+            if taken:
+                turn, sigma = self._stands.turned_deg(plan, [one.window for one in taken], window)
+                heading = taken[-1].seen.heading_deg + turn
             found = _Taken(window, Seen(up / np.linalg.norm(up), heading), sigma)
             return found, align_steps.objection(plan, seen, found.seen)
 
         asked = Asked(len(taken) + 1, plan.on_spot, align_steps.request(plan, seen), align_steps.hold(plan, seen))
         return await self._stands.next(job, asked, take, if_armed=None)
-
-    def _heading_deg(self, plan: Plan, taken: list[_Taken], now: Window) -> tuple[float, float]:
-        """How it heads now, and one sigma: by the gyros of the first IMU since the stand before, else as was asked."""
-        before = taken[-1]
-        rates = self._core.collector.snapshot(before.window.end_s, None).rates_rad_s(now.imus[0].name)
-        seen = [one.seen for one in taken]
-        heading_deg, counted = align_steps.heading_by_gyros(plan, seen, rates, before.window, now)
-        sigma = max(COUNTED_SIGMA_DEG, before.heading_sigma_deg) if counted else align_steps.BY_EYE_SIGMA_DEG
-        return heading_deg, sigma
 
     def _as_stands(self, taken: list[_Taken]) -> list[Stand]:
         names = [
@@ -191,27 +184,31 @@ class Turning:
         ]
         if not names:
             raise CalibrationRefusedError("no IMU whose accelerometers can be read")
-        return [self._as_stand(one, names) for one in taken]
+        return [self._as_stand(one, names, counted=k > 0) for k, one in enumerate(taken)]
 
-    def _as_stand(self, taken: _Taken, names: list[str]) -> Stand:
+    def _as_stand(self, taken: _Taken, names: list[str], *, counted: bool) -> Stand:
         by_name = {imu.name: imu for imu in taken.window.imus}
         return Stand(
             imus=tuple(imu_stand(by_name[name]) for name in names),
             tilt_deg=None,
             tilt_sigma_deg=(1.0, 1.0),
             heading_rad=taken.seen.heading_deg * DEG,
-            heading_sigma_rad=taken.heading_sigma_deg * DEG,
+            heading_sigma_rad=taken.turn_sigma_deg * DEG,
             on_spot=True,
+            counted=counted,
         )
 
 
 def _in_words(found: Alignment, board: Mounting | None, asked: TurnAsked) -> str:
-    sigma_mg = max(float(np.sqrt(np.diag(imu.level_covariance_m2_s4))[:2].max()) for imu in found.imus) / MG
-    words = f"level known to {sigma_mg:.2f} mg, the spot slopes by {found.slope_deg:.2f} deg"
+    words = f"level known to {_sigma_m_s2(found) / MG:.2f} mg, the spot slopes by {found.slope_deg:.2f} deg"
     if board is not None:
         words += f"; the board sits at roll {board.roll_rad / DEG:+.2f}, pitch {board.pitch_rad / DEG:+.2f} deg"
     end = "level written" if asked.level else "written" if asked.write else "not written"
     return f"{words}: {end}"
+
+
+def _sigma_m_s2(found: Alignment) -> float:
+    return max(float(np.sqrt(np.diag(imu.level_covariance_m2_s4))[:2].max()) for imu in found.imus)
 
 
 def _ground(local: LocalEarth) -> Ground:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from companion.calibration.collector.outlook import Settings
 from companion.calibration.collector.rolling import RollingCollector
 from companion.calibration.means.windows import ImuInput, ImuWindow
 from companion.calibration.noise.allan import noise_profile
+from companion.calibration.seconds.counting import Counted, TurnCounter
 from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.samples import ImuSample
 from sim.accuracy.by_hand import rivals
@@ -34,14 +36,12 @@ PROPPED_DEG: Final = 5.0
 """One sigma by which hands miss a face, about each axis."""
 SLOPE_DEG: Final = 3.0
 """Of the ground on which it is propped."""
-SLOPES_DEG: Final = (0.5, 1.5, 5.0)
+SLOPES_DEG: Final = (0.5, 1.0, 3.0, 5.0)
 """Of the spots on which it is turned."""
-TURNS: Final = ((2, 0.5), (2, 1.5), (2, 5.0), (4, 0.5), (4, 1.5), (4, 5.0))
+TURNS: Final = tuple((headings, slope) for headings in (2, 4) for slope in SLOPES_DEG)
 """Headings and slope."""
-COUNTED_DEG: Final = 0.5
-COUNTED_SCALE: Final = 0.01
-"""Of a turn, counted by the gyros: what is left of each, and what the scale makes of all."""
-_HEADINGS: Final = (0.0, 90.0, 180.0, 270.0, 360.0)
+GYRO_SCALE, GYRO_SHEAR, STAMPS_S = 0.01, 0.005, 0.5e-3
+"""One sigma of the gyros that count the turns; and half of what their stamps are rounded to."""
 _FACES: Final = ((90, 0), (-90, 0), (0, -90), (0, 90), (0, 180), (0, 0))
 """Pitch and roll; up is +x, -x, +y, -y, +z, -z."""
 _EDGES: Final = ((45, 0), (-45, 0), (0, 45), (0, -135), (45, 90), (-45, 90))
@@ -74,17 +74,17 @@ class HandRun:
 class _Stood:
     """One stand, as measured."""
 
+    start_s: float
+    end_s: float
     window: ImuWindow
     rows: Array
     """Readings of the accelerometers (n, 3)."""
-    counted_rad: float = 0.0
-    """How far it was turned on its spot, by the gyros."""
 
     def face(self) -> Face:
         return Face(np.array(self.window.accel_m_s2), np.array(self.window.accel_sigma_use_m_s2))
 
-    def on_spot(self) -> Stand:
-        window = self.window
+    def on_spot(self, turned: Counted, before: Stand | None) -> Stand:
+        window, heading_rad = self.window, turned.angle_rad + (0.0 if before is None else before.heading_rad)
         means = ImuStand(
             "imu",
             np.array(window.accel_m_s2),
@@ -92,8 +92,30 @@ class _Stood:
             np.array(window.gyro_rad_s),
             np.array(window.gyro_sigma_use_rad_s),
         )
-        sigma_deg = COUNTED_DEG if self.counted_rad else 0.01
-        return Stand((means,), None, (1.0, 1.0), self.counted_rad, math.radians(sigma_deg), on_spot=True)
+        is_turned = before is not None
+        return Stand((means,), None, (1.0, 1.0), heading_rad, turned.sigma_rad, on_spot=True, counted=is_turned)
+
+
+class _Spot:
+    """One spot: five stands, each a quarter turn farther, and what the gyros read all the while."""
+
+    def __init__(self) -> None:
+        self.stood: list[_Stood] = []
+        self.counter = TurnCounter()
+
+    def chosen(self, headings: int) -> list[Stand]:
+        """As `align turn` asks: there, turned by half a turn, and on to the first; or by quarters all round."""
+        found: list[Stand] = []
+        counter = copy.deepcopy(self.counter)  # which lets go of what was before a stand
+        chosen = self.stood[::2] if headings == 2 else self.stood
+        for before, now in zip([None, *chosen], chosen, strict=False):
+            turned: Counted | None = Counted(0.0, math.radians(0.01))
+            if before is not None:
+                bias = (np.array(before.window.gyro_rad_s) + np.array(now.window.gyro_rad_s)) / 2.0
+                turned = counter.counted(before.end_s, now.start_s, bias, np.eye(3))
+            assert turned is not None
+            found.append(now.on_spot(turned, found[-1] if found else None))
+        return found
 
 
 class _Aircraft:
@@ -113,6 +135,9 @@ class _Aircraft:
             part,
             seed=int(self.random.integers(2**62)),
             gyro_bias_rad_s=(draw(size=3) * 100.0 * DEG_H).tolist(),
+            gyro_scale=(draw(size=3) * GYRO_SCALE).tolist(),
+            gyro_misalignment_rad=(draw(size=3) * GYRO_SHEAR).tolist(),
+            gyro_shear=(draw(size=3) * GYRO_SHEAR).tolist(),
             accel_bias_m_s2=(draw(size=3) * 20.0 * MG).tolist(),
             accel_scale=self.scale.tolist(),
             accel_shear=self.shear.tolist(),
@@ -121,12 +146,26 @@ class _Aircraft:
         self.hands = Hands(self.aircraft, placement_deg=PLACEMENT_DEG, seed=int(self.random.integers(2**31)))
         self.taken = ImuInput(name="imu", rotation=np.eye(3), profile=noise_profile(part))
         self.t_s = 0.0
+        self._read_s = 0.0
 
-    def stand(self, move: Callable[[float], float], counted_rad: float = 0.0) -> _Stood:
+    def _read(self, seconds: float, counter: TurnCounter | None) -> tuple[Array, Array]:
+        """The next seconds, at times whose stamps are whole milliseconds."""
+        times = self._read_s + (np.arange(round(seconds * RATE_HZ)) + 0.5) / RATE_HZ
+        self._read_s += seconds
+        rows = self.imu.read(times, 1.0 / RATE_HZ)
+        if counter is not None:
+            stamps = times + self.random.uniform(-STAMPS_S, STAMPS_S, len(times))
+            for t_s, stamp_s, (p, q, r, *_) in zip(times.tolist(), stamps.tolist(), rows.tolist(), strict=True):
+                counter.add(ImuSample(t_s, (p, q, r), (0.0, 0.0, 0.0), None, None, stamp_s))
+        return times, rows
+
+    def stand(self, move: Callable[[float], float], counter: TurnCounter | None = None) -> _Stood:
         """Move it, and measure."""
         begin_s = math.ceil(move(self.t_s) + 1.0)
-        times = begin_s + 0.5 + (np.arange(round((STAND_S + 0.5) * RATE_HZ)) + 0.5) / RATE_HZ
-        rows = self.imu.read(times, 1.0 / RATE_HZ)
+        if counter is not None:
+            self._read(begin_s + 0.5 - self._read_s, counter)
+        self._read_s = begin_s + 0.5
+        times, rows = self._read(STAND_S + 0.5, counter)
         wanted = Settings(
             min_still_s=float(STAND_S),
             max_s=float(STAND_S),
@@ -139,7 +178,8 @@ class _Aircraft:
             collector.add_imu("imu", ImuSample(t_s, (p, q, r), (x, y, z), None))
         self.t_s = begin_s + STAND_S + 1.3
         collector.tick(self.t_s)
-        return _Stood(collector.window(self.t_s).imus[0], rows[:, 3:], counted_rad)
+        window = collector.window(self.t_s)
+        return _Stood(window.start_s, window.end_s, window.imus[0], rows[:, 3:])
 
     def propped(self, pitch_deg: float, roll_deg: float) -> _Stood:
         """By hand, on a slope that falls to any side."""
@@ -147,16 +187,15 @@ class _Aircraft:
         off = self.random.normal(size=2) * PROPPED_DEG + SLOPE_DEG * np.array([math.cos(azimuth), math.sin(azimuth)])
         return self.stand(lambda t_s: self.hands.hold(t_s, pitch_deg + float(off[0]), roll_deg + float(off[1])))
 
-    def on_spot(self, slope_deg: float) -> list[_Stood]:
+    def on_spot(self, slope_deg: float) -> _Spot:
         """Four quarter turns and the way on to the first heading, on a slope that falls to any side."""
         azimuth = self.random.uniform(0.0, 2.0 * math.pi)
         pitch, roll = slope_deg * math.cos(azimuth), slope_deg * math.sin(azimuth)
-        found = [self.stand(lambda t_s: self.hands.spot(t_s, pitch, roll))]
-        scale = 1.0 + self.random.normal() * COUNTED_SCALE
-        for quarters in range(1, 5):
-            counted_deg = 90.0 * quarters * scale + self.random.normal() * COUNTED_DEG
-            found.append(self.stand(lambda t_s: self.hands.turn(t_s, 90.0), math.radians(counted_deg)))
-        return found
+        spot = _Spot()
+        spot.stood.append(self.stand(lambda t_s: self.hands.spot(t_s, pitch, roll)))
+        for _ in range(4):
+            spot.stood.append(self.stand(lambda t_s: self.hands.turn(t_s, 90.0), spot.counter))
+        return spot
 
     def level_reading(self, bias: Array) -> Array:
         """What the accelerometers read of a level aircraft with these biases."""
@@ -193,16 +232,13 @@ def by_hand(part: str, seed: int, number: int) -> HandRun:
     )
     read = here.level_reading(bias)
     level_bias = read + np.array([0.0, 0.0, here.gravity_m_s2])
-    turns = {
-        (headings, slope): turned([one.on_spot() for one in _chosen(spots[slope], headings)], ground)
-        for headings, slope in TURNS
-    }
+    turns = {(headings, slope): turned(spots[slope].chosen(headings), ground) for headings, slope in TURNS}
     steepest = turns[4, max(SLOPES_DEG)]
     board, true_board = (
         mounting(steepest.imus[0], known.accelerometer, local.gravity_m_s2, np.eye(3)),
         _tilt((read - bias) / (1.0 + here.scale)),
     )
-    first = spots[max(SLOPES_DEG)][0].rows[: rivals.ARDUPILOT_READINGS].mean(axis=0)
+    first = spots[max(SLOPES_DEG)].stood[0].rows[: rivals.ARDUPILOT_READINGS].mean(axis=0)
     return HandRun(
         faces=known.figures - truth,
         faces_sigma=known.sigma,
@@ -215,11 +251,6 @@ def by_hand(part: str, seed: int, number: int) -> HandRun:
         level_sigma=board.sigma_rad,
         level_firmware=_tilt((first - bias) / (1.0 + here.scale)) - true_board,
     )
-
-
-def _chosen(stands: list[_Stood], headings: int) -> list[_Stood]:
-    """Of five: there, turned by half a turn, and on to the first again; or the four quarters."""
-    return stands[::2] if headings == 2 else stands[:4]
 
 
 def _wander(stands: list[_Stood]) -> Array:

@@ -1,0 +1,88 @@
+"""By how much an aircraft was turned on its spot: its gyros, sample by sample, integrated as rotations.
+
+Hands that turn an aircraft tilt it too. Where that is some 4 deg, rates about down alone miss half a turn by 0.5 deg,
+and where it is 12, by 5; all three axes together by 0.05 and 0.1 (simulated: scales of 1 %, axes 0.5 deg from square).
+What is left is the gyros' scale, 1.8 deg of half a turn, which closing the circle tells (`alignment.align_model`).
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from companion.calibration.noise.robust import median
+from companion.physics.frames import Array, Floats, Matrix, rotations, running_products
+from companion.samples import ImuSample
+
+MAX_SAMPLES: Final = 60_000
+"""Since the stand before: ten minutes at 100 Hz, 2.4 MB. A turn of more is not counted."""
+HOLE_S: Final = 0.05
+"""Beyond the stream's interval: an aircraft that hands turn by 60 deg/s turns by 3 degrees meanwhile."""
+AT_REST_S: Final = 0.5
+"""It stands at both ends, so that nothing is lost there. So far may device and host disagree on how long it took."""
+SIGMA_RAD: Final = math.radians(0.15)
+"""Of each turn, besides scale and stamps: axes that are not square, of an aircraft that is tilted on its way."""
+
+
+class Counted(NamedTuple):
+    """A turn about the vehicle's z axis, clockwise from above, not wrapped, and one sigma besides the gyros' scale."""
+
+    angle_rad: float
+    sigma_rad: float
+
+
+class TurnCounter:
+    """The latest rates of one IMU, sample by sample."""
+
+    def __init__(self) -> None:
+        self._samples = array("d")
+
+    def add(self, sample: ImuSample) -> None:
+        """Take one sample, rates in the sensor's axes."""
+        if len(self._samples) >= 5 * MAX_SAMPLES:
+            del self._samples[:]
+        device_s = math.nan if sample.t_device_s is None else sample.t_device_s
+        self._samples.extend((sample.t_s, device_s, *sample.gyro_rad_s))
+
+    def counted(self, start_s: float, end_s: float, bias_rad_s: Array, vehicle_from_sensor: Matrix) -> Counted | None:
+        """By how much it was turned between two times at which it stood; None where samples are missing.
+
+        Args:
+            start_s: end of the window before; what is older is let go.
+            end_s: beginning of the window after.
+            bias_rad_s: (3,) in the vehicle's axes.
+            vehicle_from_sensor: 3x3.
+        """
+        rows = np.array(self._samples).reshape(-1, 5)
+        old = int(np.searchsorted(rows[:, 0], start_s))
+        del self._samples[: 5 * old]
+        rows = rows[old : int(np.searchsorted(rows[:, 0], end_s))]
+        if len(rows) < 3 or rows[0, 0] - start_s > AT_REST_S or end_s - rows[-1, 0] > AT_REST_S:
+            return None
+        times, rates = _in_time(rows)
+        gaps = np.diff(times)
+        if gaps.max() > median(gaps.tolist()) + HOLE_S:
+            return None
+        rates = rates @ vehicle_from_sensor.T - bias_rad_s
+        angle_rad = _turned_rad(times, rates)
+        # What half of the samples count differently is as much as sampling and stamps can be trusted.
+        return Counted(angle_rad, math.hypot(SIGMA_RAD, angle_rad - _turned_rad(times[::2], rates[::2])))
+
+
+def _in_time(rows: Floats) -> tuple[Floats, Floats]:
+    """Times and rates: by the device's clock where it has one, for on their way samples bunch, and come twice."""
+    device_s, order = np.unique(rows[:, 1], return_index=True)
+    spans_s = float(np.ptp(rows[:, 0])), float(np.ptp(rows[:, 1]))
+    if abs(spans_s[0] - spans_s[1]) < AT_REST_S:
+        return device_s, rows[order, 2:]
+    return rows[:, 0], rows[:, 2:]
+
+
+def _turned_rad(times_s: Floats, rates_rad_s: Floats) -> float:
+    """Of rates (n, 3), by trapezoids: the twist about z of the whole rotation, followed all the way."""
+    vectors = (rates_rad_s[1:] + rates_rad_s[:-1]) / 2.0 * np.diff(times_s)[:, None]
+    turns = running_products(rotations(vectors))
+    return float(np.unwrap(np.arctan2(turns[:, 1, 0] - turns[:, 0, 1], turns[:, 0, 0] + turns[:, 1, 1]))[-1])
