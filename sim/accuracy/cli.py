@@ -15,7 +15,19 @@ from sim.accuracy.figures import Figure
 if TYPE_CHECKING:
     from sim.accuracy.figures import Section
 
-SECTIONS: Final = ("white", "floors", "methods", "tilt", "warm-up", "integers", "deck", "turning", "by-hand", "paper")
+SECTIONS: Final = (
+    "white",
+    "floors",
+    "methods",
+    "tilt",
+    "warm-up",
+    "integers",
+    "deck",
+    "turning",
+    "by-hand",
+    "power-up",
+    "paper",
+)
 HELP: Final = "errors and sigmas of the estimator, beside the physical bound and what else is done"
 
 

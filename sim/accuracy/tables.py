@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from sim.accuracy import deck_tables, paper, turning, warmup_table
+from sim.accuracy import deck_tables, paper, temperature, turning, warmup_table
 from sim.accuracy.by_hand import table as by_hand_table
 from sim.accuracy.by_hand.stands import BY_HAND, by_hand
 from sim.accuracy.experiments import (
@@ -54,7 +54,7 @@ def report(
     Args:
         runs: stands with white noise; a fifth of it of every part, a hundredth of it in every case of a warm-up, a
             twentieth for every step of noise under integers, a thirty-second of every rate of a ground that turns,
-            a tenth of it aircraft that are turned by hand.
+            a tenth of it aircraft that are turned by hand, a twentieth that are switched on day after day.
         seed: of everything.
         only: of `cli.SECTIONS`.
         jobs: processes.
@@ -98,6 +98,11 @@ def report(
         progress(f"by hand: {each} aircraft of each of {len(BY_HAND)} parts")
         boards = [(part, seed, number) for part in BY_HAND for number in range(each)]
         found["by-hand"] = by_hand_table.section(many(by_hand, boards, jobs), each)
+    if "power-up" in only:
+        each = max(runs // 20, 1)
+        progress(f"power-up: {each} aircraft of each of {len(temperature.SCATTER)} parts")
+        days = [(part, seed, number) for part in temperature.SCATTER for number in range(each)]
+        found["power-up"] = temperature.section(many(temperature.power_up, days, jobs), each)
     if "paper" in only:
         found["paper"] = _paper(errata(seed, 400))
     return found
