@@ -74,9 +74,9 @@ async def calibrate(options: argparse.Namespace) -> int:
     return _finish_briefly(options, reply)
 
 
-def _finish_briefly(options: argparse.Namespace, reply: Object, *more: str, good: bool = True) -> int:
-    answer = {key: reply.get(key) for key in ("state", "reason", *more)}
-    return finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=good)
+def _finish_briefly(options: argparse.Namespace, reply: Object) -> int:
+    answer = {key: reply.get(key) for key in ("state", "reason")}
+    return finish(options, reply, answer, [f"{answer['state']}: {answer['reason']}"], good=True)
 
 
 async def cancel(options: argparse.Namespace) -> int:
@@ -87,7 +87,9 @@ async def cancel(options: argparse.Namespace) -> int:
 async def undo(options: argparse.Namespace) -> int:
     """`companion undo`."""
     reply = await request(options, {"command": "undo", "force": options.force})
-    return _finish_briefly(options, reply, "written", good=reply.get("state") == "done")
+    answer = {key: reply.get(key) for key in ("state", "reason", "written", "undone", "undoable")}
+    lines = [f"{answer['state']}: {answer['reason']}", show.undo_line(answer["undoable"] or ())]
+    return finish(options, reply, answer, lines, good=answer["state"] == "done")
 
 
 async def history(options: argparse.Namespace) -> int:

@@ -120,9 +120,26 @@ def status_lines(status: Object) -> list[str]:
     lines.append(f"in force: {arming['in_force']}")
     lines += [f"profile {each['imu']}: {each['summary']}" for each in status["profiles"]]
     lines += end_lines(status)
+    if status["undoable"]:
+        lines.append(undo_line(status["undoable"]))
     if status["last"] is not None:
         lines += _magnetic_lines(status["last"].get("magnetic"))
     return lines
+
+
+def undo_line(steps: Sequence[Object]) -> str:
+    """What the next undo takes back, and how many more could follow."""
+    if not steps:
+        return "undo: nothing is left to take back"
+    step, more = steps[0], len(steps) - 1
+    when = f" of {_minute(step['at'])} UTC" if step["at"] else ""
+    several = f" and all since {_minute(step['since'])}" if step["since"] != step["at"] else ""
+    words = f"undo takes back: {step['what'] or 'last write'}{when}{several}, {len(step['parameters'])} parameters"
+    return words + (f"; {more} more after it" if more else "")
+
+
+def _minute(iso: str) -> str:
+    return iso[:16].replace("T", " ")
 
 
 def _counts(device: Object) -> str:

@@ -6,6 +6,8 @@ import asyncio
 from collections.abc import Mapping
 from typing import Final
 
+import msgspec
+
 from companion.calibration.records.align_record import AlignmentRecord
 from companion.calibration.records.faces_record import FacesRecord
 from companion.calibration.records.record import Record, WrittenParameter
@@ -15,6 +17,7 @@ from companion.calibration.solution.doubt import Doubt
 from companion.component.service import JobResult
 from companion.errors import CalibrationRefusedError
 from companion.samples import Triad
+from companion.storage.changes import ChangeSet
 
 ALIGNMENT: Final = "gradienter alignment"
 """The kind of job that calibrates nothing."""
@@ -25,7 +28,18 @@ TURN: Final = "turn on the spot"
 BY_STANDS: Final = (ALIGNMENT, FACES, TURN)
 """Those that are not calibrations."""
 
-Product = Record | AlignmentRecord | FacesRecord | TurnRecord | dict[str, WrittenParameter]
+
+class Undone(msgspec.Struct, frozen=True):
+    """One step back."""
+
+    step: ChangeSet
+    written: dict[str, WrittenParameter]
+    """What was put back; less than the step where others have changed something."""
+    by_hand: bool
+    """Whether it was of what stands had told, so that the last calibration is as it was."""
+
+
+Product = Record | AlignmentRecord | FacesRecord | TurnRecord | Undone
 
 
 class JobCancelledError(Exception):
@@ -50,15 +64,13 @@ class Job:
         """Whether the autopilot is to be restarted once the result is stored."""
         self.automatic = automatic
         """Whether nobody asked for it."""
-        self.undid_stands = False
-        """Of an undo: whether what stands had told was put back, so that the last calibration is as it was."""
         self.was_armed = False
         """Whether the aircraft was armed since, be it for a moment."""
         self.deadline_s = deadline_s
         """Loop time until which measuring may take; None: no limit."""
         self.finished: asyncio.Future[JobResult] = asyncio.get_running_loop().create_future()
         self.product: Product | None = None
-        """The record of a calibration or an alignment, the parameters that an undo has written."""
+        """The record of a calibration or an alignment, or what an undo has put back."""
         self.held_back: Mapping[tuple[str, Triad], Doubt] = {}
         """By IMU and triad, what is measured but not written, and why: only of what nobody asked for."""
         self.words = ""
@@ -69,6 +81,21 @@ class Job:
         self._until_s = 0.0
         self._cancelled_by: str | None = None
         self._nudge = asyncio.Event()
+
+    @property
+    def undone(self) -> Undone | None:
+        """What came of an undo."""
+        return self.product if isinstance(self.product, Undone) else None
+
+    @property
+    def undid_calibration(self) -> bool:
+        """Whether what a calibration has written was taken back; also one that nobody had asked for."""
+        return self.kind == "undo" and (self.undone is None or not self.undone.by_hand)
+
+    @property
+    def short(self) -> str:
+        """What it is, as the command line calls it."""
+        return {FACES: "faces", TURN: "turn"}.get(self.kind, self.kind)
 
     @property
     def record(self) -> Record | None:

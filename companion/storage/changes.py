@@ -1,26 +1,31 @@
 """What we changed in an autopilot: kept before the first write, so that it can be put back after any interruption.
 
 `journal.json` exists only while a write is under way (found at start, it means that the daemon died in the middle);
-`undo-N.json` holds the values before the last finished write on the vehicle with system id N. What they say is written
+`undo-N.json` holds the values before the last finished writes on the vehicle with system id N. What they say is written
 to an autopilot, so that they may name nothing else than what the companion writes, with values that can be.
 """
 
 from __future__ import annotations
 
-import functools
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 
 from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.autopilot.parameters.change import Change
+from companion.formats import Object
 from companion.storage.state import StateFile, remove_durably, write_atomically
 
 _UNDO: Final = re.compile(r"undo-(\d{1,3})\.json")
 _SYSTEM_IDS: Final = range(1, 256)
+MOST_STEPS: Final = 10
+"""Writes that can be undone one after the other; the oldest one makes room."""
+AUTOMATIC: Final = "auto calibration"
+BY_HAND: Final = ("faces", "turn", "level")
+"""What leaves no calibration's record."""
 
 
 class Changed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -36,15 +41,39 @@ class Changed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Other values that may stand there by our doing, while several are set one after the other."""
 
 
+Moment = Annotated[str, msgspec.Meta(pattern=r"^[-+:.0-9T]{0,40}\Z")]
+
+
+class Origin(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What has made a write."""
+
+    what: Annotated[str, msgspec.Meta(pattern=r"^[a-z ]{0,30}\Z")] = ""
+    """As people call it: "calibration", "auto calibration", "faces", "turn", "level"; empty: not kept."""
+    at: Moment = ""
+    """UTC, ISO 8601, by the host's clock: when that began; for calibrations `started_at` of the record."""
+    since: Moment = ""
+    """Of several in one step: when the first of them began; empty: it is the only one."""
+
+    @property
+    def first(self) -> str:
+        """When the first of them began."""
+        return self.since or self.at
+
+
 class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The changes of one calibration on one vehicle."""
+    """What one write has changed on one vehicle."""
 
     system_id: int
     changes: tuple[Changed, ...]
+    origin: Origin = Origin()
 
     @classmethod
     def of(
-        cls, system_id: int | None, changes: Iterable[Change], unforeseen: Mapping[str, float] | None = None
+        cls,
+        system_id: int | None,
+        changes: Iterable[Change],
+        unforeseen: Mapping[str, float] | None = None,
+        origin: Origin | None = None,
     ) -> ChangeSet:
         """What is kept of changes before the first is made, and the old values of what the firmware will overwrite.
 
@@ -52,12 +81,74 @@ class ChangeSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """
         found = [Changed(change.parameter, change.before, change.after, change.via) for change in changes]
         found += [Changed(name, before, None) for name, before in (unforeseen or {}).items()]
-        return cls(system_id or 0, tuple(found))
+        return cls(system_id or 0, tuple(found), origin or Origin())
 
     @property
     def names(self) -> list[str]:
         """Of the parameters."""
         return [changed.parameter for changed in self.changes]
+
+    def shown(self) -> Object:
+        """For `companion status`: what it was, when, and which parameters."""
+        origin = self.origin
+        return {"what": origin.what, "at": origin.at, "since": origin.first, "parameters": self.names}
+
+    def after(self, older: ChangeSet) -> ChangeSet:
+        """This write and the one before it as one step: back to the values from before both."""
+        were = {changed.parameter: changed for changed in older.changes}
+        joined = [_joined(were.pop(changed.parameter, None), changed) for changed in self.changes]
+        origin = msgspec.structs.replace(self.origin, since=older.origin.first)
+        return ChangeSet(self.system_id, (*were.values(), *joined), origin)
+
+    def without(self, latest: ChangeSet) -> ChangeSet:
+        """What is left of a step when its latest write, or all of it, has been put back."""
+        back = {changed.parameter: changed.before for changed in latest.changes}
+        left = [
+            msgspec.structs.replace(changed, after=back.get(changed.parameter, changed.after))
+            for changed in self.changes
+            if changed.before != back.get(changed.parameter)
+        ]
+        return msgspec.structs.replace(self, changes=tuple(left))
+
+
+def _joined(older: Changed | None, newer: Changed) -> Changed:
+    """Back to the value from before both, unless somebody else has set another one in between."""
+    if older is None or older.after != newer.before:
+        return newer
+    via = newer.via
+    if via is not None and newer.after is not None and older.via is not None:
+        # The farther one is as far from all values as the firmware wants it.
+        via = (max if via > newer.after else min)(via, older.via)
+    return msgspec.structs.replace(newer, before=older.before, via=via)
+
+
+class Undoable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """The steps that can be undone on one vehicle, the latest first."""
+
+    system_id: int
+    steps: tuple[ChangeSet, ...] = ()
+    changes: tuple[Changed, ...] = ()
+    """Of versions that kept a single step."""
+
+    @property
+    def all(self) -> tuple[ChangeSet, ...]:
+        """The steps, whichever version has kept them."""
+        return self.steps or ((ChangeSet(self.system_id, self.changes),) if self.changes else ())
+
+    def and_then(self, latest: ChangeSet) -> Undoable:
+        """With another write; those that nobody has asked for are one step, as long as nothing else comes between."""
+        steps = self.all
+        if steps and latest.origin.what == steps[0].origin.what == AUTOMATIC:
+            return Undoable(self.system_id, (latest.after(steps[0]), *steps[1:]))
+        return Undoable(self.system_id, (latest, *steps)[:MOST_STEPS])
+
+    def without(self, latest: ChangeSet) -> Undoable:
+        """When this write, or all of its step, has been put back; the same where it is not the latest of them."""
+        steps = self.all
+        if not steps or not (latest == steps[0] or (latest.origin.at and latest.origin.at == steps[0].origin.at)):
+            return self
+        left = steps[0].without(latest)
+        return Undoable(self.system_id, (left, *steps[1:]) if left.changes else steps[1:])
 
 
 ChangeFile = StateFile[ChangeSet]
@@ -73,12 +164,16 @@ class ChangeLog:
         self._probe = directory / "probe"
         self.journal: ChangeFile = StateFile(directory / "journal.json", ChangeSet, self._check)
 
-    def undo_of(self, system_id: int) -> ChangeFile:
-        """The values from before the last finished write on one vehicle."""
-        check = functools.partial(self._check, system_id=system_id)
-        return StateFile(self._directory / f"undo-{system_id}.json", ChangeSet, check)
+    def undo_of(self, system_id: int) -> StateFile[Undoable]:
+        """The values from before the last finished writes on one vehicle."""
 
-    def undos(self) -> list[ChangeFile]:
+        def check(found: Undoable) -> None:
+            for changes in (ChangeSet(found.system_id, ()), *found.all):
+                self._check(changes, system_id)
+
+        return StateFile(self._directory / f"undo-{system_id}.json", Undoable, check)
+
+    def undos(self) -> list[StateFile[Undoable]]:
         """Of all vehicles of which there is one."""
         numbers = [match[1] for match in map(_UNDO.fullmatch, self._names()) if match]
         return [self.undo_of(int(number)) for number in sorted(numbers) if number == str(int(number))]

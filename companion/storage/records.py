@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -13,8 +13,9 @@ import msgspec
 
 from companion.calibration.collector import trace as traces
 from companion.calibration.collector.trace import Trace
-from companion.calibration.records.record import Record, WrittenParameter, from_json, to_json
+from companion.calibration.records.record import Record, from_json, to_json
 from companion.errors import StorageError
+from companion.storage.changes import ChangeSet
 from companion.storage.state import UNREADABLE, read_regular, remove_durably, sealed, unsealed, write_atomically
 
 logger = logging.getLogger(__name__)
@@ -31,12 +32,6 @@ MAX_TRACE_BYTES: Final = 4_000_000
 _NAME = re.compile(r"(\d{6,})\.json")
 _TRACE = re.compile(r"(\d{6,})\.trace\.json\.gz")
 _GZIP: Final = 16 + zlib.MAX_WBITS
-
-
-def is_of(record: Record, put_back: Mapping[str, WrittenParameter]) -> bool:
-    """Whether an undo took back what this calibration has written; so does one that found nothing to put back."""
-    written = {name: one.after for imu in record.imus for name, one in imu.written.items()}
-    return not put_back or any(written.get(name) == one.after for name, one in put_back.items())
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -134,26 +129,32 @@ class RecordStore:
             raise StorageError(f"{path}: belongs to the calibration of {trace.started_at}")
         return trace
 
-    def mark_undone(self, system_id: int, undone_at: str, put_back: Mapping[str, WrittenParameter]) -> bool:
-        """Note in the latest record that has written to this vehicle that it was put back, if these values are its own.
-
-        Returns:
-            False: they are not.
+    def mark_undone(self, step: ChangeSet, undone_at: str) -> list[str]:
+        """Note in the records of what was written in this step that it was put back; returns when they had begun.
 
         Raises:
             StorageError: it could not be written.
         """
+        found: list[tuple[Path, Record]] = []
         for entry in self.entries():
             record = entry.record
-            if record is None:
+            if record is None or record.undone_at or record.state != "done" or record.system_id != step.system_id:
                 continue
-            wrote = record.state == "done" and any(imu.written for imu in record.imus)
-            if wrote and record.system_id == system_id:
-                if not is_of(record, put_back):
-                    return False
-                write_atomically(entry.path, sealed(to_json(msgspec.structs.replace(record, undone_at=undone_at))))
+            if not (written := record.written):
+                continue
+            found.append((entry.path, record))
+            if record.started_at == step.origin.first:
                 break
-        return True
+            if not step.origin.first:
+                # Of a version that did not keep whose the step was.
+                if any(written.get(each.parameter) == each.after for each in step.changes):
+                    break
+                return []
+        else:
+            return []
+        for path, record in found:
+            write_atomically(path, sealed(to_json(msgspec.structs.replace(record, undone_at=undone_at))))
+        return [record.started_at for _, record in found]
 
     @staticmethod
     def _remove(path: Path) -> None:

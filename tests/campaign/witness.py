@@ -208,7 +208,8 @@ def undoable(stage: Stage) -> list[Values]:
     found = []
     for path in stage.store.glob("undo-*.json"):
         with contextlib.suppress(ValueError, KeyError, TypeError):
-            found.append({c["parameter"]: c["after"] for c in json.loads(path.read_bytes())["changes"]})
+            for step in json.loads(path.read_bytes())["steps"]:
+                found.append({c["parameter"]: c["after"] for c in step["changes"]})
     return found
 
 

@@ -229,6 +229,7 @@ def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
     async def main() -> None:
         async with made.running():
             await made.ready()
+            old = {name: made.autopilot.parameter(name) for name in ("CAL_ACC0_XOFF", "CAL_ACC0_YOFF", "CAL_ACC0_ZOFF")}
             result = await by_sides(
                 made, hands, started(made.service.calibrating.conductor.start_faces("test", 2000.0, write=True))
             )
@@ -257,6 +258,10 @@ def test_px4s_board_is_levelled_on_a_slope_seen_in_its_telemetry_and_undone(
             assert not isinstance(undone, Refusal)
             assert (await undone.finished).outcome == "done"
             assert [made.autopilot.parameter(name) for name in names] == pytest.approx([0.3, 0.0])
+            undone = made.service.calibrating.conductor.start_undo("test")
+            assert not isinstance(undone, Refusal)
+            assert (await undone.finished).reason.endswith("old values back: faces")
+            assert {name: made.autopilot.parameter(name) for name in old} == old
 
     run_virtual(main())
 

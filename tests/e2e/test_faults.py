@@ -20,7 +20,7 @@ from companion.component.service import JobResult, Refusal
 from companion.daemon.job import Job
 from companion.daemon.stands.measuring import Measuring
 from companion.errors import ParameterTimeoutError
-from companion.storage.changes import Changed, ChangeLog, ChangeSet
+from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
 from sim.ardupilot.double import ArduPilotDouble, offset_names
 from sim.imu_model import DEG_H, MG
 from sim.motions import Handling, SlowTurn
@@ -582,7 +582,7 @@ def test_an_undo_that_a_power_cut_interrupted_is_finished_and_is_not_there_to_un
     names = offset_names(1, "gyro")
     changes = ChangeSet(1, tuple(Changed(name, before=0.0, after=0.0078125) for name in names))
     ChangeLog(tmp_path).journal.write(changes)
-    ChangeLog(tmp_path).undo_of(changes.system_id).write(changes)
+    ChangeLog(tmp_path).undo_of(1).write(Undoable(1, (changes,)))
 
     async def main() -> None:
         async with Rig(tmp_path, parameters={names[0]: 0.0, names[1]: 0.0078125, names[2]: 0.0078125}).running() as rig:

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from companion.component.service import Refusal
-from companion.storage.changes import Changed, ChangeLog, ChangeSet
+from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
 from companion.storage.state import StateFile, sealed
 from tests.support.rig import Rig
 from tests.support.virtual_time import run_virtual
@@ -111,8 +111,8 @@ def test_whatever_the_fault_no_other_name_and_no_other_value_is_written(tmp_path
     async def main() -> None:
         async with Rig(tmp_path).running() as rig:
             await rig.ready()
-            undo = rig.service.offsets.ledger
-            undo.undoable[1] = ChangeSet(1, (Changed("INS_GYROFFS_X", before=9.5, after=0.0),))
+            step = ChangeSet(1, (Changed("INS_GYROFFS_X", before=9.5, after=0.0),))
+            rig.service.offsets.ledger._undoable[1] = Undoable(1, (step,))
             rig.double.set_parameter("INS_GYROFFS_X", 0.0)
             answer = rig.service.calibrating.conductor.start_undo("test")
             assert not isinstance(answer, Refusal)

@@ -12,7 +12,7 @@ import pytest
 from companion.autopilot.parameters.change import NothingWrittenError, WriteFailedError
 from companion.daemon.offsets.ledger import Ledger
 from companion.errors import AutopilotError, StorageError
-from companion.storage.changes import Changed, ChangeLog, ChangeSet
+from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
 from companion.storage.state import StateFile
 
 NAMES = ("INS_GYROFFS_X", "INS_GYROFFS_Y")
@@ -136,7 +136,8 @@ def test_the_old_values_are_on_disk_before_the_block_and_grow_with_it(tmp_path: 
             await ledger.done(WIDER)
         assert not ledger.pending
         assert on_disk(tmp_path) is None
-        assert on_disk(tmp_path, "undo-1.json") == WIDER == ledger.undoable[1]
+        assert ChangeLog(tmp_path).undo_of(1).read() == Undoable(1, (WIDER,))
+        assert ledger.steps(1) == (WIDER,)
 
     asyncio.run(main())
 
@@ -172,7 +173,10 @@ def test_a_disk_that_refuses_the_end_leaves_the_write_to_the_mender_and_nothing_
         assert isinstance(await end_of(ledger, block), StorageError)
         assert ledger.pending
         assert on_disk(tmp_path) == OLD
+        disk.refuses = set()
+        await ledger.undone()
         assert not ledger.undoable
+        assert not opened(tmp_path).undoable
 
     asyncio.run(main())
 

@@ -17,7 +17,7 @@ from companion.calibration.collector.trace import Trace
 from companion.calibration.records.record import ImuRecord, Record, WrittenParameter, to_json
 from companion.errors import StorageError
 from companion.storage import records as records_module
-from companion.storage.changes import Changed, ChangeLog, ChangeSet
+from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
 from companion.storage.records import RecordStore
 from companion.storage.state import remove_durably, write_atomically
 
@@ -251,12 +251,12 @@ def test_journal_and_undo_outlive_the_process(tmp_path: Path) -> None:
     log = ChangeLog(tmp_path)
     assert log.journal.read() is None
     log.journal.write(changes)
-    log.undo_of(1).write(changes)
+    log.undo_of(1).write(Undoable(1, (changes,)))
     assert ChangeLog(tmp_path).journal.read() == changes
     log.journal.clear()
     log.journal.clear()
     assert ChangeLog(tmp_path).journal.read() is None
-    assert ChangeLog(tmp_path).undo_of(1).read() == changes
+    assert ChangeLog(tmp_path).undo_of(1).read() == Undoable(1, (changes,))
 
 
 def test_a_journal_that_cannot_be_understood_is_an_error_not_an_empty_one(tmp_path: Path) -> None:

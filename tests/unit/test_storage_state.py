@@ -17,11 +17,11 @@ import pytest
 
 from companion.calibration.records.record import Arming
 from companion.errors import StorageError
-from companion.storage.changes import Changed, ChangeLog, ChangeSet
+from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
 from companion.storage.learned import SIGNING_FILE, AlignmentStore, BiasStore, FacesStore, signing_time_in
 from companion.storage.profiles import ProfileStore, read_profile
 from companion.storage.records import RecordStore
-from companion.storage.state import MOST_ASIDE, BoundedList, sealed, unsealed
+from companion.storage.state import MOST_ASIDE, BoundedList, StateFile, sealed, unsealed
 from companion.web.access import kept_token
 
 
@@ -227,13 +227,17 @@ def test_a_value_changed_by_hand_is_noticed_and_a_file_from_before_there_were_ch
     tmp_path: Path,
 ) -> None:
     log = ChangeLog(tmp_path)
-    log.undo_of(1).write(CHANGES)
+    log.undo_of(1).write(Undoable(1, (CHANGES,)))
     path = tmp_path / "undo-1.json"
     path.write_bytes(path.read_bytes().replace(b"0.0015", b"0.0025"))
     with pytest.raises(StorageError, match="its checksum does not fit: damaged, or changed by hand"):
         log.undo_of(1).read()
-    path.write_bytes(msgspec.json.encode(CHANGES) + b"\n")
-    assert log.undo_of(1).read() == CHANGES
+    # Of a version that kept a single step, and not whose that was.
+    single = msgspec.json.encode({"system_id": 1, "changes": CHANGES.changes}) + b"\n"
+    path.write_bytes(single)
+    kept = log.undo_of(1).read()
+    assert kept is not None
+    assert kept.all == (CHANGES,)
     # A key that is not known may be a checksum's with a wrong letter.
     path.write_bytes(msgspec.json.encode(msgspec.to_builtins(CHANGES) | {"sha257": "0"}))
     with pytest.raises(StorageError, match="unknown field"):
@@ -296,11 +300,16 @@ def test_only_names_that_the_companion_writes_with_values_that_an_imu_can_have(
 ) -> None:
     changes = ChangeSet(1, (changed,))
     log = ChangeLog(tmp_path)
-    for file in (log.journal, log.undo_of(1)):
+    files: tuple[tuple[StateFile[Any], ChangeSet | Undoable], ...] = (
+        (log.journal, changes),
+        (log.undo_of(1), Undoable(1, (CHANGES, changes))),
+        (log.undo_of(1), Undoable(1, changes=changes.changes)),
+    )
+    for file, kept in files:
         # Neither from a file, nor by whatever fault into one.
         with pytest.raises(StorageError, match=f"not written: found {words}"):
-            file.write(changes)
-        file.path.write_bytes(sealed(msgspec.json.encode(changes)))
+            file.write(kept)
+        file.path.write_bytes(sealed(msgspec.json.encode(kept)))
         with pytest.raises(StorageError, match=f"cannot be used: found {words}"):
             file.read()
 
@@ -314,7 +323,9 @@ def test_a_change_set_is_of_one_vehicle_and_names_each_parameter_once(tmp_path: 
     ):
         with pytest.raises(StorageError, match=words):
             log.journal.write(changes)
-    log.undo_of(2).write(msgspec.structs.replace(CHANGES, system_id=2))
+    with pytest.raises(StorageError, match="found system_id 2; allowed: 1"):
+        log.undo_of(1).write(Undoable(1, (CHANGES, msgspec.structs.replace(CHANGES, system_id=2))))
+    log.undo_of(2).write(Undoable(2, (msgspec.structs.replace(CHANGES, system_id=2),)))
     (tmp_path / "undo-2.json").rename(tmp_path / "undo-1.json")
     with pytest.raises(StorageError, match="found system_id 2; allowed: 1"):
         log.undo_of(1).read()

@@ -305,6 +305,11 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     """Armings while this calibration was in force; empty in the file, filled in by the history."""
 
     @property
+    def written(self) -> dict[str, float]:
+        """What of it has come into the autopilot, by parameter."""
+        return {name: one.after for imu in self.imus for name, one in imu.written.items()}
+
+    @property
     def is_worth_keeping(self) -> bool:
         """Whether there is something to remember: no, where it was cancelled before anything was measured."""
         return self.state != "cancelled" or bool(self.imus or self.warnings)

@@ -53,6 +53,11 @@ class Draft:
     before: Record | None = None
     """The calibration before, if what it has found was good and has not been undone."""
 
+    @property
+    def started(self) -> str:
+        """When it began: UTC, ISO 8601."""
+        return self.started_at.isoformat(timespec="milliseconds")
+
     def warn(self, imu: str, *lines: str) -> None:
         """Add warnings to one IMU, each once."""
         warnings = self.imu_warnings.setdefault(imu, [])
@@ -76,7 +81,7 @@ class Draft:
             state=state,
             reason=reason,
             warnings=(*(solution.warnings if solution else ()), *unseen_turn(solution), *self.warnings),
-            started_at=self.started_at.isoformat(timespec="milliseconds"),
+            started_at=self.started,
             duration_s=round(duration_s, 3),
             pose=solution.pose if solution else None,
             site=solution.site if solution else None,

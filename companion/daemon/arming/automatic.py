@@ -168,7 +168,7 @@ class Automatic:
             return
         now_s = asyncio.get_running_loop().time()
         if job.kind == "undo":
-            if result.outcome == "done" and not job.undid_stands:
+            if result.outcome == "done" and job.undid_calibration:
                 self._stop("undone")
             return
         if not job.automatic:

@@ -200,7 +200,7 @@ class InForce:
         self._offsets.on_ended(job, result)
         done = result.outcome == "done"
         if job.kind == "undo":
-            if done and not job.undid_stands:
+            if done and job.undid_calibration:
                 self.undone, self.calibration = True, None
                 self._held_back.let_go()
                 self._held = dict.fromkeys(self._held, Why.UNDONE)

@@ -11,7 +11,7 @@ import datetime
 import logging
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Final
 
 import msgspec
@@ -21,7 +21,7 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_o
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.align_record import ImuAlignmentRecord
 from companion.calibration.records.history import Point, PowerUp, kept
-from companion.calibration.records.record import Record, WrittenParameter
+from companion.calibration.records.record import Record
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.joint import Weighed, Whole, points, weigh
 from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, expect, expect_today, pose_effect
@@ -35,8 +35,9 @@ from companion.daemon.stands.alignment import AlignmentInForce
 from companion.errors import AutopilotError, StorageError
 from companion.physics.frames import vector
 from companion.samples import Triad
+from companion.storage.changes import BY_HAND, ChangeSet
 from companion.storage.learned import BiasStore, KnownImu, this_boot
-from companion.storage.records import RecordStore, is_of
+from companion.storage.records import RecordStore
 
 logger = logging.getLogger(__name__)
 
@@ -220,17 +221,17 @@ class BiasMemory:
         best = min((max(one.sigma_stat) for one in same), default=math.inf)
         return known.identity == self._identity(imu.name) and imu.gyro_sigma_stat_rad_s.max() < _MUCH_BETTER * best
 
-    async def forget(self, started_at: str) -> None:
-        """Forget a calibration that was undone."""
-        if not any(point.started_at == started_at for known in self._known.values() for point in known.points):
+    async def forget(self, started: Collection[str]) -> None:
+        """Forget calibrations that were undone, by when they had begun."""
+        if not any(point.started_at in started for known in self._known.values() for point in known.points):
             return
         self._known = {
             name: msgspec.structs.replace(
-                known, points=tuple(point for point in known.points if point.started_at != started_at)
+                known, points=tuple(point for point in known.points if point.started_at not in started)
             )
             for name, known in self._known.items()
         }
-        self._today = {key: ref for key, ref in self._today.items() if ref.point.started_at != started_at}
+        self._today = {key: ref for key, ref in self._today.items() if ref.point.started_at not in started}
         await self._write()
 
     async def _write(self) -> None:
@@ -372,27 +373,17 @@ class Results:
             logger.error("%s", error)  # noqa: TRY400 - the traceback tells nothing more
             self._say(Severity.WARNING, f"Record not kept: {error}")
 
-    async def undone(self, system_id: int, put_back: Mapping[str, WrittenParameter]) -> bool:
-        """Note that what the last calibration of this vehicle has written is in force no more, if this was of it.
-
-        Returns:
-            Whether it was.
-        """
+    async def undone(self, step: ChangeSet) -> bool:
+        """Note that what was written in this step is in force no more; whether it was of calibrations."""
+        if step.origin.what in BY_HAND:
+            return False
         now = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
-        last = self.last
-        if last is not None and last.state == "done" and last.system_id == system_id and has_written(last):
-            if not is_of(last, put_back):
-                return False
-            self.last = msgspec.structs.replace(last, undone_at=now)
-            await self._memory.forget(last.started_at)
         try:
-            found: bool = await self._offload(self._store.mark_undone, system_id, now, put_back)
+            marked: list[str] = await self._offload(self._store.mark_undone, step, now)
         except StorageError as error:
             logger.error("the history does not show the undo: %s", error)  # noqa: TRY400 - one line
-            found = True
-        return found
-
-
-def has_written(record: Record) -> bool:
-    """Whether anything of it has come into the autopilot."""
-    return any(imu.written for imu in record.imus)
+            marked = [step.origin.at] if step.origin.at else []
+        if self.last is not None and self.last.started_at in marked:
+            self.last = msgspec.structs.replace(self.last, undone_at=now)
+        await self._memory.forget(marked)
+        return bool(marked or step.origin.what)

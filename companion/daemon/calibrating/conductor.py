@@ -22,11 +22,11 @@ from companion.calibration.solution.draft import Draft, in_words
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.component.tunes import Tune
-from companion.daemon.calibrating.bias_memory import Results, has_written
+from companion.daemon.calibrating.bias_memory import Results
 from companion.daemon.calibrating.course import Course
 from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
 from companion.daemon.core import Core
-from companion.daemon.job import ALIGNMENT, BY_STANDS, FACES, TURN, Job, JobCancelledError
+from companion.daemon.job import ALIGNMENT, BY_STANDS, FACES, TURN, Job, JobCancelledError, Undone
 from companion.daemon.offsets.ledger import Recovery
 from companion.daemon.stands.align_steps import Plan
 from companion.daemon.stands.aligner import Aligner
@@ -34,6 +34,7 @@ from companion.daemon.stands.facing import Facing
 from companion.daemon.stands.turning import TurnAsked, Turning
 from companion.errors import CompanionError
 from companion.links.system.listeners import Listeners
+from companion.storage.changes import AUTOMATIC
 
 logger = logging.getLogger(__name__)
 
@@ -129,7 +130,7 @@ class Conductor:
         missing = "accelerometers need a gradienter: none is configured" if what is What.ACCELEROMETERS else None
         if (refusal := self._refusal(requester, missing)) is not None:
             return refusal
-        kind = "auto calibration" if automatic else "calibration"
+        kind = AUTOMATIC if automatic else "calibration"
         job = Job(kind, what, requester, deadline_s, reboot=reboot, automatic=automatic)
         return self._start(job, Event.REQUEST, self._calibrate(job))
 
@@ -164,7 +165,7 @@ class Conductor:
         return Refusal("other", missing) if refusal is None and missing is not None else refusal
 
     def start_undo(self, requester: str, *, force: bool = False) -> Job | Refusal:
-        """Start putting back the values from before the last calibration, or say why not (see `Recovery.undo`)."""
+        """Start putting back the values from before the last write, or say why not (see `Recovery.undo`)."""
         running = self._by_itself()
         if running is not None and self._task is not None:
             # Somebody who wants old values back must not wait for new ones that nobody asked for.
@@ -289,7 +290,7 @@ class Conductor:
         await asyncio.wait([before])
         record = taken.record
         self._machine.on(Event.UNDO)
-        if record is not None and record.state == "cancelled" and has_written(record):
+        if record is not None and record.state == "cancelled" and record.written:
             self._machine.on(Event.CONCLUDED)
             self._end(job, JobResult("done", "auto calibration taken back"))
         else:
@@ -297,12 +298,10 @@ class Conductor:
 
     async def _undo(self, job: Job, *, force: bool) -> None:
         async def run() -> str:
-            written = await self._recovery.undo(force=force)
-            job.deliver(written)
-            if self._vehicle.system_id is not None:
-                job.undid_stands = not await self._results.undone(self._vehicle.system_id, written)
+            step, written = await self._recovery.undo(force=force)
+            job.deliver(Undone(step, written, by_hand=not await self._results.undone(step)))
             self._machine.on(Event.CONCLUDED)
-            return f"{len(written)} old values back"
+            return f"{len(written)} old values back{step.origin.what and f': {step.origin.what}'}"
 
         self._end(job, await _result(job, run()))
 

@@ -80,13 +80,12 @@ class Solving:
         self.on_solved.tell(measured, window, given, job.what, expectation)
         whole = memory.whole(solution)
         weighed: Weighed = await offload(weigh, solution, whole, expectation)
-        started_at = draft.started_at.isoformat(timespec="milliseconds")
         # From here on nobody can make this job theirs, so that a request is never answered with half of it.
         writes = job.automatic and self._core.wanted.push
         held = {key: doubt for key, doubt in weighed.doubted.items() if writes and key[0] in self._written}
         job.hold_back(held)
         draft.solution, draft.held_back = weighed.solution, dict(held)
-        draft.points = _less(memory.measured(solution, whole, weighed.doubts, started_at, unix_s), draft.held_back)
+        draft.points = _less(memory.measured(solution, whole, weighed.doubts, draft.started, unix_s), draft.held_back)
         for doubt in weighed.doubts:
             self._core.say(Severity.WARNING, doubt.words)
         if not job.automatic:
@@ -192,10 +191,10 @@ class Course:
             share = min(still_s / self._core.wanted.settings.min_still_s, 1.0)
             job.progress(WRITTEN_PERCENT + (100.0 - WRITTEN_PERCENT) * share, words or _WATCHING)
 
-        async with self._pusher.written(plan, draft, lambda words: job.progress(MEASURED_PERCENT, words)) as plan:
+        async with self._pusher.written(job, plan, draft) as plan:
             self._machine.on(Event.WRITTEN)
             job.progress(WRITTEN_PERCENT, _WATCHING)
-            await self._pusher.verify(plan, window, draft, go_on)
+            await self._pusher.verify(job, plan, window, draft, go_on)
         await self._conclusion.conclude(job, plan, window, draft)
         self._machine.on(Event.CONCLUDED)
 

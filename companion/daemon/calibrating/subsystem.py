@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator, Mapping
 from typing import Final
 
@@ -38,6 +39,8 @@ from companion.formats import Object
 from companion.storage.records import RecordStore
 
 PROGRESS_EVERY_S: Final = 0.2
+HEARD_WITHIN_S: Final = 5.0
+"""How long an undo waits for an autopilot that was not heard since the start."""
 ALIGN_TIMEOUT_S: Final = 900.0
 """An alignment that nobody ends must not keep calibrations from starting for ever."""
 
@@ -55,7 +58,7 @@ class Calibrating(Subsystem):
 
     def __init__(self, core: Core, devices: Devices, offsets: Offsets) -> None:
         config, imus = core.config, devices.imus
-        self._core = core
+        self._core, self._offsets = core, offsets
         self.store = RecordStore(config.storage.path)
         self.alignment = AlignmentInForce(config, core.offload)
         self.memory = BiasMemory(core, imus, devices.sensors, self.alignment)
@@ -127,10 +130,21 @@ class Calibrating(Subsystem):
         yield {"kind": "result", "state": self.conductor.state.shown, "reason": reason}
 
     async def _undo(self, request: Object, face: str) -> AsyncIterator[Object]:
+        vehicle = self._core.vehicle
+        if vehicle.heartbeat_age_s is None:  # the daemon may have started just now
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(HEARD_WITHIN_S):
+                    await vehicle.wait_found()
         job = _accepted(self.conductor.start_undo(f"{face} undo", force=request.get("force") is True))
         result = await asyncio.shield(job.finished)
-        written = msgspec.to_builtins(job.product or {})
-        yield {"kind": "result", "state": result.outcome, "reason": result.reason, "written": written}
+        yield {
+            "kind": "result",
+            "state": result.outcome,
+            "reason": result.reason,
+            "written": {} if job.undone is None else msgspec.to_builtins(job.undone.written),
+            "undone": None if job.undone is None else job.undone.step.shown(),
+            "undoable": self._offsets.undoable(),
+        }
 
     async def _align(self, request: Object, face: str) -> AsyncIterator[Object]:
         """Show, forget or measure the alignment."""

@@ -1,7 +1,7 @@
 """What was changed in the autopilot, in memory and on disk at once.
 
 Open: a write is under way. Orphaned: a write was interrupted (the daemon died, or the old values could not all be
-put back), and the recovery has to bring it to an end. Undoable: the last finished write on each vehicle.
+put back), and the recovery has to bring it to an end. Undoable: the last finished writes on each vehicle.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import contextlib
 import logging
 from collections.abc import AsyncIterator, Callable, Sequence
 from typing import Final
+
+import msgspec
 
 from companion.autopilot.firmware.firmwares import CALIBRATION
 from companion.autopilot.firmware.gyro_calibration import wait_until_over
@@ -24,7 +26,7 @@ from companion.component.statustext import Say, Severity, Weight
 from companion.daemon.core import Offload
 from companion.errors import AutopilotError, ParameterRefusedError, StorageError
 from companion.links.system.listeners import Listeners
-from companion.storage.changes import Changed, ChangeLog, ChangeSet
+from companion.storage.changes import Changed, ChangeLog, ChangeSet, Undoable
 
 logger = logging.getLogger(__name__)
 
@@ -41,8 +43,7 @@ class Ledger:
         """Why nothing may be written at all, for people; None while all is well."""
         self._open: ChangeSet | None = None
         self._orphaned = asyncio.Event()
-        self.undoable: dict[int, ChangeSet] = {}
-        """By vehicle's system id."""
+        self._undoable: dict[int, Undoable] = {}
         self.unusable: tuple[str, ...] = ()
         """Files that were there and were set aside, each in a line; none of it was written anywhere."""
         self.lost_write = False
@@ -62,10 +63,21 @@ class Ledger:
         journal, undos = self._log.journal, self._log.undos()
         self._open = journal.load()
         kept = [file.load() for file in undos]
-        self.undoable = {each.system_id: each for each in kept if each is not None}
-        self.unusable += tuple(file.unusable for file in (journal, *undos) if file.unusable is not None)
+        self._undoable = {each.system_id: each for each in kept if each is not None}
+        met = (journal.unusable, *(file.unusable for file in undos))
+        self.unusable += tuple(words for words in met if words is not None)
         self.lost_write |= journal.unusable is not None
         self._leave_to_recovery()
+
+    @property
+    def undoable(self) -> list[int]:
+        """The vehicles, by system id, on which there is something to undo."""
+        return sorted(system_id for system_id, each in self._undoable.items() if each.all)
+
+    def steps(self, system_id: int | None) -> tuple[ChangeSet, ...]:
+        """What can be undone on one vehicle, the latest first."""
+        found = self._undoable.get(system_id or 0)
+        return () if found is None else found.all
 
     async def interrupted(self) -> ChangeSet:
         """Wait until there is an interrupted write; it stays one until `undone`."""
@@ -113,6 +125,8 @@ class Ledger:
         Raises:
             StorageError: as `transaction`; what was kept still is.
         """
+        if self._open is not None:
+            changes = msgspec.structs.replace(changes, origin=self._open.origin)
         await self._offload(self._log.journal.write, changes)
         self._open = changes
 
@@ -122,24 +136,29 @@ class Ledger:
         Raises:
             StorageError: the disk refuses; the write stays open.
         """
-        kept = self._log.undo_of(changes.system_id)
-        await self._offload(kept.write, changes)
-        try:
-            await self.undone()
-        except StorageError:
-            # The write will be put back, so there will be nothing to undo.
-            self.undoable.pop(changes.system_id, None)
-            with contextlib.suppress(StorageError):
-                await self._offload(kept.clear)
-            raise
-        self.undoable[changes.system_id] = changes
+        kept = self._undoable.get(changes.system_id, Undoable(changes.system_id))
+        await self._keep(kept.and_then(changes))
+        await self._close()
 
     async def undone(self) -> None:
-        """The end of a transaction, or of an interrupted one: the old values are in force.
+        """The end of a transaction, or of an interrupted one, or of an undo: the old values are in force.
 
         Raises:
             StorageError: the disk refuses; the write stays open.
         """
+        if self._open is not None and (kept := self._undoable.get(self._open.system_id)) is not None:
+            # It was an undo, or a write that had come to its end but for the journal.
+            left = kept.without(self._open)
+            if left is not kept:
+                await self._keep(left)
+        await self._close()
+
+    async def _keep(self, undoable: Undoable) -> None:
+        file = self._log.undo_of(undoable.system_id)
+        await (self._offload(file.write, undoable) if undoable.steps else self._offload(file.clear))
+        self._undoable[undoable.system_id] = undoable
+
+    async def _close(self) -> None:
         await self._offload(self._log.journal.clear)
         self._open = None
         self._orphaned.clear()
@@ -148,15 +167,6 @@ class Ledger:
         """The parameters among them that we never write on this firmware."""
         known = CALIBRATION.get(firmware or "other", {})
         return [name for name in changes.names if name not in known]
-
-    async def forget_undo(self, system_id: int) -> None:
-        """What could be undone on a vehicle has been.
-
-        Raises:
-            StorageError: the disk refuses.
-        """
-        await self._offload(self._log.undo_of(system_id).clear)
-        self.undoable.pop(system_id, None)
 
 
 class Recovery:
@@ -178,12 +188,11 @@ class Recovery:
 
     def why_no_undo(self) -> str | None:
         """Why there is nothing to undo, or None when there is."""
-        undoable = self.ledger.undoable
-        if not undoable:
-            return "nothing to undo" + ("; what was kept could not be used" if self.ledger.unusable else "")
-        if self._vehicle.system_id not in undoable:
-            return f"nothing to undo here, only on system {', '.join(map(str, sorted(undoable)))}"
-        return None
+        if self.ledger.steps(self._vehicle.system_id):
+            return None
+        if elsewhere := self.ledger.undoable:
+            return f"nothing to undo here, only on system {', '.join(map(str, elsewhere))}"
+        return "nothing to undo" + ("; what was kept could not be used" if self.ledger.unusable else "")
 
     async def run(self) -> None:
         """Bring interrupted writes to an end, whenever there is one, until cancelled."""
@@ -216,9 +225,6 @@ class Recovery:
         if ours:
             with self._changing():
                 await self._writer.restore(ours)
-        if self.ledger.undoable.get(open_set.system_id) == open_set:
-            # It was an undo that was interrupted, and now it is done.
-            await self.ledger.forget_undo(open_set.system_id)
         await self.ledger.undone()
         words = f"Interrupted write: {f'{len(ours)} old values put back' if ours else 'nothing of ours was in force'}"
         if foreign:
@@ -227,8 +233,8 @@ class Recovery:
         self.on_recovered.tell(words)
         self._say(Severity.WARNING, words, Weight.RESULT)
 
-    async def undo(self, *, force: bool = False) -> dict[str, WrittenParameter]:
-        """Put back the values from before the last calibration, all or none; returns what was done.
+    async def undo(self, *, force: bool = False) -> tuple[ChangeSet, dict[str, WrittenParameter]]:
+        """Put back the values from before the last step, all or none; returns the step and what was done.
 
         Args:
             force: leave what somebody else has changed since as it is, and put the rest back; without it, nothing is
@@ -240,24 +246,23 @@ class Recovery:
                 disarmed).
             StorageError: the disk refuses.
         """
-        undoable = self.ledger.undoable.get(self._vehicle.system_id or 0)
-        why = self.why_no_undo()
-        if undoable is None or why is not None:
-            raise AutopilotError(why or "nothing to undo")
-        ours, foreign = await self._sort(undoable)
+        if (why := self.why_no_undo()) is not None:
+            raise AutopilotError(why)
+        step = self.ledger.steps(self._vehicle.system_id)[0]
+        ours, foreign = await self._sort(step)
         if foreign and not force:
             raise AutopilotError(
-                f"changed by somebody else or by a boot since, so nothing was put back: {'; '.join(foreign)}."
-                f" companion undo --force puts the others back"
+                f"{step.origin.what or 'last write'}: changed by somebody else or by a boot since, so nothing was put"
+                f" back: {'; '.join(foreign)}. companion undo --force"
+                f" {'puts the others back' if ours else 'leaves it so and comes to the one before'}"
             )
         if foreign:
             logger.warning("changed by somebody else since, left alone: %s", "; ".join(foreign))
-        async with self.ledger.transaction(undoable):
+        async with self.ledger.transaction(step):
             with self._changing():
                 written = await self._writer.undo(ours)
-            await self.ledger.forget_undo(undoable.system_id)
             await self.ledger.undone()
-        return written
+        return step, written
 
     async def _sort(self, changes: ChangeSet) -> tuple[Sequence[Change], Sequence[str]]:
         """Which changes are still as we made them, and what others have put in their place."""

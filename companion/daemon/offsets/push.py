@@ -23,6 +23,7 @@ from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
 from companion.calibration.solution.draft import Draft
+from companion.component.service import MEASURED_PERCENT
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
@@ -39,7 +40,7 @@ from companion.errors import (
     ParameterTimeoutError,
     StorageError,
 )
-from companion.storage.changes import ChangeSet
+from companion.storage.changes import ChangeSet, Origin
 
 logger = logging.getLogger(__name__)
 
@@ -88,7 +89,7 @@ class Pusher:
         return held and not (self._wanted.push and await self._px4.make_sure(list(self._imus.values())))
 
     @contextlib.asynccontextmanager
-    async def written(self, plan: Plan, draft: Draft, go_on: Callable[[str], None]) -> AsyncIterator[Plan]:
+    async def written(self, job: Job, plan: Plan, draft: Draft) -> AsyncIterator[Plan]:
         """Write and read back; on failure, also of the block, the old values are put back.
 
         The block verifies what was written: `verify` alone lets it stay.
@@ -102,28 +103,33 @@ class Pusher:
         """
         await self._wait_disarmed()
         firmware = await self._firmware.prepare(plan.gyros, draft.warnings.append)
-        async with self._ledger.transaction(ChangeSet.of(self._vehicle.system_id, plan.everything)):
+        async with self._ledger.transaction(self._kept(job, plan, draft)):
             with self._changing(plan, everything=firmware is not None):
                 try:
-                    plan = await self._write(plan, firmware, draft, go_on)
+                    plan = await self._write(job, plan, firmware, draft)
                 except WriteFailedError as error:
                     plan.note(draft, error.written)
                     raise
             yield plan
 
-    async def _write(
-        self, plan: Plan, firmware: GyroParameters | None, draft: Draft, go_on: Callable[[str], None]
-    ) -> Plan:
+    async def _write(self, job: Job, plan: Plan, firmware: GyroParameters | None, draft: Draft) -> Plan:
         if firmware is None:
             async with self._px4.standing_by([(t.calibration, t.changes, t.read_m_s2) for t in plan.targets]) as look:
                 plan.note(draft, await self._writer.apply(plan.changes, look))
             return plan
+
+        def go_on(words: str) -> None:
+            job.progress(MEASURED_PERCENT, words)
+
         done = await self._firmware.write(plan.changes, plan.gyros, firmware, go_on)
         plan.note(draft, done.written)
         draft.warnings += done.warnings
         return dataclasses.replace(plan, collateral=done.collateral, firmware=done.outcome)
 
-    async def verify(self, plan: Plan, before: Window, draft: Draft, go_on: Callable[[str], None]) -> None:
+    def _kept(self, job: Job, plan: Plan, draft: Draft) -> ChangeSet:
+        return ChangeSet.of(self._vehicle.system_id, plan.everything, origin=Origin(job.short, draft.started))
+
+    async def verify(self, job: Job, plan: Plan, before: Window, draft: Draft, go_on: Callable[[str], None]) -> None:
         """Watch the telemetry take the step that it must; `go_on(words)` is called now and then meanwhile.
 
         Raises:
@@ -138,7 +144,7 @@ class Pusher:
         if problems:
             raise AutopilotError(await self._roll_back(plan, draft, "; ".join(problems)))
         try:
-            await self._ledger.done(ChangeSet.of(self._vehicle.system_id, plan.everything))
+            await self._ledger.done(self._kept(job, plan, draft))
         except StorageError as error:
             # What cannot be undone later must not stay.
             raise AutopilotError(await self._roll_back(plan, draft, str(error))) from error

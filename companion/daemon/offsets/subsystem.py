@@ -27,6 +27,7 @@ class Offsets(Subsystem):
 
     def __init__(self, core: Core, devices: Devices) -> None:
         config, vehicle, parameters, imus = core.config, core.vehicle, core.parameters, devices.imus
+        self._vehicle = vehicle
         self.ledger = Ledger(ChangeLog(config.storage.path), core.offload)
         self.writer = ParameterWriter(parameters, vehicle)
         self.rivalry = Rivalry(core, imus)
@@ -49,8 +50,13 @@ class Offsets(Subsystem):
             "fault": self.ledger.fault,
             "putting_back": self.ledger.pending,
             "why_no_undo": self.recovery.why_no_undo(),
+            "undoable": self.undoable(),
             "warnings": [*self.ledger.unusable, *self.rivalry.warnings],
         }
+
+    def undoable(self) -> list[Object]:
+        """What can be undone on this aircraft, the latest first."""
+        return [step.shown() for step in self.ledger.steps(self._vehicle.system_id)]
 
     def tasks(self) -> Sequence[Task]:  # noqa: D102
         return [("recovery", self.recovery.run)]

@@ -73,9 +73,9 @@ class AccelWrites:
             job.check_cancelled()
             job.progress(WRITTEN_PERCENT, words or _WATCHING)
 
-        async with self._pusher.written(plan, draft, lambda words: job.progress(MEASURED_PERCENT, words)) as plan:
+        async with self._pusher.written(job, plan, draft) as plan:
             self._machine.on(Event.WRITTEN)
-            await self._pusher.verify(plan, last, draft, go_on)
+            await self._pusher.verify(job, plan, last, draft, go_on)
         for target in targets:
             kept = draft.written.get(target.name, {})
             seen = {kept[name].outcome for name in target.calibration.parameters.accel_offset if name in kept}

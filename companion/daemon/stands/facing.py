@@ -217,7 +217,7 @@ class Facing:
         first = next(iter(by_imu))
         ups = by_imu[first].up @ self._imus[first].in_force.orientation.T
         return FacesRecord(
-            measured_at=draft.started_at.isoformat(timespec="milliseconds"),
+            measured_at=draft.started,
             gravity_m_s2=local.gravity_m_s2,
             stands=tuple(
                 FaceRecord(up=vector(np.round(up, 5)), seconds=window.end_s - window.start_s)

@@ -30,7 +30,7 @@ from companion.daemon.job import Job, JobCancelledError
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import AutopilotError, CalibrationRefusedError
 from companion.physics.frames import Array, Matrix, body_from_ned, roll_pitch_from_up, rotation_matrix
-from companion.storage.changes import ChangeSet
+from companion.storage.changes import ChangeSet, Origin
 
 MOST_DEG: Final = 10.0
 SEEN_DEG: Final = 0.1
@@ -64,7 +64,7 @@ class LevelWrites:
         self._core, self._machine, self._imus, self._own = core, core.machine, imus, own
         self._ledger, self._writer = offsets.ledger, offsets.writer
 
-    async def write(self, job: Job, board: Mounting, last: Window) -> Level:
+    async def write(self, job: Job, board: Mounting, last: Window, origin: Origin) -> Level:
         """Write and look; the aircraft stands still as in the last stand.
 
         Raises:
@@ -80,7 +80,7 @@ class LevelWrites:
             job.check_cancelled()
             self._machine.on(Event.WRITE)
             job.progress(MEASURED_PERCENT, f"writing {len(plan.changes)} parameters")
-            kept = ChangeSet.of(self._core.vehicle.system_id, plan.changes)
+            kept = ChangeSet.of(self._core.vehicle.system_id, plan.changes, origin=origin)
             async with self._ledger.transaction(kept):
                 with changing(self._imus.values() if self._turns_imus else ()):
                     written = await self._writer.apply(plan.changes)

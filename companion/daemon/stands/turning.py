@@ -35,6 +35,7 @@ from companion.daemon.stands.stands import Asked, Stands, imu_stand
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import vector
 from companion.physics.units import DEG, MG
+from companion.storage.changes import Origin
 
 LOOSE_M_S2: Final = 0.5 * MG
 """A level known worse than marks allow: on a slope of which it is not known how far it was turned."""
@@ -127,7 +128,7 @@ class Turning:
                 }
                 await self._writes.write(job, taken[-1].window, changes, draft)
             elif asked.level and board is not None:
-                sits, warning = await self._levels.write(job, board, taken[-1].window)
+                sits, warning = await self._levels.write(job, board, taken[-1].window, Origin("level", draft.started))
                 draft.warnings += [] if warning is None else [warning]
                 if warning is not None:
                     self._core.say(Severity.WARNING, warning)
@@ -221,7 +222,7 @@ def _record(taken: list[_Taken], stands: list[Stand], found: Alignment, draft: D
     degrees = {imu.name: imu.temperature_degc for imu in taken[-1].window.imus}
     spans_s = [one.window.end_s - one.window.start_s for one in taken]
     return TurnRecord(
-        measured_at=draft.started_at.isoformat(timespec="milliseconds"),
+        measured_at=draft.started,
         slope_deg=round(found.slope_deg, 3),
         checked=found.checked,
         chi_square=round(found.chi_square, 3),

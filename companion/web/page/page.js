@@ -65,6 +65,8 @@ function show(status) {
   for (const it of document.querySelectorAll(".wants-gradienter")) it.hidden = !status.devices.some(({name}) => name === "gradienter");
   $("cancel").disabled = !busy;
   $("undo").disabled = busy || status.why_no_undo !== null;
+  const [step] = status.undoable;
+  $("undoes").textContent = step && step.what || "hold 1.5 s";
   const key = JSON.stringify([status.last, status.headline.word === "READY", busy]);
   if (key !== shownRecords) { shownRecords = key; records(); }
 }
