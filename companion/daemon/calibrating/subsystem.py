@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from collections.abc import AsyncIterator, Mapping
 from typing import Final
 
@@ -36,6 +35,7 @@ from companion.daemon.stands.stands import Stands
 from companion.daemon.stands.turning import TurnAsked, Turning
 from companion.errors import CalibrationRefusedError
 from companion.formats import Object
+from companion.links.system.waiting import comes
 from companion.storage.records import RecordStore
 
 PROGRESS_EVERY_S: Final = 0.2
@@ -132,9 +132,7 @@ class Calibrating(Subsystem):
     async def _undo(self, request: Object, face: str) -> AsyncIterator[Object]:
         vehicle = self._core.vehicle
         if vehicle.heartbeat_age_s is None:  # the daemon may have started just now
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(HEARD_WITHIN_S):
-                    await vehicle.wait_found()
+            await comes(vehicle.found, HEARD_WITHIN_S)
         job = _accepted(self.conductor.start_undo(f"{face} undo", force=request.get("force") is True))
         result = await asyncio.shield(job.finished)
         yield {
