@@ -16,8 +16,19 @@ from pathlib import Path
 
 from companion import __version__, config
 from companion.cli import logs
-from companion.cli.terminal import FAILED, NO_DAEMON, USAGE, Command, Parser, print_json, print_lines, seconds, within
-from companion.errors import CompanionError, ConfigError, DaemonUnreachableError, NobodyHeardError
+from companion.cli.terminal import (
+    FAILED,
+    NO_DAEMON,
+    USAGE,
+    Command,
+    Parser,
+    how_to_start,
+    print_json,
+    print_lines,
+    seconds,
+    within,
+)
+from companion.errors import CompanionError, ConfigError, DaemonDeniedError, DaemonUnreachableError, NobodyHeardError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -31,7 +42,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print_lines(error, error=True)
         return USAGE
     except (DaemonUnreachableError, NobodyHeardError) as error:
-        _fail(options, "unreachable", str(error))
+        # Who may not ask it need not start it, and from the ground nobody can.
+        starts = "" if isinstance(error, DaemonDeniedError | NobodyHeardError) else how_to_start(options)
+        _fail(options, "unreachable", str(error) + starts)
         return NO_DAEMON
     except CompanionError as error:
         _fail(options, "failed", str(error))

@@ -14,7 +14,7 @@ from typing import Any, Final
 from companion import config
 from companion.cli.asking import Asking
 from companion.cli.show import finding_lines
-from companion.cli.terminal import DONE, FAILED, config_path, load_config, print_json
+from companion.cli.terminal import DONE, FAILED, config_path, load_config, own_name, print_json
 from companion.config.rules import bind_problem
 from companion.config.sections import Config, Imu, Storage
 from companion.config.words import shown
@@ -300,14 +300,11 @@ class _Session:
             self.asking.say("", "Not checked: a companion runs, and has the ports.")
         started = self._goes_on or await self._service(runs=runs)
         is_old = runs and not started and self.answer["state"] != "unchanged"
-        steps = list(_next_steps(parsed, self._command, is_old=is_old, runs=runs or started, good=good, checks=checks))
+        steps = list(
+            _next_steps(parsed, own_name(self._options), is_old=is_old, runs=runs or started, good=good, checks=checks)
+        )
         self.answer["next"] = steps
         self.asking.say("", "Next:", *(f"  {number}. {step}" for number, step in enumerate(steps, 1)))
-
-    @property
-    def _command(self) -> str:
-        """How to call the companion with this file."""
-        return "companion" if self._path == config.DEFAULT_PATH else f"companion -c {self._path}"
 
     async def _take_other_imus(self, draft: Draft, parsed: Config, *, by_default: bool) -> None:
         """Those that the autopilot has besides; it is asked, and nothing is written to it."""

@@ -7,6 +7,7 @@ import difflib
 import io
 import json
 import math
+import shlex
 import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -102,6 +103,20 @@ def config_path(options: argparse.Namespace) -> Path:
     """The file that -c names, or the default one."""
     path: Path = getattr(options, "config", config.DEFAULT_PATH)
     return path
+
+
+def own_name(options: argparse.Namespace) -> str:
+    """How the companion is called with this configuration."""
+    path = config_path(options)
+    return "companion" if path == config.DEFAULT_PATH else f"companion -c {shlex.quote(str(path))}"
+
+
+def how_to_start(options: argparse.Namespace) -> str:
+    """What is to be typed where no daemon answers."""
+    from companion.installation.install import is_service
+
+    serves = is_service() and config_path(options) == config.DEFAULT_PATH
+    return f"; start it with: {'sudo systemctl start companion' if serves else f'{own_name(options)} run'}"
 
 
 class Parser(argparse.ArgumentParser):

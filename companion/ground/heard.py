@@ -202,6 +202,7 @@ def nobody_heard(heard: Heard, url: str, system_id: int | None, within_s: float)
         )
     which = f"of system {system_id} " if system_id is not None else ""
     what = f"no companion (component {component}) {which}heard on {url} within {within_s:g} s, only {others}"
+    how = "on another port of the autopilot than this link, and forwarded"
     if "PX4" in others:
-        return f"{what}: is `companion run` up, and MAV_1_FORWARD = 1 (then restart the autopilot)?"
-    return f"{what}: is `companion run` up, on another port of the autopilot than this link, and forwarded?"
+        how = "and is MAV_1_FORWARD = 1 (then restart the autopilot)"
+    return f"{what}: does it run (on its board: companion status), {how}?"

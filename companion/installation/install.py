@@ -338,6 +338,12 @@ def systemd_runs() -> bool:
     return Path("/run/systemd/system").is_dir()
 
 
+def is_service() -> bool:
+    """Whether systemd here knows the companion's unit, wherever it was put."""
+    folders = ("/etc", "/usr/local/lib", "/usr/lib", "/lib")
+    return systemd_runs() and any(Path(folder, "systemd/system", SERVICE.source).exists() for folder in folders)
+
+
 def _command(target: Target, run: Run, *words: str) -> Step:
     line = " ".join(words)
     if target.dry_run:

@@ -62,8 +62,7 @@ expect 0 "^companion ${version%%-*}$" companion --version
 expect 0 'calibrate' companion --help
 expect 0 'ports\|no serial' companion ports
 expect 0 'arming:set_aux_auth_passed' companion lua
-expect 3 'companion' companion status
-expect 3 'companion' companion calibrate
+expect 2 'companion setup makes it' companion status
 expect 2 'companion setup makes it' companion check
 expect 1 'apt remove companion' companion uninstall-service
 expect 1 'systemctl enable --now companion' companion install-service
@@ -78,6 +77,8 @@ expect 1 'no autopilot was heard.*nothing was written' companion setup --yes --u
 expect 0 'Written: /etc/companion/companion.toml$' \
     companion setup --yes --udp 14999 --mavlink udpin:127.0.0.1:14550 --no-check
 grep -q 'companion run ' "$log" || fail 'where no systemd runs the next step is another one'
+
+expect 3 'start it with: companion run$' companion calibrate
 
 say 'the daemon, as nobody and without a writable place of its own, as the service has it'
 cat >"$root/etc/companion/companion.toml" <<'TOML'

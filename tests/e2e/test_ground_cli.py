@@ -166,7 +166,7 @@ def test_an_autopilot_without_a_companion(tmp_path: Path, firmware: Firmware, hi
             said = await line.ground("calibrate", "--within", "2", "--json")
             assert said.code == NOBODY
             assert said.err.count("\n") == 1
-            for words in (f"only system 1 ({NAME[firmware]})", "component 191", "companion run", hint):
+            for words in (f"only system 1 ({NAME[firmware]})", "component 191", "companion status", hint):
                 assert words in said.err
             assert said.json["reason"] in said.err
             assert line.scenario.autopilot.writes == []

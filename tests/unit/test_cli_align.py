@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from companion import cli
+from companion import cli, config
 from companion.calibration.records.align_record import AlignmentRecord, GradienterSettings
 from companion.cli.client import alignment_lines
 from companion.errors import StorageError
@@ -47,10 +47,19 @@ def test_usage(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-def test_no_daemon(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "c.toml").write_text(CONFIG.format(tmp_path / "none.sock"), encoding="utf-8")
-    assert cli.main(["-c", str(tmp_path / "c.toml"), "align", "zero", "--json"]) == 3
-    assert json.loads(capsys.readouterr().out)["state"] == "unreachable"
+def test_no_daemon(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is to be typed starts just this one: with the file that was named, or the service where there is one."""
+    file = tmp_path / "my c.toml"
+    file.write_text(CONFIG.format(tmp_path / "none.sock"), encoding="utf-8")
+    assert cli.main(["-c", str(file), "align", "zero", "--json"]) == 3
+    told = capsys.readouterr()
+    assert json.loads(told.out)["state"] == "unreachable"
+    assert told.err.endswith(f"(no such socket); start it with: companion -c '{file}' run\n")
+    monkeypatch.setattr(config, "DEFAULT_PATH", file)
+    for serves, start in ((False, "companion run"), (True, "sudo systemctl start companion")):
+        monkeypatch.setattr("companion.installation.install.is_service", lambda serves=serves: serves)
+        assert cli.main(["status"]) == 3
+        assert capsys.readouterr().err.endswith(f"; start it with: {start}\n")
 
 
 def test_the_lines_for_the_configuration_hold_the_whole_offset() -> None:

@@ -115,7 +115,7 @@ def test_nobody_there_is_one_line_with_what_was_heard_and_what_to_try() -> None:
     assert "only 255/190 (a ground station)" in ground_heard.nobody_heard(heard, "url", None, 5.0)
     beat(heard, 1, 1, type=QUADROTOR, autopilot=PX4)
     px4 = ground_heard.nobody_heard(heard, "url", 3, 5.0)
-    for part in ("component 191", "of system 3", "system 1 (PX4)", "companion run", "MAV_1_FORWARD"):
+    for part in ("component 191", "of system 3", "system 1 (PX4)", "companion status", "MAV_1_FORWARD"):
         assert part in px4
     beat(heard, 1, 1, type=QUADROTOR, autopilot=ARDUPILOT)
     ardupilot = ground_heard.nobody_heard(heard, "url", None, 5.0)

@@ -269,7 +269,7 @@ async def ask(path: Path, request: Object) -> AsyncIterator[Object]:
         }.get(error.errno or 0, str(error))
         if error.errno == errno.EACCES:
             raise DaemonDeniedError(f"the daemon at {path} may not be asked: {_who_may(path)}") from None
-        raise DaemonUnreachableError(f"no daemon answers at {path} ({why}); start it with: companion run") from None
+        raise DaemonUnreachableError(f"no daemon answers at {path} ({why})") from None
     try:
         await _write(writer, request)
         while line := await reader.readline():
