@@ -8,6 +8,7 @@ import io
 import json
 import math
 import shlex
+import shutil
 import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -53,18 +54,23 @@ def print_address(url: str, token: str | None) -> None:
     print_lines(f"token: {token}")
     print_lines(f"open once on the phone: {whole}")
     if sys.stdout.isatty() and (sys.stdout.encoding or "").lower().startswith("utf"):
+        drawn = _code(whole)
+        if (wide := len(drawn[0])) > shutil.get_terminal_size().columns:
+            print_lines(f"or make this window {wide} columns wide, and its camera reads a code here")
+            return
         print_lines("or let its camera read this:")
-        sys.stdout.write(_code(whole))
+        # Dark on light, whatever the terminal's colours are.
+        sys.stdout.write("".join(f"\x1b[97;40m{line}\x1b[0m\n" for line in drawn))
         sys.stdout.flush()
 
 
-def _code(text: str) -> str:
-    """A QR code of a text for a terminal, dark on light whatever its colours are."""
+def _code(text: str) -> list[str]:
+    """A QR code of a text: lines for a terminal, of blocks that are light."""
     import segno
 
     drawn = io.StringIO()
     segno.make(text, error="l", micro=False).terminal(drawn, border=2, compact=True)
-    return "".join(f"\x1b[97;40m{line}\x1b[0m\n" for line in drawn.getvalue().splitlines())
+    return drawn.getvalue().splitlines()
 
 
 def load_config(options: argparse.Namespace, *, profiles: bool = False, forgiving: bool = False) -> Config:

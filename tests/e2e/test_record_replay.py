@@ -6,6 +6,7 @@ import asyncio
 import json
 import logging
 import random
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -485,6 +486,7 @@ def test_the_independent_reader_finds_every_message_as_its_schema_says(usual: tu
     path, kept = usual
     validators: dict[str, Any] = {}
     count: dict[str, int] = {}
+    latest: dict[str, Any] = {}
     with path.open("rb") as file:
         for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
             assert schema is not None
@@ -497,6 +499,7 @@ def test_the_independent_reader_finds_every_message_as_its_schema_says(usual: tu
             value = json.loads(message.data)
             validators[schema.name].validate(value)
             count[channel.topic] = count.get(channel.topic, 0) + 1
+            latest[channel.topic] = value
             assert message.log_time > 1.6e18, "UTC"
             if channel.topic == topics.RECORD:
                 assert msgspec.json.decode(value["record"], type=Record) == kept
@@ -513,36 +516,65 @@ def test_the_independent_reader_finds_every_message_as_its_schema_says(usual: tu
         *("/imu/fc", "/imu/own", "/gradienter", "/compass"),
         *("/companion/start", "/companion/journal", "/companion/record"),
     }
-    assert {path.partition(".")[0] for path in layout_paths()} <= set(count)
+    for topic, name, index in layout_paths():
+        assert topic in latest, "the layout for Foxglove shows what is there"
+        value = latest[topic].get(name) if name else 0.0
+        is_unknown = value is None and name == "temperature_degc"  # not every sensor tells it
+        assert is_unknown or isinstance(value if index is None else value[index], float | int), (topic, name, index)
     assert count["/imu/own"] > 200 * 10
     assert count["/imu/fc"] > 100 * 5
 
 
-def layout_paths() -> list[str]:
-    """What the panels of our layout for Foxglove show, each a topic, mostly with a field."""
+def layout_paths() -> list[tuple[str, str, int | None]]:
+    """What the panels of our layout for Foxglove show: topic, field (mostly), index (sometimes).
+
+    Read by the rules of its message paths (packages/message-path/src/grammar.ne in Lichtblick, its open source form).
+    """
     panels = json.loads(LAYOUT.read_text())["configById"].values()
-    return [
-        path
-        for panel in panels
-        for path in (panel.get("topicPath"), *(one["value"] for one in panel.get("paths", ())))
-        if path
+    paths = [
+        path for panel in panels for path in (panel.get("topicPath"), *(one["value"] for one in panel.get("paths", ())))
     ]
+    found = [PATH.fullmatch(path) for path in paths if path]
+    assert found
+    assert None not in found
+    return [(one[1], one[2] or "", int(one[3]) if one[3] else None) for one in found if one is not None]
 
 
-def test_the_layout_for_foxglove_shows_what_there_is() -> None:
+PATH = re.compile(r"((?:/[\w-]*)+)(?:\.([\w-]+)(?:\[(\d+)\])?)?", re.ASCII)
+TITLES = {"foxglovePanelTitle", "lichtblickPanelTitle"}
+PANELS = {
+    # PlotConfig and PlotPath of packages/suite-base/src/panels/Plot/utils/config.ts: what they must have.
+    "Plot": {
+        *("paths", "showLegend", "legendDisplay", "showPlotValuesInLegend", "showXAxisLabels", "showYAxisLabels"),
+        *("isSynced", "xAxisVal", "sidebarDimension"),
+    },
+    # RawMessagesPanelConfig of panels/RawMessages/types.ts.
+    "RawMessages": {"diffEnabled", "diffMethod", "diffTopicPath", "showFullMessageForDiff", "topicPath"},
+}
+
+
+def test_the_layout_for_foxglove_has_its_form() -> None:
+    """As far as its open source form says: no Foxglove is here to open it."""
     layout = json.loads(LAYOUT.read_text())
+    # LayoutData of context/CurrentLayoutContext/actions.ts; a node is a panel's id, or two nodes (react-mosaic).
+    assert set(layout) == {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"}
 
     def panels(node: Any) -> list[str]:
-        return [node] if isinstance(node, str) else [*panels(node["first"]), *panels(node["second"])]
+        if isinstance(node, str):
+            return [node]
+        assert set(node) == {"direction", "first", "second", "splitPercentage"}
+        assert node["direction"] in ("row", "column")
+        return [*panels(node["first"]), *panels(node["second"])]
 
     assert sorted(panels(layout["layout"])) == sorted(layout["configById"]), "every panel once"
-    assert {name.partition("!")[0] for name in layout["configById"]} == {"Plot", "RawMessages"}
-    for path in layout_paths():
-        topic, _, field = path.partition(".")
-        name, _, index = field.partition("[")
-        fields = topics.schema_of(topic)[1]["properties"]
-        assert not field or name in fields, path
-        assert not index or int(index.rstrip("]")) < fields[name]["maxItems"], path
+    for name, panel in layout["configById"].items():
+        wanted = PANELS[name.partition("!")[0]]
+        assert panel.keys() - TITLES == wanted
+        for path in panel.get("paths", ()):
+            assert path.keys() - {"label"} == {"value", "enabled", "timestampMethod"}
+            assert (path["timestampMethod"], panel["xAxisVal"], panel["legendDisplay"]) == (
+                "receiveTime", "timestamp", "floating",
+            )  # fmt: skip
 
 
 def foxglove_takes(schema: dict[str, Any]) -> None:

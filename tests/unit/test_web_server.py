@@ -16,7 +16,10 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 import pytest
+import zxingcpp
 
 from companion.cli import main as companion
 from companion.errors import CalibrationRefusedError, StorageError
@@ -616,13 +619,41 @@ def test_a_token_that_somebody_chose_has_twelve_characters(
     assert out.startswith("token: twelve - chars!\n")
     assert out.endswith("#token=twelve%20-%20chars%21\n")  # no picture into a pipe
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
     assert companion(["web-token", "-c", str(toml)]) == 0
-    rows = [re.sub(r"\x1b\[[\d;]*m", "", line) for line in capsys.readouterr().out.splitlines()[3:]]
-    assert set("".join(rows)) == set(" ▀▄█")
-    # Three corners have the sign by which a camera finds it, dark on light (ISO/IEC 18004, 6.3.3).
-    finder = ["█ ▄▄▄▄▄ █", "█ █   █ █", "█ █▄▄▄█ █", "█▄▄▄▄▄▄▄█"]
-    assert [row[1:10] for row in rows[1:5]] == [row[-10:-1] for row in rows[1:5]] == finder
-    assert len({len(row) for row in rows}) == 1 <= len(rows) <= 24
+    shown = capsys.readouterr().out.splitlines()[3:]
+    assert [found.text for found in zxingcpp.read_barcodes(seen(shown), try_invert=False)] == [out.split()[-1]]
+    assert len(shown) <= 24, "a terminal's height"
+    # Where its lines would be broken there is none.
+    wide = len(re.sub(r"\x1b\[[\d;]*m", "", shown[0]))
+    for columns, words in ((wide, "camera read this"), (wide - 1, f"make this window {wide} columns wide")):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        assert companion(["web-token", "-c", str(toml)]) == 0
+        assert words in (told := capsys.readouterr().out)
+        assert ("█" in told) == (columns == wide)
+
+
+def seen(lines: list[str], size: int = 4) -> npt.NDArray[np.uint8]:
+    """A black terminal as a camera sees it: cells twice as high as wide, blocks in the colours that are asked for."""
+    light = {"37": 229, "97": 255, "30": 0, "40": 0, "47": 229, "107": 255}
+    halves = {" ": (0, 0), "▀": (1, 0), "▄": (0, 1), "█": (1, 1)}
+    rows: list[list[int]] = []
+    for line in lines:
+        top: list[int] = []
+        bottom: list[int] = []
+        front, back = 229, 0
+        for codes, character in re.findall(r"\x1b\[([\d;]*)m|(.)", line):
+            if character:
+                up, down = halves[character]
+                top.append(front if up else back)
+                bottom.append(front if down else back)
+            elif codes in ("", "0"):
+                front, back = 229, 0
+            else:
+                front, back = (light[code] for code in codes.split(";"))
+        rows += [top, bottom]
+    picture = np.kron(np.array(rows, np.uint8), np.ones((size, size), np.uint8))
+    return np.pad(picture, 8 * size)
 
 
 def test_who_has_the_token_is_let_in_whoever_guesses_meanwhile(
