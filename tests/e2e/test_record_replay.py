@@ -518,9 +518,9 @@ def test_the_independent_reader_finds_every_message_as_its_schema_says(usual: tu
     }
     for topic, name, index in layout_paths():
         assert topic in latest, "the layout for Foxglove shows what is there"
-        value: Any = latest[topic].get(name) if name else 0.0
-        is_unknown = value is None and name == "temperature_degc"  # not every sensor tells it
-        assert is_unknown or isinstance(value if index is None else value[index], float | int), (topic, name, index)
+        found: Any = latest[topic].get(name) if name else 0.0
+        is_unknown = found is None and name == "temperature_degc"  # not every sensor tells it
+        assert is_unknown or isinstance(found if index is None else found[index], float | int), (topic, name, index)
     assert count["/imu/own"] > 200 * 10
     assert count["/imu/fc"] > 100 * 5
 
