@@ -321,3 +321,45 @@ def test_what_is_seen_while_it_warms_up_is_remembered_although_nobody_calibrates
             assert point.k_s == pytest.approx(0.04, rel=0.3) or (point.temperature_degc or 0.0) > 31.0
 
     run_virtual(main())
+
+
+@pytest.mark.parametrize(("slope_deg_h_k", "closes"), [(1.0, False), (54.0, True)])
+def test_the_gate_closes_by_what_the_temperature_does_to_this_imu(
+    tmp_path: Path, slope_deg_h_k: float, closes: bool
+) -> None:
+    """Five kelvin, which without a curve are too many for every part."""
+
+    async def main() -> None:
+        rig = Rig(tmp_path, part="icm42688p", at_arm="gate", up_s=3600.0, **FEW)
+        warmer = 0.0
+        rig.model.temperature_degc = lambda t_s: 20.0 + warmer  # type: ignore[method-assign]
+        async with rig.running():
+            memory, in_force = rig.service.calibrating.memory, rig.service.arming.in_force
+            await rig.ready()
+            await calibrated(rig)
+            (first,) = memory._known["fc"].points[-1:]
+            assert first.gyro is not None
+            random = np.random.default_rng(3)
+            for run in range(1, 9):
+                degc = 10.0 + 3.0 * run
+                bias = random.normal(0.0, 5.0, 3) + slope_deg_h_k * (degc - 20.0)
+                day = msgspec.structs.replace(
+                    first,
+                    started_at=f"day {run}",
+                    power_up=since(run),
+                    temperature_degc=degc,
+                    gyro=msgspec.structs.replace(first.gyro, bias=tuple((bias * DEG_H).tolist())),
+                )
+                await memory.keep({"fc": day})
+            await asyncio.sleep(10.0)
+            assert [finding.words for finding in in_force.findings(rig.now_s)] == []
+            # Nobody sees the output while somebody carries it about.
+            in_force._temperatures["fc"], in_force._present = 25.0, {}
+            words = [finding.words for finding in in_force.findings(rig.now_s)]
+            gyros = [word for word in words if word.startswith("gyro")]
+            moved = [float(word.split()[3]) for word in gyros if word.endswith(" deg/h off, 5 K warmer")]
+            assert moved == ([pytest.approx(5.0 * 54.0, rel=0.05)] if closes else [])
+            # Nothing is known of the accelerometers' curve.
+            assert [word for word in words if word not in gyros] == ["imu fc: 5 K warmer than calibrated"]
+
+    run_virtual(main())

@@ -15,12 +15,14 @@ from companion.calibration.records.validity import (
     Held,
     Limits,
     Present,
+    Seen,
     Why,
     age_limit_s,
     judge,
     worth_writing,
 )
 from companion.physics.units import DEG_H
+from companion.samples import Vector
 from tests.support.allan import use_variance
 
 GYRO = PROFILES["icm42688p"].gyro
@@ -39,9 +41,14 @@ HELD = Held(
 
 
 def whys(
-    held: Held = HELD, now_s: float = 10.0, temperature_degc: float | None = 25.0, present: Present | None = None
+    held: Held = HELD,
+    now_s: float = 10.0,
+    temperature_degc: float | None = 25.0,
+    present: Present | None = None,
+    drift: tuple[Vector, Vector] | None = None,
 ) -> set[Why]:
-    found = judge("gyro", "fc", held, GYRO, LIMITS, now_s=now_s, temperature_degc=temperature_degc, present=present)
+    seen = Seen(now_s=now_s, temperature_degc=temperature_degc, present=present, drift=drift)
+    found = judge("gyro", "fc", held, GYRO, LIMITS, seen)
     return {finding.why for finding in found}
 
 
@@ -64,6 +71,20 @@ def test_three_kelvin_is_the_temperature_limit_either_way_and_an_unknown_tempera
     assert whys(temperature_degc=28.1) == {Why.TEMPERATURE}
     assert whys(temperature_degc=21.9) == {Why.TEMPERATURE}
     assert whys(temperature_degc=None) == set()
+
+
+def test_where_the_curve_over_temperature_is_known_it_says_how_far_the_bias_is_off() -> None:
+    def by(mean_deg_h: float, sigma_deg_h: float) -> set[Why]:
+        mean, variance = mean_deg_h * DEG_H, (sigma_deg_h * DEG_H) ** 2
+        return whys(temperature_degc=35.0, drift=((0.0, mean, 0.0), (variance,) * 3))
+
+    # sigma is 5 deg/h: twice that may be missing.
+    assert by(8.0, 4.0) == set()
+    assert by(-9.0, 5.0) == {Why.TEMPERATURE}
+    assert by(0.0, 11.0) == {Why.TEMPERATURE}
+    seen = Seen(now_s=10.0, temperature_degc=20.0, drift=((90.0 * DEG_H, 0.0, 0.0), (0.0,) * 3))
+    (finding,) = judge("gyro", "fc", HELD, GYRO, LIMITS, seen)
+    assert finding.words == "gyro fc: about 90 deg/h off, 5 K colder"
 
 
 def test_an_output_off_by_more_than_three_sigma_of_both_sides_is_stale() -> None:
@@ -96,7 +117,7 @@ def test_a_sensor_that_wanders_fast_has_a_shorter_limit_than_half_an_hour() -> N
     restless = AllanModel(0.0, 0.0, 2.0 * DEG_H)  # deg/h per root second: 5 deg/h in a few seconds
     sigma = math.sqrt(use_variance(restless, 10.0, 10.0))
     held = msgspec.structs.replace(HELD, sigma_use=(sigma,) * 3, averaged_s=10.0)
-    found = judge("gyro", "fc", held, restless, LIMITS, now_s=120.0, temperature_degc=None, present=None)
+    found = judge("gyro", "fc", held, restless, LIMITS, Seen(now_s=120.0))
     assert [finding.why for finding in found] == [Why.OLD]
 
 

@@ -5,7 +5,7 @@ changes, somebody changes the offsets. All limits come from the error budget (me
 
 - age: so long as the wandering expected of the sensor's Allan profile stays below `DRIFT_SIGMAS` sigma_use, and never
   longer than the configured limit (30 minutes);
-- temperature: 3 K, configurable;
+- temperature: where the curve of the bias over it is known, `DRIFT_SIGMAS` sigma as well; else 3 K, configurable;
 - the rolling window: what is left in the output now may differ from what it must be by `RESIDUAL_SIGMAS` of what
   both were known with.
 
@@ -88,6 +88,18 @@ class Present(msgspec.Struct, frozen=True, kw_only=True):
     """Both as in `Held`."""
 
 
+class Seen(msgspec.Struct, frozen=True, kw_only=True):
+    """What is known now."""
+
+    now_s: float
+    """By the clock of `Held`."""
+    temperature_degc: float | None = None
+    present: Present | None = None
+    """From a still window, if there is one."""
+    drift: tuple[Vector, Vector] | None = None
+    """By how much the bias has moved with the temperature since `Held`, and its variance; None: not known."""
+
+
 class Finding(msgspec.Struct, frozen=True):
     """One reason against the calibration; `words` fit one line at the flight line."""
 
@@ -123,17 +135,7 @@ def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
     return low_s
 
 
-def judge(
-    triad: Triad,
-    name: str,
-    held: Held,
-    model: AllanModel,
-    limits: Limits,
-    *,
-    now_s: float,
-    temperature_degc: float | None,
-    present: Present | None,
-) -> list[Finding]:
+def judge(triad: Triad, name: str, held: Held, model: AllanModel, limits: Limits, seen: Seen) -> list[Finding]:
     """Everything that speaks against one triad's calibration now; empty while it is good.
 
     Args:
@@ -142,10 +144,9 @@ def judge(
         held: what was found right.
         model: the noise of this triad.
         limits: of age and temperature.
-        now_s: the clock of `held`.
-        temperature_degc: of the IMU now, if known.
-        present: from a still window, if there is one.
+        seen: what is known of it now.
     """
+    present, drift, temperature_degc = seen.present, seen.drift, seen.temperature_degc
     found: list[Finding] = []
     if not held.seen:
         found.append(Finding(Why.UNSEEN, f"{triad} {name}: new offsets not seen to work"))
@@ -154,11 +155,17 @@ def judge(
         found.append(Finding(Why.RESIDUAL, f"{triad} {name} is off by {worst / unit:{form}} {words}"))
     if held.temperature_degc is not None and temperature_degc is not None:
         change = temperature_degc - held.temperature_degc
-        if abs(change) > limits.max_temperature_change_k:
-            warmer = "warmer" if change > 0 else "colder"
+        warmer = "warmer" if change > 0 else "colder"
+        if drift is not None:
+            moved = max(math.sqrt(mean**2 + variance) for mean, variance in zip(*drift, strict=True))
+            if moved > DRIFT_SIGMAS * max(held.sigma):
+                unit, words, form = _UNITS[triad]
+                off = f"{triad} {name}: about {moved / unit:{form}} {words} off"
+                found.append(Finding(Why.TEMPERATURE, f"{off}, {abs(change):.0f} K {warmer}"))
+        elif abs(change) > limits.max_temperature_change_k:
             found.append(Finding(Why.TEMPERATURE, f"imu {name}: {abs(change):.0f} K {warmer} than calibrated"))
     limit_s = min(limits.max_age_s, age_limit_s(model, held.sigma, held.averaged_s))
-    if (age_s := now_s - held.confirmed_s) > limit_s:
+    if (age_s := seen.now_s - held.confirmed_s) > limit_s:
         found.append(Finding(Why.OLD, f"calibrated {age_s / 60:.0f} min ago, limit {limit_s / 60:.0f}"))
     return found
 

@@ -29,7 +29,7 @@ from companion.calibration.noise.allan import AllanModel, floor_variance
 from companion.calibration.records.align_record import Determined, ImuAlignmentRecord
 from companion.calibration.records.history import Measured, Point, PowerUp, believed
 from companion.calibration.records.record import Effective
-from companion.calibration.temperature.curve import Node, PowerUpNodes, fit
+from companion.calibration.temperature.curve import Curve, Node, PowerUpNodes, fit
 from companion.physics.frames import Array, Floats, Matrix, skew, vector
 from companion.physics.units import DEG, DEG_H, MG
 from companion.samples import Triad, Vector
@@ -127,6 +127,8 @@ CATALOGUE_SCATTER: Final[dict[Triad, float]] = {"gyro": 70.0 * DEG_H, "accel": 2
 """Method section 1.3; here it only weighs the points against one another."""
 CATALOGUE_PER_K: Final[dict[Triad, float]] = {"gyro": 54.0 * DEG_H, "accel": 0.2 * MG}
 """BMI088, the worse one of method section 2.1."""
+_KNOWN: Final = 0.5
+"""Of the catalogue's: a curve that is known worse is not worth following."""
 _IN_RUN_MEAN_S: Final = 30.0
 _SHORTEST_GAP_S: Final = 180.0
 
@@ -208,21 +210,18 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
     if len(groups) < GUARDS_FROM:
         return None
     # Where a temperature is missing they all count as measured at one.
-    told = now.temperature_degc is not None and all(p.temperature_degc is not None for group in groups for p in group)
+    told = now.temperature_degc is not None and _told(groups)
     seen = [[_of(point, triad) for point in group] for group in groups]
     here = [_here(group, found, triad, now, effect) for group, found in zip(groups, seen, strict=True)]
     zeros = [group[-1].zero_sigma_rad * now.gravity_m_s2 if triad == "accel" else 0.0 for group in groups]
-    curve = fit(
-        [
-            PowerUpNodes(
-                [_node(point, bias, one, told=told) for point, one, bias in zip(group, found, biases, strict=True)],
-                common_variance=float(np.square(pose).mean()) + zero**2,
-            )
-            for group, found, (biases, pose), zero in zip(groups, seen, here, zeros, strict=True)
-        ],
-        float(floor_variance(model.flicker, model.walk, _IN_RUN_MEAN_S, 2.0 * _SHORTEST_GAP_S)),
-        CATALOGUE_PER_K[triad],
-    )
+    nodes = [
+        PowerUpNodes(
+            [_node(point, bias, one, told=told) for point, one, bias in zip(group, found, biases, strict=True)],
+            common_variance=float(np.square(pose).mean()) + zero**2,
+        )
+        for group, found, (biases, pose), zero in zip(groups, seen, here, zeros, strict=True)
+    ]
+    curve = fit(nodes, _in_run(model), CATALOGUE_PER_K[triad])
     assert curve is not None
     degc = now.temperature_degc or 0.0
     value, variance = curve.at(degc, now.k_s) if told else curve.at(0.0)
@@ -241,6 +240,30 @@ def expect(points: Sequence[Point], triad: Triad, now: Now, effect: PoseEffect, 
         same_zero=same,
         other_zero_rad=other,
     )
+
+
+def gyro_curve(points: Sequence[Point], model: AllanModel) -> Curve | None:
+    """How the gyros' bias follows the temperature within a power-up; None where little is known of that."""
+    groups = believed(points, "gyro")
+    if len(groups) < WEIGHS_FROM or not _told(groups):
+        return None
+    nodes = [
+        PowerUpNodes([_node(point, np.array(found.bias), found, told=True) for point in group if (found := point.gyro)])
+        for group in groups
+    ]
+    curve = fit(nodes, _in_run(model), CATALOGUE_PER_K["gyro"], least_order=1)
+    assert curve is not None
+    low, high = curve.span_degc
+    _, variance = curve.change(low, low + 1.0)
+    return curve if high > low and variance.max() < (_KNOWN * CATALOGUE_PER_K["gyro"]) ** 2 else None
+
+
+def _told(groups: Sequence[Sequence[Point]]) -> bool:
+    return all(point.temperature_degc is not None for group in groups for point in group)
+
+
+def _in_run(model: AllanModel) -> float:
+    return float(floor_variance(model.flicker, model.walk, _IN_RUN_MEAN_S, 2.0 * _SHORTEST_GAP_S))
 
 
 def expect_today(last: Point, triad: Triad, now: Now, effect: PoseEffect, model: AllanModel) -> Expected | None:

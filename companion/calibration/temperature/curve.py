@@ -37,7 +37,7 @@ VALID_K: Final = 3.0
 """How far beyond the temperatures seen the curve goes on (method section 3)."""
 FEWEST: Final = 3
 """Power-ups."""
-_ORDERS: Final = (0, 1, 2, 3)
+_MOST_ORDER: Final = 3
 _BETTER: Final = 0.9
 """Of the mean square of what is foretold: a term more must be worth it."""
 _AT_LEAST: Final = 0.5
@@ -112,6 +112,16 @@ class Curve:
         outside = (steepest * self.beyond_k(degc)) ** 2
         return x @ self.coefficients, self.scatter + float(x @ self.covariance @ x) * self.widening + outside
 
+    def change(self, degc: float, then_degc: float) -> tuple[Array, Array]:
+        """By how much the bias of one power-up is more at `then_degc` than at `degc`, and its variance, (3,) each.
+
+        Of a curve of order 1 and more.
+        """
+        outside = (self.per_kelvin * abs(self.beyond_k(then_degc) - self.beyond_k(degc))) ** 2
+        x = self._row(self._inside(then_degc), 0.0) - self._row(self._inside(degc), 0.0)
+        variance = float(x @ self.covariance[1:, 1:] @ x) * self.widening + outside
+        return x @ self.coefficients[1:], variance
+
     def _inside(self, degc: float) -> float:
         return min(max(degc, self.span_degc[0] - VALID_K), self.span_degc[1] + VALID_K)
 
@@ -119,20 +129,23 @@ class Curve:
         return _terms(np.array([degc]), np.array([k_s]))[0, _of_order(self.order)]
 
 
-def fit(power_ups: Sequence[PowerUpNodes], in_run_variance: float, per_kelvin: float) -> Curve | None:
+def fit(
+    power_ups: Sequence[PowerUpNodes], in_run_variance: float, per_kelvin: float, *, least_order: int = 0
+) -> Curve | None:
     """The curve of one triad of one IMU; None of fewer than three power-ups.
 
     Args:
         power_ups: at least one node each, in the order in which they were measured.
         in_run_variance: by which a bias wanders within a power-up, (rad/s)^2 or (m/s^2)^2.
         per_kelvin: one sigma of how much parts move, rad/s or m/s^2 a kelvin.
+        least_order: of the curve; a mean tells nothing of a change within a power-up.
     """
     if len(power_ups) < FEWEST:
         return None
     sums = _Sums.of(power_ups, in_run_variance)
     seen = [node.degc for one in power_ups for node in one.nodes]
     best: Curve | None = None
-    for order in _ORDERS if max(seen) > min(seen) else _ORDERS[:1]:
+    for order in range(least_order, _MOST_ORDER + 1 if max(seen) > min(seen) else least_order + 1):
         found = _Fit(sums, order, in_run_variance, per_kelvin).curve((min(seen), max(seen)))
         if best is None or found.foretold < _BETTER * best.foretold:
             best = found

@@ -23,6 +23,7 @@ from companion.calibration.records.validity import (
     Held,
     Limits,
     Present,
+    Seen,
     Why,
     judge,
     worst_axis,
@@ -117,16 +118,15 @@ class InForce:
                     found += self._held_back.left_of((name, triad), [Finding(held, words)])
                 continue
             profile = noise_profile(self._core.profiles.of(name))
-            against = judge(
-                triad,
-                name,
-                held,
-                profile.gyro if triad == "gyro" else profile.accel,
-                self._limits,
+            degc = self._temperatures.get(name)
+            seen = Seen(
                 now_s=now_s,
-                temperature_degc=self._temperatures.get(name),
+                temperature_degc=degc,
                 present=self._present.get((name, triad)),
+                drift=self._memory.drift(name, held.temperature_degc, degc) if triad == "gyro" else None,
             )
+            model = profile.gyro if triad == "gyro" else profile.accel
+            against = judge(triad, name, held, model, self._limits, seen)
             found += self._held_back.left_of((name, triad), against)
         return found
 

@@ -21,12 +21,19 @@ from companion.autopilot.firmware.imu_calibration import ImuCalibration, whole_o
 from companion.calibration.noise.allan import noise_profile
 from companion.calibration.records.align_record import ImuAlignmentRecord
 from companion.calibration.records.history import Point, PowerUp, kept
-from companion.calibration.records.record import Record
 from companion.calibration.solution.doubt import Doubt
 from companion.calibration.solution.joint import Weighed, Whole, points, weigh
-from companion.calibration.solution.prior import Expectation, ExpectedImu, Now, expect, expect_today, pose_effect
+from companion.calibration.solution.prior import (
+    Expectation,
+    ExpectedImu,
+    Now,
+    expect,
+    expect_today,
+    gyro_curve,
+    pose_effect,
+)
 from companion.calibration.solution.solve import ImuSolution, Shared, Solution
-from companion.component.statustext import Severity
+from companion.calibration.temperature.curve import Curve
 from companion.config.sections import Noise
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
@@ -34,10 +41,8 @@ from companion.daemon.devices.sensors import SerialSensor
 from companion.daemon.stands.alignment import AlignmentInForce
 from companion.errors import AutopilotError, StorageError
 from companion.physics.frames import vector
-from companion.samples import Triad
-from companion.storage.changes import BY_HAND, ChangeSet
+from companion.samples import Triad, Vector
 from companion.storage.learned import BiasStore, KnownImu, this_boot
-from companion.storage.records import RecordStore
 
 logger = logging.getLogger(__name__)
 
@@ -83,12 +88,14 @@ class BiasMemory:
         self._store = BiasStore(config.storage.path)
         self._known: dict[str, KnownImu] = {}
         self._today: dict[tuple[str, Triad], _Reference] = {}
+        self._curves: dict[str, Curve | None] = {}
         self._written_s = -math.inf
         self._host = this_boot() or os.urandom(8).hex()
 
     def load(self) -> None:
         """Read what was kept before this start; blocking."""
         self._known = self._store.read()
+        self._follow()
 
     # --- before a result is used
 
@@ -221,6 +228,20 @@ class BiasMemory:
         best = min((max(one.sigma_stat) for one in same), default=math.inf)
         return known.identity == self._identity(imu.name) and imu.gyro_sigma_stat_rad_s.max() < _MUCH_BETTER * best
 
+    def drift(self, name: str, degc: float | None, now_degc: float | None) -> tuple[Vector, Vector] | None:
+        """By how much the gyros' bias has moved since it was so warm, rad/s, and its variance; None: not known."""
+        curve = self._curves.get(name)
+        if curve is None or degc is None or now_degc is None:
+            return None
+        mean, variance = curve.change(degc, now_degc)
+        return vector(mean), vector(variance)
+
+    def _follow(self) -> None:
+        """Work out the curves of what is known; blocking."""
+        for name, known in self._known.items():
+            if name in self._sources:
+                self._curves[name] = gyro_curve(known.points, noise_profile(self._profiles.of(name)).gyro)
+
     async def forget(self, started: Collection[str]) -> None:
         """Forget calibrations that were undone, by when they had begun."""
         if not any(point.started_at in started for known in self._known.values() for point in known.points):
@@ -235,6 +256,7 @@ class BiasMemory:
         await self._write()
 
     async def _write(self) -> None:
+        await self._offload(self._follow)
         self._written_s = asyncio.get_running_loop().time()
         try:
             await self._offload(self._store.write, dict(self._known))
@@ -330,60 +352,3 @@ def _of_autopilot(calibration: ImuCalibration) -> dict[str, str]:
 
 def _plain(value: object) -> str:
     return " ".join(f"{each:.6g}" for each in value) if isinstance(value, list | tuple) else str(value)
-
-
-class Results:
-    """Keeps records, each with the readings that it was made of."""
-
-    def __init__(self, core: Core, store: RecordStore, memory: BiasMemory) -> None:
-        self._store, self._memory = store, memory
-        self._collector, self._say, self._offload = core.collector, core.say, core.offload
-        self.last: Record | None = None
-
-    @property
-    def good(self) -> Record | None:
-        """The latest one, if it was good and has not been undone."""
-        return self.last if self.last is not None and self.last.state == "done" and not self.last.undone_at else None
-
-    def load(self) -> None:
-        """Find the latest one of those on disk; blocking."""
-        try:
-            self.last = next(iter(self._store.history(limit=1)), None)
-        except StorageError as error:
-            logger.warning("%s; the daemon goes on without earlier records", error)
-
-    async def keep(self, record: Record, started_s: float, measured_s: tuple[float, float] | None) -> None:
-        """Keep a record that is worth it; what cannot be kept is said."""
-        self.last = record
-        seen = self._collector.snapshot(started_s, measured_s)
-
-        def save() -> None:
-            try:
-                trace = seen.trace(record.started_at)
-            except Exception:
-                # What is nice to look at later must not cost the record.
-                logger.exception("the readings of this calibration cannot be kept")
-                trace = None
-            self._store.save(record, trace)
-
-        try:
-            if record.is_worth_keeping:
-                await self._offload(save)
-        except StorageError as error:
-            logger.error("%s", error)  # noqa: TRY400 - the traceback tells nothing more
-            self._say(Severity.WARNING, f"Record not kept: {error}")
-
-    async def undone(self, step: ChangeSet) -> bool:
-        """Note that what was written in this step is in force no more; whether it was of calibrations."""
-        if step.origin.what in BY_HAND:
-            return False
-        now = datetime.datetime.now(tz=datetime.UTC).isoformat(timespec="milliseconds")
-        try:
-            marked: list[str] = await self._offload(self._store.mark_undone, step, now)
-        except StorageError as error:
-            logger.error("the history does not show the undo: %s", error)  # noqa: TRY400 - one line
-            marked = [step.origin.at] if step.origin.at else []
-        if self.last is not None and self.last.started_at in marked:
-            self.last = msgspec.structs.replace(self.last, undone_at=now)
-        await self._memory.forget(marked)
-        return bool(marked or step.origin.what)

@@ -22,8 +22,8 @@ from companion.calibration.solution.draft import Draft, in_words
 from companion.component.service import JobResult, Refusal
 from companion.component.statustext import Severity, Weight
 from companion.component.tunes import Tune
-from companion.daemon.calibrating.bias_memory import Results
 from companion.daemon.calibrating.course import Course
+from companion.daemon.calibrating.results import Results
 from companion.daemon.calibrating.why_not import Obstacle, Rung, StartLimit, obstacle
 from companion.daemon.core import Core
 from companion.daemon.job import ALIGNMENT, BY_STANDS, FACES, TURN, Job, JobCancelledError, Undone
