@@ -27,8 +27,6 @@ from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Matrix
 from companion.physics.units import MG
 
-SIX: Final = 6
-"""Bias and scale: the figures that a firmware takes."""
 FIGURES: Final = 9
 BIAS: Final = slice(0, 3)
 SCALE: Final = slice(3, 6)

@@ -234,9 +234,8 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
         gradienter, compass = self.around.gradienter, self.around.compass
         accel, accel_sigma = np.zeros(3), _UNKNOWN_ACCEL_M_S2
         if gradienter is not None and compared is not None and reference is not None:
-            x, y = reference
-            off_x, off_y = (np.array(reference) - compared.difference_deg).tolist()
-            accel = _GRAVITY_M_S2 * (_up(gradienter, off_x, off_y) - _up(gradienter, x, y))
+            off = np.array(reference) - compared.difference_deg
+            accel = _GRAVITY_M_S2 * (_up(gradienter, *off.tolist()) - _up(gradienter, *reference))
             accel_sigma = _LEAST_ACCEL_M_S2
         model = imu.profile.gyro
         white = model.white

@@ -37,8 +37,6 @@ class Compared(NamedTuple):
     difference_deg: Array
     """(2,) x and y."""
     covariance_deg2: Matrix
-    lag_error_s: float
-    """By how much slower it is than it was taken to be."""
 
 
 def readings_deg(law: Law, up: Floats) -> Floats:
@@ -122,4 +120,4 @@ def compare(levels: Sequence[Level]) -> Compared:
         waves = fit_waves([column - column.mean() for column in left.T])
     spent = 3 + len(waves.terms)
     widened = len(rows) / max(len(rows) - spent, len(rows) / 4.0)
-    return Compared(np.array([x, y]), np.asarray(covariance[:2, :2] * widened), float(lag))
+    return Compared(np.array([x, y]), np.asarray(covariance[:2, :2] * widened))

@@ -28,7 +28,7 @@ class Waves(NamedTuple):
     variance: float
 
 
-def fit_waves(series: list[Floats], most: int = MOST_TERMS) -> Waves:
+def fit_waves(series: list[Floats]) -> Waves:
     """The model of one or more series of one spectrum (means taken off), its order by Akaike's corrected criterion."""
     forward, backward = [s.copy() for s in series], [s.copy() for s in series]
     points = sum(len(s) for s in series)
@@ -38,7 +38,7 @@ def fit_waves(series: list[Floats], most: int = MOST_TERMS) -> Waves:
     if variance <= 0.0:
         return best
     least = points * math.log(variance)
-    for order in range(1, min(most, points // 4) + 1):
+    for order in range(1, min(MOST_TERMS, points // 4) + 1):
         ahead, behind = [f[1:] for f in forward], [b[:-1] for b in backward]
         above = 2.0 * sum(float(f @ b) for f, b in zip(ahead, behind, strict=True))
         below = sum(float(f @ f) + float(b @ b) for f, b in zip(ahead, behind, strict=True))

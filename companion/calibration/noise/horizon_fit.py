@@ -30,9 +30,7 @@ CAUTION_SIGMAS: Final = 1.0
 def within_horizon(model: AllanModel, stretches: Sequence[tuple[NDArray[np.int64], Floats]]) -> AllanModel:
     """The model with the flicker and walk that hold for means of 10 to 60 s and the 60 to 180 s after them.
 
-    Args:
-        model: fitted to all averaging times, or borrowed.
-        stretches: slots (m,) and means (m, 3) of seconds at rest.
+    `stretches`: slots (m,) and means (m, 3) of seconds at rest.
     """
     rows, targets = [], []
     for mean_s, next_s in HORIZONS_S:

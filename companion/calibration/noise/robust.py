@@ -60,15 +60,9 @@ def _weights(residual: Floats, scale: Floats, c: Floats | float) -> Floats:
 
 
 def huber_mean(values: Floats, c: Floats | float = HUBER_C, least: Floats | float = 0.0) -> Floats:
-    """Huber's location of every column.
+    """Huber's location of every column of (m, c), m >= 1: (c,) in the unit of the values.
 
-    Args:
-        values: (m, c), m >= 1.
-        c: one or (c,), scales beyond which a value counts less.
-        least: one or (c,), the scale is at least this.
-
-    Returns:
-        (c,) in the unit of the values.
+    Beyond `c` scales a value counts less; the scale is at least `least`. Each is one for all columns, or (c,).
     """
     centre = median(values)
     scale = np.maximum(_scale(values - centre), least)
@@ -113,18 +107,12 @@ class Line(msgspec.Struct, frozen=True):
 def huber_line(
     times_s: Floats, values: Floats, end_s: float, c: Floats | float = HUBER_C, least: Floats | float = 0.0
 ) -> Line:
-    """Huber's line through every column, evaluated at the window's end and not a second later.
+    """Huber's line through every column of (m, c), m >= 3, evaluated at the window's end and not a second later.
 
-    Args:
-        times_s: (m,) ascending, m >= 3.
-        values: (m, c).
-        end_s: where the line is evaluated.
-        c: as for `huber_mean`.
-        least: as for `huber_mean`.
+    `c` and `least` as for `huber_mean`.
     """
     count = values.shape[0]
     time = (times_s - times_s.mean())[:, None]
-    weight = np.ones_like(values)
     # Starts from the median slope of pairs half a window apart, not from least squares, which a knock at the edge
     # would tilt; and from pairs, because then a slope that is added to the values is added to the line.
     half = count // 2
@@ -134,9 +122,7 @@ def huber_line(
     for _ in range(_ROUNDS):
         residual = values - level - slope * time
         weight = _weights(residual, scale, c)
-        total = weight.sum(axis=0)
-        centre = (weight * time).sum(axis=0) / total
-        spread = (weight * np.square(time - centre)).sum(axis=0)
+        total, centre, spread = _moments(weight, time)
         turn = (weight * (time - centre) * residual).sum(axis=0) / spread
         shift = (weight * residual).sum(axis=0) / total - turn * centre
         slope = slope + turn
@@ -144,9 +130,6 @@ def huber_line(
         if bool(np.all(np.abs(shift) + np.abs(turn) * time[-1] <= _CONVERGED * scale)):
             break
     residual = values - level - slope * time
-    total = weight.sum(axis=0)
-    centre = (weight * time).sum(axis=0) / total
-    spread = (weight * np.square(time - centre)).sum(axis=0)
     variance = (weight * np.square(residual)).sum(axis=0) / max(count - 2, 1)
     # A perfect line has no standard error; this keeps 0/0 out and is below anything that is measured.
     error = np.sqrt(variance / spread) + 1e-100
@@ -157,6 +140,12 @@ def huber_line(
         t_statistic=np.asarray(slope / error),
         end_leverage=np.asarray(1.0 / total + np.square(at_end - centre) / spread),
     )
+
+
+def _moments(weight: Floats, time: Floats) -> tuple[Floats, Floats, Floats]:
+    total = weight.sum(axis=0)
+    centre = (weight * time).sum(axis=0) / total
+    return total, centre, (weight * np.square(time - centre)).sum(axis=0)
 
 
 RAMP_T: Final = 5.0

@@ -49,15 +49,10 @@ def fit_slope(
     walk: Floats | float = 0.0,
     hidden: Floats | float = 0.0,
 ) -> Slope:
-    """The slope of every column of one mean a second.
+    """The slope of every column of one mean a second, (m, c) at m >= `FEWEST` ascending slots.
 
-    Args:
-        slots: (m,) seconds, ascending, m >= `FEWEST`.
-        values: (m, c).
-        white: the least white noise N, (c,) or one for all; likewise the rest.
-        flicker: the least flicker B.
-        walk: rate random walk K.
-        hidden: by how much coarse steps may hide what is between them, either way.
+    White noise N, flicker B and walk K are the least ones, (c,) or one for all; so much may coarse steps hide, either
+    way, of what is between them.
     """
     length_s = float(slots[-1] - slots[0] + 1)
     time = slots - np.add.reduce(slots) / len(slots)
@@ -101,16 +96,12 @@ def wandering(slots: NDArray[np.int64], left: Floats, white: Floats) -> tuple[Fl
 
 
 def hidden_by_steps(step: float, variance: float, *, dithered: bool = True) -> float:
-    """By how much the mean of readings rounded to `step` may be off, either way: their noise spreads it or not.
+    """By how much the mean of readings rounded to `step` (0 for floats) may be off, either way.
 
-    (q / pi) exp(-2 pi^2 sigma^2 / q^2), the first harmonic (method section 2.5); at most half a step.
-
-    Args:
-        step: q; 0 for floats.
-        variance: of the readings, rounding and all.
-        dithered: False where the readings show too few values to tell their noise.
+    (q / pi) exp(-2 pi^2 sigma^2 / q^2), the first harmonic (method section 2.5), by the variance with rounding and
+    all; at most half a step, as where the readings show too few values to tell their noise (not `dithered`).
     """
-    if step <= 0.0:
-        return 0.0
-    noise = max(variance / step**2 - 1.0 / 12.0, 0.0) if dithered else 0.0
-    return step * min(0.5, math.exp(-2.0 * math.pi**2 * noise) / math.pi) if dithered else step / 2.0
+    if step <= 0.0 or not dithered:
+        return max(step, 0.0) / 2.0
+    noise = max(variance / step**2 - 1.0 / 12.0, 0.0)
+    return step * min(0.5, math.exp(-2.0 * math.pi**2 * noise) / math.pi)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.calibration.noise.allan import FLOOR_OF_FLICKER, AllanModel, NoiseProfile
-from companion.calibration.noise.allan_fit import AxisFit, Curve, curve, fit_axis
+from companion.calibration.noise.allan_fit import AxisFit, curve, fit_axis
 from companion.calibration.noise.horizon_fit import within_horizon
 from companion.calibration.seconds.batch import Batch, summary
 from companion.calibration.stillness.gates import ImuGate
@@ -76,15 +76,11 @@ def joined(parts: Sequence[Rests]) -> Rests:
 def rests(t_s: Floats, readings: Floats, temperature_degc: Floats | None, name: str, profile: NoiseProfile) -> Rests:
     """The stretches of a recording in which the IMU lay still, by the gate that the daemon uses.
 
-    Args:
-        t_s: (n,) times, ascending.
-        readings: (n, 6) gyro in rad/s and accelerometer in m/s^2; a row that is not finite is left out.
-        temperature_degc: (n,), NaN where unknown; None: not known at all.
-        name: of the IMU, in words.
-        profile: noise that the gate allows for before it has learned.
+    Times (n,) ascend; readings are (n, 6), gyro in rad/s and accelerometer in m/s^2, of which rows that are not finite
+    are left out; temperatures (n,) are NaN where unknown. `profile` is what the gate allows for before it has learned.
     """
     batches = seconds_of(t_s, readings, temperature_degc)
-    own = learned_of(batches, at_rest=True)
+    own = learned_of(batches)
     gate, stretch = ImuGate(name, profile, own=own), Stretch(_MIN_GOOD, max(len(batches), 1))
     stretches: list[Rest] = []
     kept: list[Batch] = []
@@ -179,11 +175,6 @@ class Finding(msgspec.Struct, frozen=True, kw_only=True):
     still_s: int
 
 
-def stretch_curves(rests: Sequence[Rest]) -> list[Curve]:
-    """The Allan variances of all stretches that have any."""
-    return [found for rest in rests if (found := curve(rest.slots, rest.means)) is not None]
-
-
 def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Finding:
     """The noise of one IMU from all its stretches at rest.
 
@@ -193,8 +184,8 @@ def fit_profile(name: str, rests: Sequence[Rest], fallback: NoiseProfile) -> Fin
     still_s = sum(len(rest.slots) for rest in rests)
     if still_s < LEAST_STILL_S:
         raise CalibrationRefusedError(f"only {still_s} s at rest; a profile needs {LEAST_STILL_S} s, better an hour")
-    curves = stretch_curves(rests)
     level = [_without_line(rest) for rest in rests]
+    curves = [found for rest in rests if (found := curve(rest.slots, rest.means)) is not None]
     level_curves = [
         found
         for rest, (values, _) in zip(rests, level, strict=True)

@@ -134,15 +134,16 @@ def imu_record(imu: ImuAlignment, temperature_degc: float | None) -> ImuAlignmen
         temperature_degc=temperature_degc,
         level_bias_mg=_axes(imu.level_bias_m_s2 / MG),
         level_sigma_mg=_axes(np.sqrt(np.diag(imu.level_covariance_m2_s4)) / MG),
-        accel_bias_mg=_determined(imu.accel_bias_m_s2, MG),
-        accel_scale=_determined(imu.scale, 1.0),
-        accel_shear=_determined(imu.shear, 1.0),
-        misalignment_deg=_determined(imu.misalignment_rad, DEG),
-        gyro_bias_deg_h=_determined(imu.gyro_bias_rad_s, DEG_H),
+        accel_bias_mg=determined(imu.accel_bias_m_s2, MG),
+        accel_scale=determined(imu.scale, 1.0),
+        accel_shear=determined(imu.shear, 1.0),
+        misalignment_deg=determined(imu.misalignment_rad, DEG),
+        gyro_bias_deg_h=determined(imu.gyro_bias_rad_s, DEG_H),
     )
 
 
-def _determined(figures: Figures, unit: float) -> Determined:
+def determined(figures: Figures, unit: float) -> Determined:
+    """In another unit, rounded."""
     x, y, z = (bool(one) for one in figures.determined)
     return Determined(value=_axes(figures.value / unit), sigma=_axes(figures.sigma / unit), known=(x, y, z))
 

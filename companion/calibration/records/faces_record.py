@@ -10,19 +10,10 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from companion.calibration.alignment.align import DETERMINED
-from companion.calibration.alignment.faces import (
-    BIAS,
-    PRIOR_BIAS_M_S2,
-    PRIOR_SCALE,
-    PRIOR_SHEAR,
-    SCALE,
-    SHEAR,
-    Faces,
-)
-from companion.calibration.records.align_record import Determined
+from companion.calibration.alignment.align import DETERMINED, Figures
+from companion.calibration.alignment.faces import BIAS, PRIOR_BIAS_M_S2, PRIOR_SCALE, PRIOR_SHEAR, SCALE, SHEAR, Faces
+from companion.calibration.records.align_record import Determined, determined
 from companion.calibration.records.record import WrittenParameter
-from companion.physics.frames import vector
 from companion.physics.units import MG
 from companion.samples import Vector
 
@@ -89,16 +80,6 @@ class FacesRecord(msgspec.Struct, frozen=True, kw_only=True):
     warnings: tuple[str, ...] = ()
 
 
-class Measured(msgspec.Struct, frozen=True, kw_only=True):
-    """What belongs to the figures of one IMU."""
-
-    name: str
-    accel_id: int | None
-    corrections: dict[str, float]
-    temperature_degc: float | None
-    running: Running | None
-
-
 def check(record: FacesRecord) -> None:
     """Whether a record can be used.
 
@@ -111,26 +92,32 @@ def check(record: FacesRecord) -> None:
                 raise msgspec.ValidationError(f"bias or scale of {imu.name} cannot be")
 
 
-def faces_imu_record(of: Measured, found: Faces, written: dict[str, WrittenParameter]) -> FacesImuRecord:
-    """One IMU in the units that people know."""
+def faces_imu_record(
+    found: Faces,
+    *,
+    name: str,
+    accel_id: int | None,
+    corrections: dict[str, float],
+    temperature_degc: float | None,
+    running: Running | None,
+) -> FacesImuRecord:
+    """One IMU in the units that people know, before anything is written."""
     kept = [k for k in range(len(found.off_m_s2)) if k not in found.left_out]
     return FacesImuRecord(
-        name=of.name,
-        accel_id=of.accel_id,
-        corrections=of.corrections,
-        temperature_degc=of.temperature_degc,
-        running=of.running,
+        name=name,
+        accel_id=accel_id,
+        corrections=corrections,
+        temperature_degc=temperature_degc,
+        running=running,
         accel_bias_mg=_determined(found, BIAS, MG, PRIOR_BIAS_M_S2),
         accel_scale=_determined(found, SCALE, 1.0, PRIOR_SCALE),
         accel_shear=_determined(found, SHEAR, 1.0, PRIOR_SHEAR),
         left_out=tuple(k + 1 for k in found.left_out),
         scatter_mg=round(float(np.sqrt(np.mean(np.square(found.off_m_s2[kept])))) / MG, 4),
-        written=written,
+        written={},
     )
 
 
 def _determined(found: Faces, part: slice, unit: float, before: float) -> Determined:
     sigma = found.sigma[part]
-    x, y, z = (bool(one < DETERMINED * before) for one in sigma)
-    value = vector(np.round(found.figures[part] / unit, 7))
-    return Determined(value=value, sigma=vector(np.round(sigma / unit, 7)), known=(x, y, z))
+    return determined(Figures(found.figures[part], sigma, sigma < DETERMINED * before), unit)

@@ -111,13 +111,7 @@ class Finding(msgspec.Struct, frozen=True):
 def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
     """The horizon H at which the expected wandering, V(T, H) without its white part, reaches DRIFT_SIGMAS sigma_use.
 
-    Args:
-        model: of the sensor.
-        sigma: of the calibration, as in `Held`, in the model's unit; the smallest axis counts.
-        averaged_s: T, the length of its window.
-
-    Returns:
-        Seconds, at most a day (method section 2.2).
+    At most a day (method section 2.2); of `sigma`, as in `Held`, the smallest axis counts, `averaged_s` is T.
     """
     allowed = (DRIFT_SIGMAS * min(sigma)) ** 2
 
@@ -136,16 +130,7 @@ def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
 
 
 def judge(triad: Triad, name: str, held: Held, model: AllanModel, limits: Limits, seen: Seen) -> list[Finding]:
-    """Everything that speaks against one triad's calibration now; empty while it is good.
-
-    Args:
-        triad: which half of the IMU.
-        name: of the IMU.
-        held: what was found right.
-        model: the noise of this triad.
-        limits: of age and temperature.
-        seen: what is known of it now.
-    """
+    """Everything that speaks against one triad\'s calibration now; empty while it is good."""
     present, drift, temperature_degc = seen.present, seen.drift, seen.temperature_degc
     found: list[Finding] = []
     if not held.seen:
@@ -185,10 +170,7 @@ def worst_axis(held: Held, present: Present) -> float | None:
 def worth_writing(present: Present, held: Held | None, floor: float) -> bool:
     """Whether new offsets would better any axis by more than WORTH_SIGMAS of what is known, and more than the floor.
 
-    Args:
-        present: what the output shows.
-        held: the calibration in force, which was not known better than its own sigma; None: there is none.
-        floor: what nobody needs bettered, in the same unit.
+    The calibration in force was not known better than its own sigma; the floor is in the same unit.
     """
     expected = held.expected if held is not None else (0.0, 0.0, 0.0)
     then = held.sigma if held is not None else (0.0, 0.0, 0.0)

@@ -67,7 +67,7 @@ class Batch(msgspec.Struct, frozen=True):
     temperature_degc: float | None
     counts: Counts | None = None
     """Of a stream of integers; None for floats, and for a second that spans more than `MAX_LEVELS`."""
-    allan: Floats | None = None
+    allan: Floats = np.zeros((0, 0))
     """(k, c) Allan variances at averaging times of 1/2, 1/4 ... 1/32 of the second, each of four samples or more."""
 
 

@@ -1,4 +1,4 @@
-"""Which means of a window can be those of a biased sensor, and what is to be said of the others."""
+"""Which means of a window can be those of a biased sensor, what is to be said of the others, and why sigma is wide."""
 
 from __future__ import annotations
 
@@ -8,20 +8,16 @@ import msgspec
 import numpy as np
 
 from companion.calibration.means.windows import Hidden, ImuWindow
-from companion.calibration.solution.site import LocalEarth
+from companion.calibration.solution.site import LocalEarth, Remedies
 from companion.calibration.stillness.plausible import implausible
-from companion.physics.frames import Array
+from companion.physics.frames import Array, Matrix
 from companion.samples import Triad
 
 
-def believable(imus: Sequence[ImuWindow], up: Array, local: LocalEarth) -> tuple[ImuWindow, ...]:
+def believable(imu: ImuWindow, up: Array, local: LocalEarth) -> ImuWindow:
     """The same; what cannot be is hidden, with the words that say why and what to do. `up` (3,), vehicle FRD."""
-    return tuple(_believable(imu, local.gravity_m_s2 * up, local) for imu in imus)
-
-
-def _believable(imu: ImuWindow, expected_m_s2: Array, local: LocalEarth) -> ImuWindow:
     means = np.array(imu.gyro_rad_s), np.array(imu.accel_m_s2)
-    found = implausible(imu.name, *means, expected_m_s2, np.array(imu.mounting), local.remedies.mounting)
+    found = implausible(imu.name, *means, local.gravity_m_s2 * up, np.array(imu.mounting), local.remedies.mounting)
     hidden = {triad: Hidden(f"{words}; {local.remedies.any_bias}", useless=True) for triad, words in found.items()}
     return msgspec.structs.replace(imu, hidden={**imu.hidden, **hidden}) if hidden else imu
 
@@ -37,3 +33,21 @@ def widened(imu: ImuWindow, asked: Collection[Triad], powered_s: float, variance
         return []
     words = imu.warming.in_words(imu.name, powered_s, variance)
     return [words] if words else []
+
+
+def without_heading(imus: Sequence[ImuWindow], earth_covariance: Matrix, remedies: Remedies) -> list[str]:
+    """What made the gyros' sigma wide whose heading nobody knows: that, or a part that nobody has named.
+
+    `earth_covariance` (3, 3) is what is not known of the Earth's rate, (rad/s)^2.
+    """
+    earth = float(np.diag(earth_covariance).max())
+    by_part = [
+        imu.name
+        for imu in imus
+        # Where integers hide the mean, that made it, and is said.
+        if not imu.named and "gyro" not in imu.hidden and float(np.square(imu.gyro_sigma_use_rad_s).max()) > earth
+    ]
+    found = [f"imu {name}: gyro sigma is that of the worst common parts: {remedies.part}" for name in by_part]
+    if len(by_part) < len(imus):
+        found.append(f"{remedies.no_heading}: the horizontal part of the Earth's rate is unknown, gyro sigma widened")
+    return found

@@ -30,25 +30,14 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from companion.calibration.means.pose import (
-    CompassModel,
-    GradienterModel,
-)
+from companion.calibration.means.pose import CompassModel, GradienterModel
 from companion.calibration.means.windows import ImuWindow, Window
-from companion.calibration.records.record import (
-    Effective,
-    Magnetic,
-    Pose,
-    PoseSigma,
-    Prior,
-    Site,
-)
+from companion.calibration.records.record import Effective, Magnetic, Pose, PoseSigma, Prior, Site
 from companion.calibration.request import What
-from companion.calibration.solution.believable import believable, untold, widened
+from companion.calibration.solution.believable import believable, untold, widened, without_heading
 from companion.calibration.solution.otherwise import NOTHING, Otherwise
 from companion.calibration.solution.site import LocalEarth
 from companion.calibration.solution.truth import Truth, truth_of
-from companion.calibration.solution.widened import without_heading
 from companion.calibration.turning.watch import Turn
 from companion.config.sections import Platform
 from companion.errors import CalibrationRefusedError
@@ -184,7 +173,7 @@ def solve(
     if compass is None and truth.heading_rad is None:
         unknown_heading = local.rate_in_body(np.eye(3), heading_known=False).covariance
         warnings += without_heading(window.imus, unknown_heading, local.remedies)
-    believed = window.imus if any_bias else believable(window.imus, truth.up, local)
+    believed = window.imus if any_bias else tuple(believable(imu, truth.up, local) for imu in window.imus)
     sailing = np.zeros(3) if window.turn_rad_s is None else np.array(window.turn_rad_s)
     shared = _shared(truth, local, window.turn, 0.0 if gradienter is None else gradienter.sigma_deg * DEG, sailing)
     # A deck may turn, and a steady turn shows in nothing but the heading.

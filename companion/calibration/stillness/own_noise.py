@@ -102,9 +102,8 @@ class Known(msgspec.Struct, frozen=True):
 class OwnNoise:
     """Learns the noise of one IMU from its seconds, moving or not; knows nothing until it is certain.
 
-    Args:
-        white: N of the profile, gyro and accelerometer: where somebody named a noisier part than is common.
-        at_rest: somebody says that it is: three times as much noise is believed.
+    `white` is N of the profile, gyro and accelerometer, where somebody named a noisier part than is common. `at_rest`:
+    somebody says that it is; three times as much noise is believed.
     """
 
     def __init__(self, white: tuple[float, float] = (0.0, 0.0), *, at_rest: bool = False) -> None:
@@ -142,7 +141,7 @@ class OwnNoise:
     def add(self, batch: Batch) -> None:
         """Take the next second."""
         before = self._seconds[-1] if self._seconds else None
-        if batch.allan is None or not len(batch.allan) or self._is_beyond(batch, before, _BEYOND):
+        if not len(batch.allan) or self._is_beyond(batch, before, _BEYOND):
             self.clear()
             return
         self._calm = 0 if self._since < LEARN_S and self._is_beyond(batch, before, _CALM) else self._calm + 1
@@ -171,13 +170,12 @@ class OwnNoise:
             step = batch.mean - before.mean
             if (step * step > 2.0 * _OUTLIER_SIGMAS**2 * most2).any():
                 return True
-        rungs = _rungs(batch)
-        return bool((rungs > _allowed(len(rungs)) * most2).any())
+        return bool((batch.allan > _allowed(len(batch.allan)) * most2).any())
 
 
-def learned_of(batches: Iterable[Batch], *, at_rest: bool = False) -> OwnNoise:
-    """What the seconds of a whole recording tell."""
-    own = OwnNoise(at_rest=at_rest)
+def learned_of(batches: Iterable[Batch]) -> OwnNoise:
+    """What the seconds of a whole recording at rest tell."""
+    own = OwnNoise(at_rest=True)
     for batch in batches:
         own.add(batch)
     return own
@@ -192,8 +190,8 @@ class _Seen:
         self._variances = np.array([batch.variance for batch in seconds])
         self._white = np.mean([batch.white for batch in seconds], axis=0)
         self._samples = float(np.mean([batch.n for batch in seconds]))
-        depth = min(len(_rungs(batch)) for batch in seconds)
-        within = np.mean([_rungs(batch)[:depth] for batch in seconds], axis=0)
+        depth = min(len(batch.allan) for batch in seconds)
+        within = np.mean([batch.allan[:depth] for batch in seconds], axis=0)
         # Density and degrees of freedom of one channel, at times of parts of a second and of one sample.
         parts = _parts(depth)
         many = float(len(seconds))
@@ -270,11 +268,6 @@ def _allowed(depth: int) -> Floats:
     """(depth, 1) Allan variance that chance alone may make of noise whose density is one."""
     parts = _parts(depth)
     return np.asarray((parts * _upper(_freedom(parts), _OUTLIER_SIGMAS))[:, None])
-
-
-def _rungs(batch: Batch) -> Floats:
-    assert batch.allan is not None
-    return batch.allan
 
 
 def _upper(freedom: NDArray[np.float64] | float, sigmas: float) -> Floats:

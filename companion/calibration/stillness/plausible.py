@@ -45,27 +45,19 @@ def implausible(
 ) -> dict[Triad, str]:
     """What of one IMU's means over a still stretch cannot be biased readings, by triad, and why.
 
-    Args:
-        name: of the IMU.
-        rate_rad_s: its means in vehicle FRD, (3,); `force_m_s2` likewise.
-        force_m_s2: (3,).
-        expected_m_s2: specific force by the tilt, (3,).
-        sensor_to_vehicle: its mounting, (3, 3).
-        remedy: how another mounting is said, with {} for its name.
+    The means and `expected_m_s2`, the specific force by the tilt, are (3,) in vehicle FRD; `remedy` is how another
+    mounting is said, with {} for its name.
     """
     found: dict[Triad, str] = {}
     if words := misplaced(name, force_m_s2, expected_m_s2, sensor_to_vehicle, remedy):
         return {"gyro": words, "accel": words}
-    bias = np.abs(force_m_s2 - expected_m_s2)
-    if bias.max() > MOST_ACCEL_M_S2:
-        axis = int(bias.argmax())
+    bias, rate = np.abs(force_m_s2 - expected_m_s2), np.abs(rate_rad_s)
+    if bias[axis := int(bias.argmax())] > MOST_ACCEL_M_S2:
         found["accel"] = (
             f"accel {name}: a bias of {bias[axis] / G:.2f} g on {_AXES[axis]}, more than any part has"
             f" ({MOST_ACCEL_M_S2 / G:g}): scale, unit or tilt are wrong"
         )
-    rate = np.abs(rate_rad_s)
-    if rate.max() > MOST_GYRO_RAD_S:
-        axis = int(rate.argmax())
+    if rate[axis := int(rate.argmax())] > MOST_GYRO_RAD_S:
         found["gyro"] = (
             f"gyro {name}: a bias of {rate[axis] / DEG:.0f} deg/s on {_AXES[axis]}, more than any part has"
             f" ({MOST_GYRO_RAD_S / DEG:g}): deg/s for rad/s?"

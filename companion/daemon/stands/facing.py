@@ -9,6 +9,7 @@ import datetime
 from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
+import msgspec
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import whole_accelerometer
@@ -17,7 +18,7 @@ from companion.calibration.alignment.faces import BIAS, SCALE, Face, Faces, face
 from companion.calibration.alignment.missing import Missing, missing, seen_before, up_of
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import ImuWindow, Window
-from companion.calibration.records.faces_record import FaceRecord, FacesRecord, Measured, faces_imu_record
+from companion.calibration.records.faces_record import FaceRecord, FacesImuRecord, FacesRecord, faces_imu_record
 from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.site import LocalEarth, local_earth
 from companion.component.statustext import Severity
@@ -191,19 +192,19 @@ class Facing:
 
     # --- the record
 
-    def _measured(self, last: Window, by_imu: dict[str, Faces]) -> list[Measured]:
-        """What belongs to each IMU's figures, before anything is written."""
+    def _measured(self, last: Window, by_imu: dict[str, Faces]) -> list[FacesImuRecord]:
+        """Before anything is written."""
         degrees = {imu.name: imu.temperature_degc for imu in last.imus}
-        calibrations = {name: self._imus[name].in_force for name in by_imu}
         return [
-            Measured(
+            faces_imu_record(
+                found,
                 name=name,
-                accel_id=one.accel_id,
-                corrections=one.corrections,
+                accel_id=self._imus[name].in_force.accel_id,
+                corrections=self._imus[name].in_force.corrections,
                 temperature_degc=degrees.get(name),
                 running=self._kept.running(name),
             )
-            for name, one in calibrations.items()
+            for name, found in by_imu.items()
         ]
 
     def _record(
@@ -212,7 +213,7 @@ class Facing:
         by_imu: dict[str, Faces],
         local: LocalEarth,
         draft: Draft,
-        measured: list[Measured],
+        measured: list[FacesImuRecord],
     ) -> FacesRecord:
         first = next(iter(by_imu))
         ups = by_imu[first].up @ self._imus[first].in_force.orientation.T
@@ -223,7 +224,7 @@ class Facing:
                 FaceRecord(up=vector(np.round(up, 5)), seconds=window.end_s - window.start_s)
                 for up, window in zip(ups, windows, strict=True)
             ),
-            imus=tuple(faces_imu_record(one, by_imu[one.name], draft.written.get(one.name, {})) for one in measured),
+            imus=tuple(msgspec.structs.replace(one, written=draft.written.get(one.name, {})) for one in measured),
             warnings=(*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each)),
         )
 
