@@ -102,14 +102,7 @@ class Alignment:
 def align(
     law: Law, vehicle_from_sensor: Matrix, stands: Sequence[Stand], ground: Ground, priors: Priors | None = None
 ) -> Alignment:
-    """Estimate everything from all stands together.
-
-    Args:
-        law: of the gradienter.
-        vehicle_from_sensor: its mounting, 3x3.
-        stands: at least one.
-        ground: gravity and the Earth's rate.
-        priors: what was known before.
+    """Estimate everything from all stands, at least one, together; `vehicle_from_sensor` is the gradienter's mounting.
 
     Raises:
         CalibrationRefusedError: the equations cannot be solved: readings that cannot belong together.

@@ -102,13 +102,9 @@ class Faces:
 def faces(
     stands: Sequence[Face], gravity_m_s2: float, gravity_sigma_m_s2: float, wander_m_s2: Array | None = None
 ) -> Faces:
-    """Estimate from all stands.
+    """Estimate from all stands, at least one; what they do not determine keeps the sigma of what was known before.
 
-    Args:
-        stands: one at least; what they do not determine keeps the sigma of what was known before.
-        gravity_m_s2: at the place.
-        gravity_sigma_m_s2: its sigma.
-        wander_m_s2: as in `Faces`; None: nothing.
+    `wander_m_s2` as in `Faces`; None: nothing.
 
     Raises:
         CalibrationRefusedError: readings that no accelerometer can give.

@@ -57,9 +57,7 @@ class Missing:
 def missing(found: Faces, vehicle_from_sensor: Matrix) -> Missing | None:
     """What to do next; None where bias and scale of all axes are known well enough, and checked.
 
-    Args:
-        found: from the stands so far.
-        vehicle_from_sensor: 3x3, the mounting of the accelerometers that `found` speaks of.
+    `vehicle_from_sensor`: 3x3, the mounting of the accelerometers that `found` speaks of.
     """
     wander, gravity = ENOUGH_WANDER * found.wander_m_s2, found.gravity_m_s2
     # No stand tells by how much gravity is not what the place says: that much of the scale stays open.
@@ -85,10 +83,7 @@ def missing(found: Faces, vehicle_from_sensor: Matrix) -> Missing | None:
 def seen_before(found: Faces, up: Array, vehicle_from_sensor: Matrix) -> int | None:
     """The stand, counted from 0, that was held like this one; None where it is a new one, or no side is new any more.
 
-    Args:
-        found: from the stands before.
-        up: likewise in the sensor's axes, (3,), of length 1.
-        vehicle_from_sensor: as for `missing`.
+    `up` is in the sensor's axes, (3,), of length 1; `found` is from the stands before.
     """
     if not _not_seen(found, vehicle_from_sensor):
         return None

@@ -72,13 +72,8 @@ class Mounting:
 def mounting(level: ImuAlignment, known: Accelerometer, gravity_m_s2: float, vehicle_from_sensor: Matrix) -> Mounting:
     """How the board sits against the base, from its level bias and the bias and scale of its accelerometers.
 
-    Shear is not taken off, for no firmware does; so the attitude that is corrected by this is right when level.
-
-    Args:
-        level: of `turned` (or of `align`), of the output as it comes.
-        known: of the same output, in the sensor's axes; measured earlier, its covariance holds what came since.
-        gravity_m_s2: at the place.
-        vehicle_from_sensor: 3x3, the orientation that is configured.
+    Shear is not taken off, for no firmware does; so the attitude that is corrected by this is right when level. Both
+    are of the output as it comes; `known`, in the sensor's axes, has in its covariance what came since.
     """
     read = vehicle_from_sensor.T @ (level.level_bias_m_s2 + gravity_m_s2 * LEVEL)
     stretch = 1.0 + known.figures[SCALE]

@@ -98,16 +98,7 @@ class Afloat:
             raise CalibrationRefusedError(self._at_least(MIN_S if since_s is None else MIN_LOOK_S))
         kept = self._kept.get(since_s)
         known = kept[1] if kept is not None and kept[0] == slots else None
-        return DeckMeasurement(
-            slots=list(slots),
-            estimate=list,
-            settling=None,
-            tilt=None,
-            heading=None,
-            field=None,
-            work=self._work(slots, since_s),
-            known=known,
-        )
+        return DeckMeasurement(slots=list(slots), estimate=list, work=self._work(slots, since_s), known=known)
 
     def progress(self, settings: Settings) -> Progress:
         """How far the newest estimate is from good enough."""

@@ -93,11 +93,11 @@ class Measurement(msgspec.Struct, frozen=True, kw_only=True):
     slots: list[int]
     """Its good seconds, ascending, at least one."""
     estimate: Callable[[], Found]
-    settling: str | None
+    settling: str | None = None
     """What a pose sensor's mean has to wait for."""
-    tilt: PoseSeconds | None
-    heading: PoseSeconds | None
-    field: FieldWindow | None
+    tilt: PoseSeconds | None = None
+    heading: PoseSeconds | None = None
+    field: FieldWindow | None = None
     begun_s: dict[str, float] = {}
     """By IMU, since when it has been switched on, as far as that is known."""
     turn: Turn = Turn()

@@ -15,14 +15,7 @@ import msgspec
 from companion.calibration.collector.afloat import Afloat
 from companion.calibration.collector.intake import Intake, Source
 from companion.calibration.collector.measurement import Estimates, Found, Measurement, PoseSeconds, Work
-from companion.calibration.collector.outlook import (
-    Glance,
-    Obstacle,
-    Settings,
-    Status,
-    expected_s,
-    is_enough,
-)
+from companion.calibration.collector.outlook import Glance, Obstacle, Settings, Status, expected_s, is_enough
 from companion.calibration.collector.swell import Swell
 from companion.calibration.collector.trace import Snapshot, TraceLog
 from companion.calibration.deck.deck import Deck
@@ -66,8 +59,8 @@ class RollingCollector(Intake):
         if len({imu.name for imu in imus}) != len(imus):
             raise ValueError("two IMUs have one name")
         self._settings = settings
-        self._min_good = settings.min_slots
-        self._max_slots = settings.max_slots
+        self._min_good, self._max_slots = settings.min_slots, settings.max_slots
+        self._least = min(MIN_BATCHES, self._min_good)
         super().__init__(
             self._max_slots + _MARGIN,
             gradienter=gradienter,
@@ -126,14 +119,9 @@ class RollingCollector(Intake):
 
     def glance(self, now_s: float) -> Glance:
         """How still it is at `now_s`; costs a small part of what `status` does."""
-        if self._afloat is not None:
-            seconds = float(self._afloat.seconds)
-            return Glance(obstacle=self._obstacle(now_s), still_s=seconds, steady_s=seconds)
-        return Glance(
-            obstacle=self._obstacle(now_s),
-            still_s=float(self._stretch.good),
-            steady_s=float(self._stretch.steady),
-        )
+        afloat, stretch = self._afloat, self._stretch
+        still, steady = (stretch.good, stretch.steady) if afloat is None else (afloat.seconds, afloat.seconds)
+        return Glance(obstacle=self._obstacle(now_s), still_s=float(still), steady_s=float(steady))
 
     def pending(self, now_s: float, *, since_s: float | None = None) -> Work | DeckWork | None:
         """What `window` would have to work out now, for somebody who does it elsewhere; None when there is nothing.
@@ -158,12 +146,19 @@ class RollingCollector(Intake):
 
     def status(self, now_s: float) -> Status:
         """Where it stands at `now_s` (the samples' clock). Its figures may be those of the second before."""
-        sources = self._sources()
+        sources = tuple(source.status(now_s) for source in self._sources())
         if self._afloat is not None:
-            return self._afloat_status(self._afloat, now_s, sources)
-        waiting = self._waiting_for(now_s)
-        enough = False
-        progress = 0.0
+            obstacle, found = self._obstacle(now_s), self._afloat.progress(self._settings)
+            return Status(
+                still_s=float(self._afloat.seconds),
+                obstacle=obstacle,
+                enough=found.enough and obstacle is None,
+                progress=min(found.share, 1.0 if found.enough else 0.99),
+                sources=sources,
+                measuring=found.words,
+                left=found.left,
+            )
+        waiting, enough, progress = self._waiting_for(now_s), False, 0.0
         if self._stretch.begun and waiting is None:
             estimates = self._estimate_later(self._slots(None), None, late=1)()
             if isinstance(estimates, CalibrationRefusedError):
@@ -179,29 +174,15 @@ class RollingCollector(Intake):
             obstacle=waiting,
             enough=enough,
             progress=min(progress, 1.0 if enough else 0.99),
-            sources=tuple(source.status(now_s) for source in sources),
+            sources=sources,
             measuring=f"still for {self._stretch.good} s, measuring",
-        )
-
-    def _afloat_status(self, afloat: Afloat, now_s: float, sources: list[Source]) -> Status:
-        obstacle, progress = self._obstacle(now_s), afloat.progress(self._settings)
-        return Status(
-            still_s=float(afloat.seconds),
-            obstacle=obstacle,
-            enough=progress.enough and obstacle is None,
-            progress=min(progress.share, 1.0 if progress.enough else 0.99),
-            sources=tuple(source.status(now_s) for source in sources),
-            measuring=progress.words,
-            left=progress.left,
         )
 
     def window(self, now_s: float, *, since_s: float | None = None) -> Window:
         """Means over the still stretch that ends with the latest complete second, at most `max_s` long.
 
-        Args:
-            now_s: the samples' clock.
-            since_s: only seconds that lie wholly after this, for a look at what a write has done; then 5 good
-                seconds are enough, and `duration_s` says how many there were.
+        Of seconds that lie wholly after `since_s`, for a look at what a write has done, 5 good ones are enough;
+        `duration_s` says how many there were.
 
         Raises:
             CalibrationRefusedError: not still, not still for long enough, or a source fails its checks.
@@ -220,20 +201,18 @@ class RollingCollector(Intake):
             return self._afloat.measurement(since_s)
         slots = self._slots(since_s)
         if not self._are_enough(slots, since_s):
-            needed = self._min_good if since_s is None else min(MIN_BATCHES, self._min_good)
+            needed = self._min_good if since_s is None else self._least
             raise CalibrationRefusedError(f"still for {len(slots)} s only, needs {needed} s")
+        tilt, heading, from_field = self._tilt, self._heading, self._field is not None and self._field.from_field
         return Measurement(
             slots=slots,
             estimate=self._estimate_later(slots, since_s),
             settling=self._settles(slots, 0),
-            tilt=_pose_seconds(self._tilt, slots),
-            heading=_pose_seconds(
-                self._heading,
-                slots,
-                from_field=self._field is not None and self._field.from_field,
-                wander_deg=self.wander_deg,
-            ),
-            field=self._field.window(slots) if self._field and self._heading else None,
+            tilt=None if tilt is None else PoseSeconds(tilt.label, tilt.settled(slots), len(slots)),
+            heading=None
+            if heading is None
+            else PoseSeconds(heading.label, heading.settled(slots), len(slots), from_field, self.wander_deg),
+            field=self._field.window(slots) if self._field and heading else None,
             begun_s=self.begun_s,
             turn=self.turn,
         )
@@ -265,11 +244,10 @@ class RollingCollector(Intake):
             # Seconds that were good have lost a share.
             self._break()
         self._restarts = restarts
-        through = [source.batches.closed_through for source in sources]
-        known = [slot for slot in through if slot is not None]
+        known = [slot for source in sources if (slot := source.batches.closed_through) is not None]
         if not known:
             return
-        ready = min(known) if len(known) == len(through) else -math.inf
+        ready = min(known) if len(known) == len(sources) else -math.inf
         if math.isfinite(self._now_s):
             ready = max(ready, math.floor(self._now_s - _GRACE_S) - 1)
         if not math.isfinite(ready):
@@ -349,9 +327,8 @@ class RollingCollector(Intake):
 
     def _settles(self, slots: list[int], left_s: int) -> str | None:
         """What the mean of a pose sensor over these seconds and the next `left_s` has to wait for; None for nothing."""
-        needed = min(MIN_BATCHES, self._min_good)
         sources = filter(None, (self._tilt, self._heading))
-        return next(filter(None, (source.lacks(slots, needed, left_s) for source in sources)), None)
+        return next(filter(None, (source.lacks(slots, self._least, left_s) for source in sources)), None)
 
     def _slots(self, since_s: float | None) -> list[int]:
         start = self._stretch.start
@@ -364,7 +341,7 @@ class RollingCollector(Intake):
 
     def _are_enough(self, slots: list[int], since_s: float | None) -> bool:
         if since_s is not None:
-            return len(slots) >= min(MIN_BATCHES, self._min_good)
+            return len(slots) >= self._least
         # A stretch that has begun may have had up to a fifth rejected since.
         return len(slots) >= self._min_good or (self._stretch.begun and bool(slots))
 
@@ -391,11 +368,3 @@ class RollingCollector(Intake):
             return found
 
         return estimate
-
-
-def _pose_seconds(
-    source: Source | None, slots: list[int], *, from_field: bool = False, wander_deg: float | None = None
-) -> PoseSeconds | None:
-    if source is None:
-        return None
-    return PoseSeconds(source.label, source.settled(slots), len(slots), from_field, wander_deg)

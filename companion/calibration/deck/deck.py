@@ -62,11 +62,7 @@ class Deck:
             del self._headings[next(iter(self._headings))]
 
     def slots(self, since_s: float | None = None) -> range:
-        """The seconds that all IMUs have in common, up to the last end by `EVERY_S`, at most `MAX_S`.
-
-        Args:
-            since_s: only those that begin after it.
-        """
+        """The seconds that all IMUs have in common and that begin after `since_s`, up to the last end by `EVERY_S`."""
         ends = [(one.seconds[0].slot, one.seconds[-1].slot) for one in self._streams.values() if one.seconds]
         if not ends or len(ends) < len(self._streams):
             return range(0)

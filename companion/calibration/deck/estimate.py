@@ -17,12 +17,12 @@ from companion.calibration.deck.fluid import Compared, Level, compare
 from companion.calibration.deck.smoother import Believed, Found, smooth
 from companion.calibration.deck.stream import ImuSecond, Surroundings
 from companion.calibration.means.pose import CompassModel, GradienterModel, HeadingWindow, TiltWindow
-from companion.calibration.means.windows import ImuInput, ImuWindow, Window
+from companion.calibration.means.windows import ImuInput, ImuWindow, Window, drifts, warmed
 from companion.calibration.noise.allan import AllanModel, floor_variance, slope_variance
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import Array, Floats, Matrix, vector
 from companion.physics.gradienter import up_in_sensor, up_jacobian
-from companion.physics.units import DEG, DEG_H, MG
+from companion.physics.units import DEG, MG
 
 MIN_S: Final = 60
 """Some waves: before it nothing is said to be enough."""
@@ -51,7 +51,6 @@ random walk of B / sqrt(T), it is the flicker's part of V(T, H)."""
 _UPRIGHT: Final = 0.5
 """Square of an axis' part along the vertical."""
 _GRAVITY_M_S2: Final = 9.8
-_TEMPERATURE_WARNING_K: Final = 3.0
 
 
 class ByHeading(msgspec.Struct, frozen=True, kw_only=True):
@@ -199,7 +198,7 @@ class DeckWork(msgspec.Struct, frozen=True, kw_only=True):
             gyro_sigma_use_rad_s=vector(use[:3]),
             accel_sigma_use_m_s2=vector(use[3:]),
             temperature_degc=float(np.mean(temperatures)) if temperatures else None,
-            warnings=tuple(_warnings(imu, found, temperatures)),
+            warnings=(*drifts(imu.name, found.ramp_rad_s2), *warmed(imu.name, temperatures)),
             named=imu.profile.is_named,
             covariance=covariance,
             by_earth=found.by_earth @ _level_axes(found.body_to_ned[-1]),
@@ -327,13 +326,3 @@ def _hidden_steps(imu: ImuInput, seconds: Sequence[ImuSecond]) -> Array:
     hidden = np.where(spread < _DITHERED * steps, np.square(steps / 2.0), 0.0)
     turn = np.square(imu.rotation)
     return np.concatenate([turn @ hidden[:3], turn @ hidden[3:]])
-
-
-def _warnings(imu: ImuInput, found: Found, temperatures: list[float]) -> list[str]:
-    warnings = []
-    if found.ramp_rad_s2.any():
-        rate = float(np.abs(found.ramp_rad_s2).max()) / DEG_H
-        warnings.append(f"warm-up: gyro {imu.name} drifts {rate:.1f} deg/h per second")
-    if temperatures and (span := max(temperatures) - min(temperatures)) > _TEMPERATURE_WARNING_K:
-        warnings.append(f"temperature of imu {imu.name} moved by {span:.1f} K")
-    return warnings

@@ -127,13 +127,10 @@ def level_attitude(force: Array, heading_rad: float) -> Matrix:
 
 
 def smooth(passages: Sequence[Passage], headings_rad: Floats, compass_forward: Array, believed: Believed) -> Found:
-    """Work it out.
+    """Work it out, of at least ten passages, one after another without a gap.
 
-    Args:
-        passages: one after another without a gap, at least ten.
-        headings_rad: (n,) the compass' over the middle of each; NaN where there is none.
-        compass_forward: (3,) its forward axis in the vehicle's.
-        believed: see there.
+    `headings_rad` (n,) are the compass' over the middle of each, NaN where there is none; `compass_forward` (3,) is its
+    forward axis in the vehicle's.
     """
     stretch = _Stretch.of(passages)
     known = headings_rad[np.isfinite(headings_rad)]

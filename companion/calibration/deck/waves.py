@@ -69,10 +69,7 @@ class Wander(NamedTuple):
 def whitened(columns: Floats, waves: Waves, wander: Wander = Wander()) -> Floats:  # noqa: B008 - it never changes
     """Columns (n, c) as series of unit white noise, were they made of such waves and of what has wandered.
 
-    Args:
-        columns: readings and regressors alike; a row of NaN is a gap.
-        waves: what is stationary.
-        wander: what is not.
+    Readings and regressors alike; a row of NaN is a gap.
     """
     order = max(len(waves.terms), 1)
     angle, rate, size = order, order + 1, order + 2

@@ -60,11 +60,9 @@ class Dithered(msgspec.Struct, frozen=True):
 
 
 def shifts_lsb(reading_lsb: Floats, *, alternate: bool) -> list[Floats]:
-    """By how much the output is to be shifted at each step, (6,) each, LSB.
+    """By how much the output is to be shifted at each step, (6,) each, LSB, of mean readings true to about one step.
 
-    Args:
-        reading_lsb: (6,) mean readings, true to about one step.
-        alternate: neighbouring steps must lie far apart.
+    `alternate`: neighbouring steps must lie far apart.
     """
     side = np.where(reading_lsb < 0.0, -1.0, 1.0)
     fractions = [step / STEPS for step in range(STEPS)]
@@ -79,10 +77,7 @@ def shifts_lsb(reading_lsb: Floats, *, alternate: bool) -> list[Floats]:
 def why_void(steps: Sequence[Step], latest: Step, steps_lsb: Floats) -> str | None:
     """Why the latest step says nothing: the aircraft moved, or the shift was not taken; None when it is sound.
 
-    Args:
-        steps: the sound ones before it.
-        latest: its seconds.
-        steps_lsb: (6,) of the stream, SI units.
+    `steps` are the sound ones before it; `steps_lsb` (6,) of the stream, SI units.
     """
     if len(latest.batches) < 2:
         return "too few readings"
@@ -103,13 +98,7 @@ def why_void(steps: Sequence[Step], latest: Step, steps_lsb: Floats) -> str | No
 
 
 def combine(steps: Sequence[Step], steps_lsb: Floats, profile: NoiseProfile, horizon_s: float) -> Dithered:
-    """The means over all steps, with what averaging left and what the next minutes can expect.
-
-    Args:
-        steps: all of them.
-        steps_lsb: (6,) of the stream, SI units.
-        profile: noise of the IMU.
-        horizon_s: H of V(T, H).
+    """The means over all steps, with what averaging left and what the next minutes, H of V(T, H), can expect.
 
     Raises:
         CalibrationRefusedError: a step is missing.

@@ -69,13 +69,10 @@ class IntegerColumns(msgspec.Struct, frozen=True):
 def integer_columns(
     batches: Sequence[Sequence[Batch]], steps: Floats, truncates: NDArray[np.bool_], edges: Floats
 ) -> IntegerColumns:
-    """Work out all truncated streams.
+    """Work out all truncated streams from their good batches, which are of the same seconds.
 
-    Args:
-        batches: of every stream its good batches, of the same seconds.
-        steps: (c,) of all columns of all streams in their order.
-        truncates: (c,) likewise.
-        edges: (c,) likewise: rms displacement of the integers' edges that is known of them, in steps.
+    Of all columns of all streams, (c,) each: their steps, whether they are truncated, and what is known of the rms
+    displacement of the integers' edges, in steps.
     """
     of = truncates & (steps > 0.0)
     width = len(steps)

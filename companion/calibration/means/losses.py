@@ -25,12 +25,9 @@ def refuse_broken(name: str, steps: tuple[float, float], batches: Sequence[Batch
     """
     low = np.min([batch.low for batch in batches], axis=0)
     high = np.max([batch.high for batch in batches], axis=0)
-    for triad, part, step in ((0, "gyro", steps[0]), (3, "accel", steps[1])):
-        for axis in range(3):
-            if step == 0.0 and low[triad + axis] == high[triad + axis]:
-                raise CalibrationRefusedError(
-                    f"{part} {name} is stuck: axis {_AXIS[axis]} did not change in {len(batches)} s"
-                )
+    for column in np.flatnonzero((low == high) & (np.repeat(steps, 3) == 0.0)).tolist():
+        part = f"{'gyro' if column < 3 else 'accel'} {name}"
+        raise CalibrationRefusedError(f"{part} is stuck: axis {_AXIS[column % 3]} did not change in {len(batches)} s")
     share = lost(batches)
     if share > _LOST_REFUSAL:
         raise CalibrationRefusedError(f"imu {name} lost {share:.0%} of its samples, more than {_LOST_REFUSAL:.0%}")

@@ -97,11 +97,8 @@ def beyond_two(counts: Floats) -> Floats:
 def fit(cells: Cells, sigma: Floats | None = None, start: tuple[Floats, Floats] | None = None) -> Fit:
     """Maximum-likelihood mean, and sigma unless it is given.
 
-    Args:
-        cells: the readings.
-        sigma: (c,) of the noise where it is known from elsewhere (NaN in a column where it is not); a wrong one is
-            worse than none (0.33 instead of 0.386 LSB makes 14 deg/h, autopilots 9.3.2).
-        start: (c,) mean and sigma near the solution, to save time.
+    `sigma` (c,) of the noise where it is known from elsewhere, NaN in a column where it is not; a wrong one is worse
+    than none (0.33 instead of 0.386 LSB makes 14 deg/h, autopilots 9.3.2). `start`: mean and sigma near the solution.
     """
     known = np.zeros(cells.counts.shape[1], dtype=np.bool_) if sigma is None else sigma > 0.0
     occupied = (cells.counts > 0.0).sum(axis=0)
@@ -255,18 +252,12 @@ def shape_variance(cells: Cells, found: Fit, dispersion: Floats, least: Floats |
     """What noise that is not Gaussian, or a second quantisation below this one, may have moved the mean by.
 
     Such things act as if the integers' edges were displaced. Displacements that look like another mean and sigma can
-    never be seen, so `EDGE_RMS` is believed of every stream. Where the readings occupy more cells than the fit has
-    parameters, Pearson's chi-square may tell of more (method of moments: its excess over its degrees of freedom, over
-    the non-centrality that displacements of 1 LSB rms would give).
+    never be seen, so `EDGE_RMS` is believed of every stream, and `least`, (c,), where more is known. Where the readings
+    occupy more cells than the fit has parameters, Pearson's chi-square may tell of more (method of moments: its excess
+    over its degrees of freedom, over the non-centrality that displacements of 1 LSB rms would give).
 
-    Args:
-        cells: the readings.
-        found: their fit.
-        dispersion: (c,) variance of the mean that the scatter in time shows over that of independent readings, >= 1.
-        least: (c,) rms displacement that is known from elsewhere, LSB.
-
-    Returns:
-        (c,) variance to add to the mean's, LSB^2, and (c,) rms displacement of the edges, LSB.
+    (c,) variance to add to the mean's, LSB^2, and (c,) rms displacement of the edges, LSB. `dispersion` (c,): variance
+    of the mean that the scatter in time shows over that of independent readings, >= 1.
     """
     steps = np.diff(found.influence, axis=0) * found.density[1:-1]
     sensitivity = np.square(steps).sum(axis=0)

@@ -65,8 +65,7 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
     def unseen(self, powered_s: float) -> Floats:
         """Variance (6,) that the next minute's biases have by slopes nobody sees: gyro (rad/s)^2, accel (m/s^2)^2.
 
-        Args:
-            powered_s: for so long the sensor has been switched on at least, at the end of the window.
+        `powered_s`: for so long the sensor has been switched on at least, at the end of the window.
         """
         kelvin = self._kelvin(powered_s) / WARM_UP_K**2
         slope = np.array([*self.gyro_slope, *self.accel_slope])
@@ -78,10 +77,7 @@ class Warming(msgspec.Struct, frozen=True, kw_only=True):
     def in_words(self, name: str, powered_s: float, other_variance: Floats) -> str:
         """Why the gyros' sigma is wide, where that is for the warm-up above all; else empty.
 
-        Args:
-            name: of the IMU.
-            powered_s: as above.
-            other_variance: (6,), what is in sigma besides.
+        `other_variance` (6,) is what is in sigma besides.
         """
         unseen = self.unseen(powered_s)[:3]
         if unseen.max() <= other_variance[:3].max():
@@ -160,12 +156,8 @@ def warming(
 ) -> Warming:
     """Of one window, turned into the vehicle's axes.
 
-    Args:
-        rotation: sensor to vehicle.
-        slopes: of gyro and accelerometer, (3,) each, in the sensor's axes.
-        variances: of these; infinite where the window tells nothing.
-        warm_up: gyro and accelerometer, what `WARM_UP_K` does.
-        batches: the window's seconds.
+    Slopes and their variances are of gyro and accelerometer, (3,) each, in the sensor's axes; a variance is infinite
+    where the window tells nothing. `warm_up` is what `WARM_UP_K` does.
     """
     gyro, accel = (np.minimum(np.square(rotation) @ np.minimum(each, _NOTHING), _NOTHING) for each in variances)
     rate = temperature_rate(batches)

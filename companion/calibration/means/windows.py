@@ -176,15 +176,10 @@ class ImuEstimate(msgspec.Struct, frozen=True, kw_only=True):
 def estimates(
     imus: Sequence[ImuInput], batches: Sequence[Sequence[Batch]], *, end_s: float, horizon_s: float
 ) -> list[tuple[Estimate, Estimate]]:
-    """Gyro and accelerometer of every IMU over the same good seconds, each in its sensor's axes.
+    """Gyro and accelerometer of every IMU over the same good seconds, at least 2, each in its sensor's axes.
 
-    All columns of all IMUs go through each step at once: numpy's cost is by the call, not by the column.
-
-    Args:
-        imus: their noise and their steps.
-        batches: for every IMU its good batches, ascending, of the same at least 2 slots.
-        end_s: end of the window; a ramp is evaluated here and never later.
-        horizon_s: H of V(T, H).
+    All columns of all IMUs go through each step at once: numpy's cost is by the call, not by the column. A ramp is
+    evaluated at the end of the window, `end_s`, and never later; `horizon_s` is H of V(T, H).
     """
     models = [model for imu in imus for model in (imu.profile.gyro, imu.profile.accel)]
     slots = np.array([batch.slot for batch in batches[0]], dtype=np.int64)
@@ -306,10 +301,7 @@ def imu_estimates(
     for imu, own in zip(imus, batches, strict=True):
         refuse_broken(imu.name, (imu.gyro_step_rad_s, imu.accel_step_m_s2), own)
     triads = estimates(imus, batches, end_s=end_s, horizon_s=horizon_s)
-    return [
-        _imu_estimate(imu, own, gyro, accel, rejected)
-        for imu, own, (gyro, accel) in zip(imus, batches, triads, strict=True)
-    ]
+    return [_imu_estimate(imu, own, *both, rejected) for imu, own, both in zip(imus, batches, triads, strict=True)]
 
 
 def _imu_estimate(
@@ -317,6 +309,7 @@ def _imu_estimate(
 ) -> ImuEstimate:
     temperatures = [batch.temperature_degc for batch in batches if batch.temperature_degc is not None]
     rotation = np.asarray(imu.rotation, dtype=np.float64)
+    slopes, slope_variances = (gyro.slope_per_s, accel.slope_per_s), (gyro.slope_variance, accel.slope_variance)
     window = ImuWindow(
         name=imu.name,
         samples=sum(batch.n for batch in batches),
@@ -332,13 +325,7 @@ def _imu_estimate(
         hidden=_hidden(imu, gyro, accel),
         named=imu.profile.is_named,
         mounting=(vector(rotation[0]), vector(rotation[1]), vector(rotation[2])),
-        warming=warming(
-            rotation,
-            (gyro.slope_per_s, accel.slope_per_s),
-            (gyro.slope_variance, accel.slope_variance),
-            imu.profile.warm_up,
-            batches,
-        ),
+        warming=warming(rotation, slopes, slope_variances, imu.profile.warm_up, batches),
     )
     return ImuEstimate(gyro=gyro, accel=accel, window=window)
 
@@ -380,10 +367,7 @@ def _axes(which: NDArray[np.bool_]) -> str:
 def _warnings(
     imu: ImuInput, batches: Sequence[Batch], gyro: Estimate, accel: Estimate, temperatures: list[float], rejected: int
 ) -> list[str]:
-    found: list[str] = []
-    if gyro.ramp_per_s.any():
-        rate = float(np.abs(gyro.ramp_per_s).max()) / DEG_H
-        found.append(f"warm-up: gyro {imu.name} drifts {rate:.1f} deg/h per second")
+    found = drifts(imu.name, gyro.ramp_per_s)
     if accel.ramp_per_s.any():
         rate = float(np.abs(accel.ramp_per_s).max()) / MG * 60.0
         found.append(f"warm-up: accel {imu.name} drifts {rate:.2f} mg per minute")
@@ -397,6 +381,16 @@ def _warnings(
         found.append(f"imu {imu.name} lost {share:.0%} of its samples")
     if rejected:
         found.append(f"{rejected} of {rejected + len(batches)} s were not still and are left out")
-    if temperatures and (span := max(temperatures) - min(temperatures)) > _TEMPERATURE_WARNING_K:
-        found.append(f"temperature of imu {imu.name} moved by {span:.1f} K")
-    return found
+    return found + warmed(imu.name, temperatures)
+
+
+def drifts(name: str, ramp_rad_s2: Floats) -> list[str]:
+    """What is to be said of the gyros' ramps, (3,), where there are any."""
+    rate = float(np.abs(ramp_rad_s2).max()) / DEG_H
+    return [f"warm-up: gyro {name} drifts {rate:.1f} deg/h per second"] if ramp_rad_s2.any() else []
+
+
+def warmed(name: str, temperatures_degc: Sequence[float]) -> list[str]:
+    """What is to be said of an IMU's temperatures, where they moved."""
+    span = max(temperatures_degc, default=0.0) - min(temperatures_degc, default=0.0)
+    return [f"temperature of imu {name} moved by {span:.1f} K"] if span > _TEMPERATURE_WARNING_K else []

@@ -140,12 +140,9 @@ def slope_variance(flicker: Floats, walk: Floats, mean_s: float) -> Floats:
 
 
 def allan_variance(slots: NDArray[np.int64], values: Floats, span: int) -> tuple[Floats, float]:
-    """Overlapping Allan variance of values on a 1 s grid with holes.
+    """Overlapping Allan variance of values (m, c) at ascending slots (m,) of a 1 s grid with holes.
 
-    Args:
-        slots: (m,) grid index of every value, ascending.
-        values: (m, c) one mean a slot.
-        span: averaging length in slots; an average needs at least half of its slots.
+    An average over `span` slots needs at least half of them.
 
     Returns:
         (c,) variance (zero where no pair exists) and its equivalent degrees of freedom (white noise; NIST SP 1065

@@ -75,12 +75,7 @@ class AxisFit(msgspec.Struct, frozen=True):
 
 
 def curve(slots: Slots, values: Floats) -> Curve | None:
-    """The Allan variances of one stretch; None where it is too short.
-
-    Args:
-        slots: (m,) seconds, ascending, perhaps with holes.
-        values: (m, c) means of these seconds.
-    """
+    """The Allan variances of one stretch, from the means (m, c) of ascending seconds; None where it is too short."""
     if len(slots) < LEAST_SLOTS:
         return None
     length = int(slots[-1] - slots[0]) + 1

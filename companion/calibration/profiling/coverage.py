@@ -85,8 +85,7 @@ class _Misses(msgspec.Struct):
 def coverage(recordings: Sequence[Sequence[Rest]], fallback: NoiseProfile) -> list[Kept]:
     """Fit on all recordings but one, predict in that one, in turn; of a single one, halves in the place of recordings.
 
-    Returns:
-        A line for each triad and length of window; none where no recording has room for a window and its minute.
+    A line for each triad and length of window; none where no recording has room for a window and its minute.
     """
     parts = [list(each) for each in recordings if each]
     if len(parts) == 1:
@@ -183,17 +182,9 @@ def _naive(window: Sequence[Batch]) -> Floats:
 
 
 def _summary(triad: Triad, columns: slice, mean_s: int, misses: _Misses) -> Kept:
-    miss, use, seen, naive = (
-        np.concatenate(each)[:, columns] for each in (misses.miss, misses.use, misses.seen, misses.naive)
-    )
+    all_of = (misses.miss, misses.use, misses.seen, misses.naive)
+    miss, use, seen, naive = (np.concatenate(each)[:, columns] for each in all_of)
+    shares = {"share_strict": within(miss, use), "share_naive": within(miss, naive)}
     return Kept.against(
-        miss,
-        use,
-        seen,
-        triad=triad,
-        mean_s=mean_s,
-        windows=len(miss),
-        minutes=misses.minutes,
-        share_strict=within(miss, use),
-        share_naive=within(miss, naive),
+        miss, use, seen, triad=triad, mean_s=mean_s, windows=len(miss), minutes=misses.minutes, **shares
     )

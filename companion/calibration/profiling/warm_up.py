@@ -23,11 +23,8 @@ _LEAST_K: Final = 3.0
 def learn_warm_up(recordings: Sequence[Sequence[Rest]]) -> tuple[float, float]:
     """What `WARM_UP_K` do to gyro and accelerometer: rad/s and m/s^2 of the axis that moves most.
 
-    The range of the minutes' means of each recording; where its thermometer moved, in proportion to that, but not less
-    than the range itself.
-
-    Args:
-        recordings: of each its stretches at rest, in the order of time.
+    The range of the minutes' means of each recording (its stretches at rest, in the order of time); where its
+    thermometer moved, in proportion to that, but not less than the range itself.
 
     Raises:
         CalibrationRefusedError: too little at rest.

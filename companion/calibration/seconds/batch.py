@@ -219,11 +219,8 @@ _PAUSE_S: Final = 3.0
 class BatchSource:
     """Collects one stream into batches. Never raises on what arrives; counts what it drops by reason.
 
-    Args:
-        limits: (c,) largest believable absolute value of every channel; a sample beyond is dropped.
-        keep: how many batches are kept; the oldest go first.
-        circle: the single channel is an angle in degrees on [0, 360); means are taken on the circle.
-        steps: (c,) of a stream of integers, of which every second keeps how often each one came; None for floats.
+    Beyond `limits` (c,), absolute values, nothing is believed; `keep` batches are kept. `circle`: the single channel
+    is an angle in degrees. `steps` (c,) are of a stream of integers, of which every second keeps how often each came.
     """
 
     def __init__(

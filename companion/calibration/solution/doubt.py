@@ -100,12 +100,8 @@ def doubts(
 ) -> list[Doubt]:
     """Everything that contradicts; empty while all is well.
 
-    Args:
-        triad: which half.
-        witnesses: every IMU of which something is known from before.
-        up: unit vector in the vehicle's axes, (3,).
-        by_reading: d (accelerometer bias) / d (gradienter's readings), (3, 2).
-        today: what was known is from this very power-up.
+    A witness is every IMU of which something is known from before, `today`: from this very power-up. `up` is a unit
+    vector in the vehicle's axes; `by_reading` d (accelerometer bias) / d (gradienter's readings), (3, 2).
     """
     against = [witness for witness in witnesses if witness.contradicts]
     if not against:

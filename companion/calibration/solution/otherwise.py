@@ -49,12 +49,9 @@ class Sides(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def aged_m_s2(noise: AllanModel, gap_s: float | None, kelvin: float | None) -> float:
-    """One sigma of what has come to the biases since all sides were measured.
+    """One sigma of what has come to the biases of such accelerometers since all sides were measured.
 
-    Args:
-        noise: of the accelerometers.
-        gap_s: how long ago that was; None: it may have been in another power-up.
-        kelvin: by how much it is warmer now; None where that is not known.
+    `gap_s` is how long ago that was, None: it may have been in another power-up; it is warmer now by `kelvin`.
     """
     if gap_s is None:
         wander = CATALOGUE_SCATTER["accel"] ** 2

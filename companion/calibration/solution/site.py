@@ -82,12 +82,7 @@ class LocalEarth:
     remedies: Remedies = IN_CONFIGURATION
 
     def rate_in_body(self, body_from_ned: Matrix, *, heading_known: bool) -> Uncertain:
-        """The Earth's rate in body axes.
-
-        Args:
-            body_from_ned: the attitude; its heading does not matter where it is not known.
-            heading_known: False: the horizontal part may point anywhere; its mean is zero.
-        """
+        """In body axes; with an unknown heading the horizontal part may point anywhere, and its mean is zero."""
         mean, covariance = self.rate_ned_rad_s, self.rate_ned_covariance
         if not heading_known:
             mean_square_north = mean[0] ** 2 + covariance[0, 0]

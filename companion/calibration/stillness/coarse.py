@@ -26,8 +26,7 @@ STUCK_S: Final = 60
 class Steps:
     """The steps of one IMU's six channels, and when each triad last changed in steps.
 
-    Args:
-        told: of a stream of integers; 0 where nobody knows.
+    `told` are those of a stream of integers; 0 where nobody knows.
     """
 
     def __init__(self, told: list[float]) -> None:

@@ -120,13 +120,7 @@ class Settling:
         """Of the second after it."""
 
     def judge(self, slot: int, batch: Batch | None, *, moved: bool) -> bool:
-        """Whether what the sensor said in that second counts.
-
-        Args:
-            slot: seconds come in ascending order.
-            batch: of this very second; None where it said nothing.
-            moved: the IMUs say that the aircraft was not still.
-        """
+        """Whether what the sensor said in that second, after those before, counts; `moved`: the IMUs were not still."""
         if self._lag.lag_s <= 0.0:
             return True
         if moved:

@@ -72,12 +72,7 @@ class HeldBack:
     def still(self, key: Key, held: Held | Why, present: Present, end_s: float, most_s: float) -> bool:
         """Whether a triad stays on hold: not once the output shows what is in force, or something else again.
 
-        Args:
-            key: which.
-            held: what is in force there.
-            present: what the output shows now.
-            end_s: now.
-            most_s: how long until it is tried again.
+        After `most_s` it is tried again; `end_s` is now.
         """
         on_hold = self._kept.get(key)
         if on_hold is None:

@@ -60,9 +60,7 @@ class Measuring:
     async def read_state(self, job: Job, if_armed: str | None) -> Stand:
         """How it stands now.
 
-        Args:
-            job: what it is looked at for.
-            if_armed: why the job fails where it was armed since it began; None: it goes on once it is disarmed.
+        `if_armed` is why the job fails where it was armed since it began; None: it goes on once it is disarmed.
 
         Raises:
             CalibrationRefusedError: armed (in those words), or out of time.

@@ -106,19 +106,13 @@ class Stands:
     async def next(
         self, job: Job, asked: Asked, take: Callable[[Window], tuple[_T, str | None]], if_armed: str | None = ARMED
     ) -> _T:
-        """Wait until it stands as it should, and measure.
+        """Wait until it stands as it should, and measure; returns what the first window told that was.
 
-        Args:
-            job: of the stands.
-            asked: what is asked for.
-            take: what a window tells, and why it is not the stand that was asked for, if it is not.
-            if_armed: as `Measuring.read_state`.
-
-        Returns:
-            What the first window told that was.
+        `take` says what a window tells, and why it is not the stand that was asked for, if it is not.
 
         Raises:
-            CalibrationRefusedError: armed, out of time, or what was measured before is void.
+            CalibrationRefusedError: armed (`if_armed` as in `Measuring.read_state`), out of time, or what was measured
+                before is void.
             JobCancelledError: cancelled.
         """
         loop = asyncio.get_running_loop()
