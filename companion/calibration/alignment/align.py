@@ -224,9 +224,8 @@ def _worst(
         return None, checked
     units = _units(model, rows[k])
     # All axes of that reading together: what one axis says depends on how the aircraft is turned.
-    axes = [j for j, row in enumerate(rows) if row == rows[k] and usable[j] and row.group not in ("zero", "prior")] or [
-        k
-    ]
+    alone = rows[k].group in ("zero", "prior")
+    axes = [k] if alone else [j for j, row in enumerate(rows) if row == rows[k] and usable[j]]
     size = float(np.linalg.norm(residual[axes] / redundancy[axes])) * units
     return Complaint(rows[k], abs(float(w[k])), size), checked
 

@@ -65,11 +65,7 @@ class Source:
         settling: Settling | None = None,
         keep: int = 0,
     ) -> None:
-        self.kind = kind
-        self.name = name
-        self.batches = batches
-        self.gate = gate
-        self.settling = settling
+        self.kind, self.name, self.batches, self.gate, self.settling = kind, name, batches, gate, settling
         self.may_move = False
         """Whether only faults count: on a deck."""
         self.verdict = Verdict(still=False)
@@ -83,13 +79,8 @@ class Source:
 
     def batch_for(self, slot: int) -> Batch | None:
         """The batch of that second; of a slow pose sensor the last one, for a short while."""
-        found = self.batches.batches.get(slot)
-        if found is None and self.kind != "imu":
-            for earlier in range(slot - 1, slot - _CARRY - 1, -1):
-                found = self.batches.batches.get(earlier)
-                if found is not None:
-                    break
-        return found
+        first, batches = slot if self.kind == "imu" else slot - _CARRY, self.batches.batches
+        return next((batches[at] for at in range(slot, first - 1, -1) if at in batches), None)
 
     def judge(self, slot: int, *, moved: bool = False) -> bool:
         """Whether this source was still in that second, in which by the IMUs the aircraft `moved`; remembers it."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from companion.calibration.collector.intake import SourceStatus
 from companion.calibration.means.windows import WHITE_SHARE, Estimate, ImuEstimate
 from companion.calibration.noise.allan import floor_variance
+from companion.physics.frames import Floats
 
 
 class Obstacle(msgspec.Struct, frozen=True):
@@ -129,8 +130,6 @@ def _waited_for(settings: Settings, triad: Estimate) -> NDArray[np.bool_]:
     return triad.undecided & (not settings.dither)
 
 
-def _done(
-    white: NDArray[np.float64], use: NDArray[np.float64], target: NDArray[np.float64], undecided: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def _done(white: Floats, use: Floats, target: Floats, undecided: NDArray[np.bool_]) -> NDArray[np.bool_]:
     enough = (white < WHITE_SHARE * (use - white)) & ~undecided
     return np.asarray(np.where(undecided, np.isinf(target), use <= np.square(target)) | enough)

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from companion.calibration.seconds.batch import Batch
+from companion.physics.frames import Floats
 from companion.physics.units import DEG
 
 WATCHED_S: Final = 40
@@ -28,7 +29,7 @@ class Swell:
     """Looks at the latest seconds of one IMU."""
 
     def __init__(self) -> None:
-        self._rates: deque[tuple[int, np.ndarray[tuple[int, ...], np.dtype[np.float64]]]] = deque(maxlen=WATCHED_S)
+        self._rates: deque[tuple[int, Floats]] = deque(maxlen=WATCHED_S)
         self._known: tuple[int, bool] | None = None
 
     def add(self, batch: Batch | None) -> None:

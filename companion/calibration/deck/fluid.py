@@ -44,11 +44,10 @@ def readings_deg(law: Law, up: Floats) -> Floats:
     x, y, z = (up / np.linalg.norm(up, axis=1, keepdims=True)).T
     if law == "axis":
         return np.asarray(np.column_stack([np.arcsin(-y), np.arcsin(x)]) / DEG)
-    across = np.hypot(y, z)
-    if law == "slope":
-        # tan theta / cos gamma with cos gamma = -z / across.
-        return np.asarray(np.column_stack([np.arctan2(-y, -z), np.arctan2(x, -z)]) / DEG)
-    return np.asarray(np.column_stack([np.arctan2(-y, -z), np.arctan2(x, across)]) / DEG)
+    # By slope: tan theta / cos gamma with cos gamma = -z / hypot.
+    return np.asarray(
+        np.column_stack([np.arctan2(-y, -z), np.arctan2(x, -z if law == "slope" else np.hypot(y, z))]) / DEG
+    )
 
 
 class Fluid:

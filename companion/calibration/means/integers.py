@@ -86,8 +86,6 @@ def integer_columns(
         useless=np.zeros(width, dtype=np.bool_),
         edge_rms=np.zeros(width),
     )
-    if not of.any():
-        return result
     each = width // len(batches)
     for index, own in enumerate(batches):
         part = slice(each * index, each * (index + 1))

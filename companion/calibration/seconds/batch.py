@@ -237,10 +237,7 @@ class BatchSource:
         """Samples that never came, by the device's counter or clock, since the beginning."""
         self.restarts = 0
         """How often the clock went back and everything was dropped."""
-        self._limits = np.asarray(limits)
-        self._keep = keep
-        self._circle = circle
-        self.steps = steps
+        self._limits, self._keep, self._circle, self.steps = np.asarray(limits), keep, circle, steps
         self.on_second: Callable[[Batch, Floats, Floats], None] | None = None
         """Told of every second, its times (n,) and its rows (n, c), before those are dropped."""
         self._restart()
@@ -259,8 +256,7 @@ class BatchSource:
         self._times: list[float] = []
         self._rows: list[tuple[float, ...]] = []
         self._stamps: list[float | None] = []
-        self._temperature_sum = 0.0
-        self._temperature_count = 0
+        self._degc: list[float] = []
 
     def forget(self) -> None:
         """Drop all batches and the second under way; what was counted stays."""
@@ -291,8 +287,7 @@ class BatchSource:
         self._rows.append(row)
         self._stamps.append(stamp)
         if temperature_degc is not None and math.isfinite(temperature_degc):
-            self._temperature_sum += temperature_degc
-            self._temperature_count += 1
+            self._degc.append(temperature_degc)
         return ended
 
     def _from_the_past(self, t_s: float) -> bool:
@@ -357,11 +352,9 @@ class BatchSource:
             self.dropped["not a believable number"] += int((~sound).sum())
             rows, times = rows[sound], times[sound]
             stamps = None if stamps is None else stamps[sound]
-        if stamps is not None:
-            fresh = first_of_each(stamps, rows)
-            if fresh is not None:
-                self.dropped["repeated"] += int((~fresh).sum())
-                rows, times, stamps = rows[fresh], times[fresh], stamps[fresh]
+        if stamps is not None and (fresh := first_of_each(stamps, rows)) is not None:
+            self.dropped["repeated"] += int((~fresh).sum())
+            rows, times, stamps = rows[fresh], times[fresh], stamps[fresh]
         if len(rows) == 0:
             return None
         if stamps is not None:
@@ -372,7 +365,7 @@ class BatchSource:
             times,
             rows,
             stamps,
-            self._temperature_sum / self._temperature_count if self._temperature_count else None,
+            sum(self._degc) / len(self._degc) if self._degc else None,
             circle=self._circle,
             steps=self.steps,
         )

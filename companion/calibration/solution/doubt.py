@@ -77,7 +77,7 @@ class Doubt:
     @property
     def of_all(self) -> bool:
         """Whether it concerns this triad of all IMUs, not only of those named."""
-        return self.cause not in _OF_ONE
+        return self.cause not in ("imu", "unclear")
 
     @property
     def in_short(self) -> str:
@@ -85,7 +85,6 @@ class Doubt:
         return _IN_SHORT[self.cause]
 
 
-_OF_ONE: Final = ("imu", "unclear")
 _IN_SHORT: Final[dict[Cause, str]] = {
     "gradienter": "gradienter or its zero moved",
     "gravity": "gravity differs",

@@ -301,19 +301,13 @@ def _estimate(solution: Solution, used: Sequence[_Known], *, zero_is_known: bool
     covariance = rest @ s_d @ rest.T + gain @ s_p @ gain.T + mixed + mixed.T
     stat_covariance = rest @ np.diag(np.square(stat)) @ rest.T + gain @ s_p @ gain.T
     shift = gain @ innovation
+    part = {imu.name: slice(6 * k, 6 * k + 6) for k, imu in enumerate(solution.imus)}
+    stat = np.sqrt(np.diag(stat_covariance))
     imus = tuple(
-        _shifted(
-            imu,
-            shift[6 * k : 6 * k + 6],
-            covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6],
-            np.sqrt(np.diag(stat_covariance)[6 * k : 6 * k + 6]),
-        )
-        for k, imu in enumerate(solution.imus)
+        _shifted(imu, shift[at], covariance[at, at], stat[at])
+        for imu, at in zip(solution.imus, part.values(), strict=True)
     )
-    cross = {
-        (one.name, other.name): covariance[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
-        for (i, one), (j, other) in itertools.combinations(enumerate(imus), 2)
-    }
+    cross = {(one, other): covariance[part[one], part[other]] for one, other in itertools.combinations(part, 2)}
     return dataclasses.replace(solution, imus=imus, cross=cross)
 
 

@@ -308,10 +308,9 @@ class PoseGate:
     """The gate of the gradienter (two channels, deg) or of the compass (one channel on the circle, deg)."""
 
     def __init__(self, name: Literal["gradienter", "compass"]) -> None:
-        self._name = name
-        self._circle = name == "compass"
-        self._motion_deg = HEADING_MOTION_DEG if self._circle else TILT_MOTION_DEG
-        self._step_deg = HEADING_STEP_DEG if self._circle else TILT_STEP_DEG
+        self._name, self._circle = name, name == "compass"
+        tilt, heading = (TILT_MOTION_DEG, TILT_STEP_DEG), (HEADING_MOTION_DEG, HEADING_STEP_DEG)
+        self._motion_deg, self._step_deg = heading if self._circle else tilt
         self.new_stretch()
 
     def new_stretch(self) -> None:

@@ -52,16 +52,13 @@ class Stretch:
     def add(self, slot: int, *, good: bool) -> bool:
         """Take the next second; False when the stretch broke with it."""
         self._steady = self._steady + 1 if good else 0
+        self.flags.append(good)
         if good:
-            if self.start is None:
-                self.start = slot
-            self.good += 1
-            self._run = 0
-            self.flags.append(True)
+            self.start = slot if self.start is None else self.start
+            self.good, self._run = self.good + 1, 0
             self.begun = self.begun or self.good >= self._min_good
             return True
         self._run += 1
-        self.flags.append(False)
         rejected = len(self.flags) - sum(self.flags)
         if not self.begun or self._run > MAX_REJECTED_RUN or rejected > MAX_REJECTED * len(self.flags):
             was = self.start is not None
@@ -190,8 +187,7 @@ class HeadingWatch:
         if heading is None:
             return
         value = float(heading.mean[0])
-        if self._first_deg is None:
-            self._first_deg = value
+        self._first_deg = value if self._first_deg is None else self._first_deg
         self._latest.append(wrap_deg(value - self._first_deg))
         if len(self._latest) == SMOOTHED_OVER:
             smooth_deg = sum(self._latest) / SMOOTHED_OVER
