@@ -54,14 +54,14 @@ def turned(stands: Sequence[Stand], ground: Ground, priors: Priors = ALONE) -> A
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Mounting:
-    """How a level aircraft looks to a board whose accelerometers are corrected: what its attitude shows too much."""
+    """How a level aircraft looks to a board whose accelerometers are corrected: what its attitude shows too much.
+
+    Roll is right side down, pitch nose up; the covariance (2, 2) is of both.
+    """
 
     roll_rad: float
-    """Right side down +."""
     pitch_rad: float
-    """Nose up +."""
     covariance_rad2: Matrix
-    """(2, 2), roll and pitch."""
 
     @property
     def sigma_rad(self) -> Array:

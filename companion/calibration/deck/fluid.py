@@ -35,7 +35,6 @@ class Compared(NamedTuple):
     """What the gradienter shows more than the accelerometers would make it, over many seconds."""
 
     difference_deg: Array
-    """(2,) x and y."""
     covariance_deg2: Matrix
 
 

@@ -47,12 +47,10 @@ _erfc = np.frompyfunc(math.erfc, 1, 1)
 
 
 class Cells(msgspec.Struct, frozen=True):
-    """How often the reading fell between neighbouring edges."""
+    """How often, (k, c), the reading fell between neighbouring edges, (k + 1, c) ascending; may be weighted."""
 
     edges: Floats
-    """(k + 1, c), ascending, LSB."""
     counts: Floats
-    """(k, c); may be weighted."""
 
 
 class Fit(msgspec.Struct, frozen=True):
@@ -71,9 +69,8 @@ class Fit(msgspec.Struct, frozen=True):
     """(k, c): by how much one reading in that cell moves the mean, times the number of readings. So the mean over a
     part of the readings of (mean + influence) estimates that part's mean to first order."""
     probability: Floats
-    """(k, c) of the cells, by the fit."""
+    """(k, c) of the cells by the fit, and its density (k + 1, c) at their edges."""
     density: Floats
-    """(k + 1, c) of the fit at the edges."""
     slopes: Floats
     """(2, k, c): derivatives of the cells' log-probability by the two parameters."""
 

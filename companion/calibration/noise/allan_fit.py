@@ -46,16 +46,12 @@ _PAIRS: Final = tuple(itertools.combinations_with_replacement(range(3), 2))
 
 
 class Curve(msgspec.Struct, frozen=True):
-    """Allan variances of one stretch, c columns."""
+    """Allan variances (k, c) at averaging times (k,) of one stretch of so many seconds, of which a share is no hole."""
 
     length: int
-    """Seconds from its first to its last."""
     spans: tuple[int, ...]
-    """(k,) averaging times, s."""
     variance: Floats
-    """(k, c)."""
     filled: float
-    """Share of its seconds that are no holes."""
 
 
 class AxisFit(msgspec.Struct, frozen=True):

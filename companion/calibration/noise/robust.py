@@ -92,16 +92,13 @@ def robust_mean(values: Floats, c: Floats | float = HUBER_C, least: Floats | flo
 
 
 class Line(msgspec.Struct, frozen=True):
-    """A robust straight line through every column."""
+    """A robust straight line through every column, (c,) each: its end, slope per second, and that over its error."""
 
     end: Floats
-    """(c,) value at the end of the window."""
     slope: Floats
-    """(c,) per second."""
     t_statistic: Floats
-    """(c,) slope over its standard error."""
     end_leverage: Floats
-    """(c,) variance of `end` over the variance of one value: about 4/m, against 1/m for a mean."""
+    """Variance of `end` over the variance of one value: about 4/m, against 1/m for a mean."""
 
 
 def huber_line(

@@ -29,12 +29,10 @@ _AT_ONCE: Final = 100
 
 
 class Held(msgspec.Struct, frozen=True, kw_only=True):
-    """What was said of the time after windows, against what came."""
+    """What was said of the time after windows (the median sigma_use), against what came (rms); rad/s or m/s^2."""
 
     sigma_use: float
-    """Median of sqrt(V(T, H)), rad/s or m/s^2."""
     rms: float
-    """Of the misses."""
     ratio: float
     """Rms of a miss over its sigma; 1 where sigma is right."""
     share: float

@@ -73,7 +73,6 @@ class FacesRecord(msgspec.Struct, frozen=True, kw_only=True):
     format_version: int = FORMAT_VERSION
     kind: Literal["faces"] = "faces"
     measured_at: str
-    """UTC, ISO 8601; the host's clock."""
     gravity_m_s2: float
     stands: tuple[FaceRecord, ...]
     imus: tuple[FacesImuRecord, ...]

@@ -28,31 +28,25 @@ class TurnImuRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BoardRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """How the board sits against the base: what its attitude shows too much when the base is level."""
+    """How the board sits against the base: what its attitude (roll right side down) shows too much on a level base."""
 
     imu: str
     """Whose accelerometers told; their bias and scale are known from all sides."""
     faces_measured_at: str
     roll_deg: float
-    """Right side down +."""
     pitch_deg: float
-    """Nose up +."""
     sigma_deg: tuple[float, float]
-    """Of roll and pitch."""
     written: dict[str, WrittenParameter] = {}
 
 
 class TurnRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Finished."""
+    """Finished; figures as in `AlignmentRecord`."""
 
     format_version: int = FORMAT_VERSION
     kind: Literal["turn"] = "turn"
     measured_at: str
-    """UTC, ISO 8601; the host's clock."""
     slope_deg: float
-    """Of the spot."""
     checked: bool
-    """Whether a spot that moved between the stands would have been noticed."""
     chi_square: float
     freedom: int
     stands: tuple[StandRecord, ...]

@@ -85,14 +85,11 @@ NOTHING: Final = Otherwise()
 
 
 class Up(NamedTuple):
-    """Which way is up, by accelerometers alone."""
+    """Which way is up by one IMU's accelerometers alone: a unit vector in the vehicle's axes, and its covariance."""
 
     up: Array
-    """Unit vector in the vehicle's axes, (3,)."""
     covariance: Matrix
-    """(3, 3), radian squared."""
     imu: str
-    """Whose."""
 
 
 def up_by_sides(imus: Sequence[ImuWindow], otherwise: Otherwise, local: LocalEarth, warnings: list[str]) -> Up | None:

@@ -44,13 +44,7 @@ class Solver:
         platform, any_bias = config.vehicle.platform, config.calibration.any_bias
         found: Solution = await self._core.offload(
             lambda: solve(
-                window,
-                local_earth(given.where),
-                *poses,
-                what,
-                platform,
-                any_bias=any_bias,
-                otherwise=given.otherwise,
+                window, local_earth(given.where), *poses, what, platform, any_bias=any_bias, otherwise=given.otherwise
             )
         )
         return found, given

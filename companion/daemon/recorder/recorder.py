@@ -291,11 +291,7 @@ class Recorder(Subsystem):
         return {"record": self._answer}
 
     async def _answer(self, request: Object, _face: str) -> AsyncIterator[Object]:
-        """Begin, and tell how it goes until it ends; or end it.
-
-        Raises:
-            StorageError: the file cannot be created, or recording is not possible.
-        """
+        """Begin, and tell how it goes until it ends; or end it."""
         if request.get("stop") is True:
             if (recording := self._on_request) is None:
                 raise StorageError("nothing is being recorded on request")

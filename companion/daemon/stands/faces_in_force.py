@@ -16,7 +16,7 @@ from companion.calibration.solution.otherwise import Sides, aged_m_s2
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.formats import Object
-from companion.physics.frames import Array
+from companion.physics.frames import Array, Matrix
 from companion.physics.units import MG
 from companion.storage.learned import FacesStore, this_boot
 
@@ -46,17 +46,16 @@ class FacesInForce:
     def status(self) -> list[Object]:
         """By IMU, what its output has left of bias and scale under what corrects it now, and how well that is known."""
         found: list[Object] = []
-        for kept in () if self.record is None else self.record.imus:
-            source = self._imus.get(kept.name)
-            calibration = None if source is None else source.calibration
-            known = None if calibration is None else self.known(kept.name, calibration, kept.temperature_degc)
-            if self.record is None or known is None:
+        record = self.record
+        for kept in () if record is None else record.imus:
+            now = self._now(kept.name, kept.temperature_degc)
+            if record is None or now is None:
                 continue
-            sigma = np.sqrt(np.diag(known.covariance))
+            known, sigma = now[0], np.sqrt(np.diag(now[0].covariance))
             found.append(
                 {
                     "name": kept.name,
-                    "measured_at": self.record.measured_at,
+                    "measured_at": record.measured_at,
                     "temperature_degc": kept.temperature_degc,
                     "bias_left_mg": (known.figures[BIAS] / MG).round(4).tolist(),
                     "bias_sigma_mg": (sigma[BIAS] / MG).round(4).tolist(),
@@ -75,14 +74,14 @@ class FacesInForce:
 
     def sides(self, window: Window) -> dict[str, Sides]:
         """By IMU, for a tilt from these means."""
-        found = {}
-        for imu in window.imus:
-            source = self._imus.get(imu.name)
-            calibration = None if source is None else source.calibration
-            known = None if calibration is None else self.known(imu.name, calibration, imu.temperature_degc)
-            if known is not None and calibration is not None:
-                found[imu.name] = Sides.of(known, calibration.orientation)
-        return found
+        found = {imu.name: self._now(imu.name, imu.temperature_degc) for imu in window.imus}
+        return {name: Sides.of(*now) for name, now in found.items() if now is not None}
+
+    def _now(self, name: str, temperature_degc: float | None) -> tuple[Accelerometer, Matrix] | None:
+        """As `known`, under what is in force, and how it sits; None also where that is not known."""
+        calibration = self._imus[name].calibration if name in self._imus else None
+        known = None if calibration is None else self.known(name, calibration, temperature_degc)
+        return None if known is None or calibration is None else (known, calibration.orientation)
 
     def known(self, name: str, calibration: ImuCalibration, temperature_degc: float | None) -> Accelerometer | None:
         """Of one IMU's output under what corrects it now, in its own axes; None where nothing is known of this part."""
