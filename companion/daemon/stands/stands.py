@@ -14,8 +14,7 @@ from typing import Final, NamedTuple, TypeVar
 import msgspec
 import numpy as np
 
-from companion.calibration.alignment.align_model import ImuStand
-from companion.calibration.means.windows import ImuWindow, Window
+from companion.calibration.means.windows import Window
 from companion.component.service import JobResult
 from companion.component.statustext import CHUNK_BYTES, Severity
 from companion.component.tunes import Tune
@@ -23,9 +22,11 @@ from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.daemon.stands import align_steps
-from companion.daemon.stands.align_steps import LEVEL, Hold, Plan
+from companion.daemon.stands.align_steps import LEVEL, Hold, Plan, Seen
 from companion.daemon.stands.measuring import POLL_S, Measuring
+from companion.daemon.stands.taken import Taken
 from companion.errors import CalibrationRefusedError
+from companion.physics.frames import Array
 from companion.physics.units import DEG
 
 STAND_S: Final = 12.0
@@ -176,17 +177,33 @@ class Stands:
             self._core.prompt(Tune.WRONG, objection.partition(":")[0])
             self._say(Severity.NOTICE, asked.spoken)
 
-    def turned_deg(self, plan: Plan, taken: Sequence[Window], now: Window) -> tuple[float, float]:
-        """By how much it was turned since the last stand taken, and one sigma besides the gyros' scale.
+    async def take(
+        self, job: Job, plan: Plan, taken: Sequence[Taken], see: Callable[[Window], Taken], if_armed: str | None = ARMED
+    ) -> Taken:
+        """The next stand of a plan, as `next`; `see` says how it stands."""
+        seen = [one.seen for one in taken]
 
-        By the gyros of the first IMU; where samples are missing, as when the autopilot restarts, as was asked.
+        def fits(window: Window) -> tuple[Taken, str | None]:
+            found = see(window)
+            return found, align_steps.objection(plan, seen, found.seen)
+
+        asked = Asked(len(taken) + 1, plan.total, align_steps.request(plan, seen), align_steps.hold(plan, seen))
+        return await self.next(job, asked, fits, if_armed)
+
+    def turned(self, plan: Plan, taken: Sequence[Taken], now: Window, up: Array, first_sigma_deg: float) -> Taken:
+        """A stand whose heading is what the gyros of the first IMU have counted since the one before.
+
+        Where samples are missing, as when the autopilot restarts, it was turned as was asked.
         """
-        before, (imu, *_) = taken[-1], now.imus
+        if not taken:
+            return Taken(now, Seen(up, 0.0), first_sigma_deg)
+        before, (imu, *_) = taken[-1].window, now.imus
         bias = (np.array(before.imus[0].gyro_rad_s) + np.array(imu.gyro_rad_s)) / 2.0
         counted = self._collector.counted(imu.name, before.end_s, now.start_s, bias)
-        if counted is None:
-            return align_steps.asked_turn_deg(plan, len(taken)), align_steps.BY_EYE_SIGMA_DEG
-        return counted.angle_rad / DEG, counted.sigma_rad / DEG
+        turn_deg, sigma_deg = align_steps.asked_turn_deg(plan, len(taken)), align_steps.BY_EYE_SIGMA_DEG
+        if counted is not None:
+            turn_deg, sigma_deg = counted.angle_rad / DEG, counted.sigma_rad / DEG
+        return Taken(now, Seen(up, taken[-1].seen.heading_deg + turn_deg), sigma_deg, counted=True)
 
     @contextlib.contextmanager
     def imus_alone(self) -> Iterator[None]:
@@ -223,17 +240,6 @@ def _up(window: Window) -> tuple[float, float, float]:
     read = np.array(window.imus[0].accel_m_s2)
     x, y, z = (read / max(float(np.linalg.norm(read)), 1e-9)).round(3).tolist()
     return x, y, z
-
-
-def imu_stand(window: ImuWindow) -> ImuStand:
-    """One IMU of a stand, as measured in its window."""
-    return ImuStand(
-        window.name,
-        np.array(window.accel_m_s2),
-        np.array(window.accel_sigma_use_m_s2),
-        np.array(window.gyro_rad_s),
-        np.array(window.gyro_sigma_use_rad_s),
-    )
 
 
 def _changed(name: str) -> CalibrationRefusedError:

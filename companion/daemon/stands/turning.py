@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import datetime
 from collections.abc import Mapping
 from typing import Final, NamedTuple
@@ -12,7 +11,7 @@ import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import changes_for
 from companion.calibration.alignment.align import Alignment, in_words
-from companion.calibration.alignment.align_model import Ground, Stand
+from companion.calibration.alignment.align_model import Stand
 from companion.calibration.alignment.spot import Mounting, mounting, turned
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
@@ -26,12 +25,12 @@ from companion.configured import models
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
-from companion.daemon.stands import align_steps
 from companion.daemon.stands.accel_writes import AccelWrites
-from companion.daemon.stands.align_steps import Plan, Seen
+from companion.daemon.stands.align_steps import Plan
 from companion.daemon.stands.faces_in_force import FacesInForce
 from companion.daemon.stands.level_writes import LevelWrites
-from companion.daemon.stands.stands import Asked, Stands, imu_stand
+from companion.daemon.stands.stands import Stands
+from companion.daemon.stands.taken import Taken, ground, readable
 from companion.errors import CalibrationRefusedError
 from companion.physics.frames import vector
 from companion.physics.units import DEG, MG
@@ -39,15 +38,6 @@ from companion.storage.changes import Origin
 
 LOOSE_M_S2: Final = 0.5 * MG
 """A level known worse than marks allow: on a slope of which it is not known how far it was turned."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class _Taken:
-    """One stand, measured; its heading is counted from the first stand on, not wrapped."""
-
-    window: Window
-    seen: Seen
-    turn_sigma_deg: float
 
 
 class TurnAsked(NamedTuple):
@@ -96,18 +86,24 @@ class Turning:
 
     async def _run(self, job: Job, asked: TurnAsked) -> str:
         plan = Plan("zero", asked.headings, back=True)
-        taken: list[_Taken] = []
+        taken: list[Taken] = []
+
+        def see(window: Window) -> Taken:
+            up = np.array(window.imus[0].accel_m_s2)
+            return self._stands.turned(plan, taken, window, up / np.linalg.norm(up), 0.01)
+
         self._stands.begin(job)
         while len(taken) < plan.on_spot:
             if taken:
                 self._machine.on(Event.MOVED)
-            taken.append(await self._next(job, plan, taken))
+            taken.append(await self._stands.take(job, plan, taken, see, if_armed=None))
             self._machine.on(Event.ENOUGH)
         await self._stands.check_offsets()
         where = models.whereabouts(self._core.config, self._core.vehicle)
         local = await self._core.offload(local_earth, where)
-        stands = self._as_stands(taken)
-        found: Alignment = await self._core.offload(turned, stands, _ground(local))
+        names = readable(taken, self._imus)
+        stands = [one.as_stand(names) for one in taken]
+        found: Alignment = await self._core.offload(turned, stands, ground(local, None))
         if found.complaint is not None:
             raise CalibrationRefusedError(in_words(found.complaint, gradienter=False))
         draft = Draft(datetime.datetime.now(tz=datetime.UTC), self._core.vehicle.system_id)
@@ -162,43 +158,6 @@ class Turning:
             written=written,
         )
 
-    async def _next(self, job: Job, plan: Plan, taken: list[_Taken]) -> _Taken:
-        seen = [one.seen for one in taken]
-
-        def take(window: Window) -> tuple[_Taken, str | None]:
-            up = np.array(window.imus[0].accel_m_s2)
-            heading, sigma = 0.0, 0.01
-            if taken:
-                turn, sigma = self._stands.turned_deg(plan, [one.window for one in taken], window)
-                heading = taken[-1].seen.heading_deg + turn
-            found = _Taken(window, Seen(up / np.linalg.norm(up), heading), sigma)
-            return found, align_steps.objection(plan, seen, found.seen)
-
-        asked = Asked(len(taken) + 1, plan.on_spot, align_steps.request(plan, seen), align_steps.hold(plan, seen))
-        return await self._stands.next(job, asked, take, if_armed=None)
-
-    def _as_stands(self, taken: list[_Taken]) -> list[Stand]:
-        names = [
-            name
-            for name in self._imus
-            if all(any(one.name == name and not one.refused("accel") for one in each.window.imus) for each in taken)
-        ]
-        if not names:
-            raise CalibrationRefusedError("no IMU whose accelerometers can be read")
-        return [self._as_stand(one, names, counted=k > 0) for k, one in enumerate(taken)]
-
-    def _as_stand(self, taken: _Taken, names: list[str], *, counted: bool) -> Stand:
-        by_name = {imu.name: imu for imu in taken.window.imus}
-        return Stand(
-            imus=tuple(imu_stand(by_name[name]) for name in names),
-            tilt_deg=None,
-            tilt_sigma_deg=(1.0, 1.0),
-            heading_rad=taken.seen.heading_deg * DEG,
-            heading_sigma_rad=taken.turn_sigma_deg * DEG,
-            on_spot=True,
-            counted=counted,
-        )
-
 
 def _in_words(found: Alignment, board: Mounting | None, asked: TurnAsked) -> str:
     words = f"level known to {_sigma_m_s2(found) / MG:.2f} mg, the spot slopes by {found.slope_deg:.2f} deg"
@@ -212,22 +171,15 @@ def _sigma_m_s2(found: Alignment) -> float:
     return max(float(np.sqrt(np.diag(imu.level_covariance_m2_s4))[:2].max()) for imu in found.imus)
 
 
-def _ground(local: LocalEarth) -> Ground:
-    """Headings count from the first stand, which may point anywhere."""
-    rate = local.rate_in_body(np.eye(3), heading_known=False)
-    return Ground(local.gravity_m_s2, local.gravity_sigma_m_s2, rate.mean, rate.covariance)
-
-
-def _record(taken: list[_Taken], stands: list[Stand], found: Alignment, draft: Draft) -> TurnRecord:
+def _record(taken: list[Taken], stands: list[Stand], found: Alignment, draft: Draft) -> TurnRecord:
     degrees = {imu.name: imu.temperature_degc for imu in taken[-1].window.imus}
-    spans_s = [one.window.end_s - one.window.start_s for one in taken]
     return TurnRecord(
         measured_at=draft.started,
         slope_deg=round(found.slope_deg, 3),
         checked=found.checked,
         chi_square=round(found.chi_square, 3),
         freedom=found.freedom,
-        stands=tuple(stand_record(stand, found, k, spans_s[k], (0.0, 0.0)) for k, stand in enumerate(stands)),
+        stands=tuple(stand_record(stand, found, k, taken[k].seconds, (0.0, 0.0)) for k, stand in enumerate(stands)),
         imus=tuple(turn_imu_record(imu, degrees.get(imu.name), draft.written.get(imu.name, {})) for imu in found.imus),
         warnings=(*draft.warnings, *(words for each in draft.imu_warnings.values() for words in each)),
     )
