@@ -9,7 +9,8 @@ from __future__ import annotations
 import asyncio
 import datetime
 import logging
-from collections.abc import Awaitable, Collection, Coroutine
+from collections.abc import Awaitable, Callable, Collection, Coroutine
+from typing import Literal
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -127,7 +128,8 @@ class Conductor:
         if running is not None and whole and running.what in (what, What.BOTH):
             running.adopt(requester, deadline_s, reboot=reboot)
             return running
-        missing = "accelerometers need a gradienter: none is configured" if what is What.ACCELEROMETERS else None
+        untold = what is What.ACCELEROMETERS and not self._has_gradienter
+        missing = "accelerometers need a gradienter: none is configured" if untold else None
         if (refusal := self._refusal(requester, missing)) is not None:
             return refusal
         kind = AUTOMATIC if automatic else "calibration"
@@ -136,33 +138,35 @@ class Conductor:
 
     def start_alignment(self, plan: Plan, requester: str, timeout_s: float) -> Job | Refusal:
         """Start measuring the gradienter's zero, or say why not."""
-        if self._on_deck:
-            return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
-        refusal = self._refusal(requester, "there is no gradienter to align: none is configured")
-        if refusal is not None:
-            return refusal
-        job = Job(ALIGNMENT, What.BOTH, requester, asyncio.get_running_loop().time() + timeout_s)
-        return self._start(job, Event.REQUEST, self._align(job, plan))
+        missing = None if self._has_gradienter else "there is no gradienter to align: none is configured"
+        return self._start_stands(ALIGNMENT, requester, timeout_s, missing, lambda job: self._aligner.run(job, plan))
 
     def start_faces(self, requester: str, timeout_s: float, *, write: bool) -> Job | Refusal:
         """Start measuring the accelerometers in stands of any orientation, or say why not."""
-        if (refusal := self._refuses_stands(requester, self._facing.why_not(write=write))) is not None:
-            return refusal
-        job = Job(FACES, What.ACCELEROMETERS, requester, asyncio.get_running_loop().time() + timeout_s)
-        return self._start(job, Event.REQUEST, self._face(job, write=write))
+        missing = self._facing.why_not(write=write)
+        return self._start_stands(FACES, requester, timeout_s, missing, lambda job: self._facing.run(job, write=write))
 
     def start_turn(self, asked: TurnAsked, requester: str, timeout_s: float) -> Job | Refusal:
         """Start finding the level by turning on a spot, without a gradienter, or say why not."""
-        if (refusal := self._refuses_stands(requester, self._turning.why_not(asked))) is not None:
-            return refusal
-        job = Job(TURN, What.ACCELEROMETERS, requester, asyncio.get_running_loop().time() + timeout_s)
-        return self._start(job, Event.REQUEST, self._turn(job, asked))
+        missing = self._turning.why_not(asked)
+        return self._start_stands(TURN, requester, timeout_s, missing, lambda job: self._turning.run(job, asked))
 
-    def _refuses_stands(self, requester: str, missing: str | None) -> Refusal | None:
+    def _start_stands(
+        self, kind: str, requester: str, timeout_s: float, missing: str | None, run: Callable[[Job], Awaitable[str]]
+    ) -> Job | Refusal:
+        if self._on_deck and kind == ALIGNMENT:
+            return Refusal("other", "a zero is not measured on a deck that moves: align ashore")
         if self._on_deck:
             return Refusal("other", "accelerometers are not measured on a deck that moves: align ashore")
-        refusal = self._refusal(requester)
-        return Refusal("other", missing) if refusal is None and missing is not None else refusal
+        if (refusal := self._refusal(requester, missing)) is not None:
+            return refusal
+        what = What.BOTH if kind == ALIGNMENT else What.ACCELEROMETERS
+        job = Job(kind, what, requester, asyncio.get_running_loop().time() + timeout_s)
+
+        async def work() -> None:
+            self._end(job, await _result(job, run(job)))
+
+        return self._start(job, Event.REQUEST, work())
 
     def start_undo(self, requester: str, *, force: bool = False) -> Job | Refusal:
         """Start putting back the values from before the last write, or say why not (see `Recovery.undo`)."""
@@ -176,9 +180,7 @@ class Conductor:
             work = self._undo_instead(self._task, running, self.job, force=force)
             self._task = asyncio.get_running_loop().create_task(work, name="undo")
             return self.job
-        nothing = self._recovery.why_no_undo()
-        refusal = self._refusal(requester, nothing=nothing)
-        if refusal is not None:
+        if (refusal := self._refusal(requester, self._recovery.why_no_undo(), "nothing_to_undo")) is not None:
             return refusal
         job = Job("undo", What.BOTH, requester, None)
         return self._start(job, Event.UNDO, self._undo(job, force=force))
@@ -198,16 +200,14 @@ class Conductor:
 
     # --- starting and ending
 
-    def _refusal(self, requester: str, no_gradienter: str | None = None, nothing: str | None = None) -> Refusal | None:
+    def _refusal(
+        self, requester: str, missing: str | None, kind: Literal["other", "nothing_to_undo"] = "other"
+    ) -> Refusal | None:
         if self._only_listening is not None:
             return Refusal("other", self._only_listening)
         if (found := self.why_not()) is not None:
             return found.refusal
-        if no_gradienter is not None and not self._has_gradienter:
-            return Refusal("other", no_gradienter)
-        if nothing is not None:
-            return Refusal("nothing_to_undo", nothing)
-        return self._starts.refuses(requester)
+        return self._starts.refuses(requester) if missing is None else Refusal(kind, missing)
 
     def _by_itself(self) -> Job | None:
         """The calibration that runs without anybody having asked for it, while disarmed."""
@@ -273,15 +273,6 @@ class Conductor:
         await self._results.keep(record, started_s, draft.measured_s)
         self._collector.retarget(self._wanted.settings)
         self._end(job, result)
-
-    async def _align(self, job: Job, plan: Plan) -> None:
-        self._end(job, await _result(job, self._aligner.run(job, plan)))
-
-    async def _face(self, job: Job, *, write: bool) -> None:
-        self._end(job, await _result(job, self._facing.run(job, write=write)))
-
-    async def _turn(self, job: Job, asked: TurnAsked) -> None:
-        self._end(job, await _result(job, self._turning.run(job, asked)))
 
     # --- an undo
 

@@ -183,19 +183,19 @@ class Calibrating(Subsystem):
         return {"state": state, "reason": reason, **found}
 
     def _start_alignment(self, request: Object, face: str) -> Job:
-        action, headings = request.get("action"), request.get("headings")
-        timeout_s = request.get("timeout_s")
+        action, headings, timeout_s = (request.get(key) for key in ("action", "headings", "timeout_s"))
         timeout_s = ALIGN_TIMEOUT_S if timeout_s is None else timeout_s
-        write, level = request.get("write") is True, request.get("level") is True
-        if action == "faces" and is_time_limit(timeout_s):
-            return _accepted(self.conductor.start_faces(f"{face} align", float(timeout_s), write=write))
-        if action == "turn" and headings in (None, 2, HEADINGS) and is_time_limit(timeout_s):
-            asked = TurnAsked(headings or HEADINGS, write=write, level=level)
-            return _accepted(self.conductor.start_turn(asked, f"{face} align", float(timeout_s)))
-        headings = 2 if headings is None else headings
-        if action not in ("zero", "tilts") or headings not in (2, HEADINGS) or not is_time_limit(timeout_s):
-            raise CalibrationRefusedError(f"align: {request} is not understood")
-        return _accepted(self.conductor.start_alignment(Plan(action, headings), f"{face} align", float(timeout_s)))
+        if headings not in (None, 2, HEADINGS) or not is_time_limit(timeout_s):
+            action = None
+        conductor, write, by = self.conductor, request.get("write") is True, f"{face} align"
+        if action == "faces":
+            return _accepted(conductor.start_faces(by, timeout_s, write=write))
+        if action == "turn":
+            asked = TurnAsked(headings or HEADINGS, write=write, level=request.get("level") is True)
+            return _accepted(conductor.start_turn(asked, by, timeout_s))
+        if action in ("zero", "tilts"):
+            return _accepted(conductor.start_alignment(Plan(action, headings or 2), by, timeout_s))
+        raise CalibrationRefusedError(f"align: {request} is not understood")
 
     async def _progress(self, job: Job) -> AsyncIterator[Object]:
         while job.is_running:
