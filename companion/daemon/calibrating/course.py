@@ -22,7 +22,7 @@ from companion.calibration.solution.draft import Draft, unseen_turn
 from companion.calibration.solution.joint import Weighed, weigh
 from companion.calibration.solution.prior import Expectation
 from companion.calibration.solution.solve import Solution
-from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
+from companion.component.service import WRITTEN_PERCENT
 from companion.component.statustext import Severity
 from companion.component.tunes import Tune
 from companion.config.sections import Platform
@@ -34,7 +34,7 @@ from companion.daemon.job import Job
 from companion.daemon.offsets.dither import Ditherer
 from companion.daemon.offsets.effect import TELEMETRY
 from companion.daemon.offsets.plan import Planner
-from companion.daemon.offsets.push import Conclusion, Pusher
+from companion.daemon.offsets.push import WATCHING, Conclusion, Pusher
 from companion.daemon.stands.measuring import Measuring
 from companion.links.system.listeners import Listeners
 from companion.samples import Triad
@@ -47,7 +47,6 @@ _STARTED: Final[dict[Platform, str]] = {
     "ground": "Calibration started: keep the aircraft still",
     "deck": "Calibration started: the deck may sway",
 }
-_WATCHING: Final = "watching the telemetry take the new offsets"
 
 
 class Solving:
@@ -174,12 +173,10 @@ class Course:
         measured, window = await self._measure(job, draft)
         solution = await self._solving.solve(measured, window, job, draft)
         plan = await self._planner.plan(solution, draft, anyway=job.reboot)
-        job.check_cancelled()
         if not plan.changes:
+            job.check_cancelled()
             self._machine.on(Event.NOTHING_TO_WRITE)
             return
-        self._machine.on(Event.WRITE)
-        job.progress(MEASURED_PERCENT, f"writing {len(plan.changes)} parameters")
 
         def go_on(words: str) -> None:
             job.check_cancelled()
@@ -189,14 +186,10 @@ class Course:
             if moves is not None and words != TELEMETRY:
                 self._measuring.tell(job, moves)
             share = min(still_s / self._core.wanted.settings.min_still_s, 1.0)
-            job.progress(WRITTEN_PERCENT + (100.0 - WRITTEN_PERCENT) * share, words or _WATCHING)
+            job.progress(WRITTEN_PERCENT + (100.0 - WRITTEN_PERCENT) * share, words or WATCHING)
 
-        async with self._pusher.written(job, plan, draft) as plan:
-            self._machine.on(Event.WRITTEN)
-            job.progress(WRITTEN_PERCENT, _WATCHING)
-            await self._pusher.verify(job, plan, window, draft, go_on)
+        plan = await self._pusher.push(job, plan, window, draft, go_on)
         await self._conclusion.conclude(job, plan, window, draft)
-        self._machine.on(Event.CONCLUDED)
 
     async def _measure(self, job: Job, draft: Draft) -> tuple[Window, Window]:
         """A window of telemetry under the offsets in force; and the same, its means bettered where that is allowed."""

@@ -23,7 +23,7 @@ from companion.autopilot.vehicle.vehicle import ArmState, Vehicle
 from companion.calibration.machine import Event
 from companion.calibration.means.windows import Window
 from companion.calibration.solution.draft import Draft
-from companion.component.service import MEASURED_PERCENT
+from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
 from companion.component.statustext import Severity, Weight
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu, changing
@@ -52,6 +52,7 @@ STORED_AFTER_S: Final = 3.0
 ANSWER_S: Final = 3.0
 BACK_WITHIN_S: Final = 60.0
 CONCLUDING_PERCENT: Final = 95.0
+WATCHING: Final = "watching the telemetry take the new offsets"
 POLL_S: Final = 0.2
 GATED_TILT_DEG: Final = 0.3
 """Tilt that PX4 may have kept from before a write, above which it has to be restarted before it flies. A smaller one is
@@ -72,7 +73,7 @@ class Pusher:
         firmware: FirmwareCalibration,
         effect: EffectWatch,
     ) -> None:
-        self._vehicle, self._parameters, self._imus = core.vehicle, core.parameters, imus
+        self._vehicle, self._parameters, self._imus, self._machine = core.vehicle, core.parameters, imus, core.machine
         self._writer, self._ledger, self._wanted = writer, ledger, core.wanted
         self._px4, self._firmware, self._effect = px4, firmware, effect
 
@@ -88,19 +89,19 @@ class Pusher:
             held &= await imu.refresh()
         return held and not (self._wanted.push and await self._px4.make_sure(list(self._imus.values())))
 
-    @contextlib.asynccontextmanager
-    async def written(self, job: Job, plan: Plan, draft: Draft) -> AsyncIterator[Plan]:
-        """Write and read back; on failure, also of the block, the old values are put back.
+    async def push(self, job: Job, plan: Plan, before: Window, draft: Draft, go_on: GoOn) -> Plan:
+        """Write, read back, and watch the telemetry take the step that it must; on failure put the old values back.
 
-        The block verifies what was written: `verify` alone lets it stay.
-
-        Yields:
-            The plan, and what the firmware has changed besides.
+        `go_on(words)` is called now and then while it watches. The plan, and what the firmware has changed besides.
 
         Raises:
             AutopilotError: what went wrong, and which parameters could not be put back, if any.
             StorageError: the old values could not be kept, so nothing was written.
+            JobCancelledError: raised by `go_on`; the old values are back, or it is said which are not.
         """
+        job.check_cancelled()
+        self._machine.on(Event.WRITE)
+        job.progress(MEASURED_PERCENT, f"writing {len(plan.changes)} parameters")
         await self._wait_disarmed()
         firmware = await self._firmware.prepare(plan.gyros, draft.warnings.append)
         async with self._ledger.transaction(self._kept(job, plan, draft)):
@@ -110,7 +111,10 @@ class Pusher:
                 except WriteFailedError as error:
                     plan.note(draft, error.written)
                     raise
-            yield plan
+            self._machine.on(Event.WRITTEN)
+            job.progress(WRITTEN_PERCENT, WATCHING)
+            await self._verify(job, plan, before, draft, go_on)
+        return plan
 
     async def _write(self, job: Job, plan: Plan, firmware: GyroParameters | None, draft: Draft) -> Plan:
         if firmware is None:
@@ -129,14 +133,8 @@ class Pusher:
     def _kept(self, job: Job, plan: Plan, draft: Draft) -> ChangeSet:
         return ChangeSet.of(self._vehicle.system_id, plan.everything, origin=Origin(job.short, draft.started))
 
-    async def verify(self, job: Job, plan: Plan, before: Window, draft: Draft, go_on: Callable[[str], None]) -> None:
-        """Watch the telemetry take the step that it must; `go_on(words)` is called now and then meanwhile.
-
-        Raises:
-            AutopilotError: the autopilot does not use what it stored; the old values are back, or it is said which
-                are not.
-            JobCancelledError: raised by `go_on`; likewise.
-        """
+    async def _verify(self, job: Job, plan: Plan, before: Window, draft: Draft, go_on: GoOn) -> None:
+        """This alone lets it stay."""
         try:
             problems = await self._problems(plan, before, draft, go_on)
         except JobCancelledError as cancelled:
@@ -145,11 +143,10 @@ class Pusher:
             raise AutopilotError(await self._roll_back(plan, draft, "; ".join(problems)))
         try:
             await self._ledger.done(self._kept(job, plan, draft))
-        except StorageError as error:
-            # What cannot be undone later must not stay.
+        except StorageError as error:  # what cannot be undone later must not stay
             raise AutopilotError(await self._roll_back(plan, draft, str(error))) from error
 
-    async def _problems(self, plan: Plan, before: Window, draft: Draft, go_on: Callable[[str], None]) -> list[str]:
+    async def _problems(self, plan: Plan, before: Window, draft: Draft, go_on: GoOn) -> list[str]:
         """Why what was written must not stay."""
         verdicts, why_not = await self._effect.judge(plan, before, go_on, plan.boots)
         # What somebody has changed meanwhile explains what the telemetry shows, so it comes first.
@@ -246,6 +243,14 @@ def _note_verdicts(plan: Plan, target: Target, verdicts: list[Verdict], draft: D
     return problems
 
 
+def _going_on(job: Job, otherwise: str = "") -> GoOn:
+    def go_on(words: str) -> None:
+        job.check_cancelled()
+        job.progress(CONCLUDING_PERCENT, words or otherwise)
+
+    return go_on
+
+
 class NotRebootedError(AutopilotError):
     """The autopilot was not restarted; what was written is in force all the same."""
 
@@ -254,13 +259,12 @@ def why_not(calibrations: Sequence[ImuCalibration], changes: Sequence[Change]) -
     """Why a restart would do harm, or None."""
     after = {change.parameter: change.after for change in changes}
     gyros = {name for calibration in calibrations for name in calibration.parameters.gyro_offset}
-    for calibration in calibrations:
-        for rival in calibration.rivals:
-            if rival.acts == "at a start" and after.get(rival.parameter) != 0.0 and gyros & set(after):
-                return (
-                    f"not rebooted: {rival.parameter} = {rival.value} would measure the gyros anew at the start and"
-                    f" throw these gyro offsets away; set {rival.parameter} to 0 first (push.stop_rivals = true does)"
-                )
+    for rival in (rival for calibration in calibrations for rival in calibration.rivals):
+        if rival.acts == "at a start" and after.get(rival.parameter) != 0.0 and gyros & set(after):
+            return (
+                f"not rebooted: {rival.parameter} = {rival.value} would measure the gyros anew at the start and"
+                f" throw these gyro offsets away; set {rival.parameter} to 0 first (push.stop_rivals = true does)"
+            )
     return None
 
 
@@ -302,14 +306,11 @@ class Conclusion:
             await self._settle(job, plan, draft)
             if self._vehicle.boots != boots:
                 await self._survived(plan, draft)
+        self._machine.on(Event.CONCLUDED)
 
     async def _restart(self, job: Job, plan: Plan, before: Window, draft: Draft) -> str:
         """Restart it; why that was not done or not seen to its end, or empty."""
-
-        def go_on(words: str) -> None:
-            job.check_cancelled()
-            job.progress(CONCLUDING_PERCENT, words or "watching the telemetry after the reboot")
-
+        go_on = _going_on(job, "watching the telemetry after the reboot")
         self._machine.on(Event.REBOOT)
         try:
             draft.notes.append(await self._after(plan, before, draft.warnings.append, go_on))
@@ -321,11 +322,7 @@ class Conclusion:
 
     async def _settle(self, job: Job, plan: Plan, draft: Draft) -> None:
         """The write is done and stays; a cancel ends only the waiting for the autopilot's EKF."""
-
-        def go_on(words: str) -> None:
-            job.check_cancelled()
-            job.progress(CONCLUDING_PERCENT, words)
-
+        go_on = _going_on(job)
         job.lasts(settles_within_s(plan.firmware))
         try:
             go_on("EKF settling")
@@ -337,11 +334,7 @@ class Conclusion:
             self._say(Severity.WARNING, words, Weight.NEWS)
 
     async def _survived(self, plan: Plan, draft: Draft) -> None:
-        """After a restart that nobody here asked for: see that what was written is still there.
-
-        Raises:
-            AutopilotError: it is not, or the autopilot does not come back.
-        """
+        """After a restart that nobody here asked for: see that what was written is still there."""
         await _heartbeat(self._vehicle, BACK_WITHIN_S)
         changed = {name: now async for name, now in not_as_written(self._read, plan.changes)}
         if changed:
@@ -401,8 +394,6 @@ class Conclusion:
 
     async def _read(self, name: str) -> float:
         for _ in range(READ_ATTEMPTS - 1):
-            try:
+            with contextlib.suppress(AutopilotRebootedError, ParameterTimeoutError):
                 return await self._parameters.read(name)
-            except (AutopilotRebootedError, ParameterTimeoutError):
-                continue
         return await self._parameters.read(name)

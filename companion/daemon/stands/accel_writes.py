@@ -3,36 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Final
 
 import numpy as np
 
 from companion.autopilot.firmware.imu_calibration import output_step
 from companion.autopilot.firmware.px4 import warnings_about
 from companion.autopilot.parameters.change import Change
-from companion.calibration.machine import Event
 from companion.calibration.means.windows import ImuWindow, Window
 from companion.calibration.solution.draft import Draft
 from companion.calibration.solution.solve import ImuSolution
-from companion.component.service import MEASURED_PERCENT, WRITTEN_PERCENT
+from companion.component.service import WRITTEN_PERCENT
 from companion.daemon.core import Core
 from companion.daemon.devices.autopilot_imu import AutopilotImu
 from companion.daemon.job import Job
 from companion.daemon.offsets.plan import Plan, Target
-from companion.daemon.offsets.push import Conclusion
+from companion.daemon.offsets.push import WATCHING, Conclusion
 from companion.daemon.offsets.subsystem import Offsets
 from companion.errors import CalibrationRefusedError
-
-_WATCHING: Final = "watching the telemetry take the new offsets"
 
 
 class AccelWrites:
     """Writes what stands have told; all or nothing."""
 
     def __init__(self, core: Core, imus: Mapping[str, AutopilotImu], offsets: Offsets, conclusion: Conclusion) -> None:
-        self._core, self._machine, self._imus = core, core.machine, imus
-        self._pusher, self._conclusion = offsets.pusher, conclusion
-        self._ledger, self._writer = offsets.ledger, offsets.writer
+        self._core, self._imus, self._pusher, self._conclusion = core, imus, offsets.pusher, conclusion
 
     def why_not(self, *, write: bool) -> str | None:
         """Why there is nothing to measure, or nothing could be written; None where all is well."""
@@ -65,17 +59,12 @@ class AccelWrites:
         for target in targets:
             draft.warn(target.name, *warnings_about(target.calibration, target.changes))
         plan = Plan(targets, self._core.vehicle.boots)
-        job.check_cancelled()
-        self._machine.on(Event.WRITE)
-        job.progress(MEASURED_PERCENT, f"writing {len(plan.changes)} parameters")
 
         def go_on(words: str) -> None:
             job.check_cancelled()
-            job.progress(WRITTEN_PERCENT, words or _WATCHING)
+            job.progress(WRITTEN_PERCENT, words or WATCHING)
 
-        async with self._pusher.written(job, plan, draft) as plan:
-            self._machine.on(Event.WRITTEN)
-            await self._pusher.verify(job, plan, last, draft, go_on)
+        plan = await self._pusher.push(job, plan, last, draft, go_on)
         for target in targets:
             kept = draft.written.get(target.name, {})
             seen = {kept[name].outcome for name in target.calibration.parameters.accel_offset if name in kept}
@@ -83,7 +72,6 @@ class AccelWrites:
                 # One step of the output showed offsets and scales together.
                 plan.mark(draft, target.calibration.parameters.accel_scale, "verified")
         await self._conclusion.conclude(job, plan, last, draft)
-        self._machine.on(Event.CONCLUDED)
 
     def _target(self, imu: ImuWindow, changes: Sequence[Change]) -> Target:
         calibration = self._imus[imu.name].in_force
