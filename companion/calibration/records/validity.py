@@ -130,7 +130,7 @@ def age_limit_s(model: AllanModel, sigma: Vector, averaged_s: float) -> float:
 
 
 def judge(triad: Triad, name: str, held: Held, model: AllanModel, limits: Limits, seen: Seen) -> list[Finding]:
-    """Everything that speaks against one triad\'s calibration now; empty while it is good."""
+    """Everything that speaks against one triad's calibration now; empty while it is good."""
     present, drift, temperature_degc = seen.present, seen.drift, seen.temperature_degc
     found: list[Finding] = []
     if not held.seen:
