@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import re
 from typing import NamedTuple
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sim.earth import Array
+from sim.earth import Array, body_from_ned
 from sim.hands import AHEAD_S, SIDES, Hands
 from sim.imu_model import MG
 from sim.sitl.ground import GroundStation
@@ -90,8 +91,23 @@ async def attitude_error_deg(vehicle: SitlVehicle, ground: GroundStation) -> Arr
     seen = await ground.collect(mavlink.MAVLink_attitude_message, LOOK_S)
     if not seen:
         raise RuntimeError("no ATTITUDE came")
-    told = np.mean([(message.roll, message.pitch) for message in seen], axis=0)
-    off = told - np.array(vehicle.aircraft.angles_rad(vehicle.now_s)[:2])
+    return _off_deg(vehicle, np.mean([(message.roll, message.pitch) for message in seen], axis=0))
+
+
+async def level_error_deg(vehicle: SitlVehicle, ground: GroundStation) -> Array:
+    """What accelerometers and level make of where it stands, too much, without the estimator: roll, pitch.
+
+    Raises:
+        RuntimeError: the telemetry does not come.
+    """
+    up = (await mean_reading(vehicle, ground, 1, LOOK_S))[3:]
+    if vehicle.firmware == "ardupilot":  # PX4's telemetry is turned already
+        up = body_from_ned(await ground.get("AHRS_TRIM_X"), await ground.get("AHRS_TRIM_Y"), 0.0).T @ up
+    return _off_deg(vehicle, np.array([math.atan2(-up[1], -up[2]), math.atan2(up[0], math.hypot(up[1], up[2]))]))
+
+
+def _off_deg(vehicle: SitlVehicle, told_rad: Array) -> Array:
+    off = told_rad - np.array(vehicle.aircraft.angles_rad(vehicle.now_s)[:2])
     wrapped: Array = np.degrees((off + np.pi) % (2.0 * np.pi) - np.pi)
     return wrapped
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim.hands import AHEAD_S, PLACEMENT_DEG, PROPPED_DEG, Hands
-from sim.sitl.by_hand import SETTLE_S, attitude_error_deg, judged, own_six_positions
+from sim.sitl.by_hand import SETTLE_S, attitude_error_deg, judged, level_error_deg, own_six_positions
 from sim.sitl.ground import GroundStation
 from sim.sitl.residuals import LEVEL, ground_station, own_calibration
 from sim.sitl.vehicle import SitlVehicle
@@ -98,9 +98,11 @@ class Tape:
         self.say("TRUTH", f"{what}: {await judged(self.vehicle, self.ground, self.hands)}")
 
     async def judge_attitude(self, what: str) -> None:
-        """What ATTITUDE has wrong after a restart."""
+        """What ATTITUDE has wrong after a restart, and what of that is not its estimator's."""
         roll, pitch = await attitude_error_deg(self.vehicle, self.ground)
-        self.say("TRUTH", f"{what}, restarted, on the slope: roll {roll:+.3f}, pitch {pitch:+.3f} deg off")
+        x, y = await level_error_deg(self.vehicle, self.ground)
+        words = f"{what}, restarted, on the slope: roll {roll:+.3f}, pitch {pitch:+.3f} deg off"
+        self.say("TRUTH", f"{words}; by accelerometers and level alone {x:+.3f} {y:+.3f}")
 
     async def _hears(self) -> bool:
         """Whether the daemon has heard the autopilot."""
