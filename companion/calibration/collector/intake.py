@@ -300,8 +300,9 @@ class Intake(ABC):
 
     def counted(self, imu: str, start_s: float, end_s: float, bias_rad_s: Array) -> Counted | None:
         """`TurnCounter.counted` of an IMU; None where nothing was kept of it."""
-        counter = self._counters.get(imu)
-        return None if counter is None else counter.counted(start_s, end_s, bias_rad_s, self._inputs[imu].rotation)
+        counter, kind = self._counters.get(imu), self._inputs[imu]
+        cut_rad_s = kind.gyro_step_rad_s if kind.truncates else 0.0
+        return None if counter is None else counter.counted(start_s, end_s, bias_rad_s, kind.rotation, cut_rad_s)
 
     @property
     def turn(self) -> Turn:

@@ -19,10 +19,12 @@ from companion.samples import ImuSample
 
 MAX_SAMPLES: Final = 60_000
 """Since the stand before: ten minutes at 100 Hz, 2.4 MB. A turn of more is not counted."""
+LEAST_SAMPLES: Final = 8
 HOLE_S: Final = 0.05
 """Beyond the stream's interval: an aircraft that hands turn by 60 deg/s turns by 3 degrees meanwhile."""
 AT_REST_S: Final = 0.5
-"""It stands at both ends, so that nothing is lost there. So far may device and host disagree on how long it took."""
+"""In less nobody turns it from rest to rest. So far may device and host disagree on how long it took, too."""
+MOVES_RAD_S: Final = math.radians(0.5)
 SIGMA_RAD: Final = math.radians(0.15)
 """Of each turn, besides scale and stamps: axes that are not square, of an aircraft that is tilted on its way."""
 
@@ -47,7 +49,9 @@ class TurnCounter:
         device_s = math.nan if sample.t_device_s is None else sample.t_device_s
         self._samples.extend((sample.t_s, device_s, *sample.gyro_rad_s))
 
-    def counted(self, start_s: float, end_s: float, bias_rad_s: Array, vehicle_from_sensor: Matrix) -> Counted | None:
+    def counted(
+        self, start_s: float, end_s: float, bias_rad_s: Array, vehicle_from_sensor: Matrix, cut_rad_s: float = 0.0
+    ) -> Counted | None:
         """By how much it was turned between two times at which it stood; None where samples are missing.
 
         Args:
@@ -55,21 +59,31 @@ class TurnCounter:
             end_s: beginning of the window after.
             bias_rad_s: (3,) in the vehicle's axes.
             vehicle_from_sensor: 3x3.
+            cut_rad_s: step of integers that are cut off toward zero.
         """
         rows = np.array(self._samples).reshape(-1, 5)
         old = int(np.searchsorted(rows[:, 0], start_s))
         del self._samples[: 5 * old]
         rows = rows[old : int(np.searchsorted(rows[:, 0], end_s))]
-        if len(rows) < 3 or rows[0, 0] - start_s > AT_REST_S or end_s - rows[-1, 0] > AT_REST_S:
+        if len(rows) < LEAST_SAMPLES or rows[0, 0] - start_s > AT_REST_S or end_s - rows[-1, 0] > AT_REST_S:
             return None
         times, rates = _in_time(rows)
         gaps = np.diff(times)
-        if gaps.max() > median(gaps.tolist()) + HOLE_S:
+        if len(gaps) == 0 or gaps.max() > AT_REST_S:
             return None
-        rates = rates @ vehicle_from_sensor.T - bias_rad_s
+        rates = (rates + np.sign(rates) * cut_rad_s / 2.0) @ vehicle_from_sensor.T - bias_rad_s
+        # While it stands it does not turn, whatever integers and a bias that wanders make of minutes of it.
+        moves_s = times[np.abs(rates).max(axis=1) > MOVES_RAD_S + cut_rad_s]
+        if len(moves_s) == 0:
+            return Counted(0.0, SIGMA_RAD)
+        moves = (times > moves_s[0] - AT_REST_S) & (times < moves_s[-1] + AT_REST_S)
+        times, rates = times[moves], rates[moves]
+        if len(times) < LEAST_SAMPLES or np.diff(times).max() > median(gaps.tolist()) + HOLE_S:
+            return None
         angle_rad = _turned_rad(times, rates)
-        # What half of the samples count differently is as much as sampling and stamps can be trusted.
-        return Counted(angle_rad, math.hypot(SIGMA_RAD, angle_rad - _turned_rad(times[::2], rates[::2])))
+        # What every fourth sample counts by itself differs by twice as much as sampling and stamps make of all.
+        parts = [_turned_rad(times[k::4], rates[k::4]) - angle_rad for k in range(4)]
+        return Counted(angle_rad, math.hypot(SIGMA_RAD, float(np.linalg.norm(parts)) / math.sqrt(12.0)))
 
 
 def _in_time(rows: Floats) -> tuple[Floats, Floats]:
